@@ -7,7 +7,6 @@ Accuracy table: precision, recall and F1 of both modes on the data sets, and its
 is worse. Data sets and columns: benchmarks/README.md.
 """
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import json
@@ -16,9 +15,9 @@ import sys
 import time
 from typing import Any
 
-from data import data_folder, NoDataError
+from data import data_folder
 import numpy as np
-from results import environment, heading, RESULTS, table, write
+from results import environment, heading, options_parser, table, write_json, write_lines
 from stavpr_lab.evaluation.drive import cropped, DriveChanges, KINDS
 from stavpr_lab.evaluation.evaluate import (
     evaluate_loop_closures,
@@ -194,7 +193,7 @@ def _map(source: Any, making: FeatureExtractor) -> PlaceMap:
 
 
 def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield key and numbers of every row; print what is left out."""
+    """Yield key and numbers of every row; report rows that are left out."""
     for feature in ('g',) if quick else FEATURES:
         try:
             making = extractors(feature, folder)
@@ -272,25 +271,18 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    add = parser.add_argument
-    add('--quick', action='store_true', help='gradient features, without Nordland and tower')
-    add('--compare', type=Path, metavar='OLD', help='table to compare with; 1 if worse')
-    add('--commit', default='', help='name of the measured commit, outside a git checkout')
-    add('--output', type=Path, default=RESULTS, help='folder of the table (%(default)s)')
+    parser = options_parser(__doc__, 'gradient features, without Nordland and tower')
+    compared = 'table to compare with; 1 if worse'
+    parser.add_argument('--compare', type=Path, metavar='OLD', help=compared)
     options = parser.parse_args(arguments)
-    try:
-        folder = data_folder()
-    except NoDataError as error:
-        print(f'accuracy: {error}', file=sys.stderr)
-        return 2
     old = json.loads(options.compare.read_text())['results'] if options.compare else None
     about, began, results = environment(named_commit=options.commit), time.perf_counter(), {}
-    for key, values in measure(folder, options.quick):
+    for key, values in measure(data_folder(), options.quick):
         results[key] = values
         print(key, json.dumps(values.get('sequence', values).get('f1', values)), flush=True)
     path = options.output / f'accuracy{"-quick" if options.quick else ""}-{about["commit"]}.json'
-    write(path, about | {'results': results}, markdown(about, results))
+    write_json(path, about | {'results': results})
+    write_lines(path.with_suffix('.md'), markdown(about, results))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its .md')
     if old is None:
         return 0

@@ -8,7 +8,7 @@ strips together, its ``RANK`` largest directions) and the correlation from image
 real map: a first-order autoregressive Gaussian, each strip made unit norm. The real places lie
 together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000`` adds to
 ``benchmarks/results/city.json``, and writes the tables of docs/performance.md from it and from
-what ``soak.py --output benchmarks/results/node-NAME.json`` has measured.
+the results of ``soak.py --output benchmarks/results/node-NAME.json``.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import commit, cpu_model, RESULTS, ROOT, table
+from results import commit, cpu_model, RESULTS, ROOT, table, write_json
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -57,7 +57,7 @@ class HalfFeatures(LocalFeatures):
 
 
 def simulated(real: LocalFeatures, n: int, seed: int) -> Iterator[torch.Tensor]:
-    """Yield the strips (W, m, d) of n simulated places, some at a time."""
+    """Yield the strips (W, m, d) of n simulated places, block by block."""
     rng = np.random.default_rng(seed)
     W, m, d = real.strips.shape
     images = real.strips.transpose(0, 1).reshape(m, W * d).double()
@@ -179,12 +179,12 @@ def merged(path: Path, found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
     of_cases = {(one['case'], one['places']): one for one in (*before, *found)}
     if found:
-        path.write_text(json.dumps([*of_cases.values()], indent=1) + '\n', encoding='utf-8')
+        write_json(path, [*of_cases.values()])
     return list(of_cases.values())
 
 
 def node_lines(folder: Path) -> list[str]:
-    """Return the table of what ``soak.py`` has measured on maps of cities."""
+    """Return the table of the results of ``soak.py`` on maps of cities."""
     rows = []
     for path in sorted(folder.glob('node-*.json')):
         one = json.loads(path.read_text(encoding='utf-8'))
@@ -210,7 +210,7 @@ def write_page(found: list[dict[str, Any]], page: Path) -> None:
 
 
 def written_between(page: Path, begin: str, end: str, shown: list[str]) -> None:
-    """Replace what stands between two marks of a page."""
+    """Replace the text between two marks of a page."""
     before, rest = page.read_text(encoding='utf-8').split(begin)
     text = '\n'.join(['', '', *shown]).rstrip()
     page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')

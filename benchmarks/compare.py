@@ -184,10 +184,10 @@ def main(arguments: list[str] | None = None) -> int:
     this.close()
     other.close()
     if options.output:
-        from results import environment
+        from results import environment, write_json
 
         document = environment() | {'other': str(options.checkout.name), 'results': found}
-        options.output.write_text(json.dumps(document, indent=1) + '\n')
+        write_json(options.output, document)
     worse = any(r['ratio'] > options.allowed or not r['equal_results'] for r in found)
     return 1 if worse else 0
 

@@ -52,11 +52,11 @@ def kernels() -> list[tuple[str, Any, Any]]:
     table, codes, steps = float32[:, ::1], uint8[:, ::1], int32[::1]
     K, V = LEVELS, SPEEDS
     motion = (int64, table, codes, floats, steps, floats, float32, float32, float32, floats)
-    ways = (int64[::1], table, uint8[:, :, ::1], int32[:, ::1], int64, floats, int32[:, ::1])
+    paths = (int64[::1], table, uint8[:, :, ::1], int32[:, ::1], int64, floats, int32[:, ::1])
     found += [
         ('filter mix', place_filter.mix(K, V).py_func, (int64, *(table,) * 4, codes)),
         ('filter move', place_filter.move(K, V).py_func, (*motion, table, codes, table)),
-        ('filter trace', place_filter.trace(K, V).py_func, ways),
+        ('filter trace', place_filter.trace(K, V).py_func, paths),
     ]
     return found
 

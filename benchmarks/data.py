@@ -4,6 +4,7 @@
 
 import os
 from pathlib import Path
+import sys
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -13,21 +14,11 @@ SETTINGS = FeatureSettings('synthetic', None)
 BLOCK_BYTES = 2**28
 
 
-class NoDataError(Exception):
-    """The folder of data sets is missing."""
-
-
 def data_folder() -> Path:
-    """
-    Return the folder of the data sets: ``STAVPR_DATA``, or ``data`` in the checkout.
-
-    :raises NoDataError: no such folder.
-    """
+    """Return the folder of the data sets: ``STAVPR_DATA``, or ``data`` in the checkout."""
     folder = Path(os.environ.get('STAVPR_DATA') or Path(__file__).resolve().parents[1] / 'data')
     if not folder.is_dir():
-        raise NoDataError(
-            f'no data folder {folder}: set STAVPR_DATA to the folder of the data sets'
-        )
+        sys.exit(f'no data folder {folder}: set STAVPR_DATA to the folder of the data sets')
     return folder
 
 

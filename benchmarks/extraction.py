@@ -22,7 +22,7 @@ import torch
 
 WIDTH, HEIGHT, BATCH = 640, 480, 16
 FULL_HD, FULL_HD_IMAGES = (1920, 1080), 8
-IMAGES = 64  # more memory than a cache holds, as a camera's
+IMAGES = 64  # more memory than a cache has, as a camera's
 
 
 def make_images(seed: int) -> list[np.ndarray]:

@@ -1,29 +1,14 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Graph of a run of ``matching.py``: times over the number of places, beside bounds and peers.
-
-``python benchmarks/graphs.py benchmarks/results/matching-NAME.json docs/performance.png``.
-"""
+"""Graph of a run of ``matching.py``: times over the number of places, bounds and peers."""
 
 from collections.abc import Sequence
-import json
 from pathlib import Path
-import sys
 
-from results import PeerTime, Row
+from results import Row
 
 COLORS = {'float32': '#1f77b4', 'int8': '#d62728'}
 PEERS = ('torch float32', 'faiss flat', 'prange')
-
-
-def read(path: Path) -> list[Row]:
-    """Return the rows of a file of results."""
-    rows = []
-    for found in json.loads(path.read_text(encoding='utf-8'))['rows']:
-        del found['ratio_to_lower_bound']
-        rows.append(Row(**found | {'peers': tuple(PeerTime(**peer) for peer in found['peers'])}))
-    return rows
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
@@ -55,11 +40,11 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 axes.plot(n, bound, ':', color=color, label=f'{precision}, lower bound')
         for name, style in zip(PEERS, ('s--', 'd--', '^--'), strict=True):
             peers = [
-                (row.n, 1e3 * peer.median_s)
+                (row.n, 1e3 * peer['median_s'])
                 for row in own
                 if row.precision == 'float32'
                 for peer in row.peers
-                if peer.name == name
+                if peer['name'] == name
             ]
             if peers:
                 axes.plot(*zip(*peers, strict=True), style, color='gray', ms=4, label=name)
@@ -71,7 +56,3 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axes.legend(fontsize=7)
     figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-if __name__ == '__main__':
-    draw(read(Path(sys.argv[1])), Path(sys.argv[2]))

@@ -26,7 +26,7 @@ class Sizes:
     :param d: dimensions of a local feature.
     :param W: strips of an image.
     :param l: images of the window.
-    :param k: map images that a start of LM-DTW sees.
+    :param k: map images within reach of a start of LM-DTW.
     """
 
     n: int
@@ -117,7 +117,7 @@ def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
 
 
 def filter_belief(sizes: Sizes) -> Work:
-    """Read the largest sum of each block; the way back starts at few places."""
+    """Read the largest sum of each block; backtracking starts at few places."""
     return Work(4 * sizes.n / BLOCK, sizes.n / BLOCK)
 
 

@@ -6,25 +6,24 @@ Map files: time to the first answer, and memory.
 Every start is a process of its own, after imports and a start on a tiny map, which loads compiled
 kernels. The times are those of ``open_map``, of the recognizer, and of its first match; *cold*:
 the file was dropped from the page cache before. The floor is the time to read the bytes that the
-matcher holds, or is made of, from the same file. ``PYTHONPATH=. python benchmarks/maps.py``.
+matcher keeps, or is made of, from the same file. ``PYTHONPATH=. python benchmarks/maps.py``.
 """
 
 import argparse
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-import json
+from itertools import product
+from multiprocessing import get_context
 import os
 from pathlib import Path
-import subprocess
-import sys
 import tempfile
 import time
 from typing import Any
 
 import numpy as np
-from results import cpu_model, table
+from results import cpu_model, table, write_json
 import torch
 
-TESTS = Path(__file__).resolve().parents[1] / 'test'
 TINY = 300  # places
 CACHES = ('cold', 'warm')
 
@@ -64,7 +63,7 @@ def write_files(folder: Path, places: int) -> None:
 
 
 def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
-    """Return the times of a start in this process, s, and what it took, MB."""
+    """Return the times of a start in this process, s, and its memory, MB."""
     from memory import resident_bytes
     from stavpr_ros.mapping import descriptor_map, open_map
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -110,11 +109,10 @@ def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
 
 def measure(path: Path, case: Case, cache: str, runs: int) -> dict[str, Any]:
     """Return the run of the least time of several, each a process of its own."""
-    command = [sys.executable, __file__, '--start', str(path), case.precision, cache]
     found = []
     for _ in range(runs):
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-        found.append(json.loads(done.stdout))
+        with ProcessPoolExecutor(1, get_context('spawn')) as pool:
+            found.append(pool.submit(start, path, case.precision, cache).result())
     best: dict[str, Any] = min(found, key=lambda one: one['all'])
     return {'file': case.file, 'precision': case.precision, 'cache': cache, **best}
 
@@ -140,31 +138,22 @@ def main() -> None:
     parser.add_argument('--places', type=int, default=100_000)
     parser.add_argument('--runs', type=int, default=3, help='of each start (%(default)s)')
     parser.add_argument('--output', type=Path, help='JSON file')
-    parser.add_argument('--start', nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     from stavpr_ros.threads import wait_passively
 
     wait_passively()  # as the node does; the processes that are timed inherit it
-    if arguments.start:
-        path, precision, cache = arguments.start
-        print(json.dumps(start(Path(path), precision, cache)))
-        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_files(folder, arguments.places)
         sizes = {path.name: path.stat().st_size / 1e6 for path in sorted(folder.iterdir())}
-        rows = [
-            measure(folder / case.file, case, cache, arguments.runs)
-            for case in CASES
-            for cache in CACHES
-        ]
+        pairs = product(CASES, CACHES)
+        rows = [measure(folder / case.file, case, cache, arguments.runs) for case, cache in pairs]
     print(f'{cpu_model()}, {torch.get_num_threads()} threads; {arguments.places:,} places')
     print(', '.join(f'{name}: {size:.0f} MB' for name, size in sizes.items()))
     print('\n'.join(lines(rows)))
     if arguments.output:
         found = {'processor': cpu_model(), 'places': arguments.places, 'megabytes': sizes}
-        content = json.dumps(found | {'starts': rows}, indent=1)
-        arguments.output.write_text(content + '\n', encoding='utf-8')
+        write_json(arguments.output, found | {'starts': rows})
 
 
 if __name__ == '__main__':

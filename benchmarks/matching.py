@@ -10,18 +10,17 @@ benchmarks/matching.py``. Method and tables: benchmarks/README.md.
 import argparse
 from dataclasses import asdict
 import importlib.util
-from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING
 
-from results import RESULTS, ROOT
+from results import options_parser, RESULTS, ROOT
 
 if TYPE_CHECKING:
     from run import Run
 
 SIZES = (2_000, 20_000, 100_000, 1_000_000)
-CITY = 200_000  # places from which on only mode robust in int8 is measured, and the first stage
+CITY = 200_000  # from here on, a CPU measures mode robust in int8 and the first stage alone
 QUICK_LIMIT = 20_000  # most places of --quick
 DIMENSIONS = (224, 512)  # of the gradient features, and of projected ones
 GRAPH = ROOT / 'docs' / 'performance.png'
@@ -30,10 +29,9 @@ BUSY = 0.5  # load average above which results are not repeatable
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser = options_parser(__doc__, f'up to {QUICK_LIMIT:,} places, fewer runs')
     add = parser.add_argument
     add('--device', choices=('cpu', 'cuda'), default='cpu')
-    add('--quick', action='store_true', help=f'up to {QUICK_LIMIT:,} places, fewer runs')
     add('--sizes', type=int, nargs='+', default=SIZES, metavar='N', help='places')
     add('--dimensions', type=int, nargs='+', default=DIMENSIONS, metavar='D', help='of a feature')
     add('--precisions', nargs='+', metavar='DTYPE', help='of the map (all)')
@@ -41,8 +39,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     add('--memory', type=float, default=12, help='most GB to use (%(default)s)')
     add('--seed', type=int, default=0)
     add('--no-memory', action='store_true', help='without the memory of the pipeline')
-    add('--commit', default='', help='name of the measured commit, outside a git checkout')
-    add('--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)')
     options = parser.parse_args(arguments)
     if options.quick:
         options.sizes = [n for n in options.sizes if n <= QUICK_LIMIT]
@@ -69,7 +65,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     for n in options.sizes:
         robust_stages(run, n, options.seed)
     for n in options.sizes:
-        if n >= CITY:
+        if n >= CITY and run.device == 'cpu':
             run.skip('frame', n, 0, 'float32 and mode paper: too large, see first_stage')
             city_stages(run, n, options.dimensions[0], options.seed)
             continue
@@ -106,8 +102,8 @@ def main(arguments: list[str] | None = None) -> int:
     from graphs import draw
     from memory import CASES, measure_memory, TARGET
     from peaks import measure_peaks
-    from report import report, target_section
-    from results import environment, file_name, write
+    from report import report
+    from results import environment, file_name, write_json, write_lines
     from run import Run
     from stavpr_ros.recognition.matcher import PRECISIONS
 
@@ -125,14 +121,17 @@ def main(arguments: list[str] | None = None) -> int:
     document = about | {
         'peaks': asdict(peaks),
         'rows': [asdict(row) | {'ratio_to_lower_bound': row.ratio} for row in run.rows],
-        'memory': [asdict(held) | {'ratio': held.ratio, 'wanted': TARGET} for held in memory],
+        'memory': [asdict(one) | {'ratio': one.ratio, 'wanted': TARGET} for one in memory],
         'skipped': run.skipped,
     }
-    write(options.output / name, document, report(about, run, memory))
+    write_json(options.output / name, document)
+    lines = report(about, run, memory)
+    write_lines((options.output / name).with_suffix('.md'), lines)
     if importlib.util.find_spec('matplotlib'):
         documented = options.output == RESULTS and not options.quick and options.device == 'cpu'
         draw(run.rows, GRAPH if documented else (options.output / name).with_suffix('.png'))
-    print('\n'.join(target_section(run.rows, options.device)))
+    first, last = lines.index('## Targets'), lines.index('## All stages')
+    print('\n'.join(lines[first:last]))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {options.output / name} and its .md')
     return 0
 

@@ -9,12 +9,13 @@ libraries are resident before. The resident set is read after garbage collection
 both times.
 """
 
+from concurrent.futures import ProcessPoolExecutor
 import ctypes
 from dataclasses import dataclass
 import gc
+from multiprocessing import get_context
 import os
 from pathlib import Path
-import subprocess
 import sys
 import tempfile
 from types import SimpleNamespace
@@ -99,23 +100,22 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
     :param n, d: places and dimensions; 0 = those of ``SIZES``.
     """
     from lower_bounds import ITEM_BYTES
-    import stavpr_ros
 
     n, d = n or SIZES[operation][0], d or SIZES[operation][1]
-    package = str(Path(stavpr_ros.__file__).resolve().parents[1])
-    path = os.pathsep.join(filter(None, (package, os.environ.get('PYTHONPATH'))))
-    with tempfile.TemporaryDirectory() as folder:
+    # one thread: thousands of short calls beside other load, and the bytes are the same
+    threads = patch.dict(os.environ, OMP_NUM_THREADS='1', NUMBA_NUM_THREADS='1')
+    with (
+        tempfile.TemporaryDirectory() as name,
+        threads,
+        ProcessPoolExecutor(1, get_context('spawn')) as pool,
+    ):
+        folder = Path(name)
         if operation == 'localization':
             for places in (SMALL, n):
-                _save_map(Path(folder, f'{places}.stavpr'), places, d)
-        command = [sys.executable, __file__, operation, mode, precision, str(n), str(d), folder]
-        # one thread: thousands of short calls beside other load, and the bytes are the same
-        variables = {'PYTHONPATH': path, 'OMP_NUM_THREADS': '1', 'NUMBA_NUM_THREADS': '1'}
-        done = subprocess.run(
-            command, env=os.environ | variables, stdout=subprocess.PIPE, text=True, check=True
-        )
-    held = n * d * STRIPS * ITEM_BYTES[precision]
-    return Memory(operation, mode, precision, n, d, held, int(done.stdout))
+                _save_map(folder / f'{places}.stavpr', places, d)
+        growth = pool.submit(_growth, operation, mode, precision, n, d, folder).result()
+    size = n * d * STRIPS * ITEM_BYTES[precision]
+    return Memory(operation, mode, precision, n, d, size, growth)
 
 
 def _kind() -> 'Kind':
@@ -152,7 +152,7 @@ def resident_bytes() -> int:
 def run_pipeline(
     operation: str, mode: str, precision: str, n: int, d: int, folder: Path
 ) -> 'Pipeline':
-    """Return a pipeline that holds n places and has processed images."""
+    """Return a pipeline of n places that has processed images."""
     from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 
     settings = PipelineSettings(
@@ -172,23 +172,17 @@ def run_pipeline(
     return pipeline
 
 
-def main(arguments: list[str]) -> None:
-    """Print by how many bytes the resident set of this process grows with a pipeline."""
+def _growth(operation: str, mode: str, precision: str, n: int, d: int, folder: Path) -> int:
+    """Return by how many bytes the resident set of this process grows with a pipeline."""
     from stavpr_ros.features import registry
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
     registry.KINDS['synthetic'] = _kind()
-    operation, mode, precision, n, d, folder = arguments
-    run = (operation, mode, precision)
-    run_pipeline(*run, SMALL, int(d), Path(folder))
+    run_pipeline(operation, mode, precision, SMALL, d, folder)
     before = resident_bytes()
-    pipeline = run_pipeline(*run, int(n), int(d), Path(folder))
+    pipeline = run_pipeline(operation, mode, precision, n, d, folder)
     after = resident_bytes()
-    if pipeline.places is None or len(pipeline.places) != int(n):
-        raise SystemExit(f'memory: the pipeline holds {pipeline.places}: expected {n} places')
-    print(after - before)
-
-
-if __name__ == '__main__':
-    main(sys.argv[1:])
+    assert pipeline.places is not None
+    assert len(pipeline.places) == n
+    return after - before

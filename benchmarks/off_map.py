@@ -7,20 +7,18 @@ Off the map, at night, at other speeds: mode robust with its defaults on all dat
 benchmarks/results/. Rows: benchmarks/README.md.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-import json
 from pathlib import Path
 import sys
 import time
 from typing import Any
 
 from accuracy import extractors, FEATURES, long_cases, short_cases
-from data import data_folder, NoDataError
+from data import data_folder
 import numpy as np
 from off_map_page import DAY, markdown, NIGHT, Results, summary_section
-from results import environment, RESULTS, ROOT
+from results import environment, options_parser, ROOT, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
@@ -66,7 +64,7 @@ class Pair:
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """
-    What a drive of N images was matched with; every array has the shape (N,).
+    The matches of a drive of N images; every array has the shape (N,).
 
     :param accepted: matched.
     :param probabilities: declared for the matches, NaN = none.
@@ -308,29 +306,29 @@ class Measurement:
         return self.rows
 
 
-def opened(
-    folder: Path, feature: str, making: FeatureExtractor
-) -> Iterator[tuple[Pair | None, dict[str, PlaceMap]]]:
-    """Yield the pairs of the data sets, and at last the floors; features are extracted once."""
+def extracted(source: Any, making: FeatureExtractor) -> PlaceMap:
+    """Return a map of all images of a source."""
+    return build_map(source, making, thumbnails=False, progress=False)
+
+
+def pairs_of(folder: Path, feature: str, making: FeatureExtractor) -> Iterator[Pair]:
+    """Yield the pairs of the data sets; the features of a source are extracted once."""
     kept: dict[int, tuple[Any, PlaceMap]] = {}  # with its source, so that its id stays its own
 
     def features(source: Any) -> PlaceMap:
         if id(source) not in kept:
-            kept[id(source)] = source, build_map(source, making, thumbnails=False, progress=False)
+            kept[id(source)] = source, extracted(source, making)
         return kept[id(source)][1]
 
     for case in (*short_cases(folder), *long_cases(folder, feature)):
         if case.name not in SETS:
             continue
         places, query = features(case.places), features(case.query)
-        yield Pair(case.name, places, query, case.truth(len(query), len(places))), {}
-    kept.clear()
-    paths = sorted(path for path in (folder / TOWER).iterdir() if path.is_dir())
-    yield None, {path.name: features(open_source(path)) for path in paths}
+        yield Pair(case.name, places, query, case.truth(len(query), len(places)))
 
 
 def measure(folder: Path, chosen: Sequence[str], coarser: int) -> Results:
-    """Return all rows; print what is left out."""
+    """Return all rows; report features that are left out."""
     results: Results = {}
     for feature in chosen:
         try:
@@ -339,42 +337,29 @@ def measure(folder: Path, chosen: Sequence[str], coarser: int) -> Results:
             print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
             continue
         measurement = Measurement(feature, coarser)
-        for pair, floors in opened(folder, feature, making):
-            print(f'{FEATURES[feature]}: {TOWER if pair is None else pair.name}', file=sys.stderr)
-            if pair is not None:
-                measurement.pair(pair)
-            else:
-                measurement.floors(floors)
+        for pair in pairs_of(folder, feature, making):
+            print(f'{FEATURES[feature]}: {pair.name}', file=sys.stderr)
+            measurement.pair(pair)
+        paths = sorted(path for path in (folder / TOWER).iterdir() if path.is_dir())
+        measurement.floors({path.name: extracted(open_source(path), making) for path in paths})
         results |= measurement.finish()
     return results
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
-    add = parser.add_argument
-    add('--quick', action='store_true', help='gradient features, coarser steps; not into docs/')
-    add('--features', nargs='+', choices=tuple(FEATURES), default=tuple(FEATURES))
-    add('--commit', default='', help='name of the measured commit, outside a git checkout')
-    add('--output', type=Path, default=RESULTS, help='folder of the JSON (%(default)s)')
+    parser = options_parser(__doc__, 'gradient features, coarser steps; not into docs/')
+    kinds = tuple(FEATURES)
+    parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
     options = parser.parse_args(arguments)
-    try:
-        folder = data_folder()
-    except NoDataError as error:
-        print(f'off_map: {error}', file=sys.stderr)
-        return 2
     about, began = environment(named_commit=options.commit), time.perf_counter()
     chosen, steps = (('g',), COARSER) if options.quick else (options.features, 1)
-    results = measure(folder, chosen, steps)
+    results = measure(data_folder(), chosen, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     page = path.with_suffix('.md') if options.quick else ROOT / 'docs/off_map.md'
-    path.parent.mkdir(parents=True, exist_ok=True)
     about |= {'steps': steps}
-    path.write_text(
-        json.dumps(about | {'results': results}, indent=1, allow_nan=False) + '\n',
-        encoding='utf-8',
-    )
-    page.write_text('\n'.join(markdown(about, results)).rstrip() + '\n', encoding='utf-8')
+    write_json(path, about | {'results': results})
+    write_lines(page, markdown(about, results))
     print(*summary_section(results), sep='\n')
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and {page}')
     return 0

@@ -4,13 +4,12 @@
 Mode robust with fewer dimensions: no projection, principal components, random ones, int8.
 
 ``PYTHONPATH=. python benchmarks/projection.py`` writes ``benchmarks/results/projection.json`` and
-the table of docs/performance.md: best F1, and precision and recall at the default threshold.
+the table of docs/performance.md: the lowest of best F1, precision and recall over the data sets.
 """
 
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +17,18 @@ from accuracy import Case, extractors, long_cases, numbers, short_cases
 from city import written_between
 from data import data_folder
 import numpy as np
-from results import RESULTS, ROOT, table
+from results import RESULTS, ROOT, table, write_json
 from stavpr_lab.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.robust import MIN_PROBABILITY
 import torch
 
 PAGE = ROOT / 'docs' / 'performance.md'
 BEGIN, END = '<!-- written by benchmarks/projection.py -->', '<!-- end of projection -->'
+NUMBERS = ('f1', 'precision', 'recall')
 COLUMNS = {  # name: projection, dimension, precision
     'all': ('', 0, 'float32'),
     'all, int8': ('', 0, 'int8'),
@@ -92,7 +91,7 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
         evaluation = evaluate_on_map(
             place_map, images, case.truth(len(query), n), settings, precision=precision
         )
-        found = numbers(evaluation, 1 - MIN_PROBABILITY)
+        found = numbers(evaluation, 'robust')
         yield {
             'kind': kind,
             'dimension': places.dimension,
@@ -105,19 +104,23 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
 
 
 def lines(found: list[dict[str, Any]]) -> list[str]:
-    """Return the table of the results."""
-    cells: dict[tuple[Any, ...], dict[Any, str]] = {
-        (one['kind'], one['dimension'], one['case']): {} for one in found
-    }
+    """Return a table of the lowest F1, precision and recall over the data sets."""
+    of_cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for one in found:
-        numbers = (f'{one[key]:.3f}' for key in ('f1', 'precision', 'recall'))
-        cells[one['kind'], one['dimension'], one['case']][one['column']] = ' '.join(numbers)
-    head = ('features', 'query', *COLUMNS)
-    body = [
-        [f'{kind}, {d}', case, *(row.get(name, '-') for name in COLUMNS)]
-        for (kind, d, case), row in cells.items()
-    ]
-    return table(head, body)
+        features = f'{one["kind"]}, {one["dimension"]}'
+        of_cells.setdefault((features, one['column']), []).append(one)
+
+    def cell(features: str, column: str) -> str:
+        cases = of_cells.get((features, column), [])
+        if not cases:
+            return '-'
+        numbers = [f'{min(one[key] for one in cases):.3f}' for key in NUMBERS]
+        every = len(of_cells[features, 'all'])
+        return ' '.join(numbers) + (f' ({len(cases)} of {every})' if len(cases) < every else '')
+
+    rows = dict.fromkeys(features for features, _ in of_cells)
+    body = [[features, *(cell(features, column) for column in COLUMNS)] for features in rows]
+    return table(('features', *COLUMNS), body)
 
 
 def main() -> None:
@@ -136,9 +139,9 @@ def main() -> None:
             cases += [case for case in long_cases(folder, 'o') if case.name == 'nordland']
         for case in cases:
             new = [*rows(case, kind, extractor)]
-            print(lines(new)[2], flush=True)
+            print(case.name, lines(new)[2], flush=True)
             found += new
-    arguments.output.write_text(json.dumps(found, indent=1) + '\n', encoding='utf-8')
+    write_json(arguments.output, found)
     if arguments.output == RESULTS / 'projection.json':
         written_between(PAGE, BEGIN, END, lines(found))
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of a run: rows, the machine that they were measured on, JSON and Markdown."""
 
+import argparse
 from collections.abc import Sequence
 import contextlib
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from pathlib import Path
 import platform
 import re
 import subprocess
+import textwrap
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,25 +24,6 @@ PACKAGES = ('numpy', 'torch', 'numba', 'numba-cuda', 'opencv-python-headless', '
 INSTRUCTION_SETS = re.compile(r'sse4_2|avx\w*|fma|f16c|amx_\w+|asimd\w*|sve\w*|bf16|fphp')
 READING = 'reading the map'  # a peer
 UNITS = ((1.0, 's'), (1e-3, 'ms'), (1e-6, 'µs'))
-
-
-@dataclass(frozen=True)
-class PeerTime:
-    """
-    A peer's time for the same stage, from the same interleaved run.
-
-    :param median_s, spread_s: seconds for the whole stage; a sample's time is scaled to n.
-    :param ratio: the peer's median over that of the stage; below 1 the peer is faster.
-    :param note: conditions of the comparison.
-    :param partial: the peer does only a part of the stage's work.
-    """
-
-    name: str
-    median_s: float
-    spread_s: float
-    ratio: float
-    note: str = ''
-    partial: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +39,8 @@ class Row:
     :param median_s, spread_s: median and interquartile range, seconds.
     :param runs: number of runs.
     :param lower_bound_s: least time on this machine; 0 = none known.
+    :param peers: the fields of each :class:`run.Peer` but its job, its median_s and spread_s from
+        the same interleaved run, and the ratio of its median to that of the stage.
     :param extra: further values by name.
     """
 
@@ -68,7 +53,7 @@ class Row:
     spread_s: float
     runs: int
     lower_bound_s: float = 0.0
-    peers: tuple[PeerTime, ...] = ()
+    peers: tuple[dict[str, Any], ...] = ()
     extra: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -156,8 +141,8 @@ def heading(title: str, about: dict[str, Any]) -> list[str]:
         f'# {title}',
         '',
         f'Commit {about["commit"]}, {about["date"]}.',
-        f'Machine: {machine}.',
-        f'Versions: {versions}.',
+        *textwrap.wrap(f'Machine: {machine}.', 120),
+        *textwrap.wrap(f'Versions: {versions}.', 120),
         'Method: benchmarks/README.md.',
         '',
     ]
@@ -169,11 +154,25 @@ def file_name(machine: dict[str, Any]) -> str:
     return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
 
 
-def write(path: Path, document: dict[str, Any], lines: Sequence[str]) -> None:
-    """Write a run as JSON, and its report beside it as Markdown."""
+def options_parser(document: str | None, quick: str) -> argparse.ArgumentParser:
+    """Return a parser with the common options of the commands that write a report."""
+    parser = argparse.ArgumentParser(description=(document or '').strip().splitlines()[0])
+    add = parser.add_argument
+    add('--quick', action='store_true', help=quick)
+    add('--commit', default='', help='name of the measured commit, outside a git checkout')
+    add('--output', type=Path, default=RESULTS, help='folder of the results (%(default)s)')
+    return parser
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a document, and the folders of its path."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + '\n', encoding='utf-8')
-    path.with_suffix('.md').write_text('\n'.join(lines).rstrip() + '\n', encoding='utf-8')
+
+
+def write_lines(path: Path, lines: Sequence[str]) -> None:
+    """Write a text that ends with one line break."""
+    path.write_text('\n'.join(lines).rstrip() + '\n', encoding='utf-8')
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from lower_bounds import bound_seconds, Peaks, Work
-from results import PeerTime, Row
+from results import Row
 from timing import Job, measure, timed
 from tqdm import tqdm
 
@@ -19,7 +19,8 @@ class Peer:
     A program or product that a stage is compared with.
 
     :param job: returns the seconds for the whole stage, a sample's scaled.
-    :param note, partial: see :class:`results.PeerTime`.
+    :param note: conditions of the comparison.
+    :param partial: the peer does only a part of the stage's work.
     """
 
     name: str
@@ -69,15 +70,19 @@ class Run:
         jobs = {'': timed(call, self.device)} | {peer.name: peer.job for peer in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
-        times = []
-        for peer in peers:
-            t = timings[peer.name]
-            ratio = t.median_s / own.median_s
-            times.append(
-                PeerTime(peer.name, t.median_s, t.spread_s, ratio, peer.note, peer.partial)
-            )
+        times = tuple(
+            {
+                'name': peer.name,
+                'median_s': timings[peer.name].median_s,
+                'spread_s': timings[peer.name].spread_s,
+                'ratio': timings[peer.name].median_s / own.median_s,
+                'note': peer.note,
+                'partial': peer.partial,
+            }
+            for peer in peers
+        )
         bound, extra = bound_seconds(works, self.peaks), {'cells': cells} if cells else {}
-        summary = own.median_s, own.spread_s, own.runs, bound, tuple(times), extra
+        summary = own.median_s, own.spread_s, own.runs, bound, times, extra
         self.rows.append(Row(stage, mode, *size, precision, *summary))
         self._bar.update()
 

@@ -10,15 +10,16 @@ benchmarks/results/.
 """
 
 import argparse
-import json
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import environment, RESULTS, ROOT, table
+from results import environment, RESULTS, ROOT, table, write_json
 from slam import ate, DRIFTS
 from slam_pairs import measured, recognize, with_edges
+from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
 from stavpr_lab.demonstration.street.traverses import LENGTH
 from stavpr_lab.evaluation.ground_truth import GroundTruth
@@ -108,13 +109,7 @@ def main() -> None:
     }
     rows: list[dict[str, Any]] = []
     drawn: dict[str, tuple[LapDrive, np.ndarray]] = {}
-    cases = [
-        (name, drift, seed, draw)
-        for name in sets
-        for drift in DRIFTS
-        for seed in given.seeds
-        for draw in range(given.draws)
-    ]
+    cases = list(product(sets, DRIFTS, given.seeds, range(given.draws)))
     for name, drift, seed, draw in tqdm(cases, unit='drive'):
         (images, at, length), exclude = sets[name]
         drive = drive_of(at, length, seed, draw, DRIFTS[drift])
@@ -130,29 +125,21 @@ def main() -> None:
             cells = [f'{np.median(before):.2f}', f'{np.median(ratios):.3f}', f'{max(ratios):.3f}']
             lines.append([name, drift, f'{closures:.0f}', *cells])
     text = table(('images', 'drift', 'closures', 'ATE before, m', 'ratio', 'worst'), lines)
-    (RESULTS / 'slam_data.json').write_text(
-        json.dumps({'about': environment(), 'rows': rows}, indent=1)
-    )
+    write_json(RESULTS / 'slam_data.json', {'about': environment(), 'rows': rows})
     with page(ROOT / 'docs' / 'slam_data.png', 12.5, 9.0) as figure:
         for axes, (title, (drive, poses)) in zip(
             figure.subplots(2, 2).flat, drawn.items(), strict=True
         ):
             axes.plot(*drive.truth[:, :2].T, color='black', lw=2.2, alpha=0.5, label='truth')
-            axes.plot(*_moved(drive.odometry, drive), color='#c44', lw=1.0, label='odometry')
-            axes.plot(*_moved(poses, drive), color='#07a', lw=1.0, label='optimized')
+            odometry, truth = planar_poses(drive.odometry), planar_poses(drive.truth)
+            shown = (odometry, '#c44', 'odometry'), (poses, '#07a', 'optimized')
+            for trajectory, color, label in shown:
+                moved = trajectory_errors(drive.stamps, trajectory, truth)[2]
+                axes.plot(*moved[:, :2].T, color=color, lw=1.0, label=label)
             axes.set_aspect('equal', adjustable='datalim')
             axes.set_title(title)
             axes.legend(loc='upper right')
     print('\n'.join(text))
-
-
-def _moved(poses: np.ndarray, drive: LapDrive) -> np.ndarray:
-    """Return positions, aligned with the truth, shape (2, N)."""
-    a, b = poses[:, :2], drive.truth[:, :2]
-    U, _, V = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
-    R = V.T @ np.diag([1, np.sign(np.linalg.det(V.T @ U.T))]) @ U.T
-    moved: np.ndarray = (R @ (a - a.mean(axis=0)).T).T + b.mean(axis=0)
-    return moved.T
 
 
 if __name__ == '__main__':

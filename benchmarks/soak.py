@@ -26,7 +26,7 @@ from results import commit, cpu_model, versions
 PLACES, WIDTH, HEIGHT = 2000, 640, 480
 STEP = 41  # pixels from one view to the next
 IMAGES = 30  # different ones
-SETTLED = 3.0  # seconds for the images on their way at the end
+SETTLED = 3.0  # seconds for the last images
 
 
 def texture_route(count: int) -> Iterator[np.ndarray]:
@@ -166,13 +166,9 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=300)
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
     parser.add_argument('--map', help=f'instead of one of {PLACES} synthetic places')
-    parser.add_argument(
-        '--parameter',
-        action='append',
-        default=[],
-        metavar='NAME:=VALUE',
-        help='of the node, besides map_path; may be repeated',
-    )
+    text = 'of the node, besides map_path; may be repeated'
+    repeated: dict[str, Any] = {'action': 'append', 'default': []}
+    parser.add_argument('--parameter', metavar='NAME:=VALUE', help=text, **repeated)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from rclpy.qos import qos_profile_sensor_data

@@ -19,12 +19,7 @@ from peaks import reader
 from results import READING
 from run import Peer, Run
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
-from stavpr_ros.alignment.lm_dtw import (
-    best_match,
-    match_padded,
-    padded_width,
-    SequenceDistances,
-)
+from stavpr_ros.alignment.lm_dtw import best_match, match_padded, padded_width, SequenceDistances
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -238,8 +233,8 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
-        some = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, 'cpu', seed + low)
-        rounded.write(low, some.strips)
+        block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, 'cpu', seed + low)
+        rounded.write(low, block.strips)
     query = make_features(1, d, STRIPS, 'cpu', seed)
     weights = torch.full((STRIPS, n), STRIPS**-0.5)
     places = Int8Features(rounded, weights, query.settings)
@@ -259,7 +254,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
 
 def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
     """
-    Measure ``Pipeline.process`` of images that match, with what their edges need.
+    Measure ``Pipeline.process`` of images that match, with the inputs of their edges.
 
     The peer processes images of the same drive that do not match, as no probability is enough.
     """

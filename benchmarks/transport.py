@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Losses and latency of camera images on their way through nodes in processes of their own.
+Losses and latency of camera images through nodes in processes of their own.
 
 Images of two sizes, raw and compressed, are published reliably and with best effort to one node
 and to two. Run it where the package is built and sourced: ``make shell``, then
@@ -76,11 +76,8 @@ def main() -> None:
     )
     parser.add_argument('--seconds', type=float, default=8, help='of each case (%(default)s)')
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
-    parser.add_argument(
-        '--large-segment',
-        action='store_true',
-        help='publish through the Fast DDS profile for large images, as replay does',
-    )
+    large = 'publish through the Fast DDS profile for large images, as replay does'
+    parser.add_argument('--large-segment', action='store_true', help=large)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from rclpy.qos import QoSProfile, ReliabilityPolicy

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import fcntl
 import hashlib
 import io
+import itertools
 import os
 from pathlib import Path
 import shutil
@@ -112,7 +113,7 @@ def atomic_output(path: str | Path, kind: FileKind, force: Force = False) -> Ite
     :raises OutputTakenError: the file exists, unless it may be replaced, or is being written.
     :raises OutputError: it cannot be written; what was there is untouched.
     """
-    with _explained(path):
+    with explained(path):
         file = AtomicFile(path, kind, force)
         try:
             yield file
@@ -140,7 +141,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     :raises OutputError: it cannot be written.
     """
     target = Path(os.path.abspath(path))
-    with _explained(path):
+    with explained(path):
         require_room(target.parent / f'{target.name}.new')
         if os.path.lexists(target):
             raise OutputTakenError(
@@ -185,7 +186,7 @@ def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) 
     require_room(target)
     if not os.path.lexists(target):
         return
-    with _explained(path):
+    with explained(path):
         if not stat.S_ISREG(os.stat(target).st_mode):
             raise OutputTakenError(f'{path} exists and is no regular file: it is never replaced')
         with open_regular(target) as file:
@@ -255,6 +256,21 @@ def _is_at(path: Path, file: int) -> bool:
     return False
 
 
+def numbered(path: str | Path) -> Iterator[Path]:
+    """Yield a path and the numbered names beside it: route.stavpr, route-2.stavpr ..."""
+    path = Path(path)
+    yield path
+    yield from (path.with_stem(f'{path.stem}-{number}') for number in itertools.count(2))
+
+
+def write_at(file: int, content: bytes | memoryview, offset: int) -> None:
+    """Write all bytes at an offset of an open file; the system may take them in parts."""
+    rest = memoryview(content)
+    while rest:
+        written = os.pwrite(file, rest, offset)
+        rest, offset = rest[written:], offset + written
+
+
 def sync_folder(folder: Path) -> None:
     """Write the names in a folder, or the content of a file, to the disk."""
     file = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
@@ -265,7 +281,12 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def _explained(path: str | Path) -> Iterator[None]:
+def explained(path: str | Path) -> Iterator[None]:
+    """
+    Turn an error of the operating system into one that names the file that is being written.
+
+    :raises OutputError: for every OSError of the block.
+    """
     try:
         yield
     except OSError as error:

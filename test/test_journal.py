@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The journal: every recorded place is on disk, whatever ends the recording."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
+import json
 import os
 import shlex
 import subprocess
@@ -15,13 +16,15 @@ from pipelines import process, save, settings_of
 import pytest
 from stavpr_ros.errors import JournalError, OutputTakenError
 from stavpr_ros.mapping import journal_writer, load_map, save_map
-from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, journals, recover
+from stavpr_ros.mapping.journal import Base, frame, JournalPlace, JournalReader
+from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
+from stavpr_ros.mapping.place_map import Place
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
 import torch
 
-SETTINGS = settings_of()
+BYTES = (0, 5, 9, 13, 20, 1500)  # of each part of a record
 
 
 @pytest.fixture
@@ -34,7 +37,7 @@ def start(target):
     """Make a pipeline that records with a journal; close the journals at the end."""
     started = []
 
-    def start(operation='mapping', loaded=None, **settings):
+    def start(operation='mapping', loaded=None, target=target, **settings):
         def open_journal(base, template):
             return JournalWriter.create(target, base, template, print)
 
@@ -51,6 +54,17 @@ def start(target):
 def killed(pipeline):
     """Leave the journal as a killed process does: it is written, and no longer locked."""
     pipeline.close_journals(delete_route=False)
+
+
+def journal_of(target):
+    return target.with_name(f'{target.name}.journal')
+
+
+def wait_until(condition):
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def stamps(path):
@@ -74,12 +88,8 @@ def assert_equal(path, place_map):
 
 def places_of(place_map):
     for i in range(len(place_map)):
-        features = place_map.features[i : i + 1]
-        arrays = features.strips[:, 0].numpy(), features.weights[:, 0].numpy()
-        yield JournalPlace(
-            i, int(place_map.stamps[i]), place_map.ids[i], place_map.pose(i), *arrays,
-            place_map.thumbnails[i],
-        )  # fmt: skip
+        features, thumbnail = place_map.features[i : i + 1], place_map.thumbnails[i]
+        yield JournalPlace(i, place_map.place(i), features, thumbnail)
 
 
 @pytest.fixture
@@ -102,28 +112,137 @@ def test_recover_returns_every_part_of_every_place(written, small_map, target):
     assert os.listdir(target.parent) == ['route.stavpr']
 
 
-@pytest.mark.parametrize('change', ['cut off', 'damaged'])
-def test_journal_changed_anywhere_keeps_all_places_before(written, small_map, change):
-    content = written.read_bytes()
+def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path, monkeypatch):
+    """Copies of the journal without a write, with half of it, and with zeros in its stead."""
+    monkeypatch.setattr(journal_writer, 'SYNC_PERIOD', 0.01)
+    journal, places = journal_of(target), list(places_of(small_map))[:20]
+    appended = synced = forgotten = 0
+    writes, pwrite, fsync = [], os.pwrite, os.fsync
+
+    def is_journal(file):
+        return journal.exists() and os.path.samestat(os.fstat(file), journal.stat())
+
+    def logged_pwrite(file, content, offset):
+        written = bytes(content) if is_journal(file) else b''  # else of the file that replaces it
+        writes.append((journal.read_bytes(), offset, written, forgotten, synced))
+        return pwrite(file, content, offset)
+
+    def logged_fsync(file):
+        nonlocal synced
+        count = appended
+        fsync(file)
+        synced = count if is_journal(file) else synced
+
+    monkeypatch.setattr(os, 'pwrite', logged_pwrite)
+    monkeypatch.setattr(os, 'fsync', logged_fsync)
+    writer = JournalWriter.create(target, Base(), small_map, print)
+    for appended, place in enumerate(places, 1):
+        writer.append(place)
+        if appended % 4 == 0:
+            wait_until(lambda count=appended: synced == count)
+        if appended == 10:
+            forgotten, inode = 8, journal.stat().st_ino
+            writer.forget(forgotten, Base())
+            wait_until(lambda inode=inode: journal.stat().st_ino != inode)
+    writer.close()
+    monkeypatch.undo()
+    copy = tmp_path / 'copy.stavpr'
+    for before, offset, written, first, count in writes:
+        cut, n = before[:offset] if written else before, len(written)
+        for content in (cut, cut + written[: n // 2], cut + bytes(n), cut + bytes(8)):
+            journal_of(copy).write_bytes(content)
+            try:
+                found = stamps(recover(journal_of(copy)).path)
+            except JournalError:
+                found = []
+            assert set(small_map.stamps[first:count].tolist()) <= set(found)
+            for path in tmp_path.glob('copy*'):
+                path.unlink()
+    assert len(writes) >= 23  # header, places, and the rewritten ones
+
+
+def scaled(place, **factors):
+    factors = {name: getattr(place.features, name) * factors[name] for name in factors}
+    return place._replace(features=replace(place.features, **factors))
+
+
+@pytest.mark.parametrize(
+    'damage',
+    [
+        lambda record, place: bytes(8),
+        lambda record, place: bytes(len(record)),
+        lambda record, place: record[:-1],
+        *(lambda record, _, at=at: record[:at] + b'U' + record[at + 1 :] for at in BYTES),
+        lambda record, place: frame(b''),
+        lambda record, place: frame(b'short'),
+        lambda record, place: frame(place.encode()[:-2000]),
+        lambda record, place: frame(place.encode().replace(b'place 30', b'place \xff0')),
+        lambda record, place: scaled(place, strips=1e30),
+        lambda record, place: scaled(place, strips=np.nan),
+        lambda record, place: scaled(place, weights=-1),
+        lambda record, place: place._replace(place=Place(pose=np.ones(7))),
+        lambda record, place: place._replace(place=Place(stamp=2**62)),
+        lambda record, place: place._replace(thumbnail=b'no image'),
+        lambda record, place: place._replace(number=29),  # again
+        lambda record, place: place._replace(number=28),  # in another order
+    ],
+)
+def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target, damage):
+    content, log = written.read_bytes(), Mock()
     with JournalReader(written) as reader:
-        ends = [reader.size, *(reader.size for _ in reader.places())]
-    assert ends[-1] == len(content)
-    rng = np.random.default_rng(0)
-    for at in [*ends[:-1], *rng.integers(ends[0], len(content), 150)]:
-        rest = bytes([content[at] ^ rng.integers(1, 256)]) + content[at + 1 :]
-        written.write_bytes(content[:at] + rest * (change == 'damaged'))
-        with JournalReader(written) as reader:
-            found = [place.stamp for place in reader.places()]
-        assert found == small_map.stamps[: np.searchsorted(ends, at, 'right') - 1].tolist()
+        ends = [reader.end, *(reader.end for _ in reader.places())]
+    record = damage(content[ends[30] : ends[31]], list(places_of(small_map))[30])
+    record = record if isinstance(record, bytes) else frame(record.encode())
+    written.write_bytes(content[: ends[30]] + record + content[ends[31] :])
+    assert recover_maps(target, log) == str(target)
+    assert stamps(target) == seconds(*range(1, 31), *range(32, 61))
+    kept = target.with_name(f'{written.name}.damaged')
+    assert log.method_calls[1][0] == 'error'
+    assert f'{kept} is kept' in log.method_calls[1].args[0]
+    assert set(os.listdir(target.parent)) == {target.name, kept.name}
+    assert recover_maps(target, log) == ''  # the next start
 
 
-@pytest.mark.parametrize('content', [b'', b'\xff' * 100, b'\x10\0\0\0\0\0\0\0{}'])
-def test_recover_file_that_is_no_journal_fails_and_keeps_it(content, tmp_path):
-    path = tmp_path / 'x.stavpr.journal'
+def test_journal_that_ends_with_zeros_and_a_hole_is_read_at_once(written):
+    with written.open('ab') as file:
+        file.write(bytes(10**6))
+        file.truncate(2**40)
+    with JournalReader(written) as reader:
+        assert len(list(reader.places())) == 60
+        assert 'no whole record' in reader.problem
+
+
+def header_with(**changes):
+    about = {'format': 'stavpr-journal', 'version': 2, 'source': ''} | asdict(Base()) | changes
+    return frame(json.dumps(about).encode())
+
+
+@pytest.mark.parametrize(
+    ('content', 'text'),
+    [
+        (b'', 'no JSON'),
+        (b'\xff' * 100, 'no JSON'),
+        (frame(b'[' * 5000), 'nested too deeply'),
+        (header_with(path=7), 'another format'),
+        (header_with(places='9'), 'another format'),
+        (header_with(version=1), 'another format'),
+        (header_with(), 'damaged or truncated'),  # and no map
+    ],
+)
+def test_file_with_an_invalid_header_stops_no_start_and_is_kept(content, text, target):
+    path, log = journal_of(target), Mock()
     path.write_bytes(content)
-    with pytest.raises(JournalError, match='is no journal, or was cut off before its first place'):
+    with pytest.raises(JournalError, match=f'is no journal, or its header is damaged.*{text}'):
         recover(path)
+    assert recover_maps(target, log) == ''
     assert path.read_bytes() == content
+
+
+def test_create_on_a_full_disk_leaves_no_journal(small_map, target, monkeypatch):
+    monkeypatch.setattr(os, 'pwrite', Mock(side_effect=OSError('the disk is full')))
+    with pytest.raises(JournalError, match='the disk is full'):
+        JournalWriter.create(target, Base(), small_map, print)
+    assert not journal_of(target).exists()
 
 
 def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):
@@ -131,7 +250,7 @@ def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):
     writer = JournalWriter.create(target, Base(), small_map, print)
     for path, text in (
         (tmp_path / 'missing', 'cannot be read'),
-        (tmp_path / 'fifo', 'no regular file'),
+        (tmp_path / 'fifo', 'expected a regular file'),
         (writer.path, 'written by a running program'),
     ):
         with pytest.raises(JournalError, match=text):
@@ -262,10 +381,8 @@ def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch)
     process(pipeline, [route[i % 60] for i in range(130)])
     held = pipeline.snapshot().places
     (path,) = journals(target)
-    end = time.monotonic() + 20
-    while os.path.getsize(path) > 600_000:  # of 9,000 a place; rewritten by the thread that syncs
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    # of 9,000 a place; rewritten by the thread that syncs
+    wait_until(lambda: os.path.getsize(path) <= 600_000)
     killed(pipeline)
     result = recover(path)
     found = load_map(result.path)
@@ -299,11 +416,29 @@ def test_discarded_places_stay_in_their_journal(start, small_map, route, target,
 
 # ---------------------------------------------------------------------------------------- the disk
 
+
+@pytest.mark.parametrize('removed', ['the folder', 'the journal'])
+def test_removed_journal_is_reported_and_written_anew(start, route, tmp_path, capsys, removed):
+    target = tmp_path / 'maps' / 'route.stavpr'
+    target.parent.mkdir()
+    pipeline = start(target=target)
+    process(pipeline, route[:6])
+    journal_of(target).unlink()
+    if removed == 'the folder':
+        target.parent.rmdir()
+    wait_until(journal_of(target).exists)
+    wait_until(lambda: 'was removed: its places are written anew' in capsys.readouterr().out)
+    process(pipeline, route[6:9], first=6)
+    killed(pipeline)
+    assert recover(journals(target)[0]).recorded == 9
+    assert stamps(target) == seconds(*range(1, 10))
+
+
 FULL = """
 import resource, signal, sys
 from pipelines import process, settings_of
 from fixtures import route_images
-from stavpr_ros.mapping.journal import recover
+from stavpr_ros.mapping.journal_map import recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import Pipeline
 
@@ -320,7 +455,7 @@ process(pipeline, images[:1])
 if case != 'tmpfs':
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, resource.RLIM_INFINITY))
 process(pipeline, images[1:50], first=1)
-assert writers[0]._problem
+assert writers[0].failed
 if case == 'room':
     resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
 process(pipeline, images[50:], first=50)

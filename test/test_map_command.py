@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 from map_examples import example_map
+from map_files import parts_of, version2
 import numpy as np
 import pytest
 from stavpr_ros.commands.map import main
@@ -50,6 +51,24 @@ def test_map_info_shows_what_a_map_holds(folder, capsys):
         'a route of 23 m', '1970-01-01 00:00:24 UTC',
     ):  # fmt: skip
         assert text in shown
+
+
+def test_map_info_escapes_control_characters(folder, capsys):
+    both, escape = example_map(), '\x1b[2J'
+    sessions = replace(both.sessions[0], name=escape, robot='r\n'), *both.sessions[1:]
+    save_map(replace(both, sessions=sessions), 'both.stavpr')
+    assert main(['info', 'both.stavpr']) == 0
+    shown = capsys.readouterr().out
+    assert r'session    a, \x1b[2J, r\n: 12 places' in shown
+    assert escape not in shown
+    manifest, tensors = parts_of((folder / 'both.stavpr').read_bytes())
+    del manifest['parts']
+    tensors[escape] = tensors['stamps']
+    (folder / 'bad.stavpr').write_bytes(version2(manifest, tensors))
+    assert main(['info', 'bad.stavpr']) == 1
+    shown = capsys.readouterr().err
+    assert r'part \x1b[2J is unknown' in shown
+    assert escape not in shown
 
 
 @pytest.mark.parametrize('name', ['both.stavpr', 'night.stavpr'])

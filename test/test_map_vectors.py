@@ -13,8 +13,8 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.mapping import load_map, open_map, PlaceMap, save_map
 from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.journal import Base, JournalPlace, recover
-from stavpr_ros.mapping.journal_map import journal_map
+from stavpr_ros.mapping.journal import Base, JournalPlace
+from stavpr_ros.mapping.journal_map import journal_map, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.merging import merge_maps, select_places
 from stavpr_ros.mapping.reduction import with_principal_components
@@ -138,7 +138,7 @@ def test_journal_returns_vectors(place_map, tmp_path):
     target = tmp_path / 'route.stavpr'
     writer = JournalWriter.create(target, Base(), select_places(place_map, np.arange(1)), print)
     for i in range(len(place_map)):
-        writer.append(JournalPlace.of(i, place_map.place(i), place_map.features[i : i + 1], b''))
+        writer.append(JournalPlace(i, place_map.place(i), place_map.features[i : i + 1], b''))
     writer.close()
     assert torch.equal(journal_map(writer.path).features.vectors, place_map.features.vectors)
     assert recover(writer.path).recorded == 50

@@ -13,7 +13,7 @@ from robot import image_message, PARAMETERS
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import OutputError
 from stavpr_ros.mapping import load_map
-from stavpr_ros.mapping.journal import journals, recover
+from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.pipeline import saving
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -62,6 +62,18 @@ def test_node_without_save_path_continues_its_recording_at_the_next_start(make, 
     record(node, route[:7], first=20)
     assert len(node.runtime.pipeline.places) == 7
     assert node.runtime.pipeline._last.newest_index == 6
+
+
+def test_localization_on_another_map_names_the_journal_and_leaves_it(
+    make, route, map_file, tmp_path, capfd
+):
+    node = make()
+    record(node, route[:5])
+    end(node)
+    assert not end(make(operation='localization', map_path=map_file))
+    assert os.listdir(tmp_path) == ['recorded.stavpr.journal']
+    assert 'recorded.stavpr.journal has places of another recording' in capfd.readouterr().err
+    assert len(make(operation='mapping').runtime.pipeline.places) == 5
 
 
 def test_node_whose_last_save_fails_keeps_the_journal_and_reports_failure(

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command replay as a process, with a subscriber in this one."""
 
+from collections import deque
 from functools import partial
 import os
 import signal
@@ -16,8 +17,9 @@ from processes import DOMAIN, environment, TIMEOUT
 import pytest
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
-from stavpr_msgs.msg import PlaceMatch
+from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_ros.ros import process
+from stavpr_ros.ros.receipts import MOST_BEHIND
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_playback import spinning
@@ -123,6 +125,29 @@ def test_replay_lossless_ignores_the_recorded_pace(tmp_path, subscribe, stamped)
     assert code == 0
     assert '0 sent again, 0 dropped, 0 skipped' in output
     assert subscriber.data() == data
+
+
+def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path):
+    bag, _ = make_bag(tmp_path / 'bag', count=40)
+    waiting, backlog = deque(), []
+
+    def answer(image):
+        match.publish(PlaceMatch(header=image.header, status=PlaceMatch.MATCH))
+        waiting.append(LoopClosure(header=image.header))
+        backlog.append(len(waiting))
+
+    def close():
+        if waiting:
+            closure.publish(waiting.popleft())
+
+    with spinning('stavpr', DOMAIN) as node:
+        match = node.create_publisher(PlaceMatch, '~/match', 10)
+        closure = node.create_publisher(LoopClosure, '~/loop_closure', 10)
+        node.create_subscription(Image, 'image', answer, 10)
+        node.create_timer(0.05, close)
+        assert replay(bag, '--lossless')[0] == 0
+    assert len(backlog) == 40
+    assert max(backlog[20:]) <= MOST_BEHIND + 2
 
 
 def test_replay_lossless_without_a_match_sends_the_image_again(tmp_path, subscribe):

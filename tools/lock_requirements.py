@@ -6,8 +6,8 @@ Write requirements/locked/NAME.txt: every package with its version and the hashe
 Usage: ``python3 tools/lock_requirements.py python3.11 python3.12 python3.13``
 
 Each Python resolves requirements/NAME.txt for itself. torch and the extra ``cuda`` are not locked:
-their builds depend on the package index and on the driver. ``base.txt`` is what is always
-installed; the files of the extras hold what they add.
+their builds depend on the package index and on the driver. ``base.txt`` is always
+installed; the files of the extras list the additional packages.
 """
 
 import json
@@ -25,7 +25,7 @@ HEAD = '# Written by tools/lock_requirements.py.\n'
 
 
 def resolve(python: str) -> dict[str, Any]:
-    """Return pip's report of what it would install of all requirements."""
+    """Return pip's report of a dry run of all requirements."""
     command = [python, '-m', 'pip', 'install', '--dry-run', '--quiet', '--ignore-installed']
     command += ['--report', '-', '-c', str(FOLDER / 'constraints.txt')]
     for name in (*BASE, *LOCKED_EXTRAS):
@@ -45,22 +45,22 @@ def requirements(*names: str) -> list[Requirement]:
 
 
 def closure(wanted: list[Requirement], report: dict[str, Any]) -> set[str]:
-    """Return the names of the packages that some requirements need, of a report."""
+    """Return the names of the packages that requirements need, of a report."""
     packages = {canonicalize_name(row['metadata']['name']): row for row in report['install']}
-    seen: set[tuple[str, str]] = set()
+    done: set[tuple[str, str]] = set()
     todo = [(canonicalize_name(one.name), extra) for one in wanted for extra in ('', *one.extras)]
     while todo:
         name, extra = todo.pop()
-        if (name, extra) in seen:
+        if (name, extra) in done:
             continue
-        seen.add((name, extra))
+        done.add((name, extra))
         for text in packages[name]['metadata'].get('requires_dist', ()):
             one = Requirement(text)
             environment = report['environment'] | {'extra': extra}
             if one.marker is None or one.marker.evaluate(environment):
                 key = canonicalize_name(one.name)
                 todo += [(key, more) for more in ('', *one.extras)]
-    return {name for name, _ in seen}
+    return {name for name, _ in done}
 
 
 def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> str:
@@ -75,8 +75,8 @@ def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> st
                 found.setdefault(key, {})[version] = hashes['sha256']
     lines = []
     for (name, release), hashes in sorted(found.items()):
-        some = [f"python_version == '{version}'" for version in hashes]
-        marker = '' if len(hashes) == len(reports) else f' ; {" or ".join(some)}'
+        versions = [f"python_version == '{version}'" for version in hashes]
+        marker = '' if len(hashes) == len(reports) else f' ; {" or ".join(versions)}'
         options = ''.join(
             f' \\\n    --hash=sha256:{value}' for value in sorted({*hashes.values()})
         )

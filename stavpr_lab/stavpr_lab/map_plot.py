@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 import numpy as np
-from stavpr_lab.evaluation.plots import color_bar, page, QUIET, SCALE
+from stavpr_lab.evaluation.plots import page, QUIET, show_distances
 from stavpr_ros.mapping import PlaceMap, select_places
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import evenly
@@ -18,7 +18,7 @@ SHOWN = 8  # thumbnails
 
 
 def plot_map(place_map: PlaceMap, path: Path) -> None:
-    """Draw an opened map to a PNG file; of a long map, some places evenly."""
+    """Draw an opened map to a PNG file; of a long map, evenly spaced places."""
     with page(path, 13, 7.4) as figure:
         halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.2))
         left, right = halves
@@ -43,7 +43,7 @@ def _runs(place_map: PlaceMap) -> list[tuple[str, np.ndarray]]:
 
 
 def _draw_route(axes: Axes, place_map: PlaceMap) -> None:
-    axes.set_title('route, seen from above', fontsize=10.5, loc='left')
+    axes.set_title('route from above', fontsize=10.5, loc='left')
     assert place_map.poses is not None
     for name, places in _runs(place_map):
         x, y = place_map.poses[places, :2].T
@@ -78,12 +78,12 @@ def _draw_thumbnails(figure: SubFigure, place_map: PlaceMap, columns: int) -> No
 def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) -> None:
     """Draw the distances of places to each other, as mode robust compares images."""
     n, places = len(place_map), evenly(len(place_map), COMPARED)
-    some = select_places(place_map, places)
-    distances = PlaceRecognizer(some, RecognizerSettings(mode='robust')).distances(some.features)
-    extent = (-0.5, n - 0.5, n - 0.5, -0.5)
-    away = distances[~np.eye(len(some), dtype=bool)]
-    low, high = np.quantile(away, [0.002, 0.995]) if away.size else (0.0, 1.0)
-    image = axes.imshow(distances, extent=extent, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6))
+    part = select_places(place_map, places)
+    recognizer = PlaceRecognizer(part, RecognizerSettings(mode='robust'))
+    distances = recognizer.distances(part.features)
+    apart = ~np.eye(len(part), dtype=bool)  # a place itself is 0, which is left out of the scale
+    distances = np.where(apart, distances, distances.min(where=apart, initial=np.inf))
+    show_distances(figure, axes, distances, extent=(-0.5, n - 0.5, n - 0.5, -0.5))
     for _, session in _runs(place_map)[1:]:
         if len(session):
             axes.axhline(session[0] - 0.5, color='#ff5440', lw=1)
@@ -91,4 +91,3 @@ def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) ->
     borders = '; red: borders of sessions' if len(place_map.sessions) > 1 else ''
     axes.set_title(f'distance of places to each other{borders}', fontsize=10.5, loc='left')
     axes.set(xlabel='place', ylabel='place')
-    color_bar(figure, image, axes)

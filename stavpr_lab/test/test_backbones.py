@@ -170,7 +170,7 @@ def test_network_in_half_precision_on_gpu_is_close(kind, vgg_file, densenet_file
         ({'features.conv9': torch.zeros(1)}, r"has 'features\.conv9', unknown to the network"),
         ({'classifier.bias': torch.zeros(365, dtype=torch.long)}, 'no plain floats'),
         ({'classifier.bias': torch.full((365,), torch.nan)},
-         r'damaged: classifier\.bias holds NaN'),
+         r'damaged: classifier\.bias contains NaN'),
     ],
 )  # fmt: skip
 def test_load_parameters_of_other_network_is_rejected(densenet_parameters, changes, words):

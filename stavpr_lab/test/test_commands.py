@@ -370,7 +370,7 @@ def plain_match(status, place=-1):
 
 
 def test_evaluate_records_with_invalid_image_keeps_others_aligned():
-    """Windows of 3; image 3 is in none: the window of image 4 holds images 1, 2 and 4."""
+    """Windows of 3; image 3 is in none: the window of image 4 has images 1, 2 and 4."""
     records = [plain_match('WARMING_UP'), plain_match('WARMING_UP'), plain_match('MATCH', 1)]
     records += [plain_match('INVALID_IMAGE'), plain_match('MATCH', 2), plain_match('MATCH', 4)]
     result = evaluate_records(records, 3, 0.5, np.arange(6), 0)
@@ -378,22 +378,6 @@ def test_evaluate_records_with_invalid_image_keeps_others_aligned():
     np.testing.assert_equal(result.matches.probabilities, [0.9, 0.9, 0.9, np.nan, 0.9, 0.9])
     assert result.counts.true_positives == 5
     assert result.counts.false_negatives == 1
-
-
-@pytest.mark.parametrize(
-    'options',
-    [
-        ['--slam', 'world', '--map', 'a'],
-        ['--slam', 'world', '--false-closures', '1.5'],
-        ['--slam', 'world', '--drift', '-1'],
-        ['--slam', 'other'],
-    ],
-)
-def test_demo_with_invalid_slam_options_exits_with_usage(options, capsys):
-    with pytest.raises(SystemExit) as raised:
-        demo.main(options)
-    assert raised.value.code == 2
-    assert 'usage' in capsys.readouterr().err
 
 
 def test_demonstration_imports_no_package_of_the_extra_evaluation():

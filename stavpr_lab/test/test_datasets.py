@@ -77,7 +77,7 @@ def test_open_dataset_with_text_and_array_reads_the_text(tmp_path):
     rows = np.empty((1, 2), object)
     rows[0] = [0, [1, 2]]
     np.save(tmp_path / 'ground_truth_new.npy', rows, allow_pickle=True)
-    with pytest.raises(SourceError, match='holds Python objects'):
+    with pytest.raises(SourceError, match='contains Python objects'):
         open_dataset('berlin_a100', tmp_path)
     (tmp_path / 'ground_truth.csv').write_text('0,1\n1,2\n')
     assert open_dataset('berlin_a100', tmp_path, 0).ground_truth.pairs.tolist() == [[0, 1], [1, 2]]

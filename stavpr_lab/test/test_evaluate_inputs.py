@@ -4,9 +4,7 @@
 
 import json
 
-import cv2
 from evaluation_commands import runner, write_images
-from fixtures import route_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import evaluate
@@ -16,8 +14,6 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.descriptors import read_descriptors
 from stavpr_ros.mapping import load_map
 import torch
-
-NAMES = ('monday', 'tuesday')
 
 
 @pytest.fixture(scope='module')
@@ -108,40 +104,18 @@ def test_map_of_descriptors_takes_descriptors_only(
         assert (code, option[0] in errors) == (2, True)
 
 
-@pytest.fixture(scope='module')
-def drives(tmp_path_factory):
-    """Return folders of images of two drives."""
-    root = tmp_path_factory.mktemp('drives')
-    for seed, name in enumerate(NAMES):
-        (root / name).mkdir()
-        for i, image in enumerate(route_images(30, seed)):
-            cv2.imwrite(str(root / name / f'{i:03}.png'), image)
-    return [str(root / name) for name in NAMES]
-
-
-@pytest.fixture(scope='module')
-def built(drives, tmp_path_factory):
-    """Build maps of both, one by one."""
-    folder = tmp_path_factory.mktemp('maps')
-    for name, drive in zip(NAMES, drives, strict=True):
-        file = str(folder / f'{name}.stavpr')
-        assert build_map.main(['--input', drive, '--output', file, '--no-thumbnails']) == 0
-    return folder
-
-
 @pytest.mark.long
-def test_evaluate_of_several_queries_equals_each(built, tmp_path):
-    monday = str(built / 'monday.stavpr')
-    queries = [monday, str(built / 'tuesday.stavpr')]
-    several = ['--map', monday, '--query', *queries, '--output', str(tmp_path / 'reports')]
-    assert evaluate.main([*several, '--processes', '2']) == 0
-    assert evaluate.main(['--map', monday, '--query', monday, '--json', str(tmp_path / 'a')]) == 0
-    one, other = (
-        json.loads(file.read_text()) for file in (tmp_path / 'a', tmp_path / 'reports/monday.json')
-    )
+def test_evaluate_of_several_queries_equals_each(run, pair, vectors, tmp_path):
+    np.save(tmp_path / 'other.npy', vectors[::-1])
+    options, query = ['--map', pair[1], *pair[4:]], pair[3]
+    several = ['--query', query, tmp_path / 'other.npy', '--output', tmp_path / 'out']
+    assert run(*options, *several, '--processes', 2)[0] == 0
+    assert run(*options, '--query', query, '--json', tmp_path / 'a.json')[0] == 0
+    both = (tmp_path / 'a.json', *(tmp_path / 'out').glob('query*.json'))
+    one, other = (json.loads(file.read_text()) for file in both)
     for name in ('sequence', 'single', 'decision', 'calibration', 'map_id'):
         assert one[name] == other[name]
-    assert (tmp_path / 'reports' / 'tuesday' / 'report.html').is_file()
+    assert (tmp_path / 'out' / 'other' / 'report.html').is_file()
 
 
 def test_several_queries_reject_options_of_one(capfd):

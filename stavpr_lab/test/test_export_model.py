@@ -79,7 +79,7 @@ class Transformer(nn.Module):
 
 
 class Salad(nn.Module):
-    """As SALAD and BoQ: a vector and what it attends to; its backbone returns map and token."""
+    """As SALAD and BoQ: a vector and its attention; its backbone returns map and token."""
 
     def __init__(self):
         super().__init__()

@@ -176,7 +176,7 @@ def test_from_file_of_pickled_objects_raises(tmp_path):
     np.savez(tmp_path / 'objects.npz', truth=rows)
     (tmp_path / 'pickle.npy').write_bytes(pickle.dumps(MATRIX))
     for name in ('objects.npy', 'objects.npz', 'pickle.npy'):
-        with pytest.raises(SourceError, match=rf'{name} holds Python objects.*runs whatever'):
+        with pytest.raises(SourceError, match=rf'{name} contains Python objects.*runs whatever'):
             GroundTruth.from_file(tmp_path / name, 3, 5)
 
 
@@ -220,13 +220,6 @@ def test_from_poses_by_hand():
     for limits, pairs in expected.items():
         for poses in (queries, scaled):
             assert GroundTruth.from_poses(poses, places, *limits).pairs.tolist() == pairs
-
-
-def test_from_poses_in_chunks_equals_all_at_once(monkeypatch):
-    monkeypatch.setattr('stavpr_lab.evaluation.ground_truth.CHUNK', 7)
-    poses = np.array([pose(float(i)) for i in range(5)])
-    expected = GroundTruth.identity(5, 5, 1).pairs
-    np.testing.assert_array_equal(GroundTruth.from_poses(poses, poses, 1).pairs, expected)
 
 
 def test_from_poses_never_accepts_places_with_unknown_pose():

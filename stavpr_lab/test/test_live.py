@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Running node, replay and recorders as processes: what fails is named at once."""
+"""Running node, replay and recorders as processes: failures are named at once."""
 
 import cv2
 from map_examples import VERSION2

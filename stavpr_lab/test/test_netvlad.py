@@ -196,7 +196,7 @@ def test_netvlad_of_other_files_is_rejected(tmp_path, numbers, image):
 @pytest.mark.parametrize(
     ('name', 'value', 'words'),
     [
-        ('c', np.full((K, D), np.nan, np.float32), 'damaged: it holds NaN'),
+        ('c', np.full((K, D), np.nan, np.float32), 'damaged: it contains NaN'),
         ('c', np.zeros((K + 1, D), np.float32), r'assignment \(3, 8\), centers \(4, 8\)'),
         ('matrix', np.zeros((OUT, 7), np.float32), 'takes 7 numbers, expected 24'),
         ('kernels', None, 'convolution 0 has shape'),

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from scores import best_f1
 from stavpr_lab.evaluation.paper.datasets import open_dataset
-from stavpr_lab.evaluation.seqslam import (
-    match_differences,
-    preprocess,
-    seqslam,
-    SeqSlamSettings,
-)
+from stavpr_lab.evaluation.seqslam import match_differences, preprocess, seqslam, SeqSlamSettings
 
 SMALL = SeqSlamSettings(width=4, height=2, patch=2)
 
@@ -94,7 +89,10 @@ def test_match_differences_takes_the_first_line_where_only_one_fits_or_all_are_a
         assert places.tolist() == SeqSlamSettings().lines[0].tolist()
 
 
-@pytest.mark.parametrize(('name', 'known_f1'), [('gardens_point', 0.79), ('nordland', 0.95)])
+@pytest.mark.parametrize(
+    ('name', 'known_f1'),
+    [('gardens_point', 0.79), pytest.param('nordland', 0.95, marks=pytest.mark.long)],
+)
 def test_seqslam_on_real_traverses_gives_the_measured_f1(data_folder, name, known_f1):
     dataset = open_dataset(name, data_folder)
     images = [(frame.image for frame in source) for source in (dataset.map, dataset.query)]

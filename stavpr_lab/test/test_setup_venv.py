@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 import platform
 import re
-import subprocess
 import sys
 
 import pytest
@@ -241,21 +240,3 @@ def test_requirements_are_pinned_exactly(name):
     pins = re.sub('#.*', '', text).split()
     assert pins
     assert [pin for pin in pins if not re.fullmatch(r'[\w.\[\]-]+==[\w.]+', pin)] == []
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'expected'),
-    [
-        (['demo', 'LOOP=walk'], r'/demo +--loop "\$LOOP" *$'),
-        (['demo', 'MAP=a', 'QUERY=b', 'ARGS=-v'], r'/demo --map "\$MAP" --query "\$QUERY" +-v$'),
-        (['test', 'ARGS=-x'], r'sphinx-build .*-W(.|\n)* pytest .*test -m .not long. -x$'),
-        (['setup', 'PYTHON=python3.12'], r'^python3.12 -E tools/setup_venv.py setup '),
-    ],
-)
-def test_make_target_runs_its_program(arguments, expected):
-    command = ['make', '--dry-run', '--no-print-directory', '-C', str(ROOT), *arguments]
-    # without the variables of a make that runs the tests
-    environment = {'PATH': os.environ['PATH']}
-    printed = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    commands = re.sub(r' *\\\n\s*', ' ', printed.stdout)
-    assert re.search(expected, commands, re.MULTILINE), commands

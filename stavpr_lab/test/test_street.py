@@ -7,7 +7,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from stavpr_lab.demonstration.street import (
+from stavpr_lab.demonstration.street.laps import drive_laps, RingWorld
+from stavpr_lab.demonstration.street.objects import _from_camera
+from stavpr_lab.demonstration.street.rendering import _on_ground, center_line_ahead
+from stavpr_lab.demonstration.street.street import CELL
+from stavpr_lab.demonstration.street.traverses import (
     first_traverse,
     GOOD_LIGHT,
     nearest_places,
@@ -15,10 +19,6 @@ from stavpr_lab.demonstration.street import (
     Traverse,
     World,
 )
-from stavpr_lab.demonstration.street.laps import drive_laps, RingWorld
-from stavpr_lab.demonstration.street.objects import _from_camera
-from stavpr_lab.demonstration.street.rendering import _on_ground, center_line_ahead
-from stavpr_lab.demonstration.street.street import CELL
 
 SIZE = (96, 72)
 STILL = replace(GOOD_LIGHT, noise=0.0, shake=0.0)
@@ -52,7 +52,7 @@ def shift_of_patch(before, after, x, y, size=36, reach=14):
 
 
 def test_render_with_lateral_step_shows_parallax(world):
-    """Houses at the sides are some 20 m away, the vanishing point 60 m and more."""
+    """Houses at the sides are about 20 m away, the vanishing point 60 m and more."""
     near, far = [], []
     for along in np.arange(20.0, 320.0, 20.0):
         before = view(world, along, replace(STILL, lane=0.0), (320, 240))

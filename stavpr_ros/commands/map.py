@@ -173,6 +173,7 @@ def _tool(name: str) -> Callable[..., Any]:
 def describe(place_map: 'PlaceMap', path: Path) -> str:
     """Return what an opened map holds, a line each."""
     import numpy as np
+    from stavpr_ros.mapping.map_container import printable
     from stavpr_ros.mapping.map_version2 import VERSION
     from stavpr_ros.mapping.stored_features import StoredFeatures
 
@@ -213,7 +214,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
             own = np.flatnonzero(place_map.session_index == number)
             same = f', {np.count_nonzero(place_map.same_as[own] != own)} of them in earlier ones'
         lines.append(f'session    {session.id}{named}: {places} places{same}{start}')
-    return '\n'.join(lines)
+    return '\n'.join(map(printable, lines))
 
 
 def _time(stamp: int) -> str:

@@ -19,17 +19,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def recover_map(journal: str, output: str | None = None) -> int:
     """
-    Make a map of a journal, and delete the journal.
+    Make a map of a journal, and delete the journal unless it is damaged.
 
-    :returns: the exit code, 1 if the map that the recording continued is missing.
+    :returns: the exit code, 1 if places may be missing.
     :raises StavprError: no journal, or a map that cannot be written; the journal stays.
     """
-    from stavpr_ros.mapping.journal import recover, SUFFIX
+    from stavpr_ros.mapping.journal import SUFFIX
+    from stavpr_ros.mapping.journal_map import recover
 
     if output is None and not journal.endswith(SUFFIX):
         raise SourceError(f'{journal} does not end with {SUFFIX}: name the map, --output')
     found = recover(journal, output)
     print(f'{found.path}: {found.places} places, {found.recorded} of them from {journal}')
-    if found.problem:
-        print(f'the places before them are missing: {found.problem}')
-    return int(bool(found.problem))
+    print(*found.problems, sep='\n', end='\n' if found.problems else '')
+    return int(bool(found.problems))

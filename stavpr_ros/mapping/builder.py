@@ -128,7 +128,7 @@ def build_journal(
                     )
                     writer = JournalWriter.create(target, Base(), template, _ignore, source)
                 for i, (number, _, known, thumbnail) in enumerate(batch):
-                    writer.append(JournalPlace.of(number, known, features[i : i + 1], thumbnail))
+                    writer.append(JournalPlace(number, known, features[i : i + 1], thumbnail))
                 if writer.failed:
                     raise JournalError(
                         f'{writer.path} cannot be written: make room, and run the same again: it '

@@ -3,40 +3,42 @@
 """
 The journal of a recorded map: every place on disk while it is recorded.
 
-The file is a sequence of records: length and CRC-32 of the content (two uint32, little-endian),
-and the content. The first one is a JSON object (format, version, the map that the places
-continue), the second a map file of one place, which holds the settings of the features; each other
-record is a place. A record that was cut off or damaged ends the journal: those before it count.
+The file is a sequence of records, see :func:`frame`. The first one is a JSON object (format,
+version, the map that the places continue), the second a map file of one place, which has the
+settings of the features; each other record is a place, and their numbers increase. A damaged
+record costs no other one: the reader continues at the next ``MAGIC``.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 import fcntl
-import itertools
+from functools import cache
 import json
 import os
 from pathlib import Path
-import stat
 import struct
 import tempfile
-from typing import BinaryIO, NamedTuple, Self
+from typing import NamedTuple, Self
 import zlib
 
 import numpy as np
-from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
+from stavpr_ros.errors import JournalError, StavprError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.map_file import load_map, open_map, save_map
+from stavpr_ros.mapping.map_container import read_json
+from stavpr_ros.mapping.map_content import require_jpegs, require_weights
+from stavpr_ros.mapping.map_file import load_map
 from stavpr_ros.mapping.place_map import Place, PlaceMap
-from stavpr_ros.output_file import FileVersion
+from stavpr_ros.mapping.stored_features import require_normalized
+from stavpr_ros.regular_file import open_regular
 import torch
 
-FORMAT, VERSION = 'stavpr-journal', 1
+FORMAT, VERSION = 'stavpr-journal', 2
 SUFFIX = '.journal'
+MAGIC = b'\x93SVJ'
 LONGEST = 2**28  # bytes of a record; a longer one is damaged
-_FRAME = struct.Struct('<II')
-_PLACE = struct.Struct('<qqHIB7d')  # number, stamp, lengths of id and thumbnail, has pose, pose
-_NO_POSE = (np.nan,) * 7
+PIECE = 2**20  # bytes searched at a time
+_HEAD = struct.Struct('<4sII')  # MAGIC, length and CRC-32 of the content; its own CRC-32 follows
 
 
 @dataclass(frozen=True)
@@ -64,61 +66,91 @@ class JournalPlace(NamedTuple):
     """
     A place in a journal.
 
-    :param number: of its image, as the writer counts them.
-    :param strips, weights: of its features, shapes (W, d) and (W,), float32.
-    :param vector: of its features, shape (D,), float32; D = 0 without one.
+    :param number: of its image, as the writer counts them; larger than that of the place before.
+    :param features: of its image, strips (W, 1, d).
+    :param thumbnail: a small JPEG, empty = none.
     """
 
     number: int
-    stamp: int
-    identifier: str
-    pose: np.ndarray | None
-    strips: np.ndarray
-    weights: np.ndarray
+    place: Place
+    features: LocalFeatures
     thumbnail: bytes
-    vector: np.ndarray = np.empty(0, np.float32)
-
-    @classmethod
-    def of(cls, number: int, place: Place, features: LocalFeatures, thumbnail: bytes) -> Self:
-        """
-        Make the record of a place.
-
-        :param features: of its image, strips (W, 1, d).
-        """
-        features = features.to('cpu')
-        return cls(
-            number,
-            place.stamp,
-            place.identifier,
-            place.pose,
-            features.strips[:, 0].numpy(),
-            features.weights[:, 0].numpy(),
-            thumbnail,
-            *(() if features.vectors is None else (features.vectors[0].numpy(),)),
-        )
 
     def encode(self) -> bytes:
         """Return the content of its record."""
-        identifier = self.identifier.encode()
-        pose = _NO_POSE if self.pose is None else self.pose
-        head = _PLACE.pack(
-            self.number,
-            self.stamp,
-            len(identifier),
-            len(self.thumbnail),
-            self.pose is not None,
-            *pose,
-        )
+        stamp, identifier = self.place.stamp, self.place.identifier.encode()
+        pose = np.nan if self.place.pose is None else self.place.pose
+        arrays = self.features.strips, self.features.weights, self.features.vectors
+        strips, weights, vector = (0 if each is None else each.cpu().squeeze(1) for each in arrays)
+        row = np.zeros((), _row(*sizes_of(self.features)))
+        sizes = len(identifier), len(self.thumbnail)
+        values = self.number, stamp, *sizes, pose, weights, strips, vector
+        for name, value in zip(row.dtype.names or (), values, strict=True):
+            row[name] = value
+        return b''.join((row.data, identifier, self.thumbnail))
+
+    @classmethod
+    def decode(cls, content: bytes, template: PlaceMap) -> Self:
+        """
+        Make a place of the content of its record.
+
+        :param template: a map with the settings of the features.
+        :raises ValueError: not of this format, or values that no map file has.
+        :raises StavprError: likewise.
+        """
+        row = np.frombuffer(content, _row(*sizes_of(template.features)), 1)[0]
+        rest = content[row.nbytes :]
+        identifier, thumbnail = rest[: row['of_id']].decode(), rest[row['of_id'] :]
+        if len(thumbnail) != row['of_thumbnail']:
+            raise ValueError(f'its thumbnail has {len(thumbnail)} of {row["of_thumbnail"]} bytes')
+        require_jpegs(np.frombuffer(thumbnail, np.uint8), np.array([len(thumbnail)]))
+        require_weights(row['weights'])
         strips, weights, vector = (
-            np.ascontiguousarray(a, '<f4') for a in (self.strips, self.weights, self.vector)
+            torch.from_numpy(row[name].copy()) for name in ('strips', 'weights', 'vector')
         )
-        features = weights.data, strips.data, vector.data
-        return b''.join((head, *features, identifier, self.thumbnail))
+        require_normalized(strips, 'strips', 0)
+        require_normalized(vector[None], 'vectors', 0)
+        features = LocalFeatures(
+            strips[:, None],
+            weights[:, None],
+            template.settings,
+            template.features.cells,
+            vector[None] if len(vector) else None,
+        )
+        stamps, poses = np.array([row['stamp']]), row['pose'][None]
+        places = PlaceMap(features, template.projection, stamps, (identifier,), poses)
+        return cls(int(row['number']), places.place(0), features, thumbnail)
+
+
+def sizes_of(features: LocalFeatures) -> tuple[int, int, int]:
+    """Return the sizes W, d and D of the features of a place; D = 0 without a vector."""
+    vectors = features.vectors
+    return features.settings.strips, features.dimension, 0 if vectors is None else vectors.shape[1]
+
+
+@cache
+def _row(W: int, d: int, D: int) -> np.dtype:
+    """Return the fields of a place, all little-endian; identifier and thumbnail follow them."""
+    return np.dtype(
+        [('number', '<i8'), ('stamp', '<i8'), ('of_id', '<u4'), ('of_thumbnail', '<u4'),
+         ('pose', '<f8', 7), ('weights', '<f4', W), ('strips', '<f4', (W, d)),
+         ('vector', '<f4', D)]
+    )  # fmt: skip
 
 
 def frame(content: bytes) -> bytes:
-    """Return a record: length, checksum and content."""
-    return _FRAME.pack(len(content), zlib.crc32(content)) + content
+    """
+    Return a record: its head and its content, which is not empty.
+
+    The head is ``MAGIC``, length and CRC-32 of the content, and the CRC-32 of these, each number
+    a little-endian uint32.
+    """
+    head = _HEAD.pack(MAGIC, len(content), zlib.crc32(content))
+    return b''.join((head, _checksum(head), content))
+
+
+def _checksum(head: bytes) -> bytes:
+    return zlib.crc32(head).to_bytes(4, 'little')
 
 
 def header(base: Base, template: bytes, source: str = '') -> bytes:
@@ -128,20 +160,8 @@ def header(base: Base, template: bytes, source: str = '') -> bytes:
     :param template: file of a map of one place, with the settings of the features.
     :param source: of the places, so that only the same work is resumed.
     """
-    about = {'format': FORMAT, 'version': VERSION, 'base': asdict(base), 'source': source}
+    about = {'format': FORMAT, 'version': VERSION, 'source': source} | asdict(base)
     return frame(json.dumps(about).encode()) + frame(template)
-
-
-def map_bytes(place_map: PlaceMap) -> bytes:
-    """
-    Return the file of a map.
-
-    :raises OutputError: there is no room for a temporary file.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, 'map')
-        save_map(place_map, path)
-        return path.read_bytes()
 
 
 class JournalReader:
@@ -149,21 +169,29 @@ class JournalReader:
     A journal that no one writes; it stays locked until it is closed.
 
     ``base`` is the map that it continues, ``source`` what it was made of, ``template`` a map of
-    one place with its settings (``template_content`` its file), ``size`` the number of bytes up to
-    the end of the last whole record that was read.
+    one place with its settings (``template_content`` its file). ``end`` is the end of the last
+    whole record, in bytes; ``problem`` the first damage that was found so far, '' = none.
 
     :raises JournalError: it cannot be read, or a living program writes it.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self._file = _open_locked(self.path)
+        self.path, self.problem, self.end = Path(path), '', 0
         try:
-            self._left = os.fstat(self._file.fileno()).st_size
-            self.size = 0
-            self.base, self.template = self._header()
-        except BaseException:
-            self._file.close()
+            self._file = open_regular(self.path)
+        except OSError as error:
+            raise JournalError(
+                f'{path} cannot be read ({error.strerror}): name a journal'
+            ) from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._size = os.fstat(self._file.fileno()).st_size
+            self._read_header()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, BlockingIOError):
+                text = f'{path} is being written by a running program: end it first'
+                raise JournalError(text) from error
             raise
 
     def __enter__(self) -> 'JournalReader':
@@ -177,203 +205,73 @@ class JournalReader:
         self._file.close()
 
     def places(self) -> Iterator[JournalPlace]:
-        """Yield the places, once, in the order in which they were recorded."""
-        W, d = self.template.settings.strips, self.template.dimension
-        vectors = self.template.features.vectors
-        D = 0 if vectors is None else vectors.shape[1]
-        count = W * (d + 1) + D
-        while (content := self._record()) is not None:
-            number, stamp, of_id, of_thumbnail, has_pose, *pose = _PLACE.unpack_from(content)
-            rest = content[_PLACE.size + 4 * count :]
-            if len(rest) != of_id + of_thumbnail:
-                raise JournalError(f'{self.path} has records of another version: update')
-            values = np.frombuffer(content, '<f4', count, _PLACE.size)
-            yield JournalPlace(
-                number,
-                stamp,
-                rest[:of_id].decode(),
-                np.array(pose) if has_pose else None,
-                values[W : W * (d + 1)].reshape(W, d),
-                values[:W],
-                rest[of_id:],
-                values[W * (d + 1) :],
-            )
+        """Yield the places in the order in which they were recorded; skip what is damaged."""
+        last = -1
+        for content in self._records(self._begin):
+            try:
+                place = JournalPlace.decode(content, self.template)
+                if place.number <= last:
+                    raise ValueError(f'number {place.number} follows {last}')
+            except (ValueError, StavprError) as error:
+                problem = f'the place up to byte {self.end} is invalid: {error}'
+                self.problem = self.problem or problem
+                continue
+            last = place.number
+            yield place
 
-    def _header(self) -> tuple[Base, PlaceMap]:
+    def _read_header(self) -> None:
         """Read the two records of the header."""
+        records = self._records(0)
+        about, self.template_content = next(records, b''), next(records, b'')
+        self._begin = self.end
         try:
-            about = json.loads(self._record() or b'')
-            if about['format'] != FORMAT or about['version'] != VERSION:
-                raise ValueError('another format or version')
-            base, self.source = Base(**about['base']), str(about['source'])
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder, 'template')
-                self.template_content = self._record() or b''
-                path.write_bytes(self.template_content)
-                return base, load_map(path)
-        except (ValueError, KeyError, TypeError, StavprError) as error:
+            match read_json(about, 'its first record'):
+                case {
+                    'format': found, 'version': version, 'source': str(source),
+                    'path': str(path), 'places': int(places), 'checksum': int(checksum),
+                } if (found, version) == (FORMAT, VERSION):  # fmt: skip
+                    self.source, self.base = source, Base(path, places, checksum)
+                case _:
+                    raise ValueError('another format or version')
+            with tempfile.NamedTemporaryFile() as file:
+                Path(file.name).write_bytes(self.template_content)
+                self.template = load_map(file.name)
+        except (ValueError, OSError, StavprError) as error:
             raise JournalError(
-                f'{self.path} is no journal, or was cut off before its first place ({error})'
+                f'{self.path} is no journal, or its header is damaged ({error}): move it elsewhere'
             ) from error
 
-    def _record(self) -> bytes | None:
-        """Return the content of the next record, None at the end, or at a damaged one."""
-        head = self._file.read(_FRAME.size)
-        if len(head) < _FRAME.size:
-            return None
-        length, checksum = _FRAME.unpack(head)
-        if length > min(LONGEST, self._left):
-            return None
-        content = self._file.read(length)
-        if len(content) < length or zlib.crc32(content) != checksum:
-            return None
-        self.size += _FRAME.size + length
-        return content
+    def _records(self, at: int) -> Iterator[bytes]:
+        """Yield the contents of whole records; time and memory are bounded for any file."""
+        wasted = 0  # bytes of damaged records: only as many as the file has are searched again
+        while at < self._size:
+            head = self.read(at, _HEAD.size + 4)
+            start, length, checksum = at + len(head), 0, 0
+            if head.startswith(MAGIC) and head[-4:] == _checksum(head[:-4]):
+                _, length, checksum = _HEAD.unpack_from(head)
+            content = self.read(start, length) if length <= LONGEST else b''
+            if content and zlib.crc32(content) == checksum:
+                self.end = at = start + length
+                yield content
+            else:
+                self.problem = self.problem or f'no whole record at byte {at}'
+                wasted += len(content)
+                at = self._find(at + 1 if wasted <= self._size else start + len(content))
 
+    def _find(self, at: int) -> int:
+        """Return the position of the next ``MAGIC``, or the end of the file."""
+        file = self._file.fileno()
+        with suppress(OSError):  # a hole up to the end, or an error of the disk
+            while at < self._size:
+                at = os.lseek(file, at, os.SEEK_DATA)
+                piece = os.pread(file, PIECE, at)
+                if (found := piece.find(MAGIC)) >= 0:
+                    return at + found
+                at += max(1, len(piece) - len(MAGIC) + 1)
+        return self._size
 
-def _open_locked(path: Path) -> BinaryIO:
-    try:
-        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        raise JournalError(f'{path} cannot be read ({error.strerror}): name a journal') from error
-    file = os.fdopen(number, 'rb')
-    try:
-        if not stat.S_ISREG(os.fstat(number).st_mode):
-            raise JournalError(f'{path} is no regular file: name a journal')
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.close()
-        raise JournalError(
-            f'{path} is being written by a running program: end it first'
-        ) from error
-    except BaseException:
-        file.close()
-        raise
-    return file
-
-
-# ------------------------------------------------------------------------------------- recovering
-
-
-@dataclass(frozen=True)
-class Recovered:
-    """
-    A map made of a journal.
-
-    :param path: the map's file.
-    :param places: all of its places; ``recorded`` of them are from the journal.
-    :param problem: why the map that they continue is not part of it, '' = it is, or there is none.
-    """
-
-    path: str
-    places: int
-    recorded: int
-    problem: str = ''
-
-
-def journals(target: str | Path) -> list[Path]:
-    """Return the journals of a map and of its numbered names, oldest first."""
-    target = Path(target)
-    pattern = f'{target.stem}*{target.suffix}{SUFFIX}'
-    try:
-        found = [path for path in target.parent.glob(pattern) if _names(target, path)]
-        return sorted(found, key=lambda path: path.stat().st_mtime)
-    except OSError:
-        return []
-
-
-def _names(target: Path, journal: Path) -> bool:
-    """Return whether a journal is of a map, or of a numbered name beside it."""
-    number = Path(journal.name.removesuffix(SUFFIX)).stem.removeprefix(target.stem)
-    return not number or (number[0] == '-' and number[1:].isdigit())
-
-
-def numbered(path: str | Path) -> Iterator[Path]:
-    """Yield a path and the numbered names beside it: route.stavpr, route-2.stavpr ..."""
-    path = Path(path)
-    yield path
-    yield from (path.with_stem(f'{path.stem}-{number}') for number in itertools.count(2))
-
-
-def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
-    """
-    Make a map of the places in a journal and of the map that they continue; delete the journal.
-
-    :param output: file of the map, which must not exist; None = the journal's name without its
-        suffix. That may be the map that is continued, which is replaced then; beside another map,
-        a numbered name is taken.
-    :raises JournalError: no journal, one without places, or one that is being written.
-    :raises OutputError: the map cannot be written; the journal stays.
-    """
-    journal = Path(journal)
-    with JournalReader(journal) as reader:
-        base, problem = _base_map(reader.base)
-        places = _with_places(base or reader.template, reader, base is not None)
-        if not len(places):
-            raise JournalError(f'{journal} has no places: delete it')
-        recorded = len(places) - len(base or ())
-        place_map = places.snapshot()
-        if output is None:
-            output = _save_beside(place_map, journal.with_name(journal.name.removesuffix(SUFFIX)))
-        else:
-            save_map(place_map, output)
-        journal.unlink()
-    return Recovered(str(output), len(place_map), recorded, problem)
-
-
-def _base_map(base: Base) -> tuple[PlaceMap | None, str]:
-    """Return the map that a journal continues, or None and why it is missing."""
-    if not base.places:
-        return None, ''
-    try:
-        place_map = load_map(base.path)
-    except StavprError as error:
-        return None, str(error)
-    if Base.of(base.path, place_map.stamps[: base.places]) != base:
-        return None, f'{base.path} is another map than the one that was continued'
-    return place_map, ''
-
-
-def _with_places(start: PlaceMap, reader: JournalReader, continued: bool) -> GrowingMap:
-    """Return the places of a map, if it is continued, and those of a journal behind it."""
-    limit = 2**31
-    if continued:
-        growing = GrowingMap.from_map(start, limit)
-    else:
-        growing = GrowingMap(start.settings, start.projection, limit, start.features.cells)
-    # a map that was saved just before the end has the first places of its journal already
-    saved = start.stamps[reader.base.places :].tolist() if continued else []
-    for i, place in enumerate(reader.places()):
-        if i < len(saved) and saved[i] == place.stamp:
-            continue
-        saved = []
-        features = LocalFeatures(
-            torch.from_numpy(place.strips[:, None].copy()),
-            torch.from_numpy(place.weights[:, None].copy()),
-            start.settings,
-            vectors=torch.from_numpy(place.vector[None].copy()) if place.vector.size else None,
-        )
-        growing.add(features, place.stamp, place.identifier, place.pose, place.thumbnail)
-    return growing
-
-
-def _save_beside(place_map: PlaceMap, target: Path) -> Path:
-    """Save a map under a name that is free, or that holds an earlier state of it."""
-    for path in numbered(target):
-        version = FileVersion.of(path)
-        try:
-            force = version if version and _begins(path, place_map) else False
-            save_map(place_map, path, force=force)
-            return path
-        except OutputTakenError:
-            continue
-    raise AssertionError
-
-
-def _begins(path: Path, place_map: PlaceMap) -> bool:
-    """Return whether a file is a map of the first places of this one."""
-    try:
-        stamps = open_map(path).stamps
-    except StavprError:
-        return False
-    return np.array_equal(stamps, place_map.stamps[: len(stamps)])
+    def read(self, at: int, count: int) -> bytes:
+        """Return the bytes from a position on, fewer at the end or where the disk has an error."""
+        with suppress(OSError):
+            return os.pread(self._file.fileno(), max(0, min(count, self._size - at)), at)
+        return b''

@@ -1,91 +1,198 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A map of the places in a journal that does not fit into memory: its features stay on disk."""
+"""Maps made of journals: after an interrupted recording, and of what build_map has read."""
 
-from collections.abc import Sequence
-import mmap
-import os
+from contextlib import suppress
+from dataclasses import dataclass
+import io
 from pathlib import Path
+import re
 import tempfile
-from typing import overload
 
 import numpy as np
-from stavpr_ros.errors import JournalError
-from stavpr_ros.mapping.journal import JournalReader
+from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
+from stavpr_ros.mapping.growing_map import GrowingMap
+from stavpr_ros.mapping.journal import Base, JournalReader, sizes_of, SUFFIX
+from stavpr_ros.mapping.map_container import MapFile, Part
+from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import PlaceMap
-from stavpr_ros.mapping.stored_features import MappedFeatures
+from stavpr_ros.mapping.stored_features import StoredFeatures, StoredThumbnails
+from stavpr_ros.output_file import explained, FileVersion, numbered, write_at
 import torch
 
-PLACES_AT_ONCE = 8192  # whose pages count as memory of this process
-
-
-class _Thumbnails(Sequence[bytes]):
-    """Thumbnails that are read from the journal on every use."""
-
-    def __init__(self, path: Path, ends: list[int], sizes: list[int]) -> None:
-        self._file, self._ends, self._sizes = path.open('rb'), ends, sizes
-
-    def __len__(self) -> int:
-        return len(self._ends)
-
-    @overload
-    def __getitem__(self, index: int) -> bytes: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[bytes]: ...
-
-    def __getitem__(self, index: int | slice) -> bytes | list[bytes]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        size = self._sizes[index]
-        return os.pread(self._file.fileno(), size, self._ends[index] - size)
+DAMAGED = '.damaged'  # suffix of journals that were not read to their end
 
 
 def journal_map(path: Path) -> PlaceMap:
     """
-    Return the places of a journal as a map.
+    Return the places of a journal as a map, whose features and thumbnails take no memory.
 
-    The features are in a temporary file beside the journal that has no name, the thumbnails stay
-    in the journal: both only take memory while they are used.
+    They are in a temporary file without a name, in the same folder.
 
-    :raises JournalError: no journal, or one without places.
+    :raises JournalError: no journal, one without places, or a damaged one.
+    :raises OutputError: there is no room.
     """
-    with JournalReader(path) as reader:
-        n = sum(1 for _ in reader.places())
-    if not n:
-        raise JournalError(f'{path} has no places: delete it')
-    with JournalReader(path) as reader:
-        template = reader.template
-        W, d = template.settings.strips, template.dimension
-        D = 0 if template.features.vectors is None else template.features.vectors.shape[1]
-        with tempfile.TemporaryFile(dir=path.parent) as file:
-            file.truncate(4 * n * (W * d + D))
-            pages = mmap.mmap(file.fileno(), 0)
-        strips = np.frombuffer(pages, np.float32, W * n * d).reshape(W, n, d)
-        vectors = np.frombuffer(pages, np.float32, n * D, strips.nbytes).reshape(n, D)
-        weights = np.empty((W, n), np.float32)
-        stamps, poses = np.empty(n, np.int64), np.full((n, 7), np.nan)
-        ids, ends, sizes = [], [], []
-        for i, place in enumerate(reader.places()):
-            if i % PLACES_AT_ONCE == 0:
-                pages.madvise(mmap.MADV_DONTNEED)  # they stay in the file
-            strips[:, i], weights[:, i], stamps[i] = place.strips, place.weights, place.stamp
-            vectors[i] = place.vector
-            if place.pose is not None:
-                poses[i] = place.pose
-            ids.append(place.identifier)
-            ends.append(reader.size)
-            sizes.append(len(place.thumbnail))
-    features = MappedFeatures(
-        torch.from_numpy(strips), torch.from_numpy(weights), template.settings,
-        template.features.cells, torch.from_numpy(vectors) if D else None,
-    )  # fmt: skip
-    object.__setattr__(features, 'pages', pages)
+    with explained(path), JournalReader(path) as reader:
+        place_map = _recorded(reader, path.parent)
+    if reader.problem:
+        raise JournalError(f'{path} is damaged: {reader.problem}')
+    return place_map
+
+
+def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
+    """
+    Return the places of a journal, with a temporary file in a folder.
+
+    :raises JournalError: there are none.
+    """
+    template = reader.template
+    W, d, D = sizes_of(template.features)
+    places, weights, records, ends = [], [], [], [0]
+    for _, place, features, thumbnail in reader.places():
+        places.append(place)
+        weights.append(features.weights)
+        size = 4 * (W * d + D) + len(place.identifier.encode()) + len(thumbnail)
+        records.append((reader.end - size, size))  # strips, vector, identifier, thumbnail
+        ends.append(ends[-1] + len(thumbnail))
+    if not places:
+        raise JournalError(f'{reader.path} has no places: {reader.problem or "delete it"}')
+    n = len(places)
+    strips, vectors = Part('F32', (W, n, d)), Part('F32', (n, D), 4 * W * n * d)
+    parts = {'strips': strips} | ({'vectors/vectors': vectors} if D else {})
+    first = strips.size + vectors.size
+    parts['thumbnails'] = Part('U8', (ends[-1],), first)
+    raw = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
+    assert isinstance(raw, io.FileIO)
+    for i, (start, size) in enumerate(records):
+        content = reader.read(start, size)
+        if len(content) < size:
+            raise JournalError(f'{reader.path} is shorter than before, or its disk has an error')
+        for j in range(W):
+            strip = content[4 * j * d : 4 * (j + 1) * d]
+            write_at(raw.fileno(), strip, 4 * (j * n + i) * d)
+        vector = content[4 * W * d : 4 * (W * d + D)]
+        write_at(raw.fileno(), vector, vectors.start + 4 * i * D)
+        write_at(raw.fileno(), content[size - (ends[i + 1] - ends[i]) :], first + ends[i])
+    file = MapFile(raw, reader.path)
+    file.parts = parts
+    poses = np.array([np.full(7, np.nan) if one.pose is None else one.pose for one in places])
+    cells = template.features.cells
     return PlaceMap(
-        features=features,
+        features=StoredFeatures(file, torch.cat(weights, dim=1), template.settings, cells),
         projection=template.projection,
-        stamps=stamps,
-        ids=tuple(ids),
+        stamps=np.array([place.stamp for place in places], np.int64),
+        ids=tuple(place.identifier for place in places),
         poses=None if np.isnan(poses).all() else poses,
         camera=template.camera,
-        thumbnails=_Thumbnails(path, ends, sizes) if any(sizes) else (),
+        thumbnails=StoredThumbnails(file, np.array(ends[1:])) if ends[-1] else (),
     )
+
+
+@dataclass(frozen=True)
+class Recovered:
+    """
+    A map made of a journal.
+
+    :param path: the map's file.
+    :param places: all of its places; ``recorded`` of them are from the journal.
+    :param problems: sentences on missing places, and on the damaged journal that is kept.
+    """
+
+    path: str
+    places: int
+    recorded: int
+    problems: tuple[str, ...] = ()
+
+
+def journals(target: str | Path) -> list[Path]:
+    """Return the journals of a map and of its numbered names, oldest first."""
+    target = Path(target)
+    name = re.compile(rf'{re.escape(target.stem)}(-\d+)*{re.escape(target.suffix + SUFFIX)}')
+    try:
+        found = [path for path in target.parent.iterdir() if name.fullmatch(path.name)]
+        return sorted(found, key=lambda path: path.stat().st_mtime)
+    except OSError:
+        return []
+
+
+def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
+    """
+    Make a map of the places in a journal and of the map that they continue; delete the journal.
+
+    A journal that was not read to its end is kept, under a name with the suffix ``DAMAGED``.
+
+    :param output: file of the map, which must not exist; None = the journal's name without its
+        suffix. That may be the map that is continued, which is replaced then; beside another map,
+        a numbered name is taken.
+    :raises JournalError: no journal, one without places, or one that is being written.
+    :raises OutputError: the map cannot be written; the journal stays.
+    """
+    journal, problems = Path(journal), []
+    target = Path(output or journal.with_name(journal.name.removesuffix(SUFFIX)))
+    with explained(target), JournalReader(journal) as reader:
+        place_map = _recorded(reader, target.parent)
+        base, problem = _base_map(reader.base)
+        if base is not None:
+            place_map = _continued(base, place_map, reader.base.places)
+        if output is None:
+            target = _save_beside(place_map, target)
+        else:
+            save_map(place_map, target)
+        if problem:
+            problems.append(f'{target} lacks the map that the recording continued: {problem}')
+        if reader.problem:
+            names = numbered(journal.with_name(journal.name + DAMAGED))
+            kept = journal.rename(next(path for path in names if not path.exists()))
+            problems.append(f'{target} may lack places: {reader.problem}; {kept} is kept')
+        else:
+            journal.unlink()
+    places = len(place_map)
+    return Recovered(str(target), places, places - len(base or ()), tuple(problems))
+
+
+def _base_map(base: Base) -> tuple[PlaceMap | None, str]:
+    """Return the map that a journal continues, or None and why it is missing."""
+    if not base.places:
+        return None, ''
+    try:
+        place_map = load_map(base.path)
+    except StavprError as error:
+        return None, str(error)
+    if Base.of(base.path, place_map.stamps[: base.places]) != base:
+        return None, f'{base.path} is another map than the one that was continued'
+    return place_map, ''
+
+
+def _continued(base: PlaceMap, recorded: PlaceMap, count: int) -> PlaceMap:
+    """Return a map with the recorded places behind it; ``count`` were there when it was opened."""
+    growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
+    # a map that was saved just before the end has the first places of its journal already
+    saved = base.stamps[count : count + n]
+    known = int(np.cumprod(saved == recorded.stamps[: len(saved)]).sum())
+    thumbnails = recorded.thumbnails or [b''] * n
+    for i in range(known, n):
+        place = recorded.place(i)
+        growing.add(
+            recorded.features[i : i + 1], place.stamp, place.identifier, place.pose, thumbnails[i]
+        )
+    return growing.snapshot()
+
+
+def _save_beside(place_map: PlaceMap, target: Path) -> Path:
+    """Save a map under a name that is free, or that is of an earlier state of it."""
+    for path in numbered(target):
+        version = FileVersion.of(path)
+        force = version if version and _begins(path, place_map) else False
+        with suppress(OutputTakenError):
+            save_map(place_map, path, force=force)
+            return path
+    raise AssertionError
+
+
+def _begins(path: Path, place_map: PlaceMap) -> bool:
+    """Return whether a file is a map of the first places of this one."""
+    try:
+        stamps = open_map(path).stamps
+    except StavprError:
+        return False
+    return np.array_equal(stamps, place_map.stamps[: len(stamps)])

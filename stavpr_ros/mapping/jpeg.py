@@ -6,7 +6,7 @@ import numpy as np
 
 MOST_PIXELS = 2**24  # of a thumbnail: 50 MB when it is decoded
 MOST_SEGMENTS = 64  # before the frame header
-FRAME_HEADERS = (0xC0, 0xC1, 0xC2)  # baseline, extended, progressive
+FIRST_FRAME, LAST_FRAME = 0xC0, 0xC2  # markers: baseline, extended, progressive
 FRAME_BYTES = 10  # marker, length, precision, height, width, components
 
 
@@ -30,7 +30,8 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
         if not len(left):
             break
         header = padded[at[:, None] + np.arange(FRAME_BYTES)].astype(np.int64)
-        frame = np.isin(header[:, 1], FRAME_HEADERS) & (header[:, 0] == 0xFF)
+        frame = (header[:, 1] >= FIRST_FRAME) & (header[:, 1] <= LAST_FRAME)
+        frame &= header[:, 0] == 0xFF
         sizes = (header[:, 5] * 256 + header[:, 6]) * (header[:, 7] * 256 + header[:, 8])
         pixels[left[frame]] = np.where(sizes[frame] > 0, sizes[frame], -1)
         length = header[:, 2] * 256 + header[:, 3]

@@ -72,8 +72,7 @@ def map_content(file: MapFile) -> PlaceMap:
     cells = None if manifest['cells'] is None else (manifest['cells'][0], manifest['cells'][1])
     _require_dimension(settings, sizes.get('D', sizes['d']), cells, projection is None)
     weights = arrays['weights']
-    if weights.size and not (weights.min() >= 0 and weights.max() <= LONGEST):
-        raise ValueError('part weights is not between 0 and 1')
+    require_weights(weights)
     n = sizes['n']
     ids = [''] * n
     if 'ids' in arrays:
@@ -193,6 +192,16 @@ def _thumbnails(file: MapFile, ends: np.ndarray | None) -> Sequence[bytes]:
         require_jpegs(content, ends[first:last] - start, first)
         first = last
     return StoredThumbnails(file, ends)
+
+
+def require_weights(weights: np.ndarray) -> None:
+    """
+    Reject weights that are not between 0 and 1.
+
+    :raises ValueError: they are not.
+    """
+    if weights.size and not (weights.min() >= 0 and weights.max() <= LONGEST):
+        raise ValueError('part weights is not between 0 and 1')
 
 
 def require_jpegs(content: np.ndarray, ends: np.ndarray, first: int = 0) -> None:

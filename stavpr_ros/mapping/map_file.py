@@ -20,7 +20,7 @@ from stavpr_ros.mapping.map_schema import identity_fields
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 from stavpr_ros.mapping.map_version2 import MOST_HEADER, read_header, write_parts
 from stavpr_ros.mapping.place_map import PlaceMap
-from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
+from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.output_file import atomic_output, Force, MAP
 from stavpr_ros.regular_file import open_regular
 
@@ -130,7 +130,7 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
 def _strips(features: LocalFeatures, dtype: np.dtype) -> Iterator[np.ndarray]:
     """Yield the features of one strip after the other, (n, d)."""
     for j in range(features.settings.strips):
-        if isinstance(features, StoredFeatures | MappedFeatures):
+        if isinstance(features, StoredFeatures):
             yield features.stored_strip(j).astype(dtype, copy=False)
         else:
             yield features.strips[j].cpu().numpy().astype(dtype, copy=False)

@@ -3,7 +3,6 @@
 """Features and thumbnails of a map that stay in its file, and are read by position on use."""
 
 from collections.abc import Sequence
-import mmap
 from typing import Any, overload
 
 import numpy as np
@@ -41,25 +40,6 @@ class StoredThumbnails(Sequence[bytes]):
             return self._file.bytes_at(
                 self._file.parts['thumbnails'].start + start, int(self._ends[i]) - start
             )
-
-
-class MappedFeatures(LocalFeatures):
-    """
-    Features whose strips are mapped from a file.
-
-    ``pages`` is the mapping, set by its maker.
-    """
-
-    pages: mmap.mmap
-
-    def release(self) -> None:
-        """Release the memory of what was read; it is read from the file again."""
-        self.pages.madvise(mmap.MADV_DONTNEED)
-
-    def stored_strip(self, j: int) -> np.ndarray:
-        """Return one strip, shape (n, d), float32; pages of those before are released."""
-        self.release()
-        return self.strips[j].numpy()
 
 
 class StoredFeatures(LocalFeatures):
@@ -134,7 +114,7 @@ class StoredFeatures(LocalFeatures):
         strip: np.ndarray = np.empty((n, d), DTYPES[self._part.dtype])
         with errors_of(self.file.path):
             self.file.fill(strip, self._part.start + j * strip.nbytes)
-            _require_normalized(torch.from_numpy(strip), f'strips, strip {j}', 0)
+            require_normalized(torch.from_numpy(strip), f'strips, strip {j}', 0)
         return strip
 
     @property
@@ -180,10 +160,17 @@ class StoredFeatures(LocalFeatures):
                 self.file.fill(block, part.start + (first + place) * block[0].nbytes)
                 if dtype != np.float32:
                     target.copy_(torch.from_numpy(block))
-                _require_normalized(target, name, place)
+                require_normalized(target, name, place)
 
 
-def _require_normalized(rows: torch.Tensor, name: str, place: int) -> None:
+def require_normalized(rows: torch.Tensor, name: str, place: int) -> None:
+    """
+    Reject features that are not finite, or longer than 1.
+
+    :param rows: shape (places, d).
+    :param name: of the part, in the error; ``place`` is the number of the first one.
+    :raises ValueError: names part and place.
+    """
     for low in range(0, len(rows), PLACES_AT_ONCE):
         # by NumPy: torch would wake its threads for each of thousands of short blocks
         block = rows[low : low + PLACES_AT_ONCE].float().numpy()

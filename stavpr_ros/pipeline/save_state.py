@@ -32,7 +32,6 @@ class SaveState:
     recorded: int = 0
     saved: int = 0
     journal: JournalWriter | None = None
-    _forgotten: int = 0  # recorded places that the journal needs no longer
     _files: dict[str, FileVersion | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -68,11 +67,10 @@ class SaveState:
                 features.to('cpu'), places.projection, stamps, ids, camera=places.camera
             )
             self.journal = open_journal(self.base, template)
-            self._forgotten = self.recorded
         if self.journal is not None:
             thumbnail = places.thumbnails[-1]
-            self.journal.append(JournalPlace.of(self.recorded, newest, features, thumbnail))
-            self._forget(places.first)  # of a route, which counts as recorded does
+            self.journal.append(JournalPlace(self.recorded, newest, features, thumbnail))
+            self.journal.forget(places.first)  # of a route, which counts as recorded does
         self.recorded += 1
 
     def close_journal(self, delete: bool) -> None:
@@ -80,12 +78,6 @@ class SaveState:
         if self.journal is not None:
             self.journal.close(delete or not self.unsaved)
             self.journal = None
-
-    def _forget(self, until: int, base: Base | None = None) -> None:
-        assert self.journal is not None
-        if until > self._forgotten or base is not None:
-            self.journal.forget(max(0, until - self._forgotten), base)
-            self._forgotten = max(until, self._forgotten)
 
 
 @dataclass(frozen=True)
@@ -105,6 +97,6 @@ class MapSnapshot:
             return
         state.saved, state.base = self.recorded, Base.of(path, self.places.stamps)
         if state.journal is not None and state.unsaved:
-            state._forget(self.recorded, state.base)
+            state.journal.forget(self.recorded, state.base)
         else:
             state.close_journal(delete=True)

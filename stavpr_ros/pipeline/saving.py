@@ -9,8 +9,8 @@ from typing import Any
 
 from stavpr_ros.errors import OutputTakenError, StavprError
 from stavpr_ros.mapping import save_map
-from stavpr_ros.mapping.journal import journals, numbered, recover
-from stavpr_ros.output_file import Force, MAP, require_replaceable
+from stavpr_ros.mapping.journal_map import journals, recover
+from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.recognition.prepared_map import statistics_of_map
 
@@ -62,27 +62,35 @@ def save_recorded_map(
     return False
 
 
-def recover_maps(target: str | Path, log: 'Logger | Any') -> str:
+def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -> str:
     """
     Make maps of the journals that a killed node, or a failed save, has left; log each.
 
     :param target: file that maps are saved to; journals of numbered names count too.
+    :param is_own: whether they are of this node; others are only logged.
     :returns: the file of the latest map; '' = there were no journals.
     """
     latest = ''
     for journal in journals(target):
+        if not is_own:
+            log.warning(
+                f'{journal} has places of another recording: a node in mapping, or `stavpr map '
+                'recover`, makes a map of them'
+            )
+            continue
         try:
             found = recover(journal)
-        except StavprError as error:
-            log.warning(f'the journal {journal} was left as it is: {error}')
+        except Exception as error:  # any error: the node must start
+            cause = str(error) if isinstance(error, StavprError) else repr(error)
+            log.warning(f'the journal {journal} was left as it is: {cause}')
             continue
         latest = found.path
         log.warning(
             f'{found.recorded} places of an earlier recording were recovered from {journal}: '
             f'{found.path} has {found.places} places'
         )
-        if found.problem:
-            log.error(f'{found.path} lacks the map that the recording continued: {found.problem}')
+        for problem in found.problems:
+            log.error(problem)
     return latest
 
 

@@ -14,7 +14,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.map_statistics import MapStatistics
-from stavpr_ros.mapping.stored_features import MappedFeatures, StoredFeatures
+from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.recognition.blocks import converted_blocks, PlaceChanges
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.map_change import APART
@@ -177,10 +177,7 @@ class _AsStored(LocalFeatures):
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
         block = self.whole[images]
-        block = replace(block, strips=block.strips.cpu().to(self.dtype).float())
-        if isinstance(self.whole, MappedFeatures):
-            self.whole.release()
-        return block
+        return replace(block, strips=block.strips.cpu().to(self.dtype).float())
 
     @property
     def dimension(self) -> int:

@@ -22,7 +22,7 @@ from stavpr_ros.ros.input import Worker
 from stavpr_ros.ros.output import relative_pose_message
 from stavpr_ros.signals import time_left
 
-MOST_WAITING = 64  # closures; while there are more, the oldest goes without a relative pose
+MOST_WAITING = 16  # closures; while there are more, the oldest goes without a relative pose
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
 
 

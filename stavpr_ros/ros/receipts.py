@@ -7,10 +7,11 @@ import time
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from stavpr_msgs.msg import PlaceMatch
+from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from std_msgs.msg import Header
 
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+MOST_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
 
 
@@ -31,7 +32,10 @@ class Receipts:
         self._sent = self._received = 0
         self._last = time.monotonic()  # event
         self.status = PlaceMatch.NOT_READY
+        self._matches = self._closures = 0
         node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RESULTS)
+        topic = 'stavpr/loop_closure'
+        node.create_subscription(LoopClosure, topic, self._on_closure, RESULTS)
 
     def sent(self, header: Header) -> None:
         """Count an image; to be called before it is published."""
@@ -42,6 +46,10 @@ class Receipts:
     def complete(self) -> bool:
         """Return whether each image has its result."""
         return self._received == self._sent
+
+    def closures_follow(self) -> bool:
+        """Return whether the node, if it publishes loop closures, keeps up with their edges."""
+        return not self._closures or self._matches - self._closures <= MOST_BEHIND
 
     def settled(self) -> bool:
         """Return whether no more results are expected."""
@@ -64,6 +72,10 @@ class Receipts:
             self._received += 1
             self.status = match.status
             self._last = time.monotonic()
+        self._matches += match.status == PlaceMatch.MATCH
+
+    def _on_closure(self, _: LoopClosure) -> None:
+        self._closures += 1
 
 
 def _key(header: Header) -> tuple[int, int, str]:

@@ -277,7 +277,7 @@ class Replayer:
 
     def _send_until_answered(self, message: Image) -> None:
         """
-        Send an image and wait for a result with its header.
+        Send an image and wait for a result with its header, and for loop closures far behind.
 
         Headers may all be equal (stamps of 0), so only one image is outstanding. An image sent
         again to a slow node has two results; with an equal header the second counts for the next
@@ -291,6 +291,7 @@ class Replayer:
                 self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
             self.publisher.publish(message)
             if self._spin_until(self.receipts.complete, timeout):
+                self._spin_until(self.receipts.closures_follow, timeout)
                 break
         else:
             raise NoResultError(

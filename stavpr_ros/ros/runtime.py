@@ -107,7 +107,10 @@ class Runtime:
         self._pipeline: Pipeline | None = None
         self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         try:
-            recovered = recover_maps(self._journaled, node.get_logger())
+            # a node that only localizes on a map that is named has recorded nothing
+            is_own = settings.operation != 'localization' or not settings.map_path
+            is_own = is_own or bool(settings.save_path)
+            recovered = recover_maps(self._journaled, node.get_logger(), is_own)
             self._pipeline = self.worker.run(self._make_pipeline)
             # a route of loop closure does not continue a map
             continued = recovered if settings.operation != 'loop_closure' else ''

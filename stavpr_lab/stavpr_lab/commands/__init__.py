@@ -4,26 +4,16 @@
 
 from stavpr_ros.commands import Command
 
+TEXTS = {
+    'weights': 'download the published weights of a network',
+    'export_model': 'make one ONNX file of a network of vectors and maps',
+    'evaluate': 'evaluate the recognition of one traverse on the map of another',
+    'experiments': "reproduce the paper's tables on local data sets",
+    'monitor': 'show the node in a web browser',
+    'demo': 'build, run and evaluate everything on a synthetic street',
+}
+WITH_ROS = {'monitor', 'demo'}
 COMMANDS = {
-    'weights': Command(
-        'stavpr_lab.commands.weights', 'download the published weights of a network'
-    ),
-    'export_model': Command(
-        'stavpr_lab.commands.export_model', 'make one ONNX file of a network of vectors and maps'
-    ),
-    'evaluate': Command(
-        'stavpr_lab.commands.evaluate',
-        'evaluate the recognition of one traverse on the map of another',
-    ),
-    'experiments': Command(
-        'stavpr_lab.commands.experiments', "reproduce the paper's tables on local data sets"
-    ),
-    'monitor': Command(
-        'stavpr_lab.commands.monitor', 'show the node in a web browser', True
-    ),
-    'demo': Command(
-        'stavpr_lab.commands.demo',
-        'build, run and evaluate everything on a synthetic street',
-        True,
-    ),
+    name: Command(f'stavpr_lab.commands.{name}', text, name in WITH_ROS)
+    for name, text in TEXTS.items()
 }

@@ -55,61 +55,41 @@ def _parser() -> argparse.ArgumentParser:
     add('--output', default='demo_output', metavar='FOLDER', help='output folder (%(default)s)')
     add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
     add('--query', metavar='FOLDER|BAG', help='second traverse: it is replayed')
-    add(
-        '--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic',
-        help=f'a traverse that passes places again ({SYNTHETIC})',
-    )  # fmt: skip
+    loop = f'a traverse that passes places again ({SYNTHETIC})'
+    add('--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic', help=loop)
     add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
-    slam = parser.add_argument_group('options of --slam')
-    add_slam = slam.add_argument
-    add_slam(
-        '--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)'
-    )
-    add_slam('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
-    add_slam(
-        '--drift', type=float, default=DRIFT, metavar='F',
-        help='factor on the errors of the odometry; 0.06: some 2 m after three laps (%(default)s)',
-    )  # fmt: skip
-    add_slam(
-        '--false-closures', type=float, default=0.0, metavar='P',
-        help='share of loop closures that are made wrong (%(default)g)',
-    )  # fmt: skip
-    add_slam('--coherent', action='store_true', help='they are wrong in runs of 20 that agree')
-    add_slam(
-        '--carried', action='store_true',
-        help='the robot is carried over 60 images of lap 2, which the odometry misses',
-    )  # fmt: skip
-    add_slam(
-        '--sessions', type=int, default=1, choices=(1, 2),
-        help='2: lap 3 is on the next day, its odometry starts anew',
-    )  # fmt: skip
     add('--topic', help='image topic of the bags, if they have several')
-    add(
-        '--truth', metavar='identity|FILE',
-        help='identity: image i of the query shows place i of the map; with --loop a FILE: pairs '
-        'of images (.csv), or a square array (.npy) or black and white image of loop closures',
-    )  # fmt: skip
-    add('--tolerance', type=int, default=3, help='places that a correct match may be off '
-        '(%(default)s)')  # fmt: skip
-    add('--sequence-length', type=int, default=20, metavar='L', help='images in the window '
-        '(%(default)s)')  # fmt: skip
+    truth = (
+        'identity: image i of the query shows place i of the map; with --loop a FILE: pairs of '
+        'images (.csv), or a square array (.npy) or black and white image of loop closures'
+    )
+    add('--truth', metavar='identity|FILE', help=truth)
+    tolerance = 'places that a correct match may be off (%(default)s)'
+    add('--tolerance', type=int, default=3, help=tolerance)
+    length = 'images in the window (%(default)s)'
+    add('--sequence-length', type=int, default=20, metavar='L', help=length)
     add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
-    add(
-        '--min-probability', type=float, default=BY_NAME['min_probability'].default, metavar='P',
-        help='of the node, mode robust: matches have a greater probability (%(default)g)',
-    )  # fmt: skip
-    add(
-        '--threshold', type=float, metavar='DISTANCE',
-        help='of the node, mode paper (estimated from the first traverse)',
-    )  # fmt: skip
-    add(
-        '--exclude-places', type=int, metavar='N',
-        help=f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})',
-    )  # fmt: skip
-    add(
-        '--geometric-check', choices=('none', 'orb', 'sift'),
-        help=f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})',
-    )  # fmt: skip
+    least = 'of the node, mode robust: matches have a greater probability (%(default)g)'
+    default = BY_NAME['min_probability'].default
+    add('--min-probability', type=float, default=default, metavar='P', help=least)
+    limit = 'of the node, mode paper (estimated from the first traverse)'
+    add('--threshold', type=float, metavar='DISTANCE', help=limit)
+    exclude = f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})'
+    add('--exclude-places', type=int, metavar='N', help=exclude)
+    check = f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})'
+    add('--geometric-check', choices=('none', 'orb', 'sift'), help=check)
+    add = parser.add_argument_group('options of --slam').add_argument
+    add('--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)')
+    add('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
+    drift = 'factor on the errors of the odometry; 0.06: 2 m after three laps (%(default)s)'
+    add('--drift', type=float, default=DRIFT, metavar='F', help=drift)
+    wrong = 'share of loop closures that are made wrong (%(default)g)'
+    add('--false-closures', type=float, default=0.0, metavar='P', help=wrong)
+    add('--coherent', action='store_true', help='they are wrong in runs of 20 that agree')
+    carried = 'the robot is carried over 60 images of lap 2, which the odometry misses'
+    add('--carried', action='store_true', help=carried)
+    sessions = '2: lap 3 is on the next day, its odometry starts anew'
+    add('--sessions', type=int, default=1, choices=(1, 2), help=sessions)
     add_feature_options(parser)
     return parser
 
@@ -211,7 +191,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
 
 
 def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, object]:
-    """Return the parameters of the node that decide what is a match."""
+    """Return the parameters of the node of the limit of a match."""
     if arguments.mode == 'robust':
         return {'mode': 'robust', 'min_probability': arguments.min_probability}
     return {'mode': 'paper', 'threshold': threshold}
@@ -239,17 +219,17 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.plots import draw_result
     from stavpr_lab.evaluation.records import evaluate_records
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_ros.mapping import save_map
+    from stavpr_ros.mapping import build_map, save_map
 
     pair = _traverse_pair(arguments, folder)
     length, map_path = arguments.sequence_length, folder / 'map.stavpr'
     _print(f'2. The map of the first traverse: {map_path}')
-    place_map = pair.reference.build_map(make_extractor(arguments), _skip)
+    place_map = build_map(pair.reference.open(_skip), make_extractor(arguments))
     save_map(place_map, map_path, force=True)
     threshold = _threshold(place_map, arguments)
 
     _print('3. The second traverse through the node, over ROS, with a replay and a recorder')
-    query = pair.query.build_map(place_map.extractor(), _skip)
+    query = build_map(pair.query.open(_skip), place_map.extractor())
     if pair.true_places is not None:
         _require_all(query, len(pair.true_places))
     parameters = {
@@ -282,6 +262,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.live import run_live
     from stavpr_lab.demonstration.loops import draw_loops, read_result
     from stavpr_ros.commands.feature_options import make_extractor
+    from stavpr_ros.mapping import build_map
 
     exclude = arguments.exclude_places or EXCLUDE_PLACES
     length = arguments.sequence_length
@@ -293,7 +274,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
             f'window of {length}'
         )
     extractor = make_extractor(arguments)
-    place_map = recording.build_map(extractor, _skip)
+    place_map = build_map(recording.open(_skip), extractor)
     if traverse.ground_truth is not None:
         _require_all(place_map, traverse.N)
     features = folder / 'features.stavpr'
@@ -343,10 +324,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
         relay = [sys.executable, '-m', 'stavpr_slam.ros.false_closures']
         relay += ['--share', str(arguments.false_closures), '--seed', str(arguments.world)]
         others['false_closures'] = relay + ['--coherent'] * arguments.coherent
-    graph = {
-        'maps_folder': folder.absolute(),
-        'loop_closure_topics': [topic],
-    }
+    graph = {'maps_folder': folder.absolute(), 'loop_closure_topics': [topic]}
     others['pose_graph'] = [
         executable('pose_graph', 'stavpr_slam'), '--ros-args',
         *(word for name, value in graph.items() for word in ('-p', f'{name}:={value}')),

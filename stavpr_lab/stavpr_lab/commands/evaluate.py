@@ -8,13 +8,7 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.jobs import (
-    add_job_options,
-    Job,
-    job_names,
-    other_arguments,
-    run_jobs,
-)
+from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
@@ -53,7 +47,7 @@ another drive (they combine; applied in the order speed, stop, reverse, drop):
   --mirror                    every image mirrored left-right: no match is right
   --reverse                   the last image comes first
   --speed 3, 0.5, varying     images are left out or repeated; varying: 1/2 to 2
-  --stop 60:100               the query stands still at image 60 for 100 images more
+  --stop 60:100               the query stops at image 60 for 100 images more
   --drop 0.2                  each image is left out with probability 0.2
 
 examples:
@@ -82,32 +76,18 @@ def _parser() -> argparse.ArgumentParser:
     add('--query', nargs='+', metavar='FOLDER|BAG|MAP|ARRAY', help=query)
     add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
     add('--topic', help='image topic of the bags, if they have several')
-    add(
-        '--unknown',
-        metavar='FOLDER|BAG|MAP|ARRAY',
-        help='a traverse of places that are not in the map, for the rate of false alarms',
-    )
+    unknown = 'a traverse of places that are not in the map, for the rate of false alarms'
+    add('--unknown', metavar='FOLDER|BAG|MAP|ARRAY', help=unknown)
     add('--loop-closure', action='store_true', help="the map is the query's own past: no --map")
-    add(
-        '--exclude-places',
-        type=int,
-        metavar='N',
-        help=f'the latest N images are not part of that map ({EXCLUDE_PLACES})',
-    )
+    exclude = f'the latest N images are not part of that map ({EXCLUDE_PLACES})'
+    add('--exclude-places', type=int, metavar='N', help=exclude)
     late = 'count closures that are published late, too: see the message LoopClosure'
     add('--late-closures', action='store_true', help=late)
-    odometry = (
-        'poses of the images of the query by odometry, as --query-poses: compared with paths'
-    )
+    odometry = 'poses of the query by odometry, as --query-poses: compared with paths'
     add('--odometry', metavar='CSV', help=odometry)
     for name, side in (('map', 'right'), ('query', 'left')):
-        add(
-            f'--crop-{name}',
-            type=float,
-            default=0.0,
-            metavar='X',
-            help=f'crop this share of the {side} of every image of the {name} (%(default)g)',
-        )
+        crop = f'crop this share of the {side} of every image of the {name} (%(default)g)'
+        add(f'--crop-{name}', type=float, default=0.0, metavar='X', help=crop)
     _add_drive_options(parser)
     _add_ground_truth_options(parser)
     _add_method_options(parser)
@@ -132,7 +112,7 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     add('--reverse', action='store_true', help='drive the query in reverse order')
     speed = 'images of the query per image, varying, or stop (30 images in the middle)'
     add('--speed', '--warp', metavar='X', help=speed)
-    stop = 'stand still at image IMAGE of the query for COUNT more; may be repeated'
+    stop = 'stop at image IMAGE of the query for COUNT images more; may be repeated'
     add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
     drop = 'leave each image of the query out with this probability (%(default)g)'
     add('--drop', type=float, default=0.0, metavar='P', help=drop)

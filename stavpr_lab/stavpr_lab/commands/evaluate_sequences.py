@@ -8,13 +8,7 @@ from pathlib import Path
 import time
 
 import numpy as np
-from stavpr_lab.evaluation.drive import (
-    cropped,
-    Drive,
-    DriveChanges,
-    FrameSource,
-    mirrored,
-)
+from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource, mirrored
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_ros.commands.feature_options import (
@@ -24,19 +18,8 @@ from stavpr_ros.commands.feature_options import (
 )
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.descriptors import (
-    is_descriptors,
-    read_descriptors,
-    require_comparable,
-)
-from stavpr_ros.mapping import (
-    build_map,
-    descriptor_map,
-    is_map,
-    load_map,
-    PlaceMap,
-    select_places,
-)
+from stavpr_ros.features.descriptors import is_descriptors, read_descriptors, require_comparable
+from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
@@ -294,12 +277,7 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     query = select_places(query, drive.images)
     odometry = None if sequences.odometry is None else sequences.odometry[drive.images]
     return replace(
-        sequences,
-        reference=reference,
-        query=query,
-        drive=drive,
-        title=title,
-        odometry=odometry,
+        sequences, reference=reference, query=query, drive=drive, title=title, odometry=odometry
     )
 
 

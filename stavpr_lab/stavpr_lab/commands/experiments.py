@@ -56,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = make_parser('experiments', DESCRIPTION, EPILOG)
     add = parser.add_argument
     add('experiment', choices=(*PRESETS, 'sweep'), help='see below')
-    add('--data', metavar='FOLDER', help='the folder that holds the data sets')
+    add('--data', metavar='FOLDER', help='the folder of all data sets')
     datasets = 'data sets to run (those of the paper in --data)'
     add('--datasets', nargs='+', metavar='NAME[=FOLDER]', help=datasets)
     add('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ros2 run stavpr_lab weights``: download the published weights of a network."""
 
+import socket
 import sys
 
 from stavpr_lab.features import PublishedSettings
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import backbone_class, kinds, settings_class
+
+TIMEOUT_SECONDS = 30.0  # without a byte
 
 EPILOG = """
 Nothing else in this package goes online. The file is downloaded over https, compared with its
@@ -41,6 +44,7 @@ def main(args: list[str] | None = None) -> int:
         if len(sha256) != 64 or set(sha256) - set('0123456789abcdef'):
             raise SettingsError(f'--sha256 {sha256}: expected 64 digits 0-9 a-f')
         path = cache_folder() / published.name
+        socket.setdefaulttimeout(TIMEOUT_SECONDS)  # torch.hub sets none
         weights.download(published.address, path, sha256)
         print(f'{path}: sha256 {sha256}')
 

@@ -9,20 +9,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 import numpy as np
+from stavpr_lab.evaluation import plots
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.plots import (
-    BRIGHT,
-    color_bar,
-    draw_pairs,
-    legend_above,
-    MatchPair,
-    MEANING,
-    Outcome,
-    QUIET,
-    SCALE,
-    titled_page,
-    TRUTH,
-)
+from stavpr_lab.evaluation.plots import MatchPair, Outcome
 from stavpr_lab.evaluation.records import IN_WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
@@ -69,14 +58,14 @@ class LoopResult:
             return line
         correct = np.count_nonzero(right)
         precision = f', precision {correct / C:.3f}' if C else ''
-        seen = self.ground_truth.has_match
+        revisited = self.ground_truth.has_match
         aligned = self.pairs[self.are_correct(self.pairs)]
         closed = len(np.unique(aligned[:, 0]))
-        recall = f', recall {closed / seen.sum():.3f}' if seen.any() else ''
+        recall = f', recall {closed / revisited.sum():.3f}' if revisited.any() else ''
         return (
             f'{line}\n'
             f'{correct} of {C} loop closures are correct{precision}\n'
-            f'{closed} of {np.count_nonzero(seen)} images of places passed before are in a '
+            f'{closed} of {np.count_nonzero(revisited)} images of places passed before are in a '
             f'correct pair{recall}'
         )
 
@@ -154,14 +143,12 @@ def _draw_traverse(
     """Draw the compared pairs, the ground truth, and the aligned pairs."""
     N = result.N
     if distances is not None:
-        low, high = np.nanquantile(distances, [0.002, 0.995])
-        scale: dict[str, Any] = {'cmap': SCALE, 'vmin': low, 'vmax': max(high, low + 1e-6)}
-        color_bar(figure, axes.imshow(distances, aspect='auto', **scale), axes)
+        plots.show_distances(figure, axes, distances, aspect='auto')
     size = float(np.clip(900 / N, 2.5, 5.0))
     dots: dict[str, Any] = {'marker': '.', 'linestyle': 'none', 'mew': 0}
     if result.ground_truth is not None:
         later, earlier = result.ground_truth.pairs.T
-        style: dict[str, Any] = {'color': TRUTH, 'ms': size * 2.4, 'alpha': 0.4}
+        style: dict[str, Any] = {'color': plots.TRUTH, 'ms': size * 2.4, 'alpha': 0.4}
         axes.plot(earlier, later, label='passed before', **style, **dots)
     correct = result.are_correct(result.pairs)
     if correct is None:
@@ -171,13 +158,13 @@ def _draw_traverse(
     for outcome, mask in masks.items():
         if mask.any():
             later, earlier = result.pairs[mask].T
-            label = MEANING[outcome].replace('match', 'aligned')
-            axes.plot(earlier, later, color=BRIGHT[outcome], ms=size, label=label, **dots)
+            label = plots.MEANING[outcome].replace('match', 'aligned')
+            axes.plot(earlier, later, color=plots.BRIGHT[outcome], ms=size, label=label, **dots)
     note = 'not compared:\nlater, or too recent'
-    axes.text(N * 0.97, N * 0.04, note, ha='right', va='top', color=QUIET)
+    axes.text(N * 0.97, N * 0.04, note, ha='right', va='top', color=plots.QUIET)
     axes.set(xlabel='earlier image', ylabel='later image')
     axes.set(xlim=(-0.5, N - 0.5), ylim=(N - 0.5, -0.5))
-    for handle in legend_above(axes, 3).get_lines():
+    for handle in plots.legend_above(axes, 3).get_lines():
         handle.set(markersize=10, alpha=1)
 
 
@@ -189,9 +176,9 @@ def draw_loops(result: LoopResult, place_map: PlaceMap, title: str, folder: Path
     :returns: its path.
     """
     path = folder / 'loop.png'
-    with titled_page(path, 12.5, 5.9, title, result.summary()) as figure:
+    with plots.titled_page(path, 12.5, 5.9, title, result.summary()) as figure:
         halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.1))
         left, right = halves
         _draw_traverse(left, left.add_subplot(), result, _compared_distances(result, place_map))
-        draw_pairs(right, _pairs(result, place_map), 2)
+        plots.draw_pairs(right, _pairs(result, place_map), 2)
     return path

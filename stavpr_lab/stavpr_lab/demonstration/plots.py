@@ -9,22 +9,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 import numpy as np
-from stavpr_lab.evaluation.plots import (
-    COLORS,
-    draw_matrix,
-    draw_pairs,
-    GRID,
-    INK,
-    legend_above,
-    MatchPair,
-    MEANING,
-    Outcome,
-    PAPER,
-    runs,
-    shade_runs,
-    THRESHOLD,
-    titled_page,
-)
+from stavpr_lab.evaluation import plots
+from stavpr_lab.evaluation.plots import COLORS, MatchPair, MEANING, Outcome
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
@@ -52,40 +38,27 @@ def draw_result(
     demo_sheet(path, pairs, recognizer.distances(query.features), result, threshold, title)
 
 
-def outcomes_of(result: TraverseEvaluation) -> list[Outcome]:
-    """Return one outcome for each image."""
-    if result.true_places is None or result.correct is None:
-        return ['match' if accepted else 'no match' for accepted in result.accepted]
-    outcomes: list[Outcome] = []
-    for accepted, correct, place in zip(
-        result.accepted, result.correct, result.true_places, strict=True
-    ):
-        rejected: Outcome = 'unseen' if place < 0 else 'no match'
-        outcomes.append(('right' if correct else 'wrong') if accepted else rejected)
-    return outcomes
+def outcomes_of(result: TraverseEvaluation) -> np.ndarray:
+    """Return the :data:`stavpr_lab.evaluation.plots.Outcome` of each image, shape (N,), str."""
+    in_map = None if result.true_places is None else result.true_places >= 0
+    return plots.outcomes(result.accepted, result.correct, in_map)
 
 
-def choose_images(outcomes: list[Outcome]) -> list[int]:
+def choose_images(outcomes: np.ndarray) -> list[int]:
     """Choose one image of each outcome, and others of the most frequent, far from each other."""
-    chosen: list[int] = []
-    for outcome in dict.fromkeys(outcomes):
-        same = [i for i, other in enumerate(outcomes) if other == outcome]
-        chosen.append(same[len(same) // 2])
-    common = max(set(outcomes), key=outcomes.count)
-    candidates = np.array([i for i, other in enumerate(outcomes) if other == common])
-    while len(chosen) < min(SHOWN, len(outcomes)) and len(candidates):
+    kinds, counts = np.unique(outcomes, return_counts=True)
+    groups = [np.flatnonzero(outcomes == kind) for kind in kinds]
+    chosen = [int(same[len(same) // 2]) for same in groups]
+    common = groups[counts.argmax()]
+    while len(chosen) < min(SHOWN, len(outcomes)):
         others = np.array([0, len(outcomes), *chosen])
-        gaps = np.abs(candidates[:, None] - others).min(axis=1)
-        chosen.append(int(candidates[gaps.argmax()]))
+        gaps = np.abs(common[:, None] - others).min(axis=1)
+        chosen.append(int(common[gaps.argmax()]))
     return sorted(set(chosen))[:SHOWN]
 
 
 def _pair(
-    result: TraverseEvaluation,
-    image: int,
-    outcome: Outcome,
-    query: PlaceMap,
-    place_map: PlaceMap,
+    result: TraverseEvaluation, image: int, outcome: Outcome, query: PlaceMap, place_map: PlaceMap
 ) -> MatchPair:
     left = query.thumbnail(image)
     if left is None:
@@ -111,11 +84,11 @@ def demo_sheet(
     :param distances: every query to every place, shape (N, n).
     """
     above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
-    with titled_page(path, 11, above + below, title, result.summary()) as figure:
+    with plots.titled_page(path, 11, above + below, title, result.summary()) as figure:
         rows: Any = figure.subfigures(2, 1, height_ratios=(above, below))
         top, bottom = rows
         left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.18))
-        draw_pairs(top, pairs, 3)
+        plots.draw_pairs(top, pairs, 3)
         _draw_matrix(left, distances, result)
         _draw_time(right.add_subplot(), result, threshold)
 
@@ -126,38 +99,35 @@ def _draw_matrix(figure: SubFigure, distances: np.ndarray, result: TraverseEvalu
     pairs = np.stack([np.arange(len(distances)), result.matched], axis=1)
     if truth is None or correct is None:
         matches = {'match': pairs[result.accepted]}
-        draw_matrix(figure, axes, distances, distances.shape, None, '', matches)
+        plots.draw_matrix(figure, axes, distances, distances.shape, None, '', matches)
         return
     away = np.abs(np.arange(distances.shape[1]) - truth[:, None])
     cells = (truth >= 0)[:, None] & (away <= result.tolerance)
     matches = {'right': pairs[correct], 'wrong': pairs[result.accepted & ~correct]}
     label = f'true place ± {result.tolerance}'
-    draw_matrix(figure, axes, distances, distances.shape, cells, label, matches)
-    for start, stop in runs(truth < 0):
-        axes.axhspan(start - 0.5, stop - 0.5, color=PAPER, alpha=0.32, lw=0)
+    plots.draw_matrix(figure, axes, distances, distances.shape, cells, label, matches)
+    for start, stop in plots.runs(truth < 0):
+        axes.axhspan(start - 0.5, stop - 0.5, color=plots.PAPER, alpha=0.32, lw=0)
         if stop - start > len(truth) / 25:
             at = distances.shape[1] * 0.02, (start + stop - 1) / 2
-            axes.text(*at, 'not in the map', va='center', color=INK, fontsize=9.5)
+            axes.text(*at, 'not in the map', va='center', color=plots.INK, fontsize=9.5)
 
 
 def _draw_time(axes: Axes, result: TraverseEvaluation, threshold: float) -> None:
     """Draw the distance of each query's best match as a dot in the color of its outcome."""
-    distances, kinds = result.matches.distances, np.array(outcomes_of(result))
+    distances, kinds = result.matches.distances, outcomes_of(result)
     index = np.arange(len(distances))
-    axes.plot(index, distances, color=GRID, lw=1.0, zorder=1)
+    axes.plot(index, distances, color=plots.GRID, lw=1.0, zorder=1)
     for outcome, color in COLORS.items():
         mask = kinds == outcome
         if mask.any():
             style: dict[str, Any] = {'color': color, 'ms': 6, 'mew': 0, 'label': MEANING[outcome]}
             axes.plot(index[mask], distances[mask], '.', zorder=2, **style)
     name = f'threshold {threshold:.3g}'
-    axes.axhline(threshold, color=THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
+    axes.axhline(threshold, color=plots.THRESHOLD, lw=1.3, ls=(0, (5, 3)), label=name, zorder=1.5)
     truth = np.zeros(len(index)) if result.true_places is None else result.true_places
-    shade_runs(axes, truth < 0, 'not in the map')
-    axes.set(
-        xlabel='query image',
-        ylabel='distance of the best match',
-        xlim=(-1, max(1, len(distances))),
-    )
-    axes.grid(axis='y', color=GRID, lw=0.7)
-    legend_above(axes, 3)
+    plots.shade_runs(axes, truth < 0, 'not in the map')
+    axes.set(xlabel='query image', ylabel='distance of the best match')
+    axes.set_xlim(-1, max(1, len(distances)))
+    axes.grid(axis='y', color=plots.GRID, lw=0.7)
+    plots.legend_above(axes, 3)

@@ -9,7 +9,7 @@ from pathlib import Path
 import shutil
 
 import numpy as np
-from stavpr_lab.demonstration.street import (
+from stavpr_lab.demonstration.street.traverses import (
     AFTERNOON,
     first_traverse,
     nearest_places,
@@ -20,7 +20,7 @@ from stavpr_lab.demonstration.street import (
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, PlaceMap, save_map
+from stavpr_ros.mapping import build_map, save_map
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_file import is_bag, METADATA
@@ -47,10 +47,6 @@ class Recording:
     def open(self, on_error: OnError | None = None) -> FolderSource | BagSource:
         """Open its images; see :func:`stavpr_ros.sources.open_source`."""
         return open_source(self.path, self.topic, on_error)
-
-    def build_map(self, extractor: FeatureExtractor, on_error: OnError) -> PlaceMap:
-        """Make a map of all its images; unreadable ones are reported and skipped."""
-        return build_map(self.open(on_error), extractor)
 
     def save_feature_settings(self, extractor: FeatureExtractor, path: Path) -> None:
         """Write a map of one image, which sets the features of a node that closes loops."""

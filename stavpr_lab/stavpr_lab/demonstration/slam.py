@@ -68,7 +68,7 @@ class SlamResult:
     :param poses: corrected, aligned with the truth, shape (n, 7); ``before``: the odometry.
     :param truth: at the same stamps, shape (n, 7).
     :param in_map: the corrected trajectory as published, shape (n, 7).
-    :param numbers: what the file ``slam.json`` has.
+    :param numbers: contents of the file ``slam.json``.
     """
 
     poses: np.ndarray

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Declared probabilities beside what came true: reliability, expected calibration error."""
+"""Calibration of declared probabilities: reliability, expected calibration error."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from stavpr_lab.evaluation.metrics import accepted_counts, ConfusionCounts, sweep
 
-EDGES = np.arange(11) / 10  # of the bins: each holds its lower edge, the last one 1 as well
+EDGES = np.arange(11) / 10  # of the bins: each includes its lower edge, the last one 1 as well
 LEVELS = (0.5, 0.8, 0.9, 0.95, 0.99)  # declared probabilities from which matches are accepted
 
 
 @dataclass(frozen=True)
 class Calibration:
     """
-    How far declared probabilities of matches hold.
+    Declared probabilities of matches beside the share of correct ones.
 
     :param images: images with a probability in each bin, shape (10,), int64.
     :param declared: their mean probability, shape (10,); NaN where there are none.

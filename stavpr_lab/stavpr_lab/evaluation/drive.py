@@ -142,7 +142,7 @@ class DriveChanges:
                 raise SettingsError(f'removed places {first}:{last} overlap with others')
             kept[first:last] = False
         if not kept.any():
-            raise SettingsError(f'all {n} places of the map are removed: leave some')
+            raise SettingsError(f'all {n} places of the map are removed: keep at least one')
         return np.flatnonzero(kept)
 
     def apply(self, ground_truth: GroundTruth) -> 'Drive':
@@ -163,7 +163,7 @@ class DriveChanges:
 @dataclass(frozen=True, eq=False)
 class Drive:
     """
-    A query of N images on a map of n places, changed from what was recorded.
+    A query of N images on a map of n places, as changed from the recording.
 
     :param images: the recorded image that each one is, shape (N,), int64.
     :param places: the recorded place that each place of the map is, ascending, shape (n,), int64.

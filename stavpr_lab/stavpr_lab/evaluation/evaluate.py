@@ -77,7 +77,7 @@ class TraverseResults:
         theirs from the paths of the outermost windows.
     :param single: of each image alone.
     :param seconds: to match each image, features excluded, shape (N,).
-    :param windows: distances of some windows.
+    :param windows: distances of up to :data:`WINDOWS` windows.
     :param distances: of all images.
     :param accepted: of the windows' matches, those that the recognizer accepts, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
@@ -135,18 +135,13 @@ class Evaluation:
         """
         if self.unknown is None:
             return {}
-        both = {
-            'sequence': (self.unknown.sequence, self.sequence),
-            'single': (self.unknown.single, self.single),
-        }
-        return {
-            kind: float(np.mean(matches.scores < metrics.best.threshold))
-            for kind, (matches, metrics) in both.items()
-        }
+        sequence = self.unknown.sequence.scores < self.sequence.best.threshold
+        single = self.unknown.single.scores < self.single.best.threshold
+        return {'sequence': float(np.mean(sequence)), 'single': float(np.mean(single))}
 
     @property
     def distances(self) -> dict[str, np.ndarray]:
-        """Return the distances of the windows' matches, by what they are."""
+        """Return the distances of the windows' matches, by group."""
         scores = self.results.sequence.scores
         groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct]}
         if self.unknown is not None:
@@ -155,7 +150,7 @@ class Evaluation:
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Return how far the declared probabilities hold; None without any."""
+        """Return the calibration of the declared probabilities; None without any."""
         return calibrate(self.results.probabilities, self.correct, self.ground_truth.has_match)
 
 
@@ -237,15 +232,9 @@ def recognize_traverse(
                 windows.append(_window_distances(image, i, length, rows, match.path))
     matched = image_matches(matches, length, late)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
-    sequence = Ranking(ranked, matched.distances)
+    sequence, kept = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
-        sequence,
-        single,
-        seconds,
-        tuple(windows),
-        reduced.result(),
-        matched.accepted,
-        matched.probabilities,
+        sequence, single, seconds, *kept, matched.accepted, matched.probabilities
     )
 
 
@@ -266,7 +255,7 @@ def evaluate_on_map(
 
     :param query: features of N images.
     :param ground_truth: of the same images.
-    :param settings: of the recognizer; only what it accepts depends on its threshold.
+    :param settings: of the recognizer; only the accepted matches depend on its threshold.
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
@@ -337,17 +326,13 @@ def evaluate_traverse(
         raise InputError(
             f'ground truth of {ground_truth.N} images for {count} images: expected a row each'
         )
-    centered = centered_images(count, length)
-    return Evaluation(
-        results,
-        ground_truth,
-        length,
-        sequence=evaluate_ranking(results.sequence, ground_truth),
-        sequence_without_ends=evaluate_ranking(results.sequence, ground_truth, centered),
-        single=evaluate_ranking(results.single, ground_truth),
-        single_without_ends=evaluate_ranking(results.single, ground_truth, centered),
-        unknown=unknown,
+    sequence, sequence_inner, single, single_inner = (
+        evaluate_ranking(ranking, ground_truth, images)
+        for ranking in (results.sequence, results.single)
+        for images in (slice(None), centered_images(count, length))
     )
+    metrics = sequence, sequence_inner, single, single_inner
+    return Evaluation(results, ground_truth, length, *metrics, unknown)
 
 
 def _ranked(place: int, candidates: np.ndarray) -> np.ndarray:

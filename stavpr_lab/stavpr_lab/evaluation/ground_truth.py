@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from scipy.spatial import KDTree
 from stavpr_lab.evaluation.ground_truth_files import read_pairs
 from stavpr_ros.errors import InputError
 
-CHUNK = 1_000_000  # pairs of poses compared at a time
 LISTED = 10  # images that an error names
 
 
@@ -78,13 +78,13 @@ class GroundTruth:
         Read accepted pairs; queries and places are counted from 0.
 
         * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
-          single column holds the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
+          single column is the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
         * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
           shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none.
         * Black and white image, N high and n wide: white at row i, column j accepts place j for
           query i. For loop closures, where both are one traverse, see :meth:`loop_closures`.
 
-        :raises SourceError: the file cannot be read, or holds objects (pickles).
+        :raises SourceError: the file cannot be read, or contains objects (pickles).
         :raises InputError: it is that of other images: wrong size, or indices outside.
         """
         queries, places = read_pairs(Path(path), N, n)
@@ -118,20 +118,17 @@ class GroundTruth:
             )
         if not meters >= 0 or (degrees is not None and not degrees >= 0):
             raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
-        pairs = []
-        step = max(1, CHUNK // len(place))
-        for first in range(0, len(query), step):
-            part = query[first : first + step]
-            near = np.linalg.norm(part[:, None, :3] - place[None, :, :3], axis=2) <= meters
-            found = np.argwhere(near)
-            if degrees is not None:
-                # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
-                cosines = np.abs(np.sum(part[found[:, 0], 3:] * place[found[:, 1], 3:], axis=1))
-                angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
-                found = found[angles <= degrees + 1e-5]  # acos is inexact near 1
-            pairs.append(found + np.array([first, 0]))
-        accepted = np.concatenate(pairs)
-        return cls.from_pairs(accepted[:, 0], accepted[:, 1], len(query), len(place))
+        known = np.flatnonzero(~np.isnan(place[:, 0]))
+        near = KDTree(place[known, :3]).query_ball_point(query[:, :3], meters)
+        queries = np.repeat(np.arange(len(query)), [len(found) for found in near])
+        places = known[np.concatenate(near).astype(np.int64)]
+        if degrees is not None:
+            # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
+            cosines = np.abs(np.sum(query[queries, 3:] * place[places, 3:], axis=1))
+            angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
+            similar = angles <= degrees + 1e-5  # acos is inexact near 1
+            queries, places = queries[similar], places[similar]
+        return cls.from_pairs(queries, places, len(query), len(place))
 
     @property
     def pairs(self) -> np.ndarray:
@@ -200,7 +197,7 @@ class GroundTruth:
 
     def select(self, indices: np.ndarray) -> Self:
         """
-        Return the ground truth of some of the queries.
+        Return the ground truth of selected queries.
 
         :param indices: query of each row of the result, shape (K,), in any order, repeated or not.
         """
@@ -213,7 +210,7 @@ class GroundTruth:
 
     def on_places(self, places: np.ndarray) -> Self:
         """
-        Return the ground truth on a map that keeps only some of the places.
+        Return the ground truth on a map that keeps only the given places.
 
         :param places: those that are kept, ascending, shape (k,); they become 0 .. k - 1.
         """
@@ -227,7 +224,7 @@ class GroundTruth:
         """
         Return the ground truth of one traverse on its own past: the later image is the query.
 
-        Either triangle of a square matrix may hold the pairs, the lower one (row = query, as
+        Either triangle of a square matrix may contain the pairs, the lower one (row = query, as
         RTAB-Map writes it), the upper one or both.
 
         :param exclude: the latest images before the query that are not part of the map.

@@ -99,7 +99,7 @@ def _from_text(path: Path, N: int) -> Pairs:
     if rows and not all(_is_number(cell) for cell in rows[0][1]):
         names = rows.pop(0)[1]
     if not rows:
-        raise SourceError(f'ground truth {path} holds no line of numbers: expected query,place')
+        raise SourceError(f'ground truth {path} has no line of numbers: expected query,place')
     query_column, place_column = _columns(names, len(rows[0][1]), path)
     if query_column is None and len(rows) != N:
         raise InputError(
@@ -146,13 +146,13 @@ def _load(path: Path) -> np.ndarray:
     except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         if 'pickle' in str(error):
             raise SourceError(
-                f'ground truth {path} holds Python objects, which are stored as a pickle, and '
+                f'ground truth {path} contains Python objects, which are stored as a pickle, and '
                 'reading a pickle runs whatever program is in it: save it as an array of numbers, '
                 'or as text, query,place a line'
             ) from error
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error
     raise SourceError(
-        f'ground truth {path} holds {", ".join(names)}: expected one array, or one called {NAME}'
+        f'ground truth {path} has {", ".join(names)}: expected one array, or one called {NAME}'
     )
 
 
@@ -162,7 +162,7 @@ def _from_array(array: np.ndarray, path: Path, N: int, n: int) -> Pairs:
     if array.shape == (N, n):
         if not np.isin(array, (0, 1, array.max(initial=1))).all():
             raise InputError(
-                f'ground truth {path} holds other values than 0 and one more: expected 1 where a '
+                f'ground truth {path} has other values than 0 and one more: expected 1 where a '
                 'place is correct; is it a matrix of distances?'
             )
         queries, places = np.nonzero(array)

@@ -100,12 +100,8 @@ class ImageMatches:
     @classmethod
     def none(cls, count: int) -> Self:
         """Return the matches of images without any."""
-        return cls(
-            np.full(count, -1, np.int64),
-            np.full(count, np.inf),
-            np.zeros(count, bool),
-            np.full(count, np.nan),
-        )
+        places, accepted = np.full(count, -1, np.int64), np.zeros(count, bool)
+        return cls(places, np.full(count, np.inf), accepted, np.full(count, np.nan))
 
     def within(self, true_places: np.ndarray, tolerance: int) -> np.ndarray:
         """
@@ -121,7 +117,7 @@ class ImageMatches:
 @dataclass(frozen=True)
 class Metrics:
     """
-    Metrics of the matches of some queries.
+    Metrics of the matches of queries.
 
     :param queries: number of queries.
     :param with_match: how many of them have a place in the map.
@@ -192,12 +188,8 @@ def accepted_counts(
 
     :param accepted: shape (N,), bool; the others are as in :func:`counts_at`.
     """
-    return ConfusionCounts(
-        float('nan'),
-        int(np.count_nonzero(accepted & correct)),
-        int(np.count_nonzero(accepted & ~correct)),
-        int(np.count_nonzero(~accepted & has_match)),
-    )
+    masks = accepted & correct, accepted & ~correct, ~accepted & has_match
+    return ConfusionCounts(float('nan'), *(int(np.count_nonzero(mask)) for mask in masks))
 
 
 def sweep(

@@ -76,6 +76,22 @@ class MatchPair:
     outcome: Outcome
 
 
+def outcomes(
+    accepted: np.ndarray, correct: np.ndarray | None, in_map: np.ndarray | None
+) -> np.ndarray:
+    """
+    Return the :data:`Outcome` of each image, shape (N,), str.
+
+    :param accepted: the image is matched, shape (N,), bool.
+    :param correct: the match is right, shape (N,), bool; None = unknown.
+    :param in_map: the map has its place, shape (N,), bool; None = unknown.
+    """
+    if correct is None or in_map is None:
+        return np.where(accepted, 'match', 'no match')
+    matched = np.where(correct, 'right', 'wrong')
+    return np.where(accepted, matched, np.where(in_map, 'no match', 'unseen'))
+
+
 def reduced_matrix(
     path: Path,
     distances: np.ndarray,
@@ -167,19 +183,12 @@ def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: in
     with page(path, 7.0, float(np.clip(1.4 + 5.3 * l / k, 2.6, 7))) as figure:
         axes = figure.add_subplot()
         extent = (first - 0.5, first + k - 0.5, l - 0.5, -0.5)
-        image = axes.imshow(distances, cmap=SCALE, extent=extent, aspect='auto')
-        style: dict[str, Any] = {
-            'color': BRIGHT['right'],
-            'mec': INK,
-            'mew': 0.5,
-            'ms': 4,
-            'lw': 1.6,
-        }
-        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', **style)
+        show_distances(figure, axes, distances, extent=extent, aspect='auto')
+        style: dict[str, Any] = {'color': BRIGHT['right'], 'mec': INK, 'mew': 0.5, 'ms': 4}
+        axes.plot(pairs[:, 1] + first, pairs[:, 0], '-o', label='warping path', lw=1.6, **style)
         legend_above(axes, 1)
         axes.set(xlabel='place in the map', ylabel='image of the window')
         axes.locator_params(integer=True)
-        color_bar(figure, image, axes)
 
 
 def drive(
@@ -191,7 +200,7 @@ def drive(
     unseen: np.ndarray,
 ) -> None:
     """
-    Draw the matched and the true places of a query, image by image, and what was not matched.
+    Draw the matched and the true places of a query, and the images without a match.
 
     :param truth: correct (query, place), shape (M, 2).
     :param places: number of places n.
@@ -262,7 +271,7 @@ def page(path: Path, width: float, height: float) -> Iterator[Figure]:
 def titled_page(
     path: Path, width: float, height: float, title: str, text: str
 ) -> Iterator[SubFigure]:
-    """Yield the part of a page below its title and some lines of text, ``height`` inches high."""
+    """Yield the part of a page below its title and a text, ``height`` inches high."""
     head = 0.5 + 0.17 * len(text.splitlines())
     with page(path, width, head + height) as figure:
         parts: Any = figure.subfigures(2, 1, height_ratios=(head, height))
@@ -322,13 +331,8 @@ def _draw_pair(axes: Axes, pair: MatchPair) -> None:
         axes.text(*middle, 'no place', ha='center', va='center', color=QUIET, fontsize=9.5)
     else:
         axes.imshow(pair.place, extent=(start, start + width, height, 0), interpolation='lanczos')
-    frame: dict[str, Any] = {
-        'fill': False,
-        'ec': COLORS[pair.outcome],
-        'lw': 2.6,
-        'clip_on': False,
-    }
-    axes.add_patch(Rectangle((0, 0), start + width, height, **frame))
+    frame: dict[str, Any] = {'ec': COLORS[pair.outcome], 'lw': 2.6, 'clip_on': False}
+    axes.add_patch(Rectangle((0, 0), start + width, height, fill=False, **frame))
     axes.set_title(pair.caption, fontsize=9.5, color=INK, y=-0.03, va='top', pad=0)
     axes.set(xlim=(0, start + width), ylim=(height, 0), aspect='equal')
 
@@ -352,10 +356,7 @@ def draw_matrix(
     :param matches: (query, place), shape (count, 2), by outcome.
     """
     extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
-    finite = distances[np.isfinite(distances)]
-    low, high = np.quantile(finite, [0.002, 0.995]) if finite.size else (0.0, 1.0)
-    scale: dict[str, Any] = {'cmap': SCALE, 'vmin': low, 'vmax': max(high, low + 1e-6)}
-    image = axes.imshow(distances, aspect='auto', extent=extent, **scale)
+    show_distances(figure, axes, distances, aspect='auto', extent=extent)
     if truth is not None:
         cells = np.zeros((*truth.shape, 4), np.uint8)
         cells[truth] = [int(TRUTH[i : i + 2], 16) for i in (1, 3, 5)] + [110]
@@ -366,33 +367,34 @@ def draw_matrix(
             style: dict[str, Any] = {'color': BRIGHT[outcome], 'label': MEANING[outcome]}
             axes.plot(pairs[:, 1], pairs[:, 0], '.', ms=4, mew=0, **style)
     axes.set(xlabel='place in the map', ylabel='query image', xlim=extent[:2], ylim=extent[2:])
-    color_bar(figure, image, axes)
     for handle in legend_above(axes, 3).get_lines():
         handle.set_markersize(9)
 
 
 def legend_above(axes: Axes, columns: int) -> Legend:
     """Put the legend above the axes, where it covers nothing and does not widen the layout."""
-    handles, labels = axes.get_legend_handles_labels()
     legend = axes.legend(
-        handles,
-        labels,
-        loc='lower left',
-        bbox_to_anchor=(0, 1.0),
-        borderaxespad=0.2,
-        ncols=columns,
-        handlelength=1.2,
-        columnspacing=1.2,
-        handletextpad=0.4,
-    )
+        *axes.get_legend_handles_labels(), loc='lower left', bbox_to_anchor=(0, 1.0),
+        ncols=columns, borderaxespad=0.2, handlelength=1.2, columnspacing=1.2, handletextpad=0.4,
+    )  # fmt: skip
     legend.set_in_layout(False)
     lines = -(-len(legend.get_texts()) // columns)
     axes.set_title('\n'.join(' ' * lines), fontsize=10.5)  # keeps room for it
     return legend
 
 
-def color_bar(figure: Figure | SubFigure, image: Any, axes: Axes) -> None:
-    """Draw the scale of the distances beside the axes."""
+def show_distances(
+    figure: Figure | SubFigure, axes: Axes, distances: np.ndarray, **options: Any
+) -> None:
+    """
+    Draw distances in grays from their 0.2 % to their 99.5 % quantile, with the scale beside them.
+
+    :param distances: shape (rows, columns); others than finite ones are left white.
+    :param options: of :meth:`matplotlib.axes.Axes.imshow`.
+    """
+    finite = distances[np.isfinite(distances)]
+    low, high = np.quantile(finite, [0.002, 0.995]) if finite.size else (0.0, 1.0)
+    image = axes.imshow(distances, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6), **options)
     bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.015, aspect=32)
     bar.outline.set_visible(False)
     bar.set_label('distance')

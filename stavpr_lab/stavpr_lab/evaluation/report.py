@@ -27,7 +27,7 @@ class Report:
     :param title: names of both, a line.
     :param settings: of the run: everything that decides the numbers.
     :param times: of the run, by name; seconds, or milliseconds where the name has them.
-    :param drive: how the query was driven and what the map lacks.
+    :param drive: changes of the query, and places removed from the map.
     :param default_threshold: the mode's own, with which the recognizer ran; None = it has none.
     :param window: query image whose window is plotted; None = the worst mistake.
     """

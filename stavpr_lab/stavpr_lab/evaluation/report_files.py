@@ -46,7 +46,7 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SourceError(f'the report cannot be written into {folder}: {error}') from error
-    require_replaceable(page, HTML, force)  # the page stands for its report
+    require_replaceable(page, HTML, force)
     _write_matches(report, folder / 'answers.csv')
     _write_curves(report.evaluation, folder / 'curves.csv')
     boxes = _draw(report, folder)
@@ -140,11 +140,7 @@ def _draw_distances(evaluation: Evaluation, path: Path) -> None:
 def _draw_drive(report: Report, path: Path) -> None:
     truth, places = report.evaluation.ground_truth, report.evaluation.results.sequence.best
     unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
-    outcomes = np.where(
-        report.accepted,
-        np.where(report.evaluation.correct, 'right', 'wrong'),
-        np.where(truth.has_match, 'no match', 'unseen'),
-    )
+    outcomes = plots.outcomes(report.accepted, report.evaluation.correct, truth.has_match)
     plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
 
 

@@ -154,7 +154,7 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
 
 
 def _points(curve: np.ndarray) -> list[list[float]]:
-    """Return some points of a curve: the first, the last, some between."""
+    """Return at most :data:`POINTS` points of a curve, the first and the last among them."""
     return np.round(curve[evenly(len(curve), POINTS)], 6).tolist()
 
 

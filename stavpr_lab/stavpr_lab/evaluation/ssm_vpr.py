@@ -79,7 +79,7 @@ def cubes(maps: torch.Tensor, side: int) -> torch.Tensor:
 
 class PcaWhitening:
     """
-    PCA whitening, learned from some cubes.
+    PCA whitening, learned from samples.
 
     :param samples: shape (m, D).
     :param dimension: of the result, at most; fewer where the samples have fewer.
@@ -100,7 +100,7 @@ class PcaWhitening:
 
 
 def learn_whitening(maps: torch.Tensor, side: int, dimension: int) -> PcaWhitening:
-    """Learn the whitening of cubes from some of them, spread over all images and places."""
+    """Learn the whitening of cubes from samples, spread over all images and places."""
     n = len(maps)
     per_image = -(-SAMPLE // n)
     rng = np.random.default_rng(0)

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from stavpr_ros.features.registry import Kind, NetworkSettings, setting
 
-CACHED = 'cached'  # stands for a published file instead of a path
+CACHED = 'cached'  # the published file, instead of a path
 HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a CPU'
 
 

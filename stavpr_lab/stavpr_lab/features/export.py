@@ -4,7 +4,7 @@
 Any network to one ONNX file with the outputs ``global`` (n, D) and ``map`` (n, C, H, W).
 
 A network in Python is a program of somebody else. It runs here, once, to be recorded; nodes and
-maps only ever see the ONNX file, which is data. Requires the extra ``onnx``.
+maps only read the ONNX file, which is data. Requires the extra ``onnx``.
 """
 
 from collections.abc import Mapping
@@ -85,7 +85,7 @@ def load_hub(repository: str, commit: str, entry: str, arguments: Mapping[str, A
 
 class Chosen(nn.Module):
     """
-    The chosen outputs of a network: what becomes the outputs of the file.
+    The chosen outputs of a network, which become the outputs of the file.
 
     :param vector: number or key of the network's output (n, D); '' = no output ``global``.
     :param module: path of the module whose output is the map; '' = the network's own output.
@@ -164,7 +164,7 @@ def export_network(chosen: Chosen, size: int) -> Exported:
     weights = sum(value.nbytes for value in chosen.state_dict().values())
     if weights >= LARGEST:
         raise UnavailableError(
-            f'the network has {weights / 1e9:.1f} GB of weights, more than an ONNX file holds '
+            f'the network has {weights / 1e9:.1f} GB of weights, the limit of an ONNX file '
             '(2 GiB): compute its descriptors with its own program, and give those'
         )
     images = torch.randn(CHECKED, 3, size, size, generator=torch.Generator().manual_seed(0))

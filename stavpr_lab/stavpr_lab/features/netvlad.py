@@ -91,14 +91,8 @@ class NetVlad:
         self._k_fastest = found.k_fastest
         kept = found.whitening if settings.whitening else None
         self._whitening = None if kept is None else [part.to(self._device) for part in kept]
-        self._batch = BatchMaker(
-            settings.size,
-            settings.resize,
-            self._device,
-            scale=found.scale,
-            mean=found.mean,
-            std=found.std,
-        )
+        standard: dict[str, Any] = {'scale': found.scale, 'mean': found.mean, 'std': found.std}
+        self._batch = BatchMaker(settings.size, settings.resize, self._device, **standard)
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
         """
@@ -108,12 +102,8 @@ class NetVlad:
         :returns: shape (n, D), float32, of unit norm.
         """
         with torch.inference_mode():
-            return torch.cat(
-                [
-                    self._vectors(self._batch(images[first : first + PER_PASS]))
-                    for first in range(0, len(images), PER_PASS)
-                ]
-            )
+            parts = [images[i : i + PER_PASS] for i in range(0, len(images), PER_PASS)]
+            return torch.cat([self._vectors(self._batch(part)) for part in parts])
 
     def _vectors(self, batch: torch.Tensor) -> torch.Tensor:
         columns = normalize(self._conv5_3(batch).flatten(2), dim=1)  # (n, D, P)
@@ -174,7 +164,7 @@ def _require_fitting(found: NetVladParameters, name: str) -> None:
             f'{wrong}: its whitening takes {found.whitening[0].shape[1]} numbers, expected {K * D}'
         )
     if not all(bool(torch.isfinite(value).all()) for value in found.tensors()):
-        raise UnavailableError(f'{name} is damaged: it holds NaN or infinite numbers')
+        raise UnavailableError(f'{name} is damaged: it contains NaN or infinite numbers')
 
 
 def _from_matlab(file: BinaryIO, name: str) -> NetVladParameters:

@@ -95,11 +95,8 @@ class PublishedNetwork:
         """
         try:
             with torch.inference_mode():
-                parts = [
-                    self._layer(self._batch(images[first : first + PER_PASS]))
-                    for first in range(0, len(images), PER_PASS)
-                ]
-                return torch.cat(parts)
+                parts = [images[i : i + PER_PASS] for i in range(0, len(images), PER_PASS)]
+                return torch.cat([self._layer(self._batch(part)) for part in parts])
         except torch.cuda.OutOfMemoryError as error:
             raise UnavailableError(
                 f'device {self._device} has too little memory for '

@@ -5,27 +5,21 @@
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-import hashlib
 import http.client
 from pathlib import Path
 import re
-from typing import Any, BinaryIO, IO
-import urllib.request
+from typing import Any, BinaryIO
 
 import numpy as np
 from stavpr_lab.features import CACHED
 from stavpr_ros.errors import OutputError, UnavailableError
 from stavpr_ros.features.model_files import cache_folder
-from stavpr_ros.output_file import ANY, atomic_output, write_output
+from stavpr_ros.output_file import ANY, write_output
 from stavpr_ros.regular_file import open_regular
 import torch
 from torch import nn
-from tqdm import tqdm
 
-TIMEOUT = 30  # seconds without a byte
-PIECE = 1 << 20  # bytes
 HASH_FILE = 4096  # bytes read of NAME.sha256
-SCHEMES = ('https',)  # of downloads
 COUNTER = '.num_batches_tracked'  # for training only; missing in files from before torch 0.4
 
 
@@ -94,57 +88,15 @@ def download(address: str, path: Path, sha256: str) -> None:
     :param sha256: its required hash, all 64 digits.
     :raises UnavailableError: the download fails, is incomplete or has another hash.
     """
-    advice = f'download it by other means and give its path, or copy it to {path}'
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_output(path, ANY, force=True) as file:
-            digest = _fetched(address, file, path, advice)
-            if digest != sha256:
-                raise UnavailableError(
-                    f'the file from {address} has sha256 {digest}, expected {sha256}: it was '
-                    f'changed or damaged on its way; try again, or {advice}'
-                )
-            write_output(_hash_file(path), f'{digest}  {path.name}\n', ANY, force=True)
-    except (OSError, OutputError) as error:
-        raise UnavailableError(f'{address} cannot be downloaded ({error}): {advice}') from error
-
-
-def _fetched(address: str, file: IO[bytes], path: Path, advice: str) -> str:
-    try:
-        return _fetch(address, file, path.name)
-    except (OSError, http.client.HTTPException) as error:
-        raise UnavailableError(f'{address} cannot be downloaded ({error}): {advice}') from error
-
-
-class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follows redirects to the allowed schemes only."""
-
-    def redirect_request(self, *request: Any) -> urllib.request.Request | None:
-        _require_scheme(request[-1])  # the new address
-        return super().redirect_request(*request)
-
-
-def _require_scheme(address: str) -> None:
-    if address.partition(':')[0] not in SCHEMES:
-        raise OSError(f'{address} is not {" or ".join(SCHEMES)}')
-
-
-def _fetch(address: str, file: IO[bytes], name: str) -> str:
-    """Copy the content of an address into a file and return its sha256."""
-    digest, received = hashlib.sha256(), 0
-    _require_scheme(address)
-    with urllib.request.build_opener(_Redirects).open(address, timeout=TIMEOUT) as response:
-        length = response.headers.get('Content-Length')
-        total = int(length) if length and length.isdigit() else None
-        with tqdm(total=total, unit='B', unit_scale=True, desc=name, disable=None) as bar:
-            while piece := response.read(PIECE):
-                file.write(piece)
-                digest.update(piece)
-                received += len(piece)
-                bar.update(len(piece))
-    if total is not None and received != total:
-        raise OSError(f'only {received} of {total} bytes received')
-    return digest.hexdigest()
+        torch.hub.download_url_to_file(address, str(path), sha256)
+        write_output(_hash_file(path), f'{sha256}  {path.name}\n', ANY, force=True)
+    except (OSError, RuntimeError, http.client.HTTPException, OutputError) as error:
+        raise UnavailableError(
+            f'{address} cannot be downloaded ({error}): try again, or download it by other means '
+            f'and give its path, or copy it to {path}'
+        ) from error
 
 
 def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
@@ -170,12 +122,12 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
         content = content['state_dict']
     if not isinstance(content, Mapping) or not content:
         raise UnavailableError(
-            f'{name} holds {_kind(content)}: expected the parameters of a network by name'
+            f'{name} contains {_kind(content)}: expected the parameters of a network by name'
         )
     for key, value in content.items():
         if not isinstance(key, str) or not isinstance(value, torch.Tensor):
             raise UnavailableError(
-                f'{name} holds {_kind(value)} as {key!r}: expected parameters by name'
+                f'{name} contains {_kind(value)} as {key!r}: expected parameters by name'
             )
     return {key.removeprefix('module.'): value for key, value in content.items()}
 
@@ -230,7 +182,7 @@ def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], 
         floats[key] = value.detach().float()
         # numpy: torch would start its threads for each of 800 parameters
         if not np.isfinite(floats[key].numpy()).all():
-            raise UnavailableError(f'{name} is damaged: {key} holds NaN or infinite numbers')
+            raise UnavailableError(f'{name} is damaged: {key} contains NaN or infinite numbers')
     counters = {key: torch.zeros((), dtype=torch.long) for key in state if key.endswith(COUNTER)}
     network.load_state_dict(floats | counters, assign=True)
 

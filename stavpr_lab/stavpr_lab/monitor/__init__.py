@@ -1,3 +1,3 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The node in a web browser: what its topics show, and its services."""
+"""The node in a web browser: its topics and services."""

@@ -188,7 +188,7 @@ def drive_laps(
     :param seed: of the world.
     :param draw: of the errors of the odometry.
     :param drift: factor on the errors of the odometry.
-    :param carried: leave out some images on lap 2: the odometry misses that the robot is moved.
+    :param carried: leave out images on lap 2: the odometry misses that the robot is moved.
     :param sessions: 1, or 2: lap 3 is on the next day and its odometry starts anew.
     """
     world = RingWorld(seed)

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Things that stand or drive in the synthetic street: trees, lamps, signs, cars, vans; in numba.
+Objects in the synthetic street: trees, lamps, signs, cars, vans; in numba.
 
 They are drawn after walls and ground, from far to near, each sample compared with the depth so
 far. Cars are boxes that the rays enter from behind or from the side; all else is a flat card
@@ -15,13 +15,7 @@ facing the camera.
 from math import floor, sqrt
 
 from numba import njit
-from stavpr_lab.demonstration.street.street import (
-    CAR,
-    CELL,
-    LAMP,
-    TREE,
-    VAN,
-)
+from stavpr_lab.demonstration.street.street import CAR, CELL, LAMP, TREE, VAN
 from stavpr_lab.demonstration.street.surfaces import hash01, noise
 
 _LAMPS, _FOLIAGE, _SUN, _AMBIENT = 5, 8, 0, 4  # of the array of light; see rendering.py
@@ -136,15 +130,13 @@ def _sign(u, h, seed):
     elif shape == 1:
         edge = 0.45 - abs(u) * 1.75 - (v + 0.1)
         if edge > 0 and v > -0.35:
-            return (
-                (True, 0.78, 0.12, 0.1) if edge < 0.18 or v < -0.26 else (True, 0.95, 0.92, 0.85)
-            )
+            if edge < 0.18 or v < -0.26:
+                return True, 0.78, 0.12, 0.1
+            return True, 0.95, 0.92, 0.85
     elif abs(u) < 0.36 and abs(v) < 0.36:
-        return (
-            (True, 0.1, 0.27, 0.6)
-            if abs(u) < 0.31 and abs(v) < 0.31 and abs(u + v) > 0.1
-            else (True, 0.9, 0.9, 0.9)
-        )
+        if abs(u) < 0.31 and abs(v) < 0.31 and abs(u + v) > 0.1:
+            return True, 0.1, 0.27, 0.6
+        return True, 0.9, 0.9, 0.9
     if abs(u) < 0.045 and h < 2.6:
         return True, 0.45, 0.46, 0.46
     return False, 0.0, 0.0, 0.0
@@ -178,10 +170,8 @@ def _draw_shadow(color, depth, u, half, z0, z1, lens):
     if z1 < NEAREST:
         return
     near = max(z0, NEAREST)
-    first, last = (
-        int((horizon + eye * focal / z1) * fine) + 1,
-        int((horizon + eye * focal / near) * fine) + 1,
-    )
+    first = int((horizon + eye * focal / z1) * fine) + 1
+    last = int((horizon + eye * focal / near) * fine) + 1
     for y in range(max(0, first), min(rows, last)):
         z = eye * focal / ((y + 0.5) / fine - horizon)
         mid = columns / 2 + (u / z - yaw) * focal
@@ -263,19 +253,18 @@ def _car_paint(face, place, h, part, seed, lamps):
         return (0.12, 0.14, 0.17) if part == 1 and hue < 0.15 else (r, g, b)
     if face == 1:
         wheel = min(abs(place - 0.19), abs(place - 0.8)) * 4.3
-        if part != 1 and wheel * wheel + (h - 0.33) ** 2 < 0.1:
-            return (
-                (0.5, 0.5, 0.52) if wheel * wheel + (h - 0.33) ** 2 < 0.03 else (0.05, 0.05, 0.055)
-            )
+        away = wheel * wheel + (h - 0.33) ** 2
+        if part != 1 and away < 0.1:
+            return (0.5, 0.5, 0.52) if away < 0.03 else (0.05, 0.05, 0.055)
         if part == 1 and 0.06 < place < 0.94 and abs(place - 0.5) > 0.03 and h < 1.36:
             return 0.11, 0.13, 0.16
         if abs(place - 0.5) < 0.006 or (part == 0 and h < 0.36):
             return r * 0.45, g * 0.45, b * 0.45
         return r, g, b
     if part == 1:
-        return (
-            (0.1 + 0.1 * (h - 0.85), 0.13, 0.17) if abs(place) < 0.86 and h < 1.37 else (r, g, b)
-        )
+        if abs(place) < 0.86 and h < 1.37:
+            return 0.1 + 0.1 * (h - 0.85), 0.13, 0.17
+        return r, g, b
     top = 0.82 if part == 0 else 1.35
     if abs(place) > 0.72 and top - 0.24 < h < top:
         return (1.3, 0.16, 0.12) if lamps > 0.05 else (0.62, 0.07, 0.06)

@@ -17,12 +17,7 @@ from math import atan, cos, exp, hypot, pi, sin
 from numba import njit
 import numpy as np
 from stavpr_lab.demonstration.street.objects import draw_things
-from stavpr_lab.demonstration.street.street import (
-    CELL,
-    SIDE_STREET,
-    Street,
-    VIEW,
-)
+from stavpr_lab.demonstration.street.street import CELL, SIDE_STREET, Street, VIEW
 from stavpr_lab.demonstration.street.surfaces import ground, hash01, noise, sky
 from stavpr_lab.demonstration.street.walls import roof_height, wall
 
@@ -66,8 +61,8 @@ def render(
     light[SUN_RIGHT], light[SUN_AHEAD] = sin(towards) * level, cos(towards) * level
     things = np.concatenate([street.things, traffic])
     ahead = things['along'] - along
-    seen = np.flatnonzero((ahead > -3) & (ahead < 150))
-    things = things[seen[np.argsort(-ahead[seen], kind='stable')]]
+    visible = np.flatnonzero((ahead > -3) & (ahead < 150))
+    things = things[visible[np.argsort(-ahead[visible], kind='stable')]]
     focal = FOCAL * width
     horizon = HORIZON * height + pitch * focal
     camera = np.array([along, across, EYE, focal, horizon, yaw, heading])
@@ -85,7 +80,7 @@ def render(
 
 def center_line_ahead(street: Street, along: float) -> np.ndarray:
     """
-    Return the center line at the end of each cell ahead, as seen from its point at ``along``.
+    Return the center line at the end of each cell ahead, relative to its point at ``along``.
 
     :returns: meters ahead and to the right, sine and cosine of the direction, shape (steps, 4).
     """
@@ -108,7 +103,7 @@ def center_line_ahead(street: Street, along: float) -> np.ndarray:
 
 @njit(cache=True, error_model='numpy')
 def _find_walls(lots, lot_of, line, along, across, slope, eye, walls):
-    """Walk along one column's plane; return the number of walls that it can see."""
+    """Walk along one column's plane; return the number of visible walls."""
     count, highest = 0, -FAR
     first = int(along / CELL)
     last_near, last_far = -1, -1

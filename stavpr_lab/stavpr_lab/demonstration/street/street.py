@@ -1,10 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The layout of a synthetic street: which building, hedge, tree and lamp stands where.
+The layout of a synthetic street: places of buildings, hedges, trees and lamps.
 
 A street is cut into cells of half a meter along its center line. For each of its four rows (the
-near and the far row on the left and on the right) a cell names the lot that stands there, so that
+near and the far row on the left and on the right) a cell names its lot, so that
 the renderer finds the lot at a ray without searching. Positions are (along the route, to the right
 of its center line), in meters.
 """

@@ -46,7 +46,7 @@ class Conditions:
     Light, weather, camera and traffic of one traverse.
 
     :param sun: strength of direct sunlight; 0 is none.
-    :param sun_azimuth: where the sun stands, degrees to the right of the street's first direction.
+    :param sun_azimuth: direction of the sun, degrees to the right of the street's first direction.
     :param sun_elevation: degrees.
     :param ambient: strength of the light from everywhere.
     :param exposure: gain of the camera.
@@ -155,7 +155,7 @@ class Traverse:
     def camera(self, k: int) -> tuple[float, float, float]:
         """Return meters to the right of the center line, and pitch and yaw as in `render`."""
         c, along = self._conditions, float(self.along[k])
-        # Sway and shake depend on the place: while the vehicle stands, only traffic moves.
+        # Sway and shake depend on the place: during a stop, only traffic moves.
         sway = noise(along / 17.0, 0.0, c.traffic) - 0.5
         bump = hash01(int(along * 10), 3, c.traffic) + hash01(int(along * 10), 4, c.traffic) - 1.0
         across = float(self._lanes[k]) + 0.5 * sway
@@ -170,7 +170,7 @@ class Traverse:
         )  # fmt: skip
 
     def _driving(self, k: int) -> np.ndarray:
-        """Place the cars that drive ahead: some in each lane, coming nearer and falling back."""
+        """Place the cars that drive ahead: in both lanes, coming nearer and falling back."""
         c, along = self._conditions, float(self.along[k])
         rows = []
         for car in range(3):
@@ -217,7 +217,7 @@ def nearest_places(first: Traverse, second: Traverse) -> np.ndarray:
 
 
 def _vary_speed(seed: int, images: int) -> np.ndarray:
-    """Draw a speed for each image, from half to twice the usual, with a stop of some 12 images."""
+    """Draw a speed for each image, from half to twice the mean, with a stop of 12 images."""
     wave = np.array([noise(k / images * 9.0, 0.0, seed + 5) for k in range(images)])
     wave = (wave - wave.min()) / (wave.max() - wave.min())
     speed = 0.5 * 4.0**wave

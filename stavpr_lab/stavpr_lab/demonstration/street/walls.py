@@ -9,12 +9,7 @@
 from math import floor, sin
 
 from numba import njit
-from stavpr_lab.demonstration.street.street import (
-    BRICK,
-    HALL,
-    OFFICE,
-    PARK,
-)
+from stavpr_lab.demonstration.street.street import BRICK, HALL, OFFICE, PARK
 from stavpr_lab.demonstration.street.surfaces import hash01, noise, part
 
 
@@ -55,20 +50,17 @@ def wall(lot, front, along, height, far, lamps):
     top = lot.height
     if front and height > top:  # tiles and chimneys above the eaves
         tile = 0.8 + 0.2 * part(height * 3.0) + 2 * grain
-        return (
-            (0.42 * tile, 0.25 * tile, 0.21 * tile)
-            if seed & 1
-            else (0.27 * tile, 0.28 * tile, 0.31 * tile)
-        )
+        if seed & 1:
+            return 0.42 * tile, 0.25 * tile, 0.21 * tile
+        return 0.27 * tile, 0.28 * tile, 0.31 * tile
     r, g, b = lot.red, lot.green, lot.blue
     shade = 1.0 + grain * 1.5
     if style == BRICK and far < 30:
         course = floor(height * 7.0)
         joint = part(height * 7.0) < 0.16 or part(along * 3.2 + 0.5 * (course & 1)) < 0.07
         shade *= 1.0 + (0.16 if joint else -0.03) * (1.0 - far / 30.0)
-    shade *= 1.0 - 0.16 * noise(along * 0.9, height * 0.12, seed + 9) * (
-        1.2 if height < 6 else 0.6
-    )  # dirt runs down
+    dirt = 1.2 if height < 6 else 0.6
+    shade *= 1.0 - 0.16 * noise(along * 0.9, height * 0.12, seed + 9) * dirt
     if not front:
         shade *= 0.86
         column, story = floor(along / 3.4), floor((height - 1.2) / 3.1)
@@ -161,11 +153,9 @@ def _house_bay(lot, along, height, x, y, bay, story, shade, lamps):
         edge = 0.16 / lot.pitch
         bar = (seed & 4 and off < edge * 0.35) or (seed & 8 and 0.56 < y < 0.585)
         if bar or off > half - edge or y > tall - 0.05 or y < 0.3:
-            return (
-                (pale, pale, pale * 0.96)
-                if trim > 0.3
-                else (0.2 * shade, 0.24 * shade, 0.23 * shade)
-            )
+            if trim > 0.3:
+                return pale, pale, pale * 0.96
+            return 0.2 * shade, 0.24 * shade, 0.23 * shade
         pane = seed + bay * 131 + story * 7177
         return _glass((x - 0.5 + half) / (2 * half), (y - 0.26) / (tall - 0.26), pane, lamps)
     if seed & 16 and half <= off < half * 1.62 and 0.26 < y < tall and lot.style != BRICK:
@@ -215,12 +205,10 @@ def _ground_floor(lot, along, height, shade, lamps):
     if hash01(2, 9, seed) < 0.58:
         return _shop(along, height, top, x, seed, own, door, (r, g, b), (sr, sg, sb), lamps)
     if door and 0.34 < x < 0.66 and height < 2.7:
+        if height >= 2.5 or not 0.36 < x < 0.64:
+            return 0.85, 0.84, 0.8
         panel = 0.75 if 0.4 < x < 0.6 and (0.3 < height < 1.1 or 1.4 < height < 2.4) else 1.0
-        return (
-            (sr * panel, sg * panel, sb * panel)
-            if height < 2.5 and 0.36 < x < 0.64
-            else (0.85, 0.84, 0.8)
-        )
+        return sr * panel, sg * panel, sb * panel
     if not door and (0.16 < x < 0.42 or 0.58 < x < 0.84) and 1.1 < height < top - 0.8:
         inside = (x - 0.16) / 0.26 if x < 0.5 else (x - 0.58) / 0.26
         if inside < 0.1 or inside > 0.9 or height < 1.22:
@@ -248,11 +236,10 @@ def _shop(along, height, top, x, seed, own, door, wall_color, sign_color, lamps)
             return (0.95, 0.93, 0.86) if hash01(12, 3, seed) < 0.6 else (0.12, 0.12, 0.14)
         return sr, sg, sb
     if hash01(6, 6, own) < 0.45 and top - 1.7 < height <= top - 0.95:  # an awning
-        stripe = part(along * 1.5) < 0.5
         fold = 0.75 + 0.25 * (height - top + 1.7) / 0.75
-        return (
-            (0.9 * fold, 0.88 * fold, 0.82 * fold) if stripe else (sr * fold, sg * fold, sb * fold)
-        )
+        if part(along * 1.5) < 0.5:
+            return 0.9 * fold, 0.88 * fold, 0.82 * fold
+        return sr * fold, sg * fold, sb * fold
     if 0.05 < x < 0.95 and 0.5 < height < top - 1.15:
         if (door and 0.4 < x < 0.44) or (not door and 0.49 < x < 0.51):
             return 0.18, 0.18, 0.2

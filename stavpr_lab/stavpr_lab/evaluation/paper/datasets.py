@@ -15,7 +15,8 @@ from stavpr_ros.sources.folder import FolderSource, SUFFIXES
 SYNTH = 'synth_'  # before a name: the same with both traverses cropped
 CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query image (synth-Nord)
 GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
-HOLDERS = ('images', 'data', 'datasets', 'test')  # folders that only hold others
+DEPTH = 4  # levels of folders, the root among them
+PARENTS = ('images', 'data', 'datasets', 'test')  # folders of folders
 # Parts of folder names besides the traverse: sizes, rates, kinds of files.
 NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|gr[ae]yscale|jpg|png|test')
 
@@ -75,7 +76,7 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
     Find a data set on disk.
 
     :param name: one of ``NAMES``; ``synth_`` before a name crops both traverses as synth-Nord.
-    :param root: its own folder, or one that holds it.
+    :param root: its own folder, or a folder around it.
     :param tolerance: places; None = the paper's.
     :raises SettingsError: an unknown name.
     :raises SourceError: it is not found; names the folders that were searched.
@@ -133,22 +134,11 @@ def _folders(path: Path) -> list[Path]:
         ) from error
 
 
-def _holders(paths: list[Path]) -> list[Path]:
-    return [child for path in paths for child in _folders(path) if _letters(child.name) in HOLDERS]
-
-
 def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
-    """Return the folders of data set, map and query, those nearest to the root first."""
-    inside = _holders([root])
-    own = [
-        child
-        for path in (root, *inside)
-        for child in _folders(path)
-        if _is_called(child.name, layout)
-    ]
-    searched: list[Path] = []
-    for level in ([root], inside, own, _holders(own)):
-        searched += [path for path in level if path not in searched]
+    """Return the folders of data set, map and query, those nearest to the root."""
+    level, searched = [root], []
+    for _ in range(DEPTH):
+        searched += level
         hits = [(path, *found) for path in level if (found := _traverses(path, layout))]
         if len(hits) > 1:
             several = ', '.join(str(path) for path, *_ in hits)
@@ -157,11 +147,19 @@ def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
             )
         if hits:
             return hits[0]
-    seen = ', '.join(folder.name for path in searched for folder in _folders(path)) or 'no folder'
+        level = [
+            child
+            for path in level
+            for child in _folders(path)
+            if _letters(child.name) in PARENTS or _is_called(child.name, layout)
+        ]
+    present = (
+        ', '.join(folder.name for path in searched for folder in _folders(path)) or 'no folder'
+    )
     raise SourceError(
         f'data set {name} is not in {root}: searched {", ".join(map(str, searched))} for the map, '
         f'a folder called {_or(layout.map_names)}, and the query, {_or(layout.query_names)}, and '
-        f'found {seen}; rename them, or give map and query by their paths'
+        f'found {present}; rename them, or give map and query by their paths'
     )
 
 
@@ -176,7 +174,7 @@ def _traverses(path: Path, layout: Layout) -> tuple[Path, Path] | None:
         if len(found) > 1:
             several = ', '.join(folder.name for folder in found)
             raise SourceError(
-                f'{path} holds several folders for one traverse: {several}; leave one of them'
+                f'{path} has several folders for one traverse: {several}; leave one of them'
             )
         traverses.append(found[0])
     return traverses[0], traverses[1]

@@ -30,7 +30,7 @@ GRP, XI = 512, 3  # the paper's random projection and restricted alignment
 @dataclass(frozen=True)
 class Configuration:
     """
-    One way to recognize places.
+    Settings of one column of a table.
 
     :param name: its name in :mod:`stavpr_lab.evaluation.paper.published`.
     :param title: head of its column.
@@ -145,7 +145,7 @@ def _changed(plain: Configuration, parameter: str, value: float) -> Configuratio
 @dataclass(frozen=True)
 class BaselineInputs:
     """
-    What baselines need besides the images.
+    Inputs of the baselines besides the images.
 
     :param arrays: files of the descriptors of map and query, by the name of the column.
     :param ssm_layers: two layers of the network of the features, for SSM-VPR.
@@ -251,13 +251,8 @@ class DatasetExperiment:
         """Return the features of map and query."""
         key = (configuration.strips, configuration.projection)
         if key not in self._features:
-            extractor = FeatureExtractor(
-                self._kind,
-                self._backbone,
-                configuration.strips,
-                configuration.projection,
-                device=self._device,
-            )
+            kind = self._kind, self._backbone
+            extractor = FeatureExtractor(*kind, *key, device=self._device)
             self._features[key] = tuple(  # type: ignore[assignment]
                 build_map(source, extractor, thumbnails=False, progress=False)
                 for source in (self._dataset.map, self._dataset.query)
