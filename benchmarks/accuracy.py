@@ -32,7 +32,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import THRESHOLD
+from stavpr_ros.recognition.robust import MIN_PROBABILITY
 from stavpr_ros.sources import open_source
 
 MODES = ('paper', 'robust')
@@ -133,7 +133,8 @@ def numbers(evaluation: Evaluation, mode: str) -> dict[str, Any]:
         accepted, has_match = evaluation.results.accepted, evaluation.ground_truth.has_match
         counts = accepted_counts(accepted, evaluation.correct, has_match)
         found['at_default'] = {
-            'threshold': THRESHOLD, 'precision': counts.precision, 'recall': counts.recall
+            'threshold': 1 - MIN_PROBABILITY,
+            'precision': counts.precision, 'recall': counts.recall,
         }  # fmt: skip
     return found
 
@@ -148,7 +149,7 @@ def evaluate_case(
             place_map, query = (_map(source, extractor) for source in (case.places, case.query))
             before = extractor
         truth = case.truth(len(query), len(place_map))
-        settings = RecognizerSettings(THRESHOLD, mode=mode)
+        settings = RecognizerSettings(mode=mode)
         for warp in ('same', *KINDS) if case.warps else ('same',):
             images = DriveChanges.named(warp, len(query)).images(len(query))
             evaluation = evaluate_on_map(
@@ -165,7 +166,7 @@ def evaluate_hallway(
     for mode, extractor in making.items():
         route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), extractor)
         truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
-        settings = RecognizerSettings(THRESHOLD, mode=mode)
+        settings = RecognizerSettings(mode=mode)
         evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
         yield f'hallway/{feature}/{mode}/same', numbers(evaluation, mode)
 
@@ -175,7 +176,7 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
     floors = [
         _map(open_source(p), making) for p in sorted((folder / 'tower').iterdir()) if p.is_dir()
     ]
-    settings = RecognizerSettings(THRESHOLD, mode='robust')
+    settings = RecognizerSettings(mode='robust')
     images = matched = 0
     for place_map in floors:
         for query in floors:

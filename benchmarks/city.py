@@ -28,7 +28,6 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map, save_map
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.sources import open_source
 import torch
 
@@ -99,7 +98,7 @@ def drive(
 
     :param true: place of each image.
     """
-    settings = RecognizerSettings(THRESHOLD, mode='robust', time_budget_ms=budget)
+    settings = RecognizerSettings(mode='robust', time_budget_ms=budget)
     place_map = descriptor_map(features)
     began = time.perf_counter()
     recognizer = PlaceRecognizer(place_map, settings, 'cpu', 'int8')

@@ -44,7 +44,9 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
 
     settings = FeatureSettings('synthetic', None)
     place_map = descriptor_map(features(strips, weights))
-    recognizer = PlaceRecognizer(place_map, RecognizerSettings(1.0, mode=mode), 'cpu', precision)
+    recognizer = PlaceRecognizer(
+        place_map, RecognizerSettings(1.0, mode=mode, min_probability=1e-9), 'cpu', precision
+    )
 
     def update(strips: np.ndarray, weights: np.ndarray) -> tuple[int, float]:
         match = recognizer.update(features(strips, weights))

@@ -31,7 +31,7 @@ OFF_THE_MAP = 'tower/floor5'
 DISTRACTORS = ('corridor/ref', 'nordland_64x32/summer')
 ROUTE = 500  # places of a generated route
 TOLERANCE = 2
-SETTINGS = RecognizerSettings(0.5, mode='robust')
+SETTINGS = RecognizerSettings(mode='robust')
 
 
 def generated(traverses: list[LocalFeatures], count: int, seed: int = 0) -> LocalFeatures:

@@ -5,7 +5,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stavpr_ros.recognition.place_filter import BLOCK, FilterSettings
+from stavpr_ros.recognition.filter_paths import BLOCK
+from stavpr_ros.recognition.robust import FilterSettings
 
 ITEM_BYTES = {'float32': 4, 'int8': 1}
 

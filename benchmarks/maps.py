@@ -68,7 +68,7 @@ def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
     from stavpr_ros.mapping import descriptor_map, open_map
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
-    settings = RecognizerSettings(0.5, mode='robust')
+    settings = RecognizerSettings(mode='robust')
     tiny = open_map(path).features[:TINY]
     warm = PlaceRecognizer(descriptor_map(tiny), settings, 'cpu', precision)
     for i in range(settings.sequence.length + 1):

@@ -28,11 +28,10 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, PlaceMap, select_places
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.sources import open_source
 from tqdm import tqdm
 
-SETTINGS = RecognizerSettings(THRESHOLD, mode='robust')
+SETTINGS = RecognizerSettings(mode='robust')
 LONG = 1000  # places from which a route is driven only around the removed stretch
 REMOVED, LONG_REMOVED = (40, 70, 100), (40, 100, 200)
 STEP, LONG_STEP = 10, 100  # places from one removed stretch to the next

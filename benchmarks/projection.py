@@ -24,7 +24,6 @@ from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.robust import THRESHOLD
 import torch
 
 PAGE = ROOT / 'docs' / 'performance.md'
@@ -83,7 +82,7 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
     )
     n = len(places)
     whole = descriptor_map(places)
-    settings = RecognizerSettings(THRESHOLD, mode='robust')
+    settings = RecognizerSettings(mode='robust')
     for name, (projection, dimension, precision) in COLUMNS.items():
         limit = len(places.weights) * n // STRIPS_A_DIRECTION
         if dimension >= places.dimension or (projection == 'pca' and dimension > limit):

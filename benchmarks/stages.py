@@ -29,9 +29,9 @@ from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
-from stavpr_ros.recognition.robust import MeanCentering, z_normalized
-from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.recognition.place_filter import PlaceFilter
+from stavpr_ros.recognition.robust import FilterSettings, MeanCentering, z_normalized
+from stavpr_ros.recognition.window import SequenceBuffer
 from stavpr_ros.sources.frame import ImageRecord
 from timing import best_seconds, timed
 import torch
@@ -90,7 +90,7 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
 
     def belief() -> np.ndarray:
         found = place_filter.belief(n, lag)
-        return place_filter.way(found.ways[int(np.argmax(found.weights))], lag)
+        return place_filter.path(found.states[int(np.argmax(found.weights))], lag)
 
     add('filter_belief', call=belief, works=[bounds.filter_belief(sizes)])
 
@@ -124,14 +124,14 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
 
 def device_retrieval(run: Run, n: int, seed: int) -> None:
     """Measure LM-DTW, selection and path on a GPU: one launch, one copy back."""
-    from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
+    from stavpr_ros.recognition.lm_dtw_window import CudaLmDtwWindow
 
-    window = make_window(SEQUENCE.length, n, seed)
-    search = CudaLmDtwSearch(n, SEQUENCE)
-    for row in window:
-        search.buffer.push(torch.from_numpy(row).to(run.device))
+    rows = make_window(SEQUENCE.length, n, seed)
+    window = CudaLmDtwWindow(SEQUENCE, n)
+    for row in rows:
+        window.buffer.push(torch.from_numpy(row).to(run.device))
     works = [bounds.lm_dtw(Sizes(n, 0)), bounds.selection(Sizes(n, 0))]
-    run.measure('retrieval', (n, 0), partial(search, NMS_RADIUS), works, mode='paper')
+    run.measure('retrieval', (n, 0), partial(window.match, NMS_RADIUS), works, mode='paper')
 
 
 def sequence_peers(run: Run, window: np.ndarray, ours: SequenceDistances) -> list[Peer]:
@@ -228,8 +228,8 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     """Measure the image distances of a map in int8 and its first stage, on a CPU."""
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+    from stavpr_ros.recognition.filter_paths import BLOCK, TOP
     from stavpr_ros.recognition.first_stage import FirstStage
-    from stavpr_ros.recognition.place_filter import BLOCK, TOP
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Candidate, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.match import ranked_candidates
+from stavpr_ros.recognition.match import ranked_candidates, WindowSequences
 from stavpr_ros.recognition.robust import ROBUST
 
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -31,7 +30,7 @@ def plain(costs, places, count, nms_radius):
 
 def nearest_of(costs, places, distance):
     best = int(np.argmin(costs))
-    return SequenceMatch(best, best, int(places[best]), distance, -1, math.nan)
+    return Candidate(int(places[best]), distance)
 
 
 cases = st.integers(1, 40).flatmap(
@@ -51,7 +50,7 @@ def test_ranked_candidates_equal_plain_loop(case):
     costs, places = np.array(costs, np.float32), np.array(places, np.int32)
     nearest = nearest_of(costs, places, float(costs.min())) if np.isfinite(costs).any() else None
     before = costs.copy()
-    found = ranked_candidates(nearest, (costs, places), count, nms_radius)
+    found = ranked_candidates(nearest, WindowSequences(costs, places), count, nms_radius)
     expected = plain(costs.tolist(), places.tolist(), count, nms_radius)
     assert found == [Candidate(int(places[i]), float(costs[i])) for i in expected]
     np.testing.assert_array_equal(costs, before)
@@ -61,7 +60,7 @@ def test_ranked_candidates_by_hand():
     costs = np.array([0.5, 0.1, 0.2, 0.3, 0.2, np.inf], np.float32)
     places = np.array([0, 10, 12, 13, 14, 30])
     nearest = nearest_of(costs, places, 0.05)
-    ranked = ranked_candidates(nearest, (costs, places), 9, 2)
+    ranked = ranked_candidates(nearest, WindowSequences(costs, places), 9, 2)
     # 12 is within two places of the nearest, and 13 of 14, which is nearer
     assert ranked == [
         Candidate(10, 0.05),

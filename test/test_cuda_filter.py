@@ -45,7 +45,7 @@ def drive(count, gaps=()):
 
 
 def assert_equal_answers(cuda, cpu, n, ago):
-    """Compare two filters of n places; return the middle of the most probable way, None = none."""
+    """Compare filters of n places; return the middle of the most probable path, None = none."""
     found, expected = cuda.places_of_states(), cpu.places_of_states()
     np.testing.assert_allclose(found[:n], expected[:n], rtol=1e-3, atol=1e-7)
     assert not found[n:].any()
@@ -55,10 +55,10 @@ def assert_equal_answers(cuda, cpu, n, ago):
     if not len(other.places):
         return None
     top = np.argmax(other.weights)
-    np.testing.assert_array_equal(one.ways[top], other.ways[top])
-    way = cpu.way(other.ways[top], ago)
-    np.testing.assert_array_equal(cuda.way(one.ways[top], ago), way)
-    return way[0]
+    np.testing.assert_array_equal(one.states[top], other.states[top])
+    path = cpu.path(other.states[top], ago)
+    np.testing.assert_array_equal(cuda.path(one.states[top], ago), path)
+    return path[0]
 
 
 @pytest.mark.parametrize('gaps', [(), (11, 12, 13, 14)])
@@ -115,9 +115,7 @@ def test_recognizer_in_mode_robust_equals_that_of_the_cpu(cuda_filter, sessions,
         same_as[15] = 2
         names = Session('a'), Session('b')
         place_map = map_of(features, sessions=names, session_index=index, same_as=same_as)
-    settings = RecognizerSettings(
-        0.5, sequence=SequenceSettings(length), nms_radius=3, mode='robust'
-    )
+    settings = RecognizerSettings(sequence=SequenceSettings(length), nms_radius=3, mode='robust')
     cpu, cuda = (
         PlaceRecognizer(place_map, settings, backend, precision) for backend in ('cpu', 'cuda')
     )

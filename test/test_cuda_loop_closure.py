@@ -11,7 +11,7 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.recognition.window import SequenceBuffer
 from test_cuda_filter import assert_equal_answers, SMALL
 import torch
 
@@ -79,9 +79,7 @@ def test_loop_closer_on_device_equals_that_of_the_cpu(
     """Growing, whitened anew, settled, evicted; late matches, too."""
     monkeypatch.setattr(route_features, 'SETTLED', settled)
     features = laps(44)
-    settings = RecognizerSettings(
-        0.5, sequence=SequenceSettings(LENGTH), nms_radius=3, mode='robust'
-    )
+    settings = RecognizerSettings(sequence=SequenceSettings(LENGTH), nms_radius=3, mode='robust')
     cpu, cuda = (
         LoopCloser(
             settings, EXCLUDE, features.settings, limit=limit, backend=backend, precision=precision

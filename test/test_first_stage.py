@@ -17,7 +17,7 @@ from stavpr_ros.recognition.matcher import PRECISIONS
 import torch
 
 W, d = 7, 40
-SETTINGS = RecognizerSettings(0.5, mode='robust')
+SETTINGS = RecognizerSettings(mode='robust')
 pytestmark = pytest.mark.usefixtures('one_thread')
 
 

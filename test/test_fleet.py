@@ -32,7 +32,7 @@ for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
     pytest.importorskip(package, reason='the extra fleet is not installed')
 from qdrant_server import QdrantServer  # noqa: E402
 
-CITY, SETTINGS = 6000, RecognizerSettings(0.5, mode='robust')
+CITY, SETTINGS = 6000, RecognizerSettings(mode='robust')
 STORES = ('memory', 'faiss', 'qdrant', 'server')
 FIRST, DRIVEN = 2500, 60
 SOURCE = FeatureSettings('descriptors', settings_class('descriptors')(), 3)

@@ -19,6 +19,7 @@ from stavpr_ros.errors import (
 )
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
+from stavpr_ros.recognition.filter_paths import BAND, CLOSE
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     choose_loop_backend,
@@ -26,15 +27,12 @@ from stavpr_ros.recognition.loop_closer import (
     LEAST_PLACES,
     LoopCloser,
 )
-from stavpr_ros.recognition.place_filter import CLOSE
 from stavpr_ros.recognition.robust import (
     PAPER,
     ROBUST,
-    THRESHOLD,
     z_normalized,
 )
 from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
-from stavpr_ros.recognition.sequence_search import BAND
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -62,7 +60,7 @@ def laps():
 
 def settings_of(robust_options, **changes):
     return RecognizerSettings(
-        THRESHOLD, sequence=SHORT, nms_radius=5, robust_options=robust_options, **changes
+        0.5, sequence=SHORT, nms_radius=5, robust_options=robust_options, **changes
     )
 
 
@@ -241,9 +239,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
     rng = np.random.default_rng(1)
     strips[:, lap:] += 0.5 * rng.standard_normal(strips[:, lap:].shape).astype(np.float32)
     features = features_of(strips)
-    settings = RecognizerSettings(
-        THRESHOLD, sequence=SequenceSettings(length), nms_radius=5, mode='robust'
-    )
+    settings = RecognizerSettings(sequence=SequenceSettings(length), nms_radius=5, mode='robust')
     closer = LoopCloser(settings, exclude, features.settings)
     middle, closed, late = (length - 1) // 2, set(), {}
     for i in range(len(features)):
@@ -259,11 +255,11 @@ def test_late_matches_close_what_was_not_certain_at_first():
         assert oldest not in closed
         assert abs(int(found.path[0, 1]) - found.place_index) <= CLOSE
         late[oldest] = found.place_index
-        state = closer._filter
-        belief = state.filter.belief(state.buffer.known, length - 1)
-        near, probabilities = belief.probabilities(state.buffer.known)
+        window = closer._window
+        belief = window.filter.belief(window.buffer.known, length - 1)
+        near, probabilities = belief.probabilities(window.buffer.known)
         best = near[np.argmax(probabilities)]
-        share = state.at(0, settings.nms_radius).shares[0]
+        share = window.match_oldest(settings.nms_radius, True).shares[0]
         assert found.probability == pytest.approx(share * of_sequence(belief, best))
     assert len(late) >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
@@ -275,7 +271,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
 def test_mode_paper_and_localization_have_no_late_matches(laps, small_map):
     paper = LoopCloser(RecognizerSettings(10.0, sequence=SHORT), 12, laps.settings)
     assert all(match.late is None for match in drive(paper, laps[:150]))
-    localizer = PlaceRecognizer(small_map, RecognizerSettings(THRESHOLD, mode='robust'))
+    localizer = PlaceRecognizer(small_map, RecognizerSettings(mode='robust'))
     assert {match.late for match in drive(localizer, small_map.features)} == {None}
 
 

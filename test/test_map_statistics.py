@@ -16,19 +16,19 @@ from stavpr_ros.commands.map import main as map_main
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import load_map, open_map, save_map
-from stavpr_ros.recognition import held_map, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.held_map import METHOD, statistics_of_map
+from stavpr_ros.recognition import PlaceRecognizer, prepared_map, RecognizerSettings
 from stavpr_ros.recognition.map_change import APART
+from stavpr_ros.recognition.prepared_map import METHOD, statistics_of_map
 from stavpr_ros.recognition.robust import MeanCentering
 import torch
 
-SETTINGS = RecognizerSettings(0.5, mode='robust')
+SETTINGS = RecognizerSettings(mode='robust')
 
 
 @pytest.fixture(autouse=True)
 def small_maps(monkeypatch):
     """Keep the statistics of small maps, too."""
-    monkeypatch.setattr(held_map, 'LEAST_PLACES', 1)
+    monkeypatch.setattr(prepared_map, 'LEAST_PLACES', 1)
 
 
 @pytest.fixture(scope='module')
@@ -102,7 +102,7 @@ def test_changes_are_those_of_neighbors_up_to_five_places_apart(place_map):
 
 
 def test_small_map_keeps_none(place_map, monkeypatch):
-    monkeypatch.setattr(held_map, 'LEAST_PLACES', 601)
+    monkeypatch.setattr(prepared_map, 'LEAST_PLACES', 601)
     assert statistics_of_map(place_map) is None
 
 

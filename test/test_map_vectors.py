@@ -169,7 +169,7 @@ def few(monkeypatch):
 
 
 def recognizer(features, **changes):
-    settings = RecognizerSettings(0.5, mode='robust', time_budget_ms=1e-6, **changes)
+    settings = RecognizerSettings(mode='robust', time_budget_ms=1e-6, **changes)
     return PlaceRecognizer(map_of(features), settings)
 
 
@@ -194,7 +194,7 @@ def test_first_stage_takes_candidates_by_vector_not_by_strips(few):
 def test_recognizer_with_vectors_matches_as_exact_one(few):
     features = features_of(1200)
     query = noisy(features[800:840], 0.5)
-    exact = PlaceRecognizer(map_of(features), RecognizerSettings(0.5, mode='robust'))
+    exact = PlaceRecognizer(map_of(features), RecognizerSettings(mode='robust'))
     coarse = recognizer(features)
     assert 'a first stage of vectors' in coarse.stages
     for i in range(len(query)):

@@ -52,7 +52,7 @@ def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, prec
 
 def test_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
     opened = open_map(path)
-    PlaceRecognizer(opened, RecognizerSettings(1.0, mode='robust'), precision='int8')
+    PlaceRecognizer(opened, RecognizerSettings(mode='robust'), precision='int8')
     save_map(opened, tmp_path / 'copy')
     assert torch.equal(load_map(tmp_path / 'copy').features.strips, small_map.features.strips)
     grown = GrowingMap.from_map(opened, 100).snapshot()

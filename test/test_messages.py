@@ -42,12 +42,12 @@ WINDOW = tuple((16 + i) * SECOND + 7 for i in range(5))
 
 
 def accepted(path=PATH, **fields):
-    fields = {'window_stamps': WINDOW} | fields
+    fields = {'window_stamps': WINDOW, 'distance': 0.25} | fields
     return Match(Status.MATCH, '', 0.3, NEAREST, path, **fields)
 
 
 def rejected(**fields):
-    fields = {'window_stamps': WINDOW} | fields
+    fields = {'window_stamps': WINDOW, 'distance': 0.25} | fields
     return Match(Status.NO_MATCH, 'too far', 0.3, NEAREST, PATH, **fields)
 
 
@@ -141,7 +141,7 @@ SEQUENCE = {'distance': 0.25, 'sequence_first': 30, 'sequence_last': 35, 'sequen
                 'inliers': 40,
             },
         ),
-        (rejected(relative=True, probability=0.75), SEQUENCE | {'probability': 0.75}),
+        (rejected(probability=0.75), SEQUENCE | {'probability': 0.75}),
         (rejected(inliers=3), SEQUENCE | {'inliers': 3}),
     ],
     ids=['mapped', 'warming up', 'match', 'no match in mode robust', 'no match in mode paper'],
@@ -155,7 +155,7 @@ def test_match_message_has_the_fields_of_its_status(places, match, fields):
 
 def test_match_message_has_the_probability_of_each_place_of_the_path(places):
     ratios = np.array([0.5, 1, 1, 1.2, 2])
-    match = accepted(probability=0.8, path_ratios=ratios, relative=True)
+    match = accepted(probability=0.8, path_ratios=ratios)
     message = match_message(HEADER, match, places)
     assert list(message.path_probabilities) == pytest.approx([0.4, 0.8, 0.8, 0.96, 1])
     assert len(message.path_probabilities) == len(message.path)
@@ -196,10 +196,11 @@ def test_match_message_with_an_edge_names_its_pair(places):
 
 
 @pytest.mark.parametrize(
-    ('relative', 'probabilities'), [(False, [math.nan, math.nan]), (True, [0.75, 0.5])]
+    'probabilities', [[math.nan, math.nan], [0.75, 0.5]], ids=['mode paper', 'mode robust']
 )
-def test_candidates_message_lists_places(places, relative, probabilities):
-    match = rejected(candidates=(Candidate(32, 0.25), Candidate(50, 0.5)), relative=relative)
+def test_candidates_message_lists_places(places, probabilities):
+    candidates = map(Candidate, (32, 50), (0.25, 0.5), probabilities)
+    match = rejected(candidates=tuple(candidates))
     message = candidates_message(HEADER, match, places)
     assert message.header == HEADER
     assert message.threshold == pytest.approx(0.3)
@@ -367,7 +368,7 @@ def test_draw_match_has_the_text_and_the_thumbnail_of_the_place(monkeypatch, ext
     for match, has_place, words, place in (
         (accepted(image=query, inliers=20), False, 'distance 0.250 (threshold 0.300), 20', 35),
         (rejected(image=query), True, 'distance 0.250 (threshold 0.300)', 32),
-        (rejected(image=query, relative=True, probability=0.934), True, 'p 0.93', 32),
+        (rejected(image=query, probability=0.934), True, 'p 0.93', 32),
     ):
         thumbnail, (text, is_match, label) = overlay.draw_match(match, route)
         assert (thumbnail is not None, label) == (has_place, f'map place {place}')

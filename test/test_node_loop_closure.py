@@ -51,7 +51,9 @@ def test_loop_closures_of_the_node_are_those_of_the_library(robot, laps, tmp_pat
     """Match for match, with both poses or none; the recorded route is saved."""
     matches, closures, stamps = laps
     extractor, sequence = FeatureExtractor(), SequenceSettings(LENGTH)
-    settings = RecognizerSettings(0.95, sequence=sequence, nms_radius=5, mode='robust')
+    settings = RecognizerSettings(
+        sequence=sequence, nms_radius=5, mode='robust', min_probability=0.05
+    )
     closer = LoopCloser(settings, EXCLUDED, extractor.settings)
     closed = 0
     for i, image in enumerate((route_images(LAP) * 3)[:IMAGES]):

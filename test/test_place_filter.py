@@ -9,14 +9,10 @@ import oracle
 import pytest
 from stavpr_ros.alignment.cpu.simd import LANES, load, store
 from stavpr_ros.compilation import kernel
-from stavpr_ros.recognition.place_filter import (
-    CLOSE,
-    exp,
-    FilterSettings,
-    NEGLIGIBLE,
-    PlaceFilter,
-    TOP,
-)
+from stavpr_ros.recognition.filter_kernels import exp
+from stavpr_ros.recognition.filter_paths import CLOSE, NEGLIGIBLE, TOP
+from stavpr_ros.recognition.place_filter import PlaceFilter
+from stavpr_ros.recognition.robust import FilterSettings
 
 
 @kernel
@@ -154,30 +150,29 @@ def assert_belief_equal(one, plain, n, images_ago):
     by_place = plain.a.sum(axis=(0, 1))
     tops = set(np.argsort(by_place)[-TOP:].tolist())
     largest = plain.a.max()
-    weights, ways = np.zeros(n), {}
+    weights, states = np.zeros(n), {}
     for state in np.ndindex(plain.a.shape):
         p = plain.a[state]
         there = plain.way(state, images_ago)[-1]
         if state[2] in tops and p >= NEGLIGIBLE * largest > 0 and there and there[2] >= 0:
             weights[there[2]] += p
-            ways[there[2]] = max(ways.get(there[2], (0,)), (p, *state, there[1]))
+            states[there[2]] = max(states.get(there[2], (0,)), (p, *state, there[1]))
     np.testing.assert_allclose(
         dense(found.places, found.weights, n), weights, rtol=1e-4, atol=1e-5
     )
     close = np.minimum([weights[max(y - CLOSE, 0) : y + CLOSE + 1].sum() for y in range(n)], 1)
     np.testing.assert_allclose(dense(*found.probabilities(n), n), close, rtol=1e-4, atol=1e-5)
-    found_ways = dict(zip(found.places.tolist(), found.ways.tolist(), strict=True))
-    for place, (p, *way) in ways.items():
-        assert found_ways[place] == way, (place, p)
-        places = [
-            -1 if state is None else state[2] for state in plain.way(tuple(way[:3]), images_ago)
-        ]
-        np.testing.assert_array_equal(one.way(np.array(way), images_ago), places)
+    found_states = dict(zip(found.places.tolist(), found.states.tolist(), strict=True))
+    for place, (p, *state) in states.items():
+        assert found_states[place] == state, (place, p)
+        earlier = plain.way(tuple(state[:3]), images_ago)
+        places = [-1 if each is None else each[2] for each in earlier]
+        np.testing.assert_array_equal(one.path(np.array(state), images_ago), places)
 
 
 @pytest.mark.parametrize('sizes', [[1] * 5, [5] * 6, [40] * 7, [90] * 9, [6, 8, 9, 12, 5, 5]])
-@pytest.mark.parametrize('spread', [0.12, 0.4])  # 0.4: most ways are not straight
-def test_belief_equals_plain_ways_back(sizes, spread):
+@pytest.mark.parametrize('spread', [0.12, 0.4])  # 0.4: most paths are not straight
+def test_belief_equals_plain_paths(sizes, spread):
     """At every turn of the ring, up to the oldest image in it."""
     s = replace(LIVELY, enter=0.02, spread=spread)
     one, plain = driven(s, sizes, 2)
@@ -185,8 +180,8 @@ def test_belief_equals_plain_ways_back(sizes, spread):
         assert_belief_equal(one, plain, sizes[-1], images_ago)
 
 
-def test_belief_of_places_born_on_map_since_then_is_nothing():
-    """Ways that came onto the map later were nowhere on it."""
+def test_belief_of_states_that_entered_since_then_is_nothing():
+    """States that entered the map later were off it."""
     one = PlaceFilter(9, LAG, replace(FEW, enter=0.9))
     for places in (0, 0, 9):
         one.update(np.zeros(places, np.float32), 0.1, np.ones(3))

@@ -18,7 +18,7 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.sequence_search import SequenceBuffer
+from stavpr_ros.recognition.window import SequenceBuffer
 import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -120,7 +120,7 @@ def test_recognizer_settings_out_of_range_are_rejected(small_map):
     with pytest.raises(SettingsError, match='xi = 8'):
         recognizer(small_map, spatial=SpatialSettings(xi=8))
     with pytest.raises(SettingsError, match='threshold'):
-        recognizer(small_map).set_threshold(0)
+        recognizer(small_map).set_limits(0.0, 0.5)
 
 
 @pytest.mark.parametrize('copies', [1, 2])

@@ -49,7 +49,7 @@ def driven_map(features, positions, **parts):
 
 def settings_of(**changes):
     return RecognizerSettings(
-        0.5, sequence=SequenceSettings(LENGTH), nms_radius=5, mode='robust', **changes
+        sequence=SequenceSettings(LENGTH), nms_radius=5, mode='robust', **changes
     )
 
 

@@ -8,7 +8,7 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.place_filter import CLOSE
+from stavpr_ros.recognition.filter_paths import CLOSE
 from stavpr_ros.recognition.robust import (
     MeanCentering,
     options_of,
@@ -17,7 +17,6 @@ from stavpr_ros.recognition.robust import (
     ROBUST,
     RobustOptions,
     STRENGTH,
-    THRESHOLD,
     Whitening,
     z_normalized,
 )
@@ -27,7 +26,7 @@ SHORT = SequenceSettings(length=5, beta=2.0)
 
 
 def robust(place_map, **changes) -> PlaceRecognizer:
-    return PlaceRecognizer(place_map, RecognizerSettings(THRESHOLD, mode='robust', **changes))
+    return PlaceRecognizer(place_map, RecognizerSettings(mode='robust', **changes))
 
 
 # ------------------------------------------------ the options
@@ -42,8 +41,9 @@ def test_robust_options_by_name():
     for wrong in (lambda: ROBUST.without('other'), lambda: options_of('other')):
         with pytest.raises(SettingsError, match='other'):
             wrong()
-    with pytest.raises(SettingsError, match='no probability is left'):
-        RecognizerSettings(1.01, mode='robust')
+    for probability in (0.0, 1.0):
+        with pytest.raises(SettingsError, match='min_probability'):
+            RecognizerSettings(mode='robust', min_probability=probability)
     with pytest.raises(SettingsError, match='other'):
         RecognizerSettings(0.5, mode='other')
 

@@ -21,9 +21,11 @@ from stavpr_ros.mapping import (
     select_session,
 )
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.place_filter import FilterSettings, PlaceFilter
+from stavpr_ros.recognition.place_filter import PlaceFilter
+from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.recognition.sessions import layout_of
+from stavpr_ros.recognition.window import ColumnLayout
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -64,7 +66,7 @@ def test_filter_of_sessions_equals_plain_loops():
     index = np.repeat(np.arange(3, dtype=np.int32), sizes)
     layout = layout_of(PlaceMapOf(index), 2)
     plain = oracle.PlaceFilter(LIVELY, (0, 6, 7))
-    one = PlaceFilter(layout.width, 4, LIVELY, layout.gaps)
+    one = PlaceFilter(layout.width(n), 4, LIVELY, layout.gaps)
     for image in range(12):
         z, weights = rng.standard_normal(n).astype(np.float32), rng.uniform(0.1, 1, 3)
         alpha = 0.0 if image == 5 else 0.4
@@ -88,10 +90,9 @@ class PlaceMapOf:
         return len(self.session_index)
 
 
-def test_map_of_one_session_has_no_layout(town):
-    assert layout_of(town[0], 20) is None
+def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
-    assert layout_of(one, 20) is None
+    assert type(layout_of(town[0], 20)) is type(layout_of(one, 20)) is ColumnLayout
     query = features_of(route(0), 1.0, 9)[10:50]
     for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
         assert repr(found) == repr(expected)
@@ -115,8 +116,8 @@ def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
         np.testing.assert_array_equal(
             match.path, matches[nearest].path + np.array([0, first], np.int32)
         )
-        costs, middles = together._window.sequences()
-        alone_costs = np.concatenate([one._window.sequences()[0] for one in alone])
+        costs, middles, _ = together._found.sequences()
+        alone_costs = np.concatenate([one._found.sequences().costs for one in alone])
         assert sorted(costs[np.isfinite(costs)]) == sorted(alone_costs[np.isfinite(alone_costs)])
         assert middles.max() < len(merged)
 

@@ -42,7 +42,7 @@ def matched(recognizer, features):
 
 
 def robust():
-    return RecognizerSettings(0.5, mode='robust')
+    return RecognizerSettings(mode='robust')
 
 
 def test_unknown_route_is_not_matched_with_a_map_that_has_a_standstill():

@@ -246,7 +246,7 @@ def test_draw_window_shows_the_path_over_its_places(places):
     rows[:, 0] = np.inf
     path = np.array([[i, places // 2] for i in range(5)], np.int32)
     sequence = SimpleNamespace(middle=places // 2, distance=0.1)
-    match = Match(Status.MATCH, sequence=sequence, path=path, relative=True, probability=0.9)
+    match = Match(Status.MATCH, sequence=sequence, path=path, probability=0.9)
     drawn = draw_window(rows, 0, match)
     without = draw_window(rows, 0, Match(Status.WARMING_UP))
     assert 200 < drawn.shape[1] < 1400

@@ -34,7 +34,7 @@ class Scripted:
         path = np.array(self.paths[self.at], np.int32)
         places = path[:, 1].tolist()
         nearest = SequenceMatch(places[0], places[-1], places[1], 0.25, -1, float('nan'))
-        return Match(Status.MATCH, sequence=nearest, path=path)
+        return Match(Status.MATCH, sequence=nearest, path=path, distance=0.25)
 
     def newest_row(self):
         """Return a view that the next image overwrites."""

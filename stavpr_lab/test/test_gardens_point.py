@@ -52,7 +52,7 @@ def test_node_on_gardens_point_equals_library(
 
     query = extract_features(open_source(bags / 'day_right'), extractor, progress=False)
     offline = recognize_all(
-        PlaceRecognizer(place_map, RecognizerSettings(threshold, mode=mode)), query
+        PlaceRecognizer(place_map, RecognizerSettings(mode=mode, **limit)), query
     )
     expected = image_matches(offline, 20)
 

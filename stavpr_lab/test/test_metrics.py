@@ -26,7 +26,8 @@ def ranking(places, scores):
 
 def window(middle, path, distance):
     nearest = SequenceMatch(path[0][1], path[-1][1], middle, distance, -1, float('nan'))
-    return Match(Status.NO_MATCH, sequence=nearest, path=np.array(path, np.int32))
+    path = np.array(path, np.int32)
+    return Match(Status.NO_MATCH, sequence=nearest, path=path, distance=distance)
 
 
 def test_best_f1_on_a_tie_is_that_of_the_lowest_threshold():

@@ -12,10 +12,9 @@ from stavpr_lab.evaluation.metrics import accepted_counts
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.robust import THRESHOLD
 from stavpr_ros.sources import open_source
 
-SETTINGS = RecognizerSettings(THRESHOLD, mode='robust')
+SETTINGS = RecognizerSettings(mode='robust')
 
 
 @pytest.fixture(scope='module')

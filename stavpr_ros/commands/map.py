@@ -296,7 +296,7 @@ def _sessions(arguments: argparse.Namespace) -> None:
 
 def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import save_map
-    from stavpr_ros.recognition.held_map import statistics_of_map, with_codes
+    from stavpr_ros.recognition.prepared_map import statistics_of_map, with_codes
 
     storage = getattr(arguments, 'storage', '')
     learned = statistics_of_map(place_map, storage)

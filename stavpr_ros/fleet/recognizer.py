@@ -32,10 +32,10 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART, ImageChange
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
-from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 from stavpr_ros.recognition.sessions import SessionLayout
 from stavpr_ros.threads import call_on_thread
 import torch
@@ -128,9 +128,8 @@ class FleetRecognizer(SequenceRecognizer):
                 f'mode {settings.mode}, vertical {settings.spatial.vertical}: the map of a fleet '
                 'is matched in mode robust, without vertical alignment'
             )
-        super().__init__(settings, city.settings, 0)
-        if city.poses is not None:
-            self._enable_odometry_check(city.poses[:, :2])
+        positions = () if city.poses is None else city.poses[:, :2]
+        super().__init__(settings, city.settings, FilterWindow(settings.sequence, 0), positions)
         self._city, self._timeout = city, timeout
         index = city.store.index
         self._centering = index.centering()
@@ -173,7 +172,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._images: deque[_Image] = deque(maxlen=HISTORY)
         self._unasked: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
         self._votes = Votes(self._settings.sequence.length, FilterSettings().speeds)
-        self._clear_window()
+        super().reset()
         self._rebuild()
 
     def update(
@@ -196,22 +195,19 @@ class FleetRecognizer(SequenceRecognizer):
         z = (row[self._sampled :] - np.float32(mean)) / np.float32(deviation)
         image = _Image(strips, features.weights[:, 0], change, stamp, mean, deviation, z)
         self._images.append(image)
-        self._changes.append(change)
         self._count += 1
         self._unasked.append((self._count, place_vectors(strips[:, None])))
-        if self._motion is not None:
-            self._motion.way.append(position)
         if self._update_neighborhoods():
             self._rebuild()
-        elif self._layout is not None:
+        elif len(self._order):
             self._push(image)
-        if self._layout is not None:
-            return self._compared(self._match_window(), position)
+        if len(self._order):
+            return self._match(position)
+        self._motion.trajectory.append(position)
         status = Status.WARMING_UP
         if self.window_fill == self._settings.sequence.length:
             status = Status.NO_MATCH
-        reason = self.problem or 'no neighborhood has arrived yet'
-        return Match(status, reason, self._settings.threshold)
+        return Match(status, self.problem or 'no neighborhood has arrived yet')
 
     def newest_row(self) -> np.ndarray:
         """See :meth:`SequenceRecognizer.newest_row`; +inf for places that are not loaded."""
@@ -234,7 +230,7 @@ class FleetRecognizer(SequenceRecognizer):
     def _update_neighborhoods(self) -> bool:
         """Look neighborhoods up if it is time; return whether other places are loaded."""
         if self._pending is None:
-            if self._layout is not None and len(self._unasked) < EVERY:
+            if len(self._order) and len(self._unasked) < EVERY:
                 return False
             asked = list(self._unasked)
             self._unasked.clear()
@@ -282,9 +278,11 @@ class FleetRecognizer(SequenceRecognizer):
 
     def _likely(self) -> np.ndarray:
         """Return the places that are most probable now."""
-        if self._layout is None or self._filter is None:
+        if not len(self._order):
             return np.empty(0, np.int64)
-        probabilities = self._filter.filter.places_of_states()[self._layout.columns]
+        probabilities = self._filter_window.layout.gathered(
+            self._filter_window.filter.places_of_states()
+        )
         top = np.argsort(-probabilities)[:LIKELY]
         return self._places[self._order][top[probabilities[top] > LEAST]]
 
@@ -326,7 +324,6 @@ class FleetRecognizer(SequenceRecognizer):
         self._order = filled[np.argsort(self._places[filled])]
         places = self._places[self._order]
         if not len(places):
-            self._layout = None
             return
         firsts = _firsts(places, self._city.store.index.runs(places))
         same_as = np.searchsorted(places, self._same_as[self._order])
@@ -334,22 +331,17 @@ class FleetRecognizer(SequenceRecognizer):
         here = places[same_as] == self._same_as[self._order]
         same_as = np.where(here, same_as, np.arange(len(places)))
         layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)
-        sequence = self._settings.sequence
-        self._layout = layout
-        self._buffer = SequenceBuffer(sequence.length, layout.width, sequence.k, copies=1)
         model, share = FilterSettings(), len(places) / len(self._city)
         model = replace(model, start=model.start * share, enter=model.enter * share)
-        self._search = self._filter = FilterSearch(self._buffer, model, layout)
-        self._filter.change.copy_statistics(self._learned, self._from_before[self._order])
+        window = FilterWindow(self._settings.sequence, len(places), model, layout)
+        window.change.copy_statistics(self._learned, self._from_before[self._order])
+        self._window = self._filter_window = window
         for image in self._images:
             self._push(image)
 
     def _push(self, image: _Image) -> None:
-        assert self._layout is not None
-        assert self._filter is not None
-        row = self._layout.spread(torch.from_numpy(image.z[self._order]))
-        self._buffer.push(row, image.stamp)
-        self._filter.update(row.numpy(), image.change)
+        z = torch.from_numpy(image.z[self._order])
+        self._filter_window.add(z, image.stamp, image.change)
 
 
 def _firsts(places: np.ndarray, runs: np.ndarray) -> np.ndarray:

@@ -29,12 +29,12 @@ def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray
         )
     place = match.newest_index if match.accepted else match.sequence.middle
     text = f'{match.status.label}: place {place}, '
-    if match.relative:
+    if not math.isnan(match.probability):
         text += f'p {match.probability:.2f}'
     else:
         text += f'distance {match.distance:.3f}'
-    if not (match.relative or math.isnan(match.threshold)):
-        text += f' (threshold {match.threshold:.3f})'
+        if not math.isnan(match.threshold):
+            text += f' (threshold {match.threshold:.3f})'
     if match.inliers >= 0:
         text += f', {match.inliers} inliers'
     return match_image(
@@ -121,7 +121,7 @@ def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
         cv2.polylines(sheet, [np.array(points, np.int32)], False, ink, 2, cv2.LINE_AA)
     bar = np.full((24, sheet.shape[1], 3), _PAPER, np.uint8)
     text = f'images of the window (newest below) x places {first} to {first + width - 1}'
-    if match.relative and match.sequence is not None:
+    if match.sequence is not None and not math.isnan(match.probability):
         text += f'; place {match.sequence.middle}, p {match.probability:.2f}'
     _write(bar, text, 11)
     return np.vstack([sheet, bar])

@@ -160,7 +160,7 @@ class Pipeline:
         elif self._operation is not None and self._operation.recognizer and threshold is not None:
             if before is None:
                 self.reset()  # images since then are not in the window
-            self._operation.recognizer.set_threshold(threshold)
+            self._operation.recognizer.set_limits(settings.threshold, settings.min_probability)
         self.settings, self.threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
         if settings.geometric != (self._verifier and self._verifier.settings):
@@ -359,7 +359,7 @@ class Pipeline:
         """
         if self._verifier is None or match.sequence is None:
             return match
-        weighed = match.relative and self.operation == 'localization'
+        weighed = not math.isnan(match.probability) and self.operation == 'localization'
         checked = self._evidence.wants(match.probability) if weighed else match.accepted
         if not checked or query is None:
             return match

@@ -64,11 +64,7 @@ class PipelineSettings:
     geometric: GeometricSettings | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.min_probability < 1:
-            raise SettingsError(
-                f'min_probability = {self.min_probability} must be above 0 and below 1'
-            )
-        if self.threshold is not None and self._has_probability:
+        if self.threshold is not None and options_of(self.mode).place_filter:
             raise SettingsError(
                 f'threshold = {self.threshold} is of mode paper: mode {self.mode} matches above '
                 f'the probability min_probability = {self.min_probability}; set that, and leave '
@@ -84,32 +80,27 @@ class PipelineSettings:
         self.recognition()
 
     @property
-    def _has_probability(self) -> bool:
-        """Whether matches have a probability; distances are 1 - probability then."""
-        return options_of(self.mode).place_filter
-
-    @property
     def applied_threshold(self) -> float | None:
         """Return the distance below which a window is matched, None = not set."""
-        return 1 - self.min_probability if self._has_probability else self.threshold
+        return self.recognition().applied_threshold
 
     def recognition(self) -> RecognizerSettings:
-        """Return settings of the recognizer; without a threshold, with one that is not applied."""
-        threshold = self.applied_threshold or 1.0
+        """Return the settings of the recognizer."""
         return RecognizerSettings(
-            threshold,
+            self.threshold,
             self.spatial,
             self.sequence,
             self.nms_radius,
             self.mode,
             odometry_error=self.odometry_error,
             time_budget_ms=self.time_budget_ms,
+            min_probability=self.min_probability,
         )
 
     @property
     def compares_odometry(self) -> bool:
         """Whether odometry is compared with the paths of matches, where places have poses."""
-        return self._has_probability and self.odometry_error > 0
+        return self.recognition().compares_odometry
 
     def require_operation(self, operation: str) -> None:
         """

@@ -1,10 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-All places of a map, some at a time: they may be in its file, and need not fit into memory.
+Block-wise iteration over the places of a map, which may be in its file and exceed the memory.
 
-Blocks are small, so that threads which share the work of one block would wait for each other most
-of the time. Each is computed by one thread, several of them at the same time.
+Blocks are small: threads that share one would wait for each other most of the time. Each block is
+computed by one thread, several blocks at the same time.
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ PIECE = 256  # places read or centered at a time
 
 
 def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
-    """Yield features some places at a time."""
+    """Yield the features of each block of places."""
     for places in _slices(features):
         yield places, features[places]
 
@@ -32,7 +32,7 @@ def converted_blocks(
     features: LocalFeatures, convert: Callable[[LocalFeatures], torch.Tensor]
 ) -> Iterator[tuple[slice, torch.Tensor]]:
     """
-    Yield what a function makes of the blocks, in their order.
+    Yield the converted blocks, in their order.
 
     Meanwhile torch has one thread, on the calling thread too.
     """
@@ -45,8 +45,8 @@ def converted_blocks(
         pending: deque[tuple[slice, Future[torch.Tensor]]] = deque()
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             for places in slices:
-                of_block = pool.submit(lambda places: convert(features[places]), places)
-                pending.append((places, of_block))
+                future = pool.submit(lambda places: convert(features[places]), places)
+                pending.append((places, future))
                 if len(pending) > threads:
                     first, future = pending.popleft()
                     yield first, future.result()
@@ -57,24 +57,24 @@ def converted_blocks(
 def converted(
     features: LocalFeatures,
     convert: Callable[[torch.Tensor], torch.Tensor],
-    see: Callable[[torch.Tensor], None] = lambda strips: None,
+    visit: Callable[[torch.Tensor], None] = lambda strips: None,
 ) -> LocalFeatures:
     """
-    Return new features: those of one block after the other, converted.
+    Return new features, converted block by block.
 
-    :param see: called with the strips of each converted block.
+    :param visit: called with the strips of each converted block.
     """
     shape = (*features.weights.shape, features.dimension)
     strips = torch.empty(shape, device=features.weights.device)
-    for places, some in converted_blocks(features, lambda some: convert(some.strips)):
-        see(some)
-        strips[:, places] = some
+    for places, block in converted_blocks(features, lambda block: convert(block.strips)):
+        visit(block)
+        strips[:, places] = block
     return LocalFeatures(strips, features.weights, features.settings, features.cells)
 
 
 @contextmanager
 def one_thread() -> Iterator[int]:
-    """Let torch have one thread on this one; yields how many it had."""
+    """Limit torch to one thread on the calling thread; yields the number before."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -95,11 +95,11 @@ class PlaceChanges:
     The change of two images is 1 less the mean cosine similarity of their strips, each with the
     one in the same place.
 
-    :param n: places; 0 = blocks are not looked at.
+    :param n: places; 0 = blocks are ignored.
     :param apart: most places apart.
 
-    ``changes`` holds those of each place from the ones 1, 2, ... places before, shape (apart, n),
-    float32; 0 where there are no such.
+    ``changes`` of each place from the places 1, 2, ... before it, shape (apart, n), float32; 0
+    where there is no such place.
     """
 
     def __init__(self, n: int, apart: int) -> None:

@@ -58,7 +58,7 @@ class CpuMatcher:
         self._weights = features.weights.cpu()
         self._places = self._weights.shape[1]
         if precision == 'int8' and isinstance(features, LocalFeatures):
-            features = rounded(features, lambda some: some)
+            features = rounded(features, lambda block: block)
         if isinstance(features, Int8Features):
             self._map = features.strips.kernel_arguments()
             return

@@ -1,16 +1,31 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The place filter on a CUDA device: its state lies there, one copy an answer comes back."""
+"""The place filter on a CUDA device: its state stays there, one copy an image comes back."""
 
 import numpy as np
 from stavpr_ros.alignment.cuda.compilation import runtime
-from stavpr_ros.recognition.place_filter import ALL_BORN, Belief, belief_of, NEGLIGIBLE, TOP
+from stavpr_ros.recognition.filter_paths import (
+    ALL_ENTERED,
+    Belief,
+    belief_of,
+    NEGLIGIBLE,
+    TOP,
+)
 from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
 from stavpr_ros.recognition.route_strips import move_up
 import torch
 from torch.nn import functional
 
-MOST = 512  # most probable places that are copied back: more than are ever excluded
+MOST = 512  # most probable places that are copied to the host: more than are ever excluded
+
+
+def current_device() -> torch.device:
+    """
+    Return torch's current CUDA device.
+
+    :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
+    """
+    return runtime().torch_device
 
 
 def z_normalized_on_device(
@@ -36,12 +51,11 @@ def z_normalized_on_device(
 
 class CudaPlaceFilter:
     """
-    See :class:`stavpr_ros.recognition.place_filter.PlaceFilter`, on torch's current CUDA device.
+    See :class:`stavpr_ros.recognition.filter_window.StateFilter`, on torch's current CUDA device.
 
     Probabilities differ from those of the CPU in the last digits: sums are formed in another
-    order. Nothing waits for the device but the first of :meth:`belief`, :meth:`most_probable` and
-    :meth:`way` after an image.
-
+    order. Only the first of :meth:`belief`, :meth:`most_probable` and :meth:`path` after an image
+    waits for the device. Parameters: see :class:`stavpr_ros.recognition.place_filter.PlaceFilter`.
     """
 
     def __init__(
@@ -74,13 +88,13 @@ class CudaPlaceFilter:
         self._states, self._mixed = zeros(K * V, room), zeros(K * V, room)
         self._codes = zeros(K * V, room, dtype=torch.uint8)
         self._origins = zeros(lag, K * ((V + 1) // 2), room, dtype=torch.uint8)
-        self._origins.fill_(ALL_BORN)
+        self._origins.fill_(ALL_ENTERED)
         self._steps = zeros(lag, V, dtype=torch.int32)
         self._sums = zeros(2 * K, room + self._reach)
-        self._factors, self._births = zeros(K, K), zeros(K)
+        self._factors, self._entering = zeros(K, K), zeros(K)
         self._speed_factors, self._z = zeros(5, V), zeros(room)
         tops, top = min(TOP, room), min(MOST, room)
-        # one buffer of what is copied back: scale; sums and places; states and their ways
+        # one buffer for the copy to the host: scale; places; their sums; states and their paths
         parts = (8, 8 * top, 4 * top, 4 * tops * K * V, 4 * (lag + 1) * tops * K * V)
         ends = np.cumsum([-(-size // 8) * 8 for size in parts]).tolist()
         self._parts = [
@@ -97,13 +111,13 @@ class CudaPlaceFilter:
         self._views = {
             name: self._runtime.array(getattr(self, name))
             for name in (
-                *('_states', '_mixed', '_codes', '_sums', '_levels', '_factors', '_births'),
+                *('_states', '_mixed', '_codes', '_sums', '_levels', '_factors', '_entering'),
                 *('_speed_factors', '_z', '_origins', '_steps'),
             )
         }
         self._slots = [self._runtime.array(slot) for slot in self._origins]
         self._slot_steps = [self._runtime.array(slot) for slot in self._steps]
-        self._answer = [self._runtime.array(part) for part in self._out]
+        self._copied = [self._runtime.array(part) for part in self._out]
 
     def reset(self) -> None:
         """Forget where the camera was."""
@@ -111,7 +125,7 @@ class CudaPlaceFilter:
         self._sums.zero_()
         K = len(self.settings.levels)
         self._off = torch.full((K,), 1 / K, dtype=torch.float64, device=self._device)
-        self._seen = torch.zeros(K, dtype=torch.float64, device=self._device)
+        self._on_map = torch.zeros(K, dtype=torch.float64, device=self._device)
         self._scale = torch.ones((), dtype=torch.float64, device=self._device)
         self.count, self._known, self._read_at = 0, 0, -1
 
@@ -129,20 +143,20 @@ class CudaPlaceFilter:
         """Drop the oldest places; the others move up."""
         for values in (self._states, self._sums, *self._origins):
             move_up(values, count, values.shape[1])
-            values[:, -count:] = ALL_BORN if values.dtype == torch.uint8 else 0
-        self._find_seen()
+            values[:, -count:] = ALL_ENTERED if values.dtype == torch.uint8 else 0
+        self._sum_states()
 
-    def _find_seen(self) -> None:
-        self._seen = self._sums[: self._shape[0]].sum(dim=1, dtype=torch.float64)
+    def _sum_states(self) -> None:
+        self._on_map = self._sums[: self._shape[0]].sum(dim=1, dtype=torch.float64)
         self._read_at = -1
 
     def _clear_from(self, n: int) -> None:
         """Set states and sums from place n on to 0."""
         self._states[:, n:] = self._sums[:, n:] = 0
-        self._find_seen()
+        self._sum_states()
 
     def places_of_states(self) -> np.ndarray:
-        """Return the probability of each place, (room,), float32; copied from the device."""
+        """See :meth:`StateFilter.places_of_states`; copied from the device."""
         found: np.ndarray = (self._by_place() * self._scale).float().cpu().numpy()
         return found
 
@@ -153,6 +167,10 @@ class CudaPlaceFilter:
         block = self._kernels.BLOCK
         self._runtime.launch(kernel, (-(-count // block), 1), block, *arguments)
 
+    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
+        """See :meth:`StateFilter.z_normalized`."""
+        return z_normalized_on_device(row, around, torch.from_numpy(counted).to(row.device))
+
     def update(
         self,
         z: torch.Tensor,
@@ -160,7 +178,7 @@ class CudaPlaceFilter:
         speed_weights: np.ndarray,
         speed_likelihoods: np.ndarray | float = 1.0,
     ) -> None:
-        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.update`; z on the device."""
+        """See :meth:`StateFilter.update`."""
         s, (K, V), v, n = self.settings, self._shape, self._views, len(z)
         slot = self.count % len(self._origins)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
@@ -170,19 +188,19 @@ class CudaPlaceFilter:
             self._states[:, :n] = s.start / (K * V * real)
             self._states[:, self._gaps] = 0
             self._off.fill_((1 - s.start) / K)
-            self._seen.fill_(s.start / K)
+            self._on_map.fill_(s.start / K)
         elif n < self._known:
             self._clear_from(n)
         off = self._off @ self._level_changes.double()
-        before = lost = self._seen
+        before = lost = self._on_map
         if n:
             self._z[:n] = z
             self._z[self._gaps] = -torch.inf
             changes = s.speed_changes(speed_weights, speed_likelihoods)
             self._speed_factors.copy_(torch.from_numpy(changes))
             self._factors.copy_(self._level_changes * self._scale.float())
-            self._births.copy_(off * s.enter / (V * real))
-            before = self._seen @ self._factors.double()
+            self._entering.copy_(off * s.enter / (V * real))
+            before = self._on_map @ self._factors.double()
             self._launch(
                 self._kernels.mix(K, V), n, n, v['_states'], v['_factors'], v['_speed_factors'],
                 v['_mixed'], v['_codes'],
@@ -190,18 +208,19 @@ class CudaPlaceFilter:
             self._launch(
                 self._kernels.move(K, V), n + self._reach, n, v['_mixed'], v['_codes'], v['_z'],
                 self._slot_steps[slot], v['_levels'], np.float32(weight), np.float32(s.spread),
-                np.float32(1 - s.leave), v['_births'], v['_states'], self._slots[slot], v['_sums'],
+                np.float32(1 - s.leave), v['_entering'], v['_states'], self._slots[slot],
+                v['_sums'],
             )  # fmt: skip
             sums = self._sums[:, : n + self._reach].sum(dim=1, dtype=torch.float64)
-            self._seen, lost = sums.view(2, K)
+            self._on_map, lost = sums.view(2, K)
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
-        total = off.sum() + self._seen.sum()
+        total = off.sum() + self._on_map.sum()
         self._off, self._scale = off / total, 1 / total
         self._known = n
         self.count += 1
 
     def _read(self) -> None:
-        """Copy the most probable places, their states and ways back; once an image."""
+        """Copy the most probable places, their states and paths to the host; once an image."""
         if self._read_at == self.count:
             return
         sums, places = torch.topk(self._by_place(), len(self._out[1]))
@@ -209,46 +228,46 @@ class CudaPlaceFilter:
             part.copy_(value)
         newest = (self.count - 1) % len(self._origins)
         self._launch(
-            self._kernels.trace(*self._shape), self._out[4].shape[1], self._answer[1],
+            self._kernels.trace(*self._shape), self._out[4].shape[1], self._copied[1],
             self._views['_states'], self._views['_origins'], self._views['_steps'], newest,
-            self._answer[3], self._answer[4],
+            self._copied[3], self._copied[4],
         )  # fmt: skip
         self._runtime.fetch(self._buffer, self._host)
-        scale, self._top, top_sums, states, ways = (
+        scale, self._top, top_sums, states, paths = (
             self._host[part].numpy().view(dtype)
             for part, dtype in zip(
                 self._parts, (np.float64, np.int64, np.float32, np.float32, np.int32), strict=True
             )
         )
         self._top_sums, self._top_states = top_sums * scale[0], states * scale[0]
-        self._ways = ways.reshape(len(self._origins) + 1, -1)
+        self._paths = paths.reshape(len(self._origins) + 1, -1)
         self._read_at = self.count
 
     def belief(self, n: int, images_ago: int) -> Belief:
-        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.belief`."""
+        """See :meth:`StateFilter.belief`."""
         self._read()
         K, V = self._shape
-        then = self._ways[images_ago]
+        then = self._paths[images_ago]
         least = NEGLIGIBLE * self._top_states.max(initial=0)
         kept = np.flatnonzero((self._top_states >= max(least, 1e-300)) & (then >= 0))
-        ways = np.stack(
+        states = np.stack(
             [
                 *(then[kept] // 16, kept % (K * V) // V, kept % V),
                 *(self._top[kept // (K * V)], then[kept] % 16),
             ],
             axis=1,
         ).astype(np.int64)
-        return belief_of(ways, self._top_states[kept].astype(np.float64))
+        return belief_of(states, self._top_states[kept].astype(np.float64))
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
-        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.most_probable`."""
+        """See :meth:`StateFilter.most_probable`."""
         self._read()
         left = np.flatnonzero(~np.isin(self._top, excluded))
         return (int(self._top[left[0]]), float(self._top_sums[left[0]])) if len(left) else (0, 0.0)
 
-    def way(self, state: np.ndarray, images: int) -> np.ndarray:
-        """See :meth:`stavpr_ros.recognition.place_filter.PlaceFilter.way`."""
+    def path(self, state: np.ndarray, images: int) -> np.ndarray:
+        """See :meth:`StateFilter.path`."""
         self._read()
         (K, V), (k, v, y) = self._shape, state[:3]
         column = (int(np.flatnonzero(self._top == y)[0]) * K + k) * V + v
-        return self._ways[: images + 1, column] // 16
+        return self._paths[: images + 1, column] // 16

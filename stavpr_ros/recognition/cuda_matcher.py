@@ -16,7 +16,7 @@ from stavpr_ros.recognition.int8_features import Int8Features, rounded
 from stavpr_ros.recognition.route_strips import DeviceInt8Route, RouteStrips
 import torch
 
-BLOCK_WORDS = 2**26  # most words of products that lie in memory at a time: 256 MiB
+BLOCK_WORDS = 2**26  # most words of products in memory at a time: 256 MiB
 QUERIES = 32  # most images of a batch whose products are made at once
 AT_ONCE = 1024  # places of a route: the memory of products is the same for so many
 PLACES_IN_PIECES = 2**14  # most places of int8 widened at a time
@@ -47,12 +47,14 @@ class CudaMatcher:
         self._runtime = runtime()
         device = self._runtime.torch_device
         if precision == 'int8' and isinstance(features, LocalFeatures):
-            features = rounded(features, lambda some: some)
+            features = rounded(features, lambda block: block)
         if isinstance(features, Int8Features):
             lengths = features.strips.reciprocals[:, : len(features)]
-            self._hold(features.strips.rounded().to(device), torch.from_numpy(lengths).to(device))
+            self._set_strips(
+                features.strips.rounded().to(device), torch.from_numpy(lengths).to(device)
+            )
         else:
-            self._hold(features.strips.to(device, torch.float32).contiguous(), None)
+            self._set_strips(features.strips.to(device, torch.float32).contiguous(), None)
         self._weights = features.weights.to(device)
         self._workspace: tuple[torch.Tensor, Any] | None = None
         self._choose_kernel(spatial)
@@ -60,7 +62,7 @@ class CudaMatcher:
             W, _, d = self._strips.shape
             self.distances(torch.zeros(W, d), torch.zeros(W))
 
-    def _hold(self, strips: torch.Tensor, reciprocals: torch.Tensor | None) -> None:
+    def _set_strips(self, strips: torch.Tensor, reciprocals: torch.Tensor | None) -> None:
         """Compare with these strips; reciprocal lengths are of int8."""
         self._strips, self._reciprocals = strips, reciprocals
 
@@ -106,7 +108,7 @@ class CudaMatcher:
         return out
 
     def _align(self, queries: torch.Tensor, first_query: int, out: Any) -> None:
-        """Write the rows of some queries, a piece of the map at a time: products stay small."""
+        """Write the rows of queries, a piece of the map at a time: products stay small."""
         W, n, _ = self._strips.shape
         vectors, lengths = self._rounded(queries)
         places = min(n, max(1, BLOCK_WORDS // (len(vectors) * W)))
@@ -134,7 +136,7 @@ class CudaMatcher:
     def _products(
         self, vectors: torch.Tensor, lengths: torch.Tensor | None, first: int, last: int
     ) -> Any:
-        """Multiply query strips by those of some places: (Q W, W, last - first), for kernels."""
+        """Multiply query strips by those of places: (Q W, W, last - first), for kernels."""
         W, n, d = self._strips.shape
         rows = len(vectors)
         is_whole = last - first == n and self._reciprocals is None
@@ -188,7 +190,7 @@ class CudaRouteMatcher(CudaMatcher):
 
     def __init__(self, W: int, spatial: SpatialSettings) -> None:
         self._runtime = runtime()
-        self._hold(torch.empty((W, 0, 0)), None)
+        self._set_strips(torch.empty((W, 0, 0)), None)
         self._workspace = None
         self._choose_kernel(spatial)
 
@@ -207,8 +209,8 @@ class CudaRouteMatcher(CudaMatcher):
         """
         ahead = slice(min(strips.shape[1], -(-places // AT_ONCE) * AT_ONCE))
         if isinstance(strips, DeviceInt8Route):
-            self._hold(strips.whole[:, ahead], strips.reciprocals[:, ahead])
+            self._set_strips(strips.whole[:, ahead], strips.reciprocals[:, ahead])
         else:
             assert isinstance(strips, torch.Tensor)
-            self._hold(strips[:, ahead], None)
+            self._set_strips(strips[:, ahead], None)
         return self.distance_matrix(newest, newest[:, :, 0])[0, :places]

@@ -10,7 +10,7 @@ beside their strips, it is that of the vectors instead. It is computed for all p
 distances are computed in chunks of places: those with the smallest coarse distances, those that
 the place filter finds probable after the images so far, and a fixed sample. Mean and deviation of
 the sample scale the coarse distances to exact ones, so that z-normalization, the filter and the
-second best see one row with an entry for every place.
+second best have one row with an entry for every place.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.recognition.filter_paths import BLOCK
 from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.place_filter import BLOCK
 from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, unit_norm
 import torch
 
@@ -37,7 +37,7 @@ class FirstStage:
     A matcher that compares images with few places exactly, see the module.
 
     :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
-    :param features: of the places: as the matcher holds them; or their vectors, as one strip.
+    :param features: of the places: those of the matcher; or their vectors, as one strip.
     :param probable: returns the first places of the blocks of ``BLOCK`` places that the filter
         finds probable.
     """

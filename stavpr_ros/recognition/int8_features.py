@@ -31,16 +31,16 @@ class Int8Features:
 def rounded(
     features: LocalFeatures,
     convert: Callable[[LocalFeatures], LocalFeatures],
-    see: Callable[[torch.Tensor], None] = lambda strips: None,
+    visit: Callable[[torch.Tensor], None] = lambda strips: None,
 ) -> Int8Features:
     """
-    Return features rounded to int8: one block after the other, converted before.
+    Return features, converted and rounded to int8 block by block.
 
-    :param see: called with the strips of each block, before they are rounded.
+    :param visit: called with the strips of each block, before they are rounded.
     """
     W, n = features.weights.shape
     strips = Int8Strips(W, n, features.dimension)
-    for places, some in converted_blocks(features, lambda some: convert(some).strips.cpu()):
-        see(some)
-        strips.write(places.start, some.contiguous())
+    for places, block in converted_blocks(features, lambda block: convert(block).strips.cpu()):
+        visit(block)
+        strips.write(places.start, block.contiguous())
     return Int8Features(strips, features.weights, features.settings, features.cells)

@@ -12,13 +12,15 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
+from stavpr_ros.recognition.filter_window import FilterWindow
+from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.route_features import RouteFeatures
-from stavpr_ros.recognition.sequence_search import FilterSearch, SequenceBuffer
 from stavpr_ros.recognition.settings import RecognizerSettings
+from stavpr_ros.recognition.window import QueryWindow
 import torch
 
 if TYPE_CHECKING:
@@ -58,8 +60,8 @@ class LoopCloser(SequenceRecognizer):
     :param settings: strategies ``adaptive`` and ``vanilla``.
     :param exclude: the latest images that are not part of the map, at least 1.
     :param feature_settings: how the features are made.
-    :param limit: most places held; None for all. It must leave room for more than the excluded
-        images.
+    :param limit: most places that are kept; None for all. It must leave room for more than the
+        excluded images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :param backend: see :func:`choose_loop_backend`. On ``cuda`` the route's features lie on the
         device; without the place filter, sequences are matched on the CPU.
@@ -68,8 +70,6 @@ class LoopCloser(SequenceRecognizer):
     :raises SettingsError: invalid settings.
     :raises UnavailableError: no such backend here.
     """
-
-    _around = AROUND
 
     def __init__(
         self,
@@ -87,9 +87,9 @@ class LoopCloser(SequenceRecognizer):
                 f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
             )
         backend = choose_loop_backend(backend)
-        super().__init__(
-            settings, feature_settings, 0, to_oldest=True, model=MODEL, backend=backend
-        )
+        self._track: list[np.ndarray] = []  # position of each place that is not evicted
+        window = _route_window(settings, backend)
+        super().__init__(settings, feature_settings, window, self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._matcher: CpuRouteMatcher | CudaRouteMatcher
@@ -104,25 +104,21 @@ class LoopCloser(SequenceRecognizer):
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit, precision, device
         )
-        # of the images of the window: each one had a match as the middle one
-        self._closed: deque[bool] = deque(maxlen=settings.sequence.length)
-        self._track: list[np.ndarray] = []  # position of each place held
-        self._enable_odometry_check(self._track)
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
 
     def __len__(self) -> int:
-        """Return the number of places that are held; ``first + len`` images have come."""
+        """Return the number of places that are not evicted; ``first + len`` images have come."""
         return self._route.count
 
     @property
     def first(self) -> int:
-        """Return the oldest place that is held: the number of evicted places."""
-        return self._buffer.first
+        """Return the oldest place that is not evicted: the number of evicted ones."""
+        return self._window.buffer.first
 
     def features(self) -> LocalFeatures:
-        """Return the features of the places held, strips (W, n, d), as they came."""
+        """Return the features of the places, strips (W, n, d), as they came."""
         return self._route.original()
 
     def reset(self) -> None:
@@ -132,9 +128,8 @@ class LoopCloser(SequenceRecognizer):
         Places before the reset count as old enough in seconds, since stamps cannot be compared
         over a jump.
         """
-        self._clear_window()
+        super().reset()
         self._young.clear()
-        self._closed.clear()
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -148,36 +143,23 @@ class LoopCloser(SequenceRecognizer):
         self._require_one_image(features, 'the route so far')
         self._append(features, stamp)
         self._track.append(position)
-        newest = self._route.newest[:, 0]
-        match = self._match(self._distances(), newest, stamp, position)
+        self._window.push(self._distances(), self._route.newest[:, 0], stamp)
+        match = self._match(position)
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
         return replace(match, late=self._late(match))
 
     def _late(self, match: Match) -> Match | None:
         """
-        Return the match of the oldest image, if it had none as the middle one, but is certain now.
+        Return the match of the oldest image, if it had none as the middle one and is certain now.
 
         It is a backward pass over the window. Windows without a match have no late one either.
         """
-        self._closed.append(False)
-        if self._filter is None or not self._buffer.full:
+        if not self._window.buffer.full:
             return None
-        self._closed[match.position] = match.accepted
-        if self._closed[0] or not match.accepted:
-            return None
-        window = self._filter.at(0, self._settings.nms_radius)
-        nearest = window.nearest
-        if nearest is None or not nearest.distance < match.threshold:
-            return None
-        return replace(
-            match,
-            sequence=nearest,
-            path=window.path,
-            path_ratios=window.path_ratios(0),
-            probability=1 - nearest.distance,
-            is_late=True,
-        )
+        found = self._window.match_oldest(self._settings.nms_radius, match.accepted)
+        late = match.of_window(found, 0)
+        return replace(late, is_late=True) if late.accepted else None
 
     def newest_row(self) -> np.ndarray:
         """
@@ -189,25 +171,20 @@ class LoopCloser(SequenceRecognizer):
 
     def _append(self, features: LocalFeatures, stamp: int) -> None:
         """Make the image a place, and count the places that it may be matched with."""
-        route = self._route
-        parts: list[SequenceBuffer | FilterSearch] = [self._buffer]
-        if self._filter is not None:
-            parts.append(self._filter)
+        route, window = self._route, self._window
         if route.count == self._limit:
             evicted = max(1, self._limit // EVICTED)
             route.evict(evicted)
-            for part in parts:
-                part.evict(evicted)
+            window.evict(evicted)
             del self._track[:evicted]
             while len(self._young) > route.count:
                 self._young.popleft()
         if route.append(features):
-            for part in parts:
-                part.grow(route.room)
-        if self._filter is not None:
+            window.grow(route.room)
+        if isinstance(window, FilterWindow):
             latest = route.latest.numpy()
-            self._filter.change.learn_newest(latest, route.count)
-            self._filter.change.recenter_query(latest[:, -2:][:, 0])
+            window.change.learn_newest(latest, route.count)
+            window.change.recenter_query(latest[:, -2:][:, 0])
         self._young.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
 
@@ -224,6 +201,23 @@ class LoopCloser(SequenceRecognizer):
         if self._places < LEAST_PLACES:
             return torch.empty(0, device=self._matcher.device)
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
+
+
+def _route_window(settings: RecognizerSettings, backend: str) -> QueryWindow:
+    """Return an empty window for a route without places."""
+    options, sequence = settings.applied_options, settings.sequence
+    if not options.place_filter:
+        return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
+    return FilterWindow(
+        sequence,
+        0,
+        MODEL,
+        None,
+        options.query_znorm,
+        AROUND,
+        to_oldest=True,
+        on_device=backend == 'cuda',
+    )
 
 
 def least_limit(exclude: int, length: int) -> int:

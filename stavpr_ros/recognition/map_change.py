@@ -18,9 +18,9 @@ APART = 5  # places apart up to which the map's changes are learned
 STANDING = 0.05  # weight of a place by its change, up to which the curve is not learned from it
 AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
-UNLIT = 0.3  # probability of such places above which equal images do not mean standstill
+UNLIT = 0.3  # probability of such places above which equal images are no standstill
 SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
-NOISE = 0.15  # deviation of what noise adds to all changes
+NOISE = 0.15  # deviation of the change by noise, common to all
 LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
@@ -31,8 +31,8 @@ class ImageChange:
     """
     Changes of a map from place to place, and of a query from image to image.
 
-    ``curve`` holds the mean change of places 0, 1, ... ``APART`` apart while the camera moves, 1
-    where none is known; ``standstill`` the change below which a camera stands.
+    ``curve`` is the mean change of places 0, 1, ... ``APART`` apart while the camera moves, 1
+    where none is known; ``standstill`` the change below which a camera is at rest.
 
     :param places: places that there is room for.
     """
@@ -88,7 +88,7 @@ class ImageChange:
 
     def copy_statistics(self, learned: 'ImageChange', from_before: np.ndarray) -> None:
         """
-        Use what was learned from a sample of the map that these places are of.
+        Use the statistics of a sample of the map that these places are of.
 
         :param from_before: change of each place from the one before, (n,), float32.
         """
@@ -164,7 +164,7 @@ class ImageChange:
             self._last = strips
 
     def is_standstill(self, change: float) -> bool:
-        """Whether the query's images are equal up to noise: the camera stands, or it is dark."""
+        """Whether an image equals the one before up to noise: at rest, or in the dark."""
         return bool(change < self.standstill)
 
     def distinct(self, n: int) -> np.ndarray:
@@ -172,11 +172,11 @@ class ImageChange:
         distinct = ~self._equal[:n]
         return distinct if np.count_nonzero(distinct) >= LEAST_DISTINCT else np.ones(n, bool)
 
-    def stood(self) -> np.ndarray:
-        """Return the places where the map's camera stood, (places there is room for,), bool."""
-        stood = self._equal.copy()
-        stood[:-1] |= self._equal[1:]
-        return stood
+    def at_rest(self) -> np.ndarray:
+        """Return the places where the map's camera was at rest, ascending, (m,)."""
+        at_rest = self._equal.copy()
+        at_rest[:-1] |= self._equal[1:]
+        return np.flatnonzero(at_rest)
 
     def stretches(self, first: int, end: int) -> np.ndarray:
         """Return the number of the stretch of equal places that each is in, (end - first,)."""
@@ -191,8 +191,8 @@ class ImageChange:
     def speed_weights(self, change: float) -> np.ndarray:
         """Return the relative probability of each speed after another change, (V,)."""
         self._latest.append(change)
-        seen = np.log(sum(self._latest) / len(self._latest) + OFFSET)
-        off = (seen - self._expected[:, 0]) / self._settings.change_deviation
+        logarithm = np.log(sum(self._latest) / len(self._latest) + OFFSET)
+        off = (logarithm - self._expected[:, 0]) / self._settings.change_deviation
         return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
 
     def speed_likelihoods(self, change: float) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -13,6 +14,7 @@ from stavpr_ros.alignment.path import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
 
 NO_SHARES = np.empty(0)
+LEAST_SHARE = 1e-9  # of a place of the path; ratios to it are finite
 
 
 class Status(enum.IntEnum):
@@ -40,10 +42,52 @@ class Candidate:
 
     :param place: its index, the middle of the sequence that the window was matched with.
     :param distance: on the scale of :attr:`Match.distance`.
+    :param probability: NaN in mode paper.
     """
 
     place: int
     distance: float
+    probability: float = math.nan
+
+
+class WindowSequences(NamedTuple):
+    """
+    All sequences that a window was compared with.
+
+    :param costs: shape (n,); +inf where there is no sequence. Mode robust: 1 - probability.
+    :param places: the middle of each, shape (n,), int64.
+    :param probabilities: shape (n,); None in mode paper.
+    """
+
+    costs: np.ndarray = np.empty(0, np.float32)
+    places: np.ndarray = np.empty(0, np.int64)
+    probabilities: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WindowMatch:
+    """
+    The nearest sequence of a window, and all others.
+
+    :param nearest: with the second best; None where no sequence is possible.
+    :param path: its warping path, shape (m, 2), int32: position in the window, place.
+    :param probability: of the nearest sequence; NaN in mode paper.
+    :param shares: probability of each place of the path and its neighbors, given the sequence,
+        (m,); empty in mode paper.
+    :param sequences: returns all sequences; valid until the next match of the window.
+    """
+
+    nearest: SequenceMatch | None = None
+    path: np.ndarray = field(default_factory=lambda: NO_PATH)
+    sequences: Callable[[], WindowSequences] = WindowSequences
+    probability: float = math.nan
+    shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
+
+    def path_ratios(self, position: int) -> np.ndarray:
+        """Return the shares over that of the place of one image of the window, (m,)."""
+        if not len(self.shares):
+            return NO_SHARES
+        return self.shares / max(self.shares[position], LEAST_SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,30 +95,36 @@ class Match:
     """
     The result for one image; indices are 0-based places of the map.
 
-    The recognizer fills the fields up to ``window_changes``, the pipeline the others.
+    The recognizer fills the fields from ``threshold`` to ``window_changes``, the pipeline the
+    others.
 
     :param status: only ``MATCH`` names a place.
     :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.
-    :param threshold: a window is matched below it; NaN = not set.
-    :param sequence: the nearest sequence of the map, accepted or not; None where there is none.
+    :param threshold: a window is matched below this distance; mode robust: 1 - min_probability.
+        NaN = not set.
+    :param sequence: the nearest sequence of the map by the images alone, accepted or not; None =
+        there is none.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param relative: distances are those of mode robust, 1 - probability.
-    :param probability: that the nearest sequence is the right place; NaN = unknown (mode paper).
+    :param distance: of the nearest sequence, accepted or not; NaN without one. Mode paper: q_m of
+        LM-DTW, a mean image distance of this window alone. Mode robust: 1 - probability.
+    :param probability: that the nearest sequence is the right place; NaN in mode paper. It has
+        memory: successive values are correlated.
+    :param min_probability: mode robust: a window is matched above this probability.
     :param path_ratios: probability of each place of the path over that of the matched place, (m,);
         empty in mode paper.
     :param is_late: the place is that of the oldest image of the window instead of the middle one.
-    :param late: the match of the oldest image, where it had none as the middle one; None = it had,
-        or is not certain now either.
+    :param late: the match of the oldest image, if that image had none as the middle one; None = it
+        had one, or is still uncertain.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
-    :param window_changes: how much each of them differs from the image before it, 0 = equal; empty
-        in mode paper.
+    :param window_changes: difference of each of them from the image before it, 0 = equal; empty in
+        mode paper.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param inliers: of the geometric verification, -1 = not verified.
     :param candidates: nearest places, nearest first.
-    :param cause: why the image is in no window, two or three words to be counted; '' = it is in
+    :param cause: why the image is in no window, two or three words for statistics; '' = it is in
         one.
-    :param stages: seconds that each stage took.
-    :param image: the image, RGB, where it was decoded.
+    :param stages: duration of each stage, seconds.
+    :param image: the decoded image, RGB; None = not decoded.
     """
 
     status: Status
@@ -82,8 +132,9 @@ class Match:
     threshold: float = math.nan
     sequence: SequenceMatch | None = None
     path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
-    relative: bool = False
+    distance: float = math.nan
     probability: float = math.nan
+    min_probability: float = math.nan
     path_ratios: np.ndarray = field(default_factory=lambda: NO_SHARES, repr=False)
     is_late: bool = False
     late: 'Match | None' = field(default=None, repr=False)
@@ -117,16 +168,6 @@ class Match:
         return aligned_index(self.path, int(self.path[-1, 0])) if self.accepted else -1
 
     @property
-    def distance(self) -> float:
-        """
-        Distance of the nearest sequence, accepted or not; NaN without one.
-
-        In mode paper, q_m of LM-DTW: a mean image distance of this window alone. In mode robust
-        (``relative``), 1 - probability, which has memory: successive values are correlated.
-        """
-        return self.sequence.distance if self.sequence else math.nan
-
-    @property
     def path_probabilities(self) -> np.ndarray:
         """Return the probability of each place of the path, (m,); empty in mode paper."""
         return np.minimum(self.probability * self.path_ratios, 1)
@@ -139,28 +180,54 @@ class Match:
 
     @property
     def score(self) -> float:
-        """Return the distance; +inf without a sequence, or without any probability."""
-        if self.sequence is None or (self.relative and self.sequence.distance >= 1):
-            return math.inf
-        return self.sequence.distance
+        """Return the distance; +inf without a sequence, or with a probability of 0."""
+        impossible = self.distance >= 1 and not math.isnan(self.probability)
+        return math.inf if self.sequence is None or impossible else self.distance
+
+    def of_window(self, found: WindowMatch, position: int) -> 'Match':
+        """
+        Return the match of an image by a full window, accepted or not.
+
+        :param position: of the image in the window.
+        """
+        nearest = found.nearest
+        if nearest is None:
+            return replace(self, status=Status.NO_MATCH, reason='the map is empty')
+        return self._decided(
+            nearest.distance,
+            found.probability,
+            sequence=nearest,
+            path=found.path,
+            path_ratios=found.path_ratios(position),
+        )
 
     def with_probability(self, probability: float) -> 'Match':
         """Return the match of mode robust with another probability, accepted or not by it."""
-        if self.sequence is None:
-            return self
-        sequence = replace(self.sequence, distance=1 - probability)
-        accepted = sequence.distance < self.threshold
-        return replace(
-            self,
-            status=Status.MATCH if accepted else Status.NO_MATCH,
-            reason='' if accepted else improbable(probability, self.threshold),
-            sequence=sequence,
-            probability=1 - sequence.distance,
-        )
+        return self._decided(1 - probability, probability)
+
+    def _decided(self, distance: float, probability: float, **fields: Any) -> 'Match':
+        """Return the match, accepted by its probability or, in mode paper, by its distance."""
+        if math.isnan(probability):
+            accepted = distance < self.threshold
+            reason = (
+                f'nearest distance {distance:.4f} is not below the threshold {self.threshold:.4f}'
+            )
+        else:
+            accepted = probability > self.min_probability
+            reason = (
+                f'the probability of the best place, {probability:.3f}, is not above '
+                f'{self.min_probability:.3f}'
+            )
+        status = Status.MATCH if accepted else Status.NO_MATCH
+        fields |= {'status': status, 'reason': '' if accepted else reason}
+        return replace(self, distance=distance, probability=probability, **fields)
 
     def with_candidates(self, ranked: Sequence[Candidate]) -> 'Match':
         """Return the match with its ranked places; the first is the match itself."""
-        own = [replace(first, distance=self.distance) for first in ranked[:1]]
+        own = (
+            replace(first, distance=self.distance, probability=self.probability)
+            for first in ranked[:1]
+        )
         return replace(self, candidates=(*own, *ranked[1:]))
 
     @property
@@ -169,30 +236,22 @@ class Match:
         return self.image_index - len(self.window_stamps) + 1 if self.image_index >= 0 else -1
 
 
-def improbable(probability: float, threshold: float) -> str:
-    """Return the reason of mode robust for no match."""
-    return (
-        f'the probability of the best place, {probability:.3f}, is not above {1 - threshold:.3f}'
-    )
-
-
 def ranked_candidates(
-    nearest: SequenceMatch | None,
-    sequences: tuple[np.ndarray, np.ndarray],
+    nearest: Candidate | None,
+    sequences: WindowSequences,
     count: int,
     nms_radius: int,
     positions: Callable[[np.ndarray | int], np.ndarray] = np.asarray,
 ) -> list[Candidate]:
     """
-    Rank places by non-maximum suppression: around a place that is taken no other one is.
+    Rank places by non-maximum suppression: no candidate is close to one ranked before it.
 
     The first is the nearest sequence, the second its second best. O(count x n).
 
-    :param nearest: the nearest sequence as it was matched; None if there is none.
-    :param sequences: costs of all sequences, shape (n,), +inf where there is none, and their
-        places, shape (n,), whole numbers, in any order; of equal costs the first is taken.
+    :param nearest: the nearest sequence; None if there is none.
+    :param sequences: all sequences, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
-    :param nms_radius: candidates are more than so many places from each other.
+    :param nms_radius: candidates are more than this many places from each other.
     :param positions: of places, between which the distance is measured.
     :raises InputError: count below 0.
     """
@@ -200,31 +259,28 @@ def ranked_candidates(
         raise InputError(f'count = {count} candidates: expected at least 0')
     if nearest is None or not count:
         return []
-    costs, places = sequences[0].copy(), sequences[1]
-    at_position = positions(places)
-    found = [Candidate(nearest.middle, nearest.distance)]
+    costs, places, probabilities = sequences
+    costs, at_position = costs.copy(), positions(places)
+    found = [nearest]
     while len(found) < count and len(costs):
         costs[np.abs(at_position - positions(found[-1].place)) <= nms_radius] = np.inf
-        at = int(np.argmin(costs))
-        cost = float(costs[at])
-        if math.isinf(cost):
+        best = int(np.argmin(costs))
+        if math.isinf(costs[best]):
             break
-        found.append(Candidate(int(places[at]), cost))
+        probability = math.nan if probabilities is None else float(probabilities[best])
+        found.append(Candidate(int(places[best]), float(costs[best]), probability))
     return found
 
 
-def distinct_places(
-    distances: np.ndarray, places: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def distinct_places(sequences: WindowSequences, count: int) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the nearest distinct places, nearest first (the lowest index on a tie).
 
-    :param distances: of each sequence, shape (m,); +inf where there is none.
-    :param places: its middle, shape (m,).
-    :returns: places and distances, at most ``count`` of each.
+    :returns: places and costs, at most ``count`` of each.
     """
-    order = np.argsort(distances, kind='stable')
-    order = order[np.isfinite(distances[order])]
+    costs, places, _ = sequences
+    order = np.argsort(costs, kind='stable')
+    order = order[np.isfinite(costs[order])]
     _, first = np.unique(places[order], return_index=True)
     order = order[np.sort(first)[:count]]
-    return places[order].astype(np.int64), distances[order]
+    return places[order].astype(np.int64), costs[order]

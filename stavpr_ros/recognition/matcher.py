@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A matcher holds the features of a map on one backend and compares images with them."""
+"""Matchers: distances of images to all places of a map, whose features are on one backend."""
 
 from typing import Protocol
 
@@ -35,7 +35,7 @@ class Matcher(Protocol):
 
     def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
         """
-        Return the distances of Q images to every place, as :meth:`distances` but many at once.
+        Return the distances of Q images to every place, as :meth:`distances` of each.
 
         :param strips: shape (W, Q, d), float32.
         :param weights: shape (W, Q), float32.

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Places of a map that show what the place before them shows: the camera stood there."""
+"""Removes the places of a map at which the camera was at rest."""
 
 from dataclasses import replace
 
@@ -11,17 +11,16 @@ from stavpr_ros.recognition.blocks import blocks
 from stavpr_ros.recognition.robust import FilterSettings, MeanCentering
 from tqdm import tqdm
 
-MOVED = 0.1  # of the median step: a camera that moved farther did not stand
+MIN_MOTION = 0.1  # share of the median step; a camera that moved farther was not at rest
 
 
 def without_duplicates(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
     """
-    Return a map without the places at which the camera stood, but for the first of each stop.
+    Return a map with the first place of each stop of the camera only.
 
-    The camera stood where a place hardly differs from the last kept one of its session, in
+    The camera was at rest where a place hardly differs from the last kept one of its session, in
     relation to the mean change of neighbors, as the place filter decides it; and, where both have
-    poses, has hardly moved. Without poses, a drive through the dark is not distinguished from a
-    stop.
+    poses, hardly moved. Without poses, a drive through the dark is not distinguished from a stop.
 
     :param progress: show it on standard error.
     """
@@ -34,7 +33,7 @@ def without_duplicates(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
         if (
             _is_first(place_map, place)
             or change_between(strips, last) >= least
-            or _distance(place_map, kept, place) > MOVED * step
+            or _distance(place_map, kept, place) > MIN_MOTION * step
         ):
             last = strips
         else:
@@ -49,8 +48,8 @@ def _centered(place_map, text, progress):  # type: ignore[no-untyped-def]
     centering = MeanCentering(place_map.features)
     bar = tqdm(total=len(place_map), desc=text, unit='place', disable=None if progress else True)
     with bar:
-        for places, some in blocks(place_map.features):
-            strips = centering.places(some).strips.numpy()
+        for places, block in blocks(place_map.features):
+            strips = centering.places(block).strips.numpy()
             yield from zip(range(places.start, places.stop), strips.swapaxes(0, 1), strict=True)
             bar.update(places.stop - places.start)
 

@@ -1,11 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Relative motion: whether the way of the query, by odometry, fits its path on the map.
+Relative motion: whether the trajectory of the query, by odometry, fits its path on the map.
 
-Look-alike corridors are distinguished by where they turn. Only positions are compared, in the
-plane of x and y (z is up), relative to each other: the frames of odometry and map may differ, and
-so may the bodies whose poses they are.
+Look-alike corridors are distinguished by their turns. Only positions are compared, in the plane of
+x and y (z is up), relative to each other: the frames of odometry and map may differ, and so may
+the bodies whose poses they are.
 """
 
 from collections import deque
@@ -17,10 +17,10 @@ from scipy.special import chdtrc
 from stavpr_ros.recognition.match import Match
 
 ALONG = 0.5  # deviation of a matched place along the track, places
-TURNS = 2  # degrees of freedom of the shape of the way; its length has one
-UNUSUAL = 0.05  # of right paths, so many disagree more: from there on, probabilities are lowered
+TURNS = 2  # degrees of freedom of the shape of the trajectory; its length has one
+UNUSUAL = 0.05  # share of right paths that disagree more, below which probabilities are lowered
 LEAST_IMAGES = 3
-LONGEST = 5  # windows that the way is compared over
+LONGEST = 5  # windows of the trajectory that are compared
 FARTHEST = 5  # places from image to image
 LEAST_DOUBT = 1e-9  # no probability is 1
 Positions = Sequence[np.ndarray] | np.ndarray
@@ -28,35 +28,36 @@ Positions = Sequence[np.ndarray] | np.ndarray
 
 class RelativeMotion:
     """
-    Compares the way of a query with the paths of its matches.
+    Compares the trajectory of a query by odometry with the paths of its matches.
 
-    What disagreed once lasts: while matches continue each other, the way since the first of them
-    is compared, at most ``LONGEST`` windows, beside that of the window alone.
+    A disagreement stays in the test for ``LONGEST`` windows: while matches continue each other,
+    the trajectory since the first of them is compared beside that of the window.
 
     :param length: images in a window, l.
     :param error: see :func:`agreement`.
+    :param positions: x and y of the places that are not evicted, meters; NaN = unknown. Empty =
+        nothing is compared.
 
-    ``way`` takes x and y of each image by odometry, (2,), meters; NaN = unknown.
+    ``trajectory`` contains x and y of each image by odometry, (2,), meters; NaN = unknown.
     """
 
-    def __init__(self, length: int, error: float) -> None:
-        self._length, self._error = length, error
-        self.way: deque[np.ndarray] = deque(maxlen=LONGEST * length)
+    def __init__(self, length: int, error: float, positions: Positions) -> None:
+        self._length, self._error, self.positions = length, error, positions
+        self.trajectory: deque[np.ndarray] = deque(maxlen=LONGEST * length)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the query."""
-        self.way.clear()
+        """Drop the images of the query."""
+        self.trajectory.clear()
         self._followed, self._last = 0, 0  # matches that continued each other; place of the last
 
-    def compared(
-        self, match: Match, positions: Positions, first: int, session: tuple[int, int]
-    ) -> Match:
+    def weighed(self, match: Match, first: int, session: tuple[int, int]) -> Match:
         """
-        Return a match of mode robust, less probable if odometry disagrees with its path.
+        Return a match with a sequence, less probable if odometry disagrees with its path.
 
-        :param positions: x and y of the places held, meters; NaN = unknown.
-        :param first: the first of them.
+        The last position of the trajectory, that of the match's newest image, is known.
+
+        :param first: first place that is not evicted.
         :param session: first place of the match's session, and the first one behind it.
         """
         assert match.sequence is not None
@@ -64,14 +65,16 @@ class RelativeMotion:
         follows = match.accepted and 0 <= place - self._last <= FARTHEST
         self._followed = self._followed + 1 if follows else 0
         self._last = place
-        reach = FARTHEST * len(self.way) + 1  # places to either side that the way may lead along
-        low, high = max(session[0], place - reach), min(session[1], place + reach)
-        track = np.array(positions[low - first : high - first])
-        way, after = np.array(self.way), self._length - 1 - (self._length - 1) // 2
-        agreed = 1.0
-        for count in {self._length, min(len(way), self._length + self._followed)}:
+        reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
+        low = max(first, session[0], place - reach)
+        high = min(first + len(self.positions), session[1], place + reach)
+        track = np.array(self.positions[low - first : high - first])
+        trajectory = np.array(self.trajectory)
+        after, agreed = self._length - 1 - (self._length - 1) // 2, 1.0
+        for count in {self._length, min(len(trajectory), self._length + self._followed)}:
+            part = trajectory[-count:]
             found = agreement(
-                track, (place - low, newest - low), way[-count:], count - 1 - after, self._error
+                track, (place - low, newest - low), part, count - 1 - after, self._error
             )
             agreed = agreed if np.isnan(found) else min(agreed, found)
         return less_probable(match, agreed)
@@ -79,7 +82,7 @@ class RelativeMotion:
 
 def less_probable(match: Match, agreed: float) -> Match:
     """
-    Return a match whose way agrees so far with its path.
+    Return a match whose trajectory agrees with its path to a degree from 0 to 1.
 
     Agreement is no evidence: other places have a track of that shape as well.
     """
@@ -93,15 +96,15 @@ def less_probable(match: Match, agreed: float) -> Match:
 
 
 def agreement(
-    track: np.ndarray, places: tuple[int, int], way: np.ndarray, middle: int, error: float
+    track: np.ndarray, places: tuple[int, int], trajectory: np.ndarray, middle: int, error: float
 ) -> float:
     """
-    Return how often the way of a query on its right path would fit the map less than this one.
+    Return the share of queries on the right path whose trajectory would fit the map less.
 
-    From the middle image of the window on, the way by odometry is laid along the track. Two things
-    are compared: its shape, less one rotation and shift, and its length from the middle image to
-    the newest with that of the path. With the deviations sigma_i = hypot(``ALONG`` spacings,
-    ``error`` s_i) of an image s_i meters from the middle one, the sum
+    The trajectory by odometry is laid along the track, from the middle image of the window on. Two
+    properties are compared: its shape, less one rotation and shift, and its length from the middle
+    image to the newest with that of the path. With the deviations sigma_i = hypot(``ALONG``
+    spacings, ``error`` s_i) of an image s_i meters from the middle one, the sum
 
         chi^2 = 2 mean_i (|r_i| / sigma_i)^2 + (length - length of path)^2 / sigma^2
 
@@ -110,18 +113,18 @@ def agreement(
 
     :param track: positions of successive places, meters, (k, 2); NaN = unknown.
     :param places: rows of the track matched with the middle image and with the newest.
-    :param way: positions of successive images by odometry, meters, (m, 2); NaN = unknown.
-    :param middle: row of the middle image in ``way``.
+    :param trajectory: positions of successive images by odometry, meters, (m, 2); NaN = unknown.
+    :param middle: row of the middle image in ``trajectory``.
     :param error: of a distance by odometry, as a share of it.
     :returns: 0 to 1; NaN where too little is known.
     """
     at, lengths = _lengths(track)
-    images, driven = _lengths(way)
+    images, driven = _lengths(trajectory)
     ends = [np.flatnonzero(at == place) for place in places]
     own = np.flatnonzero(images == middle)
-    if not (own.size and images[-1] == len(way) - 1 and all(end.size for end in ends)):
+    if not (own.size and images[-1] == len(trajectory) - 1 and all(end.size for end in ends)):
         return float('nan')
-    if not lengths[-1] > 0:  # the map's camera stood
+    if not lengths[-1] > 0:  # the map's camera was at rest
         return float('nan')
     start, end = (float(lengths[found[0]]) for found in ends)
     driven = driven - driven[own[0]]
@@ -132,7 +135,7 @@ def agreement(
     if np.count_nonzero(inside) < LEAST_IMAGES:
         return float('nan')
     images, driven = images[inside], driven[inside]
-    mine = way[images] @ (1, 1j)
+    mine = trajectory[images] @ (1, 1j)
     theirs = np.interp(start + driven, lengths, track[at] @ (1, 1j))
     mine, theirs = mine - mine.mean(), theirs - theirs.mean()
     turn = np.vdot(mine, theirs)

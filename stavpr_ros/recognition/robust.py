@@ -27,13 +27,12 @@ import torch
 
 MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
-THRESHOLD = 1 - MIN_PROBABILITY  # of the distance, 1 less the probability
 PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most
 SAMPLE = 256  # places that whitening is learned from
 STRENGTH = 1.5  # of whitening: c in the gains of its directions
 LARGE = 0.97  # quantile of changes from place to place
-NOISE, SLOW = 0.02, 0.1  # shares of it: of a camera that stands at most, and creeps
+NOISE, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a slow one
 LEAST_DISTINCT = 5  # places: fewer have no meaningful mean and deviation
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
@@ -47,10 +46,10 @@ class RobustOptions:
         running mean of the query from the query's: the part shared by all images distinguishes no
         places.
     :param whitening: shrink the directions in which the map's places vary most
-        (:class:`Whitening`): what many places share distinguishes few of them.
+        (:class:`Whitening`): a direction that many places share distinguishes few of them.
     :param query_znorm: z-normalize the distances of an image to all places (:func:`z_normalized`):
-        some images are far from all.
-    :param place_filter: follow place and speed with a Bayes filter that knows of being off the
+        certain images are far from all places.
+    :param place_filter: follow place and speed with a Bayes filter with a state off the
         map (:mod:`stavpr_ros.recognition.place_filter`) instead of matching each window by LM-DTW,
         where one place may absorb a window.
     """
@@ -67,7 +66,7 @@ class RobustOptions:
 
     def without(self, *names: str) -> 'RobustOptions':
         """
-        Return these options with some switched off.
+        Return these options without those of certain names.
 
         :raises SettingsError: no option of that name.
         """
@@ -104,7 +103,7 @@ class FilterSettings:
         map do.
     :param most_change, least_change: limits of the change, over that of neighboring places, that
         alpha is multiplied by.
-    :param standstill: change, over that of neighboring places, below which the camera stands.
+    :param standstill: change, over that of neighboring places, below which the camera is at rest.
     :param keep_level: probability of keeping the level.
     :param keep_speed: probability of keeping the speed.
     :param spread: probability of one place more than the speed's, and of one less.
@@ -179,7 +178,7 @@ class Whitening:
 
     Shares are relative to their mean, weighted by themselves, so that c has the same meaning for
     all kinds of features. Whitening in full, c to infinity, would make noise of weak directions as
-    strong as the others: a map of one light does not show what other lights change.
+    strong as the others: a map of one light does not show the changes by other lights.
 
     :param directions: u_i, shape (W, rank, d), float32.
     :param gains: g_i, shape (W, rank), float64.
@@ -194,7 +193,7 @@ class Whitening:
 
     @staticmethod
     def learned(strips: torch.Tensor) -> 'Whitening':
-        """Learn from unit-norm features of some places, (W, m, d), m > 0."""
+        """Learn from unit-norm features of places, (W, m, d), m > 0."""
         with one_thread():  # so that the result does not depend on how many there are
             found = [_principal_directions(strip) for strip in strips]  # one by one: less memory
         directions, gains = zip(*found, strict=True)
@@ -239,12 +238,12 @@ class MeanCentering:
     """
     Subtracts the part of the features that all images of a traverse share, and whitens the rest.
 
-    Features have unit norm again afterwards; zero features stay zero. Where the camera stands, all
-    its images count as one: the others would be the same as its place once it is subtracted.
+    Features have unit norm again afterwards; zero features stay zero. All images of a camera at
+    rest count as one: the mean would become its place.
 
     :param features: those of the map, strips (W, n, d).
     :param centering, whitening: which of the two to apply.
-    :param statistics: what was learned from the features before, both applied; None = learn it.
+    :param statistics: learned from the features before, for both; None = learn them.
     """
 
     def __init__(
@@ -267,14 +266,14 @@ class MeanCentering:
     def _learn(self, features: LocalFeatures, whitening: bool) -> None:
         total = torch.zeros((len(features.weights), features.dimension), dtype=torch.float64)
         total = total.to(features.weights.device)
-        seen = PlaceChanges(len(features), 1)
-        for _, strips in converted_blocks(features, lambda some: some.strips):
-            seen.add(strips)
+        changes = PlaceChanges(len(features), 1)
+        for _, strips in converted_blocks(features, lambda block: block.strips):
+            changes.add(strips)
             total += strips.sum(dim=1)
-        weights = change_weights(seen.changes[0])
-        for places, some in blocks(features) if weights.min(initial=1) < 1 else ():
+        weights = change_weights(changes.changes[0])
+        for places, block in blocks(features) if weights.min(initial=1) < 1 else ():
             less = torch.from_numpy(1 - weights[places]).to(total.device)
-            total -= (some.strips * less[:, None]).sum(dim=1)
+            total -= (block.strips * less[:, None]).sum(dim=1)
         self.mean = (total / max(weights.sum(), 1)).float() * self._centering  # (W, d)
         if whitening and len(features):
             centered = self.places(features[evenly_weighted(weights, SAMPLE)]).strips
@@ -289,14 +288,14 @@ class MeanCentering:
     def places(
         self,
         features: LocalFeatures,
-        see: Callable[[torch.Tensor], None] = lambda strips: None,
+        visit: Callable[[torch.Tensor], None] = lambda strips: None,
     ) -> LocalFeatures:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
 
-        :param see: called with the strips of each block.
+        :param visit: called with the strips of each block.
         """
-        return converted(features, lambda strips: self._converted(strips, self.mean), see)
+        return converted(features, lambda strips: self._converted(strips, self.mean), visit)
 
     def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
         if strips.shape[1] == 1 and not strips.is_cuda:
@@ -383,7 +382,7 @@ def z_normalized(
 
 def change_weights(changes: np.ndarray) -> np.ndarray:
     """
-    Return how much each place counts, (n,): less where the camera stood or crept.
+    Return how much each place counts, (n,): less where the camera was at rest or slow.
 
     Nothing below a change from the place before of ``NOISE``, fully above ``SLOW`` of the large
     changes, and in proportion between; the largest, from one drive to another, do not matter.
@@ -398,7 +397,7 @@ def change_weights(changes: np.ndarray) -> np.ndarray:
     return weights
 
 
-# ------------------------------------------------ kernels: of one image, calls are what takes time
+# ------------------------------------------------ kernels of one image
 
 
 @reassociating_kernel

@@ -37,7 +37,7 @@ class RouteFeatures:
     Features of the places of a route, less their mean and whitened if that is wanted, unit norm.
 
     With the norm that a feature had before it was made unit norm, the features give back the
-    original ones: nothing is held twice.
+    original ones: nothing is in memory twice.
 
     :param settings: how the features are made.
     :param mean_centering: subtract the mean.
@@ -47,7 +47,7 @@ class RouteFeatures:
     :param device: a CUDA device where the features lie; None = on the CPU. Only the image's own
         are copied to it, and a sample is copied back when whitening is learned.
 
-    ``latest`` holds the features of the newest ``LATEST`` places, oldest first, (W, m, d), on the
+    ``latest`` are the features of the newest ``LATEST`` places, oldest first, (W, m, d), on the
     CPU; ``mean`` the mean that is subtracted, (W, d), float32, zeros without centering.
     """
 
@@ -234,8 +234,8 @@ class RouteFeatures:
         self._shift(first, self._whitened((self.mean - mean)[:, None])[:, 0])
         self.mean, self._since_mean = mean, 0
         if self._whitens and self.count <= SETTLED and not self._is_settled:
-            some = evenly_weighted(weights, SAMPLE)
-            whitening = Whitening.learned(unit_norm(self._centered(some)).cpu())
+            sample = evenly_weighted(weights, SAMPLE)
+            whitening = Whitening.learned(unit_norm(self._centered(sample)).cpu())
             there = copy(whitening).to(self._device)
             for low in range(0, self.count, AT_ONCE):
                 places = slice(low, min(low + AT_ONCE, self.count))

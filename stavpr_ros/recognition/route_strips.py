@@ -57,7 +57,7 @@ class DeviceInt8Route:
         return self.shape[0]
 
     def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> torch.Tensor:
-        """Return strips of some places, [:, places], float32, of unit norm again."""
+        """Return strips of places, [:, places], float32, of unit norm again."""
         return self.whole[index].float() * self.reciprocals[index][..., None]
 
     def write(self, first: int, strips: torch.Tensor) -> None:
@@ -105,9 +105,9 @@ def rounded_strips(strips: torch.Tensor, count: int, on_device: bool) -> RouteSt
     :param on_device: of the kind that kernels of a CUDA device take.
     """
     W, room, d = strips.shape
-    held: Int8Route | DeviceInt8Route = (
+    rounded: Int8Route | DeviceInt8Route = (
         DeviceInt8Route(W, room, d, strips.device) if on_device else Int8Route(W, room, d)
     )
     for low in range(0, count, PIECE):
-        held.write(low, strips[:, low : min(low + PIECE, count)].cpu().contiguous())
-    return held
+        rounded.write(low, strips[:, low : min(low + PIECE, count)].cpu().contiguous())
+    return rounded

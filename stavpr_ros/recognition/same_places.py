@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which places of a session show what an earlier session of the map shows: by recognition."""
+"""Relates places of a session to those of earlier sessions with the same view, by recognition."""
 
 from dataclasses import replace
 
@@ -41,8 +41,10 @@ def with_same_places(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
 
 
 def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) -> np.ndarray:
-    """Return the place of a reference that each of some images shows, -1 = none, (m,)."""
-    recognizer = PlaceRecognizer(reference, RecognizerSettings(1 - SURE, mode='robust'))
+    """Return the place of a reference that each image shows, -1 = none, (m,)."""
+    recognizer = PlaceRecognizer(
+        reference, RecognizerSettings(mode='robust', min_probability=SURE)
+    )
     found, near = (np.full(len(images), -1) for _ in range(2))
     for i, image in enumerate(images.tolist()):
         match = recognizer.update(place_map.features[image : image + 1])

@@ -1,29 +1,25 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Maps of several sessions in matching: no sequence runs from one session into another.
+Places in the columns of a window's rows: no sequence continues from one session into another.
 
-The searches see a row of columns instead of places: between two sessions lies a gap of columns
-whose distances are +inf. Where a place of one session shows what one of an earlier session shows
-(:attr:`stavpr_ros.mapping.PlaceMap.same_as`), the two are one position: their probabilities add
-up, and neither is the second best of the other.
+Between two sessions lies a gap of columns whose distances are +inf. A place of one session and the
+place of an earlier session with the same view (:attr:`stavpr_ros.mapping.PlaceMap.same_as`) are
+one position: their probabilities add up, and neither is the second best of the other.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.match import ranked_candidates
-from stavpr_ros.recognition.place_filter import Belief
+from stavpr_ros.recognition.filter_paths import Belief
+from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.window import ColumnLayout
 import torch
 
-Sequences = tuple[np.ndarray, np.ndarray]
 
-
-class SessionLayout:
+class SessionLayout(ColumnLayout):
     """
     Places of several sessions in columns with gaps between them.
 
@@ -42,32 +38,49 @@ class SessionLayout:
         self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         run = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=n))
         self.columns = np.arange(n) + run * self._gap
-        self.width = n + (len(firsts) - 1) * self._gap
-        self._places = np.repeat(np.arange(n), np.diff(self.columns, append=self.width))
+        self._width = n + (len(firsts) - 1) * self._gap
+        self._positions = np.repeat(np.arange(n), np.diff(self.columns, append=self._width))
+        self._places = self._positions  # of each column, as matches name them
         self._same_as = same_as
-        self._shared = np.arange(self.width)  # column where the position's probability is summed
+        self._shared = np.arange(self._width)  # column where the position's probability is summed
         self._shared[self.columns] = self.columns[same_as]
-        is_gap = np.ones(self.width, bool)
+        is_gap = np.ones(self._width, bool)
         is_gap[self.columns] = False
         self.gaps = np.flatnonzero(is_gap)
 
+    def width(self, places: int) -> int:
+        """See :meth:`ColumnLayout.width`."""
+        return self._width
+
     def spread(self, row: torch.Tensor) -> torch.Tensor:
-        """Return distances to places (n,) as those to columns, (width,)."""
-        out = torch.full((self.width,), torch.inf, dtype=row.dtype, device=row.device)
+        """See :meth:`ColumnLayout.spread`."""
+        out = torch.full((self._width,), torch.inf, dtype=row.dtype, device=row.device)
         out[torch.from_numpy(self.columns).to(row.device)] = row
         return out
 
+    def gathered(self, values: np.ndarray) -> np.ndarray:
+        """See :meth:`ColumnLayout.gathered`."""
+        return values[self.columns]
+
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """See :meth:`ColumnLayout.columns_of`."""
+        return self.columns[places]
+
     def positions_of(self, columns: np.ndarray) -> np.ndarray:
-        """Return the positions of columns among those of places; in a gap, the one before."""
-        return self.columns.searchsorted(columns, 'right') - 1
+        """See :meth:`ColumnLayout.positions_of`."""
+        return self._positions[columns]
+
+    def positions_from(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`ColumnLayout.positions_from`."""
+        return self.columns.searchsorted(columns)
 
     def first_column(self, column: int) -> int:
-        """Return the first column of a column's session."""
+        """See :meth:`ColumnLayout.first_column`."""
         firsts = self.columns[self.firsts]
         return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
 
     def session_of(self, place: int) -> tuple[int, int]:
-        """Return the first place of a place's session, and the first one behind it."""
+        """See :meth:`ColumnLayout.session_of`."""
         run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
         return int(run.start), int(run.stop)
 
@@ -79,23 +92,16 @@ class SessionLayout:
         :param close: columns to either side that count for a position, too.
         :returns: probability of each column's position, (width,).
         """
-        of_position = np.bincount(self._shared, weights, self.width)
+        of_position = np.bincount(self._shared, weights, self._width)
         sums = np.concatenate([np.zeros(close + 1), np.cumsum(of_position)])
         sums = np.concatenate([sums, np.full(close, sums[-1])])
         return np.minimum(sums[2 * close + 1 :] - sums[: -2 * close - 1], 1)[self._shared]
 
-    def shared(self, belief: Belief, close: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """
-        Let places of one position share their probability.
-
-        :param close: places to either side that count for a place, too.
-        :returns: columns whose probability is not 0, ascending, and their probabilities; among
-            them the most probable one: of the session that is most probable at the most probable
-            position.
-        """
-        weights, own = np.zeros(self.width), np.zeros(self.width)
+    def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """See :meth:`ColumnLayout.shared`."""
+        weights, own = np.zeros(self._width), np.zeros(self._width)
         weights[belief.places] = belief.weights
-        near, probabilities_near = belief.probabilities(self.width)
+        near, probabilities_near = belief.probabilities(self._width)
         own[near] = probabilities_near
         probabilities = self.summed(weights, close)
         best = int(np.argmax(probabilities))
@@ -106,42 +112,44 @@ class SessionLayout:
         return columns, probabilities[columns], int(np.searchsorted(columns, column))
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """Return positions: those at most nms_radius apart are neighbors in one session."""
+        """See :meth:`ColumnLayout.positions`."""
         return self.columns[self._same_as[places]]
 
-    def in_places(
-        self, nearest: SequenceMatch, path: np.ndarray, in_columns: Callable[[], Sequences]
-    ) -> tuple[SequenceMatch, np.ndarray, Callable[[], Sequences]]:
-        """Return the fields of a match whose columns have become places, with its second best."""
+    def in_places(self, found: WindowMatch) -> WindowMatch:
+        """See :meth:`ColumnLayout.in_places`."""
 
-        def sequences() -> Sequences:
-            costs, columns = in_columns()
-            return costs, self._places[columns]
+        def sequences() -> WindowSequences:
+            return in_columns._replace(places=self._places[in_columns.places])
 
-        path = path.copy()
-        path[:, 1] = self._places[path[:, 1]]
-        nearest = replace(
-            nearest,
-            first=int(self._places[nearest.first]),
-            last=int(self._places[nearest.last]),
-            middle=int(self._places[nearest.middle]),
+        if found.nearest is None:
+            return found
+        in_columns = found.sequences()
+        first, last, middle = (
+            int(self._places[column])
+            for column in (found.nearest.first, found.nearest.last, found.nearest.middle)
         )
-        second = ranked_candidates(nearest, sequences(), 2, self._radius, self.positions)[1:]
+        best = Candidate(middle, found.nearest.distance)
+        second = ranked_candidates(best, sequences(), 2, self._radius, self.positions)[1:]
         nearest = replace(
-            nearest,
+            found.nearest,
+            first=first,
+            last=last,
+            middle=middle,
             second_best_index=second[0].place if second else -1,
             second_best_distance=second[0].distance if second else float('nan'),
         )
-        return nearest, path, sequences
+        path = found.path.copy()
+        path[:, 1] = self._places[path[:, 1]]
+        return replace(found, nearest=nearest, path=path, sequences=sequences)
 
 
-def layout_of(place_map: PlaceMap, nms_radius: int) -> SessionLayout | None:
-    """Return the layout of a map of several sessions, None of one session."""
+def layout_of(place_map: PlaceMap, nms_radius: int) -> ColumnLayout:
+    """Return the layout of a map."""
     if place_map.session_index is None or not len(place_map):
-        return None
+        return ColumnLayout()
     firsts = np.flatnonzero(np.diff(place_map.session_index, prepend=-1))
     if len(firsts) == 1:
-        return None
+        return ColumnLayout()
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(len(place_map))

@@ -7,7 +7,7 @@ import math
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.recognition.robust import options_of, RobustOptions
+from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of, RobustOptions
 
 
 @dataclass(frozen=True)
@@ -15,10 +15,11 @@ class RecognizerSettings:
     """
     Settings of the recognizer.
 
-    :param threshold: a window is matched when its distance is below it; > 0.
+    :param threshold: mode paper: a window is matched when its distance is below it; > 0. None =
+        not set, nothing is matched. Mode robust has ``min_probability`` instead.
     :param spatial: how two images are compared.
     :param sequence: how a window is matched.
-    :param nms_radius: the second best's midpoint is more than so many places from the nearest
+    :param nms_radius: the second best's midpoint is more than this many places from the nearest
         one's.
     :param mode: ``paper``, or ``robust``, with all options of
         :class:`stavpr_ros.recognition.robust.RobustOptions`.
@@ -29,9 +30,11 @@ class RecognizerSettings:
     :param time_budget_ms: of :class:`PlaceRecognizer`, for an image; maps whose exact matching
         takes longer get a first stage (:mod:`stavpr_ros.recognition.first_stage`). 0 = always
         exact.
+    :param min_probability: mode robust: a window is matched when its probability is above it;
+        above 0, below 1.
     """
 
-    threshold: float
+    threshold: float | None = None
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = 20
@@ -39,11 +42,17 @@ class RecognizerSettings:
     robust_options: RobustOptions | None = None
     odometry_error: float = 0.1
     time_budget_ms: float = 0.0
+    min_probability: float = MIN_PROBABILITY
 
     def __post_init__(self) -> None:
-        if not self.threshold > 0 or math.isnan(self.threshold):
+        options_of(self.mode)  # rejects an unknown mode
+        if self.threshold is not None and not self.threshold > 0:
             raise SettingsError(
                 f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
+            )
+        if not 0 < self.min_probability < 1:
+            raise SettingsError(
+                f'min_probability = {self.min_probability} must be above 0 and below 1'
             )
         if self.nms_radius < 0:
             raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
@@ -51,19 +60,10 @@ class RecognizerSettings:
             raise SettingsError(
                 f'odometry_error = {self.odometry_error} must be a share of the distance, 0 to 1'
             )
-        if (
-            options_of(self.mode).place_filter
-            and self.robust_options is None
-            and self.threshold > 1
-        ):
-            raise SettingsError(
-                f'threshold = {self.threshold}: distances of mode robust end at 1, '
-                'where no probability is left'
-            )
         if not 0 <= self.time_budget_ms < math.inf:
             raise SettingsError(f'time_budget_ms = {self.time_budget_ms} must be at least 0')
         with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
-        if self.time_budget_ms and not (self.applied_options.place_filter and with_dtw):
+        if self.time_budget_ms and not (self.has_probability and with_dtw):
             raise SettingsError(
                 f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
                 'strategy adaptive or vanilla, without vertical alignment; take 0'
@@ -73,3 +73,18 @@ class RecognizerSettings:
     def applied_options(self) -> RobustOptions:
         """Return the options that are applied."""
         return options_of(self.mode) if self.robust_options is None else self.robust_options
+
+    @property
+    def has_probability(self) -> bool:
+        """Whether matches have a probability: their distance is 1 - probability then."""
+        return self.applied_options.place_filter
+
+    @property
+    def applied_threshold(self) -> float | None:
+        """Return the distance below which a window is matched; None = not set."""
+        return 1 - self.min_probability if self.has_probability else self.threshold
+
+    @property
+    def compares_odometry(self) -> bool:
+        """Whether odometry is compared with the paths of matches, where places have poses."""
+        return self.has_probability and self.odometry_error > 0

@@ -4,7 +4,7 @@
 Geometric verification: whether two images show the same scene from two viewpoints.
 
 Keypoints of both are matched, and the matches counted that one epipolar geometry explains. A wrong
-place that looks alike has matches as well, but few that one geometry explains.
+place that looks alike has matches as well; one geometry explains few of them.
 """
 
 from collections import OrderedDict
@@ -21,14 +21,14 @@ METHODS = ('orb', 'sift')
 LEAST_MATCHES = 8  # a fundamental matrix fits any seven
 ITERATIONS = 2000
 CONFIDENCE = 0.999
-LOWEST = 32  # rows of an image below which keypoints have no room, and some detectors fail
+LOWEST = 32  # rows of an image below which keypoints have no room, and certain detectors fail
 TALLEST = 4  # an image is brought to at most so many times its width
 IMPROBABLE, CERTAIN = 0.1, 0.99  # probabilities between which a match is checked
 EACH = 10  # of so many certain matches one is checked
 WRONG_PASSED = 0.1  # share of wrong pairs that pass: doubtful ones look alike
 PRIOR_PASSED, PRIOR_CHECKED = 1.0, 4.0  # right pairs before the first is checked
 LEAST_PASSED = 0.3  # r of a pair that has passed: right pairs do pass on this drive
-CACHED = 256  # places whose keypoints are kept, some 40 kB each
+CACHED = 256  # places whose keypoints are kept, about 40 kB each
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class GeometricVerifier:
     def query_keypoints(self, query: np.ndarray) -> Keypoints:
         """Return the keypoints of an image, RGB (h, w, 3) uint8; those of the last are kept."""
         gray = self._small_gray(query, 'query')
-        # compared by what it shows: a caller may use the memory of an image again for the next
+        # compared by content: a caller may use the memory of an image again for the next
         if self._query is None or not np.array_equal(self._query[0], gray):
             self._query = gray, self._detected(gray)
         return self._query[1]

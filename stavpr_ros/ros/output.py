@@ -153,7 +153,7 @@ def candidates_message(
             PlaceCandidate(
                 place_index=candidate.place,
                 distance=candidate.distance,
-                probability=1 - candidate.distance if match.relative else math.nan,
+                probability=candidate.probability,
                 place_stamp=time_message(place.stamp),
                 place_id=place.identifier,
                 session=place.session,

@@ -187,8 +187,7 @@ class Visualization:
         if places is not None:
             best = [] if not match.accepted else [(match.newest_index, match.probability, 0.8)]
             for place, probability, size in best + [
-                (each.place, 1 - each.distance if match.relative else math.nan, 0.4)
-                for each in match.candidates
+                (each.place, each.probability, 0.4) for each in match.candidates
             ]:
                 if (pose := places.place(place).pose) is not None:
                     ball = add(Marker.SPHERE, color=color(probability))
@@ -200,7 +199,7 @@ class Visualization:
                 text.pose.position.z += 1.0
                 text.scale.z = 0.6
                 text.text = f'place {match.newest_index}'
-                if match.relative:
+                if not math.isnan(match.probability):
                     text.text += f', p {match.probability:.2f}'
         return MarkerArray(markers=markers)
 

@@ -11,7 +11,7 @@ import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
-from stavpr_ros.recognition import held_map
+from stavpr_ros.recognition import prepared_map
 from stavpr_ros.sources.frame import Frame
 
 VERSION2 = Path(__file__).parents[1] / 'data' / 'version2'
@@ -43,9 +43,9 @@ def example_files(folder: Path) -> list[bytes]:
     """Return the content of map files of both storages, with and without a projection."""
     save_map(example_map(), folder / 'float32')
     projected = example_map(projection=16)
-    with patch.object(held_map, 'LEAST_PLACES', 1):
-        statistics = held_map.statistics_of_map(projected, 'float16')
+    with patch.object(prepared_map, 'LEAST_PLACES', 1):
+        statistics = prepared_map.statistics_of_map(projected, 'float16')
         assert statistics is not None
-        statistics = held_map.with_codes(statistics, projected, 'float16')
+        statistics = prepared_map.with_codes(statistics, projected, 'float16')
     save_map(projected, folder / 'projected', 'float16', statistics=statistics)
     return [(folder / name).read_bytes() for name in ('float32', 'projected')]

@@ -3,7 +3,7 @@
 """Evaluation of the matches that a node published for one traverse, as ``record`` wrote them."""
 
 from dataclasses import dataclass
-from math import isnan, nan
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -84,7 +84,7 @@ def match_of(record: dict[str, Any]) -> Match:
         Status[record['status']],
         sequence=sequence,
         path=path,
-        relative=not isnan(probability),
+        distance=nan if record['distance'] is None else record['distance'],
         probability=probability,
         path_ratios=of_path / max(probability, 1e-9) if of_path.size else of_path,
     )

@@ -16,7 +16,7 @@ import numpy as np
 from stavpr_ros.alignment.cuda.compilation import kernel
 
 BLOCK = 128  # threads of one block
-BORN = 9  # as in recognition.place_filter
+ENTERED = 9  # as in recognition.filter_paths
 
 ZERO, ONE, TWO, HALF = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
 LEAST, MOST, GAP = np.float32(-87), np.float32(80), np.float32(-1e30)
@@ -77,7 +77,7 @@ def move(K: int, V: int) -> Any:
     - ``levels``: mean z of right places, (K,).
     - ``weight``, ``spread``, ``stay``: alpha, probability of one place more or less, of staying on
       the map.
-    - ``births``: (K,).
+    - ``entering``: (K,).
     - ``states``: (K V, room), written.
     - ``origins``: of this image, (K (V + 1) // 2, room), uint8, written.
     - ``sums``: (2 K, room + reach), written: of a place's states of each level, and of what
@@ -86,7 +86,7 @@ def move(K: int, V: int) -> Any:
     halves = (V + 1) // 2
 
     def move_states(
-        n, mixed, codes, z, steps, levels, weight, spread, stay, births, states, origins, sums
+        n, mixed, codes, z, steps, levels, weight, spread, stay, entering, states, origins, sums
     ):
         y = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
         if y >= sums.shape[1]:
@@ -110,10 +110,10 @@ def move(K: int, V: int) -> Any:
                     lost += arrived
                     if y < n:
                         states[row, y] = ZERO
-                        origins[k * halves + v // 2, y] = uint8(BORN | BORN << 4)
+                        origins[k * halves + v // 2, y] = uint8(ENTERED | ENTERED << 4)
                     continue
                 arrived *= stay
-                state = (arrived + births[k]) * likelihood
+                state = (arrived + entering[k]) * likelihood
                 states[row, y] = state
                 total += state
                 code, origin = int32(0), at
@@ -122,8 +122,8 @@ def move(K: int, V: int) -> Any:
                     most, code, origin = faster, int32(3), at - 1
                 if most < slower:
                     code, origin = int32(6), slow
-                if not births[k] < arrived:
-                    code = int32(BORN)
+                if not entering[k] < arrived:
+                    code = int32(ENTERED)
                 else:
                     code += int32(codes[row, origin])
                 packed = packed | code << 4 if v % 2 else code
@@ -161,10 +161,10 @@ def trace(K: int, V: int) -> Any:
         on = True
         for image in range(length):
             slot = (newest - image + length) % length
-            origin = BORN
+            origin = ENTERED
             if on:
                 origin = (origins[slot, k * halves + v // 2, y] >> (v % 2 * 4)) & 15
-            if origin == BORN:
+            if origin == ENTERED:
                 on = False
                 paths[image + 1, i] = -1
                 continue

@@ -1,9 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A map as it is recognized: its features as a matcher holds them, and what is learned from them.
+Maps prepared for recognition: features of the matcher, and statistics learned from them.
 
-What is learned takes several passes over the features. It is kept in the file of a large map.
+Learning takes several passes over the features; the statistics of a large map are in its file.
 """
 
 from dataclasses import dataclass, replace
@@ -29,15 +29,15 @@ import torch
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
-LEAST_PLACES = 1000  # of a map whose statistics are kept: they take the room of some 70 places
+LEAST_PLACES = 1000  # of a map whose statistics are kept: as long as those of 70 places
 
 
 @dataclass(frozen=True, eq=False)
-class HeldMap:
+class PreparedMap:
     """
-    What a recognizer takes from a map.
+    A map, prepared for a recognizer.
 
-    :param features: as the matcher holds them, in memory once.
+    :param features: for the matcher, in memory once.
     :param centering: learned from them; None without.
     :param changes: see :attr:`stavpr_ros.mapping.map_statistics.MapStatistics.changes`.
     :param note: why statistics in the map's file are not used, for the log; empty = they are, or
@@ -50,7 +50,7 @@ class HeldMap:
     note: str = ''
 
 
-def hold(features: LocalFeatures, options: RobustOptions, precision: str) -> HeldMap:
+def prepare_map(features: LocalFeatures, options: RobustOptions, precision: str) -> PreparedMap:
     """
     Read and convert the features of a map.
 
@@ -62,18 +62,19 @@ def hold(features: LocalFeatures, options: RobustOptions, precision: str) -> Hel
     if options.mean_centering or options.whitening:
         centering = MeanCentering(features, options.mean_centering, options.whitening, statistics)
     learns = options.place_filter and statistics is None
-    seen = PlaceChanges(len(features) if learns else 0, APART)
-    held: LocalFeatures | Int8Features
+    changes = PlaceChanges(len(features) if learns else 0, APART)
+    prepared: LocalFeatures | Int8Features
     if (
         statistics is not None
         and precision == 'int8'
         and isinstance(features, StoredFeatures)
         and features.has_codes
     ):
-        held = _of_codes(features)
+        prepared = _of_codes(features)
     else:
-        held = _held(features, centering, precision, seen)
-    return HeldMap(held, centering, statistics.changes if statistics else seen.changes, note)
+        prepared = _converted(features, centering, precision, changes)
+    learned = statistics.changes if statistics else changes.changes
+    return PreparedMap(prepared, centering, learned, note)
 
 
 def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
@@ -88,17 +89,18 @@ def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
     return None, f'the statistics in {path} {why}: learned again; map compact renews them'
 
 
-def _held(
-    features: LocalFeatures, centering: MeanCentering | None, precision: str, seen: PlaceChanges
+def _converted(
+    features: LocalFeatures, centering: MeanCentering | None, precision: str, changes: PlaceChanges
 ) -> LocalFeatures | Int8Features:
-    """Return the features for the matcher; those of a map are not copied."""
+    """Return the features for the matcher, and add them to the changes; a map's are not copied."""
     if precision == 'int8':
-        return rounded(features, centering.places if centering else lambda some: some, seen.add)
+        convert = centering.places if centering else lambda block: block
+        return rounded(features, convert, changes.add)
     if centering is not None:
-        return centering.places(features, seen.add)
-    held = features[:]
-    seen.add(held.strips)
-    return held
+        return centering.places(features, changes.add)
+    whole = features[:]
+    changes.add(whole.strips)
+    return whole
 
 
 def _of_codes(features: StoredFeatures) -> Int8Features:
@@ -118,7 +120,7 @@ def _of_codes(features: StoredFeatures) -> Int8Features:
 
 
 def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> MapStatistics:
-    """Add the features as precision int8 holds them; see :func:`statistics_of_map`."""
+    """Add the features, rounded for precision int8; see :func:`statistics_of_map`."""
     features = _AsStored(place_map.features, storage)
     centering = MeanCentering(features, statistics=statistics)
     return replace(statistics, codes=rounded(features, centering.places).strips.rounded().numpy())
@@ -126,7 +128,7 @@ def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> 
 
 def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:
     """
-    Learn from a map what :func:`stavpr_ros.mapping.save_map` keeps in its file.
+    Learn the statistics of a map that :func:`stavpr_ros.mapping.save_map` writes.
 
     :param storage: of the features in the file; '' = as :func:`stavpr_ros.mapping.save_map` does.
     :returns: None for a small map, whose file they would lengthen much.
@@ -140,9 +142,9 @@ def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics |
         if not note:
             return known
     features = _AsStored(features, storage or stored)
-    centering, seen = MeanCentering(features), PlaceChanges(len(features), APART)
-    for _, some in converted_blocks(features, lambda some: centering.places(some).strips):
-        seen.add(some)
+    centering, changes = MeanCentering(features), PlaceChanges(len(features), APART)
+    for _, strips in converted_blocks(features, lambda block: centering.places(block).strips):
+        changes.add(strips)
     assert centering.whitening is not None
     whitening = centering.whitening
     return MapStatistics(
@@ -150,7 +152,7 @@ def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics |
         centering.mean.numpy(),
         whitening.directions.numpy(),
         whitening.gains.numpy(),
-        seen.changes,
+        changes.changes,
     )
 
 
@@ -174,8 +176,8 @@ class _AsStored(LocalFeatures):
         return len(self.whole)
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
-        some = self.whole[images]
-        return replace(some, strips=some.strips.cpu().to(self.dtype).float())
+        block = self.whole[images]
+        return replace(block, strips=block.strips.cpu().to(self.dtype).float())
 
     @property
     def dimension(self) -> int:

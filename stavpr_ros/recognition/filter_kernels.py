@@ -1,0 +1,274 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The place filter on the CPU: level, speed and place of all states change with an image.
+
+The memory is that of :mod:`stavpr_ros.recognition.place_filter`. For each block of a part,
+``_mix`` lets level and speed of its states and of the ``reach`` columns before it change, where
+reach is more than the largest step and one place; ``_move`` moves them on and weighs them by the
+image::
+
+    mixed    (K, V, reach + BLOCK)  |<-- reach -->|<--------- BLOCK -------->|
+    states   (K, V, BLOCK)              |--- step -->|   one place more or less
+
+The origin of a state in speed is kept in the lowest two bits of its mixed probability, which are
+below the precision of all results.
+"""
+
+import numba as nb
+import numpy as np
+from stavpr_ros.alignment.cpu.simd import (
+    bits,
+    from_bits,
+    LANES,
+    load,
+    load_bytes,
+    load_splat,
+    prefetch,
+    select,
+    splat,
+    store,
+    store_bytes,
+)
+from stavpr_ros.compilation import kernel, parallel_kernel
+from stavpr_ros.recognition.filter_paths import BLOCK, ENTERED
+
+F, INT = np.float32, np.int32
+PLACES = 2048  # of a part; a multiple of BLOCK
+LEAST, MOST = -87.0, 80.0  # exponents whose powers are finite float32 numbers
+NEAR_INFINITY = -1e30  # z below it is of a gap
+LINE = 16  # numbers of a cache line
+
+
+@kernel
+def exp(x):
+    """Return e^x, within 2e-7 relative; 0 below LEAST, e^MOST above MOST."""
+    kept = select(splat(F(LEAST)) < x, x, splat(F(LEAST)))
+    kept = select(kept < splat(F(MOST)), kept, splat(F(MOST)))
+    magic = splat(F(12582912))  # 1.5 * 2^23: adding it rounds to whole numbers
+    shifted = kept * splat(F(1.44269504)) + magic
+    whole = shifted - magic
+    rest = kept - whole * splat(F(0.693359375)) - whole * splat(F(-2.12194440e-4))
+    power = splat(F(1.9875691500e-4))
+    power = power * rest + splat(F(1.3981999507e-3))
+    power = power * rest + splat(F(8.3334519073e-3))
+    power = power * rest + splat(F(4.1665795894e-2))
+    power = power * rest + splat(F(1.6666665459e-1))
+    power = power * rest + splat(F(5.0000001201e-1))
+    power = power * rest * rest + rest + splat(F(1))
+    found = from_bits(bits(power) + (bits(shifted) << splat(INT(23))))
+    return select(x < splat(F(LEAST)), splat(F(0)), found)
+
+
+@kernel
+def _likelihoods(z, first, count, weight, mu, likely):
+    """Write the likelihood of each level and place, (K, BLOCK); 0 from ``count`` on."""
+    K = len(mu)
+    flat = likely.reshape(-1)
+    if weight == 0:
+        likely[:] = 1
+    else:
+        likely[0, :count] = z[first : first + count]
+        likely[0, count:] = 0
+        factor = splat(weight)
+        for x in range(0, BLOCK, LANES):
+            distance = load(flat, x)
+            for k in range(K):
+                level = load_splat(mu, k)
+                off = level * distance - level * level * splat(F(0.5))
+                likelihood = exp(factor * off)
+                gap = distance < splat(F(NEAR_INFINITY))
+                store(flat, k * BLOCK + x, select(gap, splat(F(1)), likelihood))
+    likely[:, count:] = 0
+
+
+@kernel
+def _mix(source, at, pitch, count, levels, speeds, b, mixed, to, width, sums):
+    """
+    Let level and speed change, for ``count`` neighboring places, whole vectors.
+
+    :param source, at, pitch: flat states; level j, speed v begin at + (j V + v) pitch.
+    :param levels: factor by the level before and after, (K, K), neighbors only.
+    :param speeds: factors of the speed to stay, of the one below, of the one above, after any, and
+        of any before, flat (5, V).
+    :param b: (V + 1) LANES, scratch, zero at the end.
+    :param mixed: flat, (K, V, width), written from column ``to`` on.
+    :param sums: K LANES; sums after the change of level are added.
+    """
+    K = len(levels)
+    V = len(b) // LANES - 1
+    changes = levels.reshape(-1)
+    mask = splat(INT(-4))
+    for x in range(0, count, LANES):
+        for k in range(K):
+            lower, upper = max(k - 1, 0), min(k + 1, K - 1)
+            # at the ends, a missing neighbor is the level itself, with the factor 0
+            from_lower = load_splat(changes, lower * K + k) if k else splat(F(0))
+            from_upper = load_splat(changes, upper * K + k) if k + 1 < K else splat(F(0))
+            from_same = load_splat(changes, k * K + k)
+            at_lower, at_same = at + lower * V * pitch + x, at + k * V * pitch + x
+            at_upper = at + upper * V * pitch + x
+            anywhere = total = splat(F(0))
+            for v in range(V):
+                state = from_lower * load(source, at_lower + v * pitch)
+                state = state + from_same * load(source, at_same + v * pitch)
+                state = state + from_upper * load(source, at_upper + v * pitch)
+                store(b, v * LANES, state)
+                anywhere = anywhere + state * load_splat(speeds, 4 * V + v)
+                total = total + state
+            store(sums, k * LANES, load(sums, k * LANES) + total)
+            below, current = splat(F(0)), load(b, 0)
+            for v in range(V):
+                above = load(b, (v + 1) * LANES)
+                same = current * load_splat(speeds, v)
+                slower = below * load_splat(speeds, V + v)
+                faster = above * load_splat(speeds, 2 * V + v)
+                target = (same + slower) + (faster + anywhere * load_splat(speeds, 3 * V + v))
+                from_below = same < slower
+                code = select(from_below, splat(INT(1)), splat(INT(0)))
+                code = select(select(from_below, slower, same) < faster, splat(INT(2)), code)
+                store(mixed, (k * V + v) * width + to + x, from_bits((bits(target) & mask) | code))
+                below, current = current, above
+
+
+@kernel
+def _move(
+    mixed, at, slow, count, spread, stay_on, entering, likely, likely_at, a, to, origins,
+    to_origin, half, places,
+):  # fmt: skip
+    """
+    Move the states of one level and speed on, and weigh them by the image; see advance.
+
+    :param mixed, at: flat; the states that move on by the step itself begin there.
+    :param slow: 1 where states may move on by one place less; 0 where the step is 0.
+    :param entering: probability of each state to come from off the map.
+    :param half: of the origins' bytes that is written; 0, the lower one, comes first.
+    :param places: (BLOCK,), to which the states are added.
+    :returns: sums of the states, by lane.
+    """
+    total = splat(F(0))
+    center, aside = splat(F(1) - F(2) * spread), splat(spread)
+    staying, entered = splat(stay_on), splat(entering)
+    three, six, nine = splat(INT(3)), splat(INT(6)), splat(INT(ENTERED))
+    low = splat(INT(3))
+    for x in range(0, count, LANES):
+        straight_from = load(mixed, at + x)
+        faster_from = load(mixed, at + x - 1)
+        slower_from = load(mixed, at + x + slow)
+        straight = center * straight_from
+        faster, slower = aside * faster_from, aside * slower_from
+        arrived = (straight + faster + slower) * staying
+        state = (arrived + entered) * load(likely, likely_at + x)
+        store(a, to + x, state)
+        store(places, x, load(places, x) + state)
+        total = total + state
+        fast = straight < faster
+        most = select(fast, faster, straight)
+        code = select(fast, (bits(faster_from) & low) + three, bits(straight_from) & low)
+        code = select(most < slower, (bits(slower_from) & low) + six, code)
+        code = select(entered < arrived, code, nine)
+        if half:
+            code = (code << splat(INT(4))) | load_bytes(origins, to_origin + x)
+        store_bytes(origins, to_origin + x, code)
+    return total
+
+
+@kernel
+def _lost(row, step, spread):
+    """Return the loss of a row, which ends with the map, over the end of the map."""
+    end = len(row)
+    slow = step - 1 if step > 0 else 0
+    total = (F(1) - F(2) * spread) * row[end - step :].sum()
+    return total + spread * (row[end - step - 1 :].sum() + row[end - slow :].sum())
+
+
+@kernel
+def _sum_of_lanes(values, at):
+    total = 0.0
+    for lane in range(LANES):
+        total += values[at + lane]
+    return total
+
+
+@kernel
+def _scratch(size):
+    """Return zeros, (size,), that begin with a cache line."""
+    memory = np.zeros(size + LINE, np.float32)
+    first = -memory.ctypes.data % (LINE * memory.itemsize) // memory.itemsize
+    return memory[first : first + size]
+
+
+@parallel_kernel
+def advance(
+    a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, entering, halos, origins, totals,
+    by_place, maxima,
+):  # fmt: skip
+    """
+    Advance all states by one image.
+
+    :param a: states, (blocks, K, V, BLOCK), read and written; 0 from place n on.
+    :param n: places, at least 1.
+    :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level.
+    :param levels, speeds: see :func:`_mix`.
+    :param steps: places that each speed moves on, (V,).
+    :param spread: probability of one place more, and of one less, never back.
+    :param stay_on: probability of staying on the map.
+    :param entering: probability of each state of a level to come from off the map, (K,).
+    :param halos: (parts, K, V, reach), scratch; zeros in the first. Reach is of whole vectors.
+    :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written.
+    :param totals: (blocks, K, 3), written: sums before the motion, of the states that moved over
+        the end of the map, and with the image.
+    :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
+        block, (blocks,); written.
+    """
+    _, K, V, _ = a.shape
+    reach, halves, parts = halos.shape[3], origins.shape[2], (n + PLACES - 1) // PLACES
+    width, size = reach + BLOCK, K * V * BLOCK
+    states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
+    for part in range(1, parts):  # too little work to share
+        for row in range(K * V):
+            before = ((part * PLACES // BLOCK - 1) * K * V + row + 1) * BLOCK - reach
+            for x in range(0, reach, LANES):
+                store(flat_halos, (part * K * V + row) * reach + x, load(states, before + x))
+    for part in nb.prange(parts):
+        mixed, places = _scratch(K * V * width), _scratch(BLOCK)
+        likely, b = _scratch(K * BLOCK).reshape(K, BLOCK), _scratch((V + 1) * LANES)
+        sums, lanes = _scratch(K * LANES), np.empty(LANES, np.float32)
+        blocks = (min(n - part * PLACES, PLACES) + BLOCK - 1) // BLOCK
+        for block in range(blocks - 1, -1, -1):
+            first = part * PLACES + block * BLOCK
+            count, at = min(BLOCK, n - first), first // BLOCK
+            whole = (count + LANES - 1) // LANES * LANES
+            _likelihoods(z, first, count, weight, mu, likely)
+            if block:
+                before = (at - 1) * size + BLOCK - reach
+                _mix(states, before, BLOCK, reach, levels, speeds, b, mixed, 0, width, sums)
+            else:
+                _mix(
+                    flat_halos, part * K * V * reach, reach, reach, levels, speeds, b, mixed, 0,
+                    width, sums,
+                )  # fmt: skip
+            sums[:] = 0
+            _mix(states, at * size, BLOCK, whole, levels, speeds, b, mixed, reach, width, sums)
+            places[:] = 0
+            for k in range(K):
+                totals[at, k, 0], totals[at, k, 1] = _sum_of_lanes(sums, k * LANES), 0
+                total = splat(F(0))
+                for v in range(V):
+                    row, step = (k * V + v) * width, steps[v]
+                    following = (max(at - 1, 0) * K * V + k * V + v) * BLOCK
+                    for line in range(following, following + BLOCK, LINE):
+                        prefetch(states, line)
+                    if first + count == n:
+                        ending = mixed[row : row + reach + count]
+                        totals[at, k, 1] += _lost(ending, step, spread)
+                    total = total + _move(
+                        mixed, row + reach - step, 1 if step > 0 else 0, whole, spread, stay_on,
+                        entering[k], likely.reshape(-1), k * BLOCK, states,
+                        at * size + (k * V + v) * BLOCK, flat_origins,
+                        ((at * K + k) * halves + v // 2) * BLOCK, v % 2, places,
+                    )  # fmt: skip
+                store(lanes, 0, total)
+                totals[at, k, 2] = _sum_of_lanes(lanes, 0)
+            by_place[first : first + count] = places[:count]
+            maxima[at] = places[:count].max()

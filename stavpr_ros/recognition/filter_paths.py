@@ -1,0 +1,300 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where the camera was: states of the place filter followed back over the latest images.
+
+For each image, an origin of every state is kept. Two of them share a byte, that of an even speed
+in the lower half and that of the next speed in the upper one:
+
+    origin = 3 * step + speed    step 0: as far as the speed, 1: one place more, 2: one less
+                                 speed 0: the same, 1: one lower, 2: one higher
+    ENTERED                      the state was off the map
+
+    ring of the latest images    (lag, blocks, K, (V + 1) // 2, BLOCK), uint8
+
+The path of a state is then refined (:func:`offset_probabilities`): the speeds of the filter are
+few, and before the middle of the window the path is a straight line. The offset of each image's
+place from it is a hidden Markov model: it changes little from image to image, and the evidence is
+the filter's, at the path's level. The forward-backward algorithm gives its probabilities.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from stavpr_ros.alignment.cpu.simd import prefetch
+from stavpr_ros.compilation import kernel
+
+BLOCK = 128  # places whose states are neighbors in memory; a multiple of all LANES
+ENTERED = 9  # origin of a state that came from off the map
+ALL_ENTERED = ENTERED | ENTERED << 4  # two origins
+TOP = 64  # places whose states are followed back
+NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
+CLOSE = 2  # places: the probability of a place is that of its neighbors within CLOSE, too
+BAND = 5  # places to either side of the filter's path
+START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
+STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
+OFFSETS = np.arange(-BAND, BAND + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """
+    Where the camera was a number of images ago.
+
+    :param places: places that paths of probable states lead to, ascending, (m,).
+    :param weights: probability of each of them alone, (m,).
+    :param states: of each, the most probable state now and the speed then, (m, 4), int: level,
+        speed, place, speed then.
+    """
+
+    places: np.ndarray
+    weights: np.ndarray
+    states: np.ndarray
+
+    def probabilities(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the places of n whose probability, with that of close ones, is not 0.
+
+        :returns: places, ascending, (m,), and their probabilities.
+        """
+        most = len(self.places) * (2 * CLOSE + 1)
+        near, sums = np.empty(most, np.int64), np.empty(most)
+        count = _sum_close(self.places, self.weights, n, near, sums)
+        return near[:count], sums[:count]
+
+
+def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
+    """
+    Return the belief that states give.
+
+    :param states: (m, 5): place then, level, speed and place now, speed then.
+    :param probabilities: of each state, (m,), float64.
+    """
+    order = np.argsort(states[:, 0], kind='stable')
+    best, weights = np.empty(len(order), np.int64), np.zeros(len(order))
+    count = _merge(states, probabilities, order, best, weights)
+    found = states[best[:count]]
+    return Belief(found[:, 0], weights[:count], found[:, 1:])
+
+
+def offset_probabilities(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
+) -> np.ndarray:
+    """
+    Return the probability of each offset from a path, by all images of the window.
+
+    :param z: z-normalized distances of each image to the places near the path, (l, S).
+    :param path: place of each image, (l,).
+    :param exponents: of their likelihoods: alpha times the mean of right places, (l,).
+    :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
+    :param n: places.
+    :returns: shape (l, S); each row sums to 1.
+    """
+    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(STEPS)))
+    _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
+    masses = np.empty(z.shape)
+    masses[0] = np.exp(-0.5 * (OFFSETS / START_DEVIATION) ** 2)
+    smooth(likelihoods, moves, masses)
+    return masses
+
+
+# ------------------------------------------------ kernels
+
+
+@kernel
+def _before(k, v, y, origins, steps):
+    """Return speed and place of a state one image before, -1 as place where it was off the map."""
+    origin = (origins[y // BLOCK, k, v // 2, y % BLOCK] >> (v % 2 * 4)) & 15
+    if origin == ENTERED:
+        return v, -1
+    r, step, change = steps[v], origin // 3, origin % 3
+    places = r if step == 0 else r + 1 if step == 1 else max(r - 1, 0)
+    return v - (change == 1) + (change == 2), y - places
+
+
+@kernel
+def trace_back(k, v, y, origins, steps, newest, count, places):
+    """
+    Write the most probable path to a state, newest place first.
+
+    :param origins: ring of the last images' origins, (m, blocks, K, (V + 1) // 2, BLOCK), uint8.
+    :param steps: ring of their steps, (m, V).
+    :param newest: slot of the newest image.
+    :param count: images to go back, at most m.
+    :param places: (count + 1,), written: the place at each image, -1 before the path entered the
+        map.
+    """
+    places[0] = y
+    for i in range(count):
+        slot = (newest - i) % len(origins)
+        v, y = _before(k, v, y, origins[slot], steps[slot])
+        places[i + 1] = y
+        if y < 0:
+            places[i + 1 :] = -1
+            return
+
+
+@kernel
+def backtrack_states(a, least, tops, origins, steps, newest, count, states, probabilities):
+    """
+    Follow states back over a number of images.
+
+    :param a: states, (blocks, K, V, BLOCK).
+    :param least: states below it are excluded.
+    :param tops: places whose states count, (m,).
+    :param count: images to go back; other parameters: see :func:`trace_back`.
+    :param states: (m K V, 5), written: place then, state now (k, v, y), speed then.
+    :param probabilities: (m K V,), written: of these states.
+    :returns: number of states that were on the map then.
+    """
+    found = 0
+    for y in tops:
+        for k in range(a.shape[1]):
+            for v in range(a.shape[2]):
+                p = a[y // BLOCK, k, v, y % BLOCK]
+                if p >= least:
+                    states[found, 0], states[found, 1], states[found, 2] = y, k, v
+                    states[found, 3], states[found, 4] = y, v
+                    probabilities[found] = p
+                    found += 1
+    _, blocks, _, halves, _ = origins.shape
+    flat = origins.reshape(-1)
+    for i in range(count):  # all together: each waits for its memory
+        slot, left = (newest - i) % len(origins), 0
+        earlier = (newest - i - 1) % len(origins) * blocks
+        for at in range(found):
+            speed, place = _before(
+                states[at, 1], states[at, 4], states[at, 0], origins[slot], steps[slot]
+            )
+            if place >= 0:
+                states[left], probabilities[left] = states[at], probabilities[at]
+                states[left, 0], states[left, 4] = place, speed
+                row = ((earlier + place // BLOCK) * a.shape[1] + states[at, 1]) * halves
+                prefetch(flat, (row + speed // 2) * BLOCK + place % BLOCK)
+                left += 1
+        found = left
+    return found
+
+
+@kernel
+def find_largest(by_place, blocks, n, places):
+    """Write the places of blocks, below n, with the largest sums, the largest first."""
+    values, last = np.full(len(places), -1, np.float32), len(places) - 1
+    for block in blocks:
+        for y in range(block * BLOCK, min((block + 1) * BLOCK, n)):
+            if by_place[y] <= values[last]:
+                continue
+            at = last
+            while at > 0 and values[at - 1] < by_place[y]:
+                values[at], places[at] = values[at - 1], places[at - 1]
+                at -= 1
+            values[at], places[at] = by_place[y], y
+
+
+@kernel
+def _merge(states, probabilities, order, best, weights):
+    """
+    Add up the probabilities of states that were at one place.
+
+    :param states: see :func:`belief_of`; order: of their places, ascending.
+    :param best, weights: of each place, its most probable state and its sum, written.
+    :returns: number of places.
+    """
+    found = -1
+    for i in order:
+        if found < 0 or states[i, 0] != states[best[found], 0]:
+            found += 1
+            best[found] = i
+        elif probabilities[i] > probabilities[best[found]]:
+            best[found] = i
+        weights[found] += probabilities[i]
+    return found + 1
+
+
+@kernel
+def _sum_close(places, weights, n, near, sums):
+    """Write the places below n within ``CLOSE`` of any place, and their sums, at most 1."""
+    found = low = end = 0
+    for place in places:
+        for y in range(max(place - CLOSE, end), min(place + CLOSE + 1, n)):
+            while places[low] < y - CLOSE:
+                low += 1
+            total, i = 0.0, low
+            while i < len(places) and places[i] <= y + CLOSE:
+                total += weights[i]
+                i += 1
+            near[found], sums[found] = y, min(total, 1.0)
+            found, end = found + 1, y + 1
+    return found
+
+
+@kernel
+def find_most_probable(by_place, maxima, excluded):
+    """Return the most probable place outside ``excluded``, ascending, and its sum, 0 if none."""
+    best, at, i = np.float32(-1), 0, 0
+    for block in range(len(maxima)):
+        while i < len(excluded) and excluded[i] < block * BLOCK:
+            i += 1
+        if maxima[block] <= best:
+            continue
+        for y in range(block * BLOCK, (block + 1) * BLOCK):
+            while i < len(excluded) and excluded[i] < y:
+                i += 1
+            value = np.float32(0) if i < len(excluded) and excluded[i] == y else by_place[y]
+            if value > best:
+                best, at = value, y
+    return at, best
+
+
+@kernel
+def _window_likelihoods(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
+    likelihoods: np.ndarray, moves: np.ndarray,
+) -> None:  # fmt: skip
+    """Write the input of :func:`smooth`; parameters: see :func:`offset_probabilities`."""
+    for i in range(len(path)):
+        for s in range(z.shape[1]):
+            inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
+            likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
+        step = path[i] - path[i - 1] if i else 0
+        moves[i] = np.where(np.arange(step - 2, step + 3) >= 0, STEPS, 0)
+        if i and images[i] == images[i - 1]:
+            moves[i] = 0, 0, 1, 0, 0
+
+
+@kernel
+def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> None:
+    """
+    Write the probability of each offset at each image, by the forward-backward algorithm.
+
+    Images that no offset explains give no evidence.
+
+    :param likelihoods: of each image at each offset, (l, S).
+    :param moves: probability that the offset becomes 2 less, ..., 2 more before an image, (l, 5).
+    :param masses: (l, S), written; its first row contains the probabilities before all images.
+    """
+    l, S = likelihoods.shape
+    for i in range(l):
+        for s in range(S):
+            if i:
+                masses[i, s] = 0
+                for d in range(max(-2, s - S + 1), min(2, s) + 1):
+                    masses[i, s] += masses[i - 1, s - d] * moves[i, d + 2]
+            masses[i, s] *= likelihoods[i, s]
+        total = masses[i].sum()
+        if total > 0:
+            masses[i] /= total
+        else:
+            masses[i] = 1 / S
+    later, weighed = np.ones(S), np.empty(S)
+    for i in range(l - 2, -1, -1):
+        weighed[:] = later * likelihoods[i + 1]
+        for s in range(S):
+            later[s] = 0
+            for d in range(max(-2, -s), min(2, S - 1 - s) + 1):
+                later[s] += moves[i + 1, d + 2] * weighed[s + d]
+        total = later.sum()
+        later[:] = later / total if total > 0 else np.ones(S)
+        combined = masses[i] * later
+        if combined.sum() > 0:
+            masses[i] = combined / combined.sum()

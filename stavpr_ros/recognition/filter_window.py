@@ -1,0 +1,361 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The window of mode robust: a place filter, read at the middle of the window."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
+from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.recognition.filter_paths import (
+    BAND,
+    Belief,
+    CLOSE,
+    NEGLIGIBLE,
+    offset_probabilities,
+    OFFSETS,
+)
+from stavpr_ros.recognition.map_change import ImageChange
+from stavpr_ros.recognition.match import WindowMatch, WindowSequences
+from stavpr_ros.recognition.place_filter import PlaceFilter
+from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
+import torch
+
+AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
+
+
+@dataclass
+class WindowImage:
+    """
+    An image of the window.
+
+    :param change: from the image before.
+    :param weight: exponent alpha of its likelihood.
+    :param number: of the filter's last update; images of a camera at rest share one.
+    :param is_matched: it had a match as the middle image.
+    """
+
+    change: float
+    weight: float
+    number: int
+    is_matched: bool = False
+
+
+class StateFilter(Protocol):
+    """
+    A place filter over n places, on the CPU or on a CUDA device.
+
+    ``count`` is the number of images since the reset.
+    """
+
+    count: int
+
+    def reset(self) -> None:
+        """Forget where the camera was."""
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+
+    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
+        """See :func:`stavpr_ros.recognition.robust.z_normalized`; on the filter's device."""
+
+    def update(
+        self,
+        z: torch.Tensor,
+        weight: float,
+        speed_weights: np.ndarray,
+        speed_likelihoods: np.ndarray | float = 1.0,
+    ) -> None:
+        """
+        Advance by an image.
+
+        :param z: z-normalized distances to the first m places, (m,), float32, on the filter's
+            device; +inf excludes a place.
+        :param weight: alpha; 0 = the image is no evidence.
+        :param speed_weights: relative probability of each speed, (V,).
+        :param speed_likelihoods: of each speed relative to that off the map, (V,).
+        """
+
+    def places_of_states(self) -> np.ndarray:
+        """Return the probability of each place, (room,), float32."""
+
+    def belief(self, n: int, images_ago: int) -> Belief:
+        """
+        Return where the camera was a number of images ago, by the images since then, too.
+
+        :param n: places.
+        :param images_ago: at most the lag and ``count - 1``.
+        """
+
+    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
+        """
+        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
+
+        :param excluded: places, ascending.
+        """
+
+    def path(self, state: np.ndarray, images: int) -> np.ndarray:
+        """
+        Return the places of the most probable path to a state, newest first, (images + 1,).
+
+        :param state: level, speed, place.
+        """
+
+
+class FilterWindow(QueryWindow):
+    """
+    A :class:`PlaceFilter` updated image by image, and the window that its answers are of.
+
+    :param sequence: l and k.
+    :param places: number of places n.
+    :param settings: model of the filter.
+    :param layout: of the places.
+    :param normalizes, around: see :class:`stavpr_ros.recognition.window.QueryWindow`.
+    :param to_oldest: states are followed back to the oldest image of the window, which
+        :meth:`match_oldest` requires, instead of the middle one.
+    :param on_device: rows and filter are on torch's current CUDA device.
+
+    ``change`` compares images, ``filter`` contains the states.
+    """
+
+    filter: StateFilter
+
+    def __init__(
+        self,
+        sequence: SequenceSettings,
+        places: int,
+        settings: FilterSettings | None = None,
+        layout: ColumnLayout | None = None,
+        normalizes: bool = False,
+        around: int = 0,
+        to_oldest: bool = False,
+        on_device: bool = False,
+    ) -> None:
+        layout, settings = layout or ColumnLayout(), settings or FilterSettings()
+        length, width = sequence.length, layout.width(places)
+        device = torch.device('cpu')
+        filter_class: Callable[..., StateFilter] = PlaceFilter
+        if on_device:
+            from stavpr_ros.recognition import cuda_filter
+
+            device, filter_class = cuda_filter.current_device(), cuda_filter.CudaPlaceFilter
+        buffer = SequenceBuffer(length, width, sequence.k, device=device, copies=1)
+        super().__init__(buffer, layout, normalizes, around)
+        self._middle = (length - 1) // 2
+        lag = length - 1 - (0 if to_oldest else self._middle)
+        self.filter = filter_class(width, lag, settings, layout.gaps)
+        self.change = ImageChange(places, settings)
+        self._speeds, self._levels = settings.speeds, settings.levels
+        self._images: deque[WindowImage] = deque(maxlen=length)
+
+    @property
+    def changes(self) -> tuple[float, ...]:
+        """Change of each image from the one before, oldest first."""
+        return tuple(image.change for image in self._images)
+
+    @property
+    def is_standstill(self) -> bool:
+        """Whether the newest image equals the one before, up to noise."""
+        return self.change.is_standstill(self._images[-1].change)
+
+    def reset(self) -> None:
+        """Drop all images."""
+        super().reset()
+        self.filter.reset()
+        self.change.reset()
+        self._images.clear()
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+        super().grow(places)
+        self.filter.grow(places)
+        self.change.grow(places)
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        super().evict(count)
+        self.filter.evict(count)
+        self.change.evict(count)
+
+    def push(self, row: torch.Tensor, strips: torch.Tensor, stamp: int) -> None:
+        """See :meth:`QueryWindow.push`."""
+        row = self._as_columns(row)
+        self.buffer.push(row, stamp)
+        self._update(row, self.change.next_query(strips.cpu().numpy()))
+
+    def add(self, row: torch.Tensor, stamp: int, change: float) -> None:
+        """
+        Add the newest image by its normalized distances, and drop the oldest.
+
+        :param row: to the places, (n,), float32, on the device of the filter.
+        :param change: from the image before.
+        """
+        row = self.layout.spread(row)
+        self.buffer.push(row, stamp)
+        self._update(row, change)
+
+    def _counted(self, n: int) -> np.ndarray:
+        return self.change.distinct(n)
+
+    def _normalized(self, row: torch.Tensor, counted: np.ndarray) -> torch.Tensor:
+        return self.filter.z_normalized(row, self._around, counted)
+
+    def _update(self, z: torch.Tensor, change: float) -> None:
+        """
+        Advance the filter by an image.
+
+        An image of a camera at rest adds nothing. Where the map's own images are equal, in a dark
+        tunnel, the camera may move: the filter goes on at its speed, without evidence.
+
+        :param z: z-normalized distances to the columns, (m,), float32.
+        """
+        weight, ones = 0.0, np.ones(len(self._speeds))
+        if not self.filter.count:  # the change of the first image is unknown
+            weight = self.change.weight(change)
+            self.filter.update(z, weight, ones, ones)
+        elif not self.change.is_standstill(change):
+            weight = self.change.weight(change)
+            speeds = self.change.speed_weights(change)
+            likelihoods = self.change.speed_likelihoods(change)
+            moves = speeds[0] < AT_REST * speeds.max()
+            self.filter.update(self._of_moving(z) if moves else z, weight, speeds, likelihoods)
+        else:
+            by_place = self.layout.gathered(self.filter.places_of_states()[: len(z)])
+            if self.change.is_dark_stretch(by_place):
+                self.filter.update(z, 0.0, ones, ones)
+        self._images.append(WindowImage(change, weight, self.filter.count - 1))
+
+    def _of_moving(self, z: torch.Tensor) -> torch.Tensor:
+        """Return z of a moving camera: places where the map's camera was at rest are not near."""
+        columns = self.layout.columns_of(self.change.at_rest())
+        far = torch.from_numpy(columns[columns < len(z)]).to(z.device)
+        return z.index_put((far,), z[far].clamp(min=0)) if len(far) else z
+
+    def _match(self, nms_radius: int) -> WindowMatch:
+        return self._match_image(self._middle, nms_radius)
+
+    def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
+        """See :meth:`QueryWindow.match_oldest`."""
+        self._images[self._middle].is_matched = is_matched
+        if self._images[0].is_matched or not is_matched:
+            return WindowMatch()
+        return self._match_image(0, nms_radius)
+
+    def _match_image(self, position: int, nms_radius: int) -> WindowMatch:
+        """
+        Return the match of an image by all images of the window.
+
+        :param position: of the image in the window, not before the lag of the filter.
+        """
+        n, first = self.buffer.known, self.buffer.first
+        if not n:
+            return WindowMatch()
+        belief = self.filter.belief(n, self._images[-1].number - self._images[position].number)
+        if not len(belief.places):
+            return self._off_map(n, first)
+        places, probabilities, best = self.layout.shared(belief, n, CLOSE)
+        apart = np.abs(belief.places - places[best])
+        near = apart <= CLOSE
+        # of the sequence: its path is known within the band
+        of_sequence = max(probabilities[best], min(belief.weights[apart <= BAND].sum(), 1))
+        state = belief.states[near][np.argmax(belief.weights[near])]
+        refined, shares = self._refined(self._path(state, position), state[0], n)
+        probability, middle = float(of_sequence * shares[position]), int(refined[position])
+        second, found = self._second_best(n, places, probabilities, middle, nms_radius)
+        path = np.stack([np.arange(len(refined)), refined + first], axis=1).astype(np.int32)
+        match = SequenceMatch(
+            first=int(path[0, 1]),
+            last=int(path[-1, 1]),
+            middle=middle + first,
+            distance=1 - probability,
+            second_best_index=second + first if found > 0 else -1,
+            second_best_distance=1 - found if found > 0 else float('nan'),
+        )
+        sequences = partial(self._sequences, n, first, places, probabilities)
+        return WindowMatch(match, path, sequences, probability, shares)
+
+    def _refined(self, path: np.ndarray, level: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return places near a path that explain the images of the window best, and their shares.
+
+        The place of an image is at the mean of the offset from the path.
+
+        :param path: place of each image, (l,).
+        :param level: index of the mean z-normalized distance of right places.
+        :returns: places, which never go back, (l,), and probabilities of these and those close to
+            them, (l,).
+        """
+        places = path[:, None] + OFFSETS
+        inside = places.clip(0, n - 1)
+        exponents = np.array([image.weight for image in self._images]) * self._levels[level]
+        masses = offset_probabilities(self.buffer.at(inside), path, exponents, self._numbers(), n)
+        refined = path + np.rint(masses @ OFFSETS).astype(np.int64)
+        lowest = self.layout.first_column(path[-1])
+        refined = np.maximum.accumulate(refined.clip(lowest, n - 1))
+        close = np.abs(places - refined[:, None]) <= CLOSE
+        close |= self._equal(inside, refined[:, None])
+        return refined, (masses * close).sum(axis=1)
+
+    def _numbers(self) -> np.ndarray:
+        return np.array([image.number for image in self._images])
+
+    def _equal(self, columns: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """Return which columns are in one stretch of equal places with others, as if one place."""
+        places, others = self.layout.positions_of(columns), self.layout.positions_of(others)
+        first = min(places.min(), others.min())
+        stretches = self.change.stretches(first, max(places.max(), others.max()) + 1)
+        equal: np.ndarray = stretches[places - first] == stretches[others - first]
+        return equal
+
+    def _second_best(
+        self, n: int, places: np.ndarray, probabilities: np.ndarray, middle: int, radius: int
+    ) -> tuple[int, float]:
+        """Return the most probable place beyond a radius, and its probability, 0 if none."""
+        around = np.arange(max(0, middle - radius), min(n, middle + radius + 1))
+        now, faint = self.filter.most_probable(np.sort(np.append(around, places)))
+        faint *= NEGLIGIBLE
+        apart = np.abs(places - middle) > radius
+        if apart.any():
+            second = int(np.argmax(np.where(apart, probabilities, 0)))
+            if probabilities[second] >= faint:
+                return int(places[second]), float(probabilities[second])
+        return now, faint
+
+    def _sequences(
+        self, n: int, first: int, places: np.ndarray, probabilities: np.ndarray
+    ) -> WindowSequences:
+        """Return all places; improbable ones have a share of their probability now."""
+        every = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
+        every[places] = probabilities
+        costs = np.where(every > 0, 1 - every, np.inf)
+        return WindowSequences(costs, np.arange(first, first + n), every)
+
+    def _off_map(self, n: int, first: int) -> WindowMatch:
+        """Return the place that is most probable now, with the probability 0."""
+        nothing = np.empty(0, np.int64)
+        place = self.filter.most_probable(nothing)[0] + first
+        match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
+        length = self.buffer.length
+        path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
+        return WindowMatch(
+            match, path, partial(self._sequences, n, first, nothing, np.empty(0)), 0.0
+        )
+
+    def _path(self, state: np.ndarray, position: int) -> np.ndarray:
+        """Return the place of each image, (l,); before the one at a position at one speed."""
+        images = self._numbers()
+        back = images[-1] - images
+        lag = int(back[position])
+        places = self.filter.path(state, lag)
+        slope = (places[0] - places[lag]) / lag if lag else self._speeds[state[3]]
+        earlier = np.maximum(back - lag, 0) * slope
+        path = places[np.minimum(back, lag)].astype(np.int64) - np.rint(earlier).astype(np.int64)
+        return np.maximum(path, self.layout.first_column(places[0]))
