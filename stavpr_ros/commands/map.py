@@ -14,6 +14,7 @@ from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError
 from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_replaceable
+from stavpr_ros.units import SECOND
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
@@ -217,7 +218,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
 
 
 def _time(stamp: int) -> str:
-    return datetime.fromtimestamp(stamp // 10**9, UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
+    return datetime.fromtimestamp(stamp // SECOND, UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
 
 
 def _verify(arguments: argparse.Namespace) -> int:

@@ -9,8 +9,8 @@ from threading import Lock
 import numpy as np
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError
+from stavpr_ros.units import SECOND
 
-SECOND = 1_000_000_000
 MAX_GAP = 5 * SECOND  # without odometry, across which interpolation would be a guess
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.checks import require_above, require_choice
 from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
@@ -64,10 +65,7 @@ class PipelineSettings:
     geometric: GeometricSettings | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.min_probability < 1:
-            raise SettingsError(
-                f'min_probability = {self.min_probability} must be above 0 and below 1'
-            )
+        require_above('min_probability', self.min_probability, 0, below=1)
         if self.threshold is not None and self._has_probability:
             raise SettingsError(
                 f'threshold = {self.threshold} is of mode paper: mode {self.mode} matches above '
@@ -117,10 +115,7 @@ class PipelineSettings:
 
         :raises SettingsError: names the settings.
         """
-        if operation not in OPERATIONS:
-            raise SettingsError(
-                f'operation {operation!r} is unknown: take one of {", ".join(OPERATIONS)}'
-            )
+        require_choice('operation', operation, OPERATIONS)
         if self.geometric is not None and operation != 'localization' and not self.thumbnail_width:
             raise SettingsError(
                 f'geometric_check = {self.geometric.method} with thumbnail_width = 0 and '
@@ -248,8 +243,8 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     """
     for name, value in values.items():
         choices = kinds(from_images=True) if name == 'features' else BY_NAME[name].choices
-        if choices and value not in choices:
-            raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
+        if choices:
+            require_choice(name, value, choices)
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
     values |= {name: absolute_path(values[name]) for name in ('map_path', 'save_path')}
     values['model_path'] = os.path.expanduser(values['model_path'])  # or a word: cached, download

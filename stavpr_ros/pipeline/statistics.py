@@ -11,10 +11,11 @@ import threading
 import time
 from typing import Any
 
+from stavpr_ros.units import SECOND
+
 RECENT = 10  # seconds behind rates, recent counts and times
 SHORTEST_SPAN = 0.5  # seconds of a rate at least: two images of a burst are not a thousand Hz
 WAITING = 'waiting'  # stage before the worker takes an image: in the total, not in the work
-NANOSECONDS = 1_000_000_000
 REORDERING_SECONDS = 0.1  # images less than this out of order were reordered on the way
 INTERVALS = 40  # pauses between images for the period of a camera, which needs half of them
 REGULAR = 0.75  # share of them near a multiple of the period, from which on a camera has one
@@ -209,14 +210,14 @@ class StampWatch:
             return 0.0, 0
         last, newest = self._last, self._newest
         self._last = self._newest = stamp
-        ahead = (stamp - newest) / NANOSECONDS if newest else 0.0
+        ahead = (stamp - newest) / SECOND if newest else 0.0
         if ahead <= -REORDERING_SECONDS:
             self._last = 0
             self._intervals.clear()
             return ahead, 0
         if ahead < 0:
             self._newest = newest
-        missing = self._missing((stamp - last) / NANOSECONDS) if last else 0
+        missing = self._missing((stamp - last) / SECOND) if last else 0
         return (ahead if 0 < self.gap < ahead else 0.0), missing
 
     def _missing(self, interval: float) -> int:

@@ -22,6 +22,7 @@ from stavpr_ros.ros.output import nanoseconds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.subscriptions import AdaptiveSubscription, qos_remedy
 from stavpr_ros.signals import time_left
+from stavpr_ros.units import SECOND
 
 STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end
 QUEUE = 10  # images in the middleware while the executor is busy
@@ -144,7 +145,7 @@ class ImageInput:
         """Return why an image exceeds ``max_rate``, by stamps, or by arrival without them."""
         if not self.max_rate:
             return ''
-        now, last = stamp / 1e9 if stamp else arrival, self._last
+        now, last = stamp / SECOND if stamp else arrival, self._last
         # a tolerance of a tenth of the period: a camera of exactly this rate has jitter; an image
         # that was overtaken in transport, and has an earlier stamp, must not restart the count
         if last is not None and abs(now - last) < 0.9 / self.max_rate:

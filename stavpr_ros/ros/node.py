@@ -36,6 +36,7 @@ from stavpr_ros.ros.parameters import (
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
+from stavpr_ros.units import SECOND
 
 
 class PlaceRecognitionNode(ManagedNode):
@@ -298,7 +299,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _on_clock_jump(self, jump: Any) -> None:
         if (runtime := self._runtime) is not None:
-            runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
+            runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / SECOND:.3f} s')
 
     def _health(self) -> Health:
         self._publish_map_info()

@@ -30,12 +30,12 @@ from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
+from stavpr_ros.units import SECOND
 from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-SECOND = 1_000_000_000
 MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
 
 

@@ -12,11 +12,11 @@ from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag, reading
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.units import SECOND
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
-SECOND = 1_000_000_000
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
 LEAST_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
 Item = TypeVar('Item')

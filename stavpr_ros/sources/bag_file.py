@@ -18,9 +18,9 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError, StavprError
 from stavpr_ros.regular_file import require_regular
+from stavpr_ros.units import SECOND
 
 METADATA = 'metadata.yaml'
-SECOND = 1_000_000_000
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
 LOG_SUFFIXES = ('-wal', '-journal')
 """Files of SQLite beside a database with writes that are not in the database yet."""

@@ -12,9 +12,9 @@ import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.sources.files import decode_file
 from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.units import SECOND
 
 SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
-SECOND = 1_000_000_000
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
