@@ -24,7 +24,7 @@ from results import commit, cpu_model
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_messages import pose_array

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, StavprError
-from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, thumbnail_of
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.pipeline.operations import Localization, Mapping, Observation, Operation
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
-from stavpr_ros.pipeline.start import LoadedMap, start_operation
+from stavpr_ros.pipeline.start import LoadedMap, Operation, start_operation
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.verification import GeometricEvidence, PlaceVerifier
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
@@ -103,7 +103,7 @@ class Pipeline:
         """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
         if self.operation == 'localization':
             return 'loaded' if self._map is not None else 'none'
-        return 'full' if self._is_full(self._operation) else 'growing'
+        return 'full' if self._is_full else 'growing'
 
     @property
     def window_fill(self) -> int:
@@ -114,8 +114,8 @@ class Pipeline:
     @property
     def stages(self) -> str:
         """Return how a time budget is kept; empty without one."""
-        operation = self._operation
-        return operation.recognizer.stages if isinstance(operation, Localization) else ''
+        operation = self._operation if self.operation == 'localization' else None
+        return operation.recognizer.stages if operation and operation.recognizer else ''
 
     @property
     def missing(self) -> str:
@@ -224,16 +224,22 @@ class Pipeline:
             )
         return self._last.with_candidates(recognizer.ranked(count))
 
-    def matched_pair(self, match: Match, aligned: bool = True) -> MatchedPair | None:
+    def matched_pair(self, match: Match, relative_pose: str = 'auto') -> MatchedPair | None:
         """
-        Return the pair of the newest match, or its late one, for its edge; None without.
+        Return the pair of the newest match, or its late one, for its edge.
 
-        :param aligned: the edge may be aligned by odometry, which needs distances of the window.
+        :param relative_pose: the parameter of this name.
+        :returns: None without a match, or where the place of a map can have no edge.
         """
         operation = self._operation
         if not match.accepted or operation is None or operation.recognizer is None or match.cause:
             return None
         places, distances = operation.places, operation.recognizer.window_columns
+        if self.operation == 'localization' and (
+            relative_pose == 'none' or places.place(match.place_index).pose is None
+        ):
+            return None
+        aligned = relative_pose in ('auto', 'aligned')
         unknown = np.full(7, np.nan)
         poses = np.array([unknown if pose is None else pose for pose in self._poses])
         query = self._thumbnails[0]
@@ -304,24 +310,24 @@ class Pipeline:
         pose: np.ndarray | None,
         camera: Camera | None,
     ) -> Match:
-        width = self._thumbnail_width(operation, camera)
+        width = self._thumbnail_width(camera)
         with _timed(stages, 'decoding'):
             image = decode_message(message, _needed_size(operation, width))
             self.contrast = _contrast(image)
             if reason := self._keyframes.too_alike(image):
                 return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
-        if self._is_full(operation):
+        if self._is_full:
             reason = f'the map is full: parameter max_places = {self.settings.max_places}'
             return Match(Status.NOT_READY, reason, image=image, cause='map full')
         with _timed(stages, 'extraction'):
             features = operation.extractor.extract([image])
         with _timed(stages, 'matching'):
             thumbnail = thumbnail_of(image, width) if width else None
-            match = operation.update(Observation(features, thumbnail, stamp, pose))
+            match = _update(operation, features, thumbnail, stamp, pose)
         self._thumbnails.append(thumbnail)
         self._poses.append(pose)
         self._keyframes.accept(stamp, pose, image)
-        if not isinstance(operation, Localization):
+        if isinstance(operation.places, GrowingMap):
             operation.places.camera = operation.places.camera or camera
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
@@ -333,10 +339,10 @@ class Pipeline:
         self._last = replace(match, image=image)
         return self._last
 
-    def _thumbnail_width(self, operation: Operation, camera: Camera | None) -> int:
+    def _thumbnail_width(self, camera: Camera | None) -> int:
         """Return the width of the thumbnails that are needed, 0 = none is."""
         width = self.settings.thumbnail_width
-        if isinstance(operation, Localization):
+        if self.operation == 'localization':
             return (width or THUMBNAIL_WIDTH) if self._verifier or camera else 0
         return width
 
@@ -423,9 +429,36 @@ class Pipeline:
             return self._map
         return places.snapshot() if isinstance(places, GrowingMap) else places
 
-    @staticmethod
-    def _is_full(operation: Operation | None) -> bool:
-        return isinstance(operation, Mapping) and operation.places.full
+    @property
+    def _is_full(self) -> bool:
+        """Whether mapping stops here; a full route of loop closure evicts places instead."""
+        places = self.places
+        return self.operation == 'mapping' and isinstance(places, GrowingMap) and places.full
+
+
+def _update(
+    operation: Operation,
+    features: LocalFeatures,
+    thumbnail: np.ndarray | None,
+    stamp: int,
+    pose: np.ndarray | None,
+) -> Match:
+    """Match the window that ends with an image, and add the image to growing places."""
+    places, recognizer = operation.places, operation.recognizer
+    jpeg = b''
+    if isinstance(places, GrowingMap) and thumbnail is not None:
+        # first, since it may fail: recognizer and route stay in step
+        jpeg = encode_thumbnail(thumbnail)
+    match = Match(Status.MAPPED)
+    if recognizer is not None:
+        match = recognizer.update(features, stamp, pose)
+    if not isinstance(places, GrowingMap):
+        return match
+    if isinstance(recognizer, LoopCloser):  # it evicts the oldest places
+        places.forget(recognizer.first - places.first)
+    index = places.add(features, stamp, pose=pose, thumbnail=jpeg)
+    late = match.late and replace(match.late, image_index=index)
+    return replace(match, image_index=index, late=late)
 
 
 def _needed_size(operation: Operation, thumbnail_width: int) -> tuple[int, int] | None:

@@ -18,11 +18,13 @@ from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator, needed_by_pnp
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair
-from stavpr_ros.ros.input import Worker
-from stavpr_ros.ros.output import relative_pose_message
+from stavpr_ros.ros.messages import relative_pose_message
+from stavpr_ros.ros.worker import Worker
 from stavpr_ros.signals import time_left
 
 MOST_WAITING = 64  # closures; while there are more, the oldest goes without a relative pose
+UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
+NO_POSE = 'the place has no pose: record maps and routes with odometry'
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
 
 
@@ -45,7 +47,7 @@ class EdgePublisher:
     :param statistics: counts the edges by source.
     :param ending: set when the node ends.
 
-    ``aligns``: edges may be aligned by odometry.
+    ``method`` is that of the estimator.
     """
 
     def __init__(
@@ -56,23 +58,31 @@ class EdgePublisher:
         ending: threading.Event,
     ) -> None:
         self._estimator, self._publish = estimator, publish
-        self.aligns = estimator.method in ('auto', 'aligned')
+        self.method = estimator.method
         self._statistics = statistics
-        self._worker = Worker(self._complete, 2**31, ending)
+        self._worker = Worker(self._complete, UNLIMITED, ending, 'edges')
 
     def immediate(
-        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+        self, pair: MatchedPair | None, query_camera: Camera | None, place_camera: Camera | None
     ) -> Edge:
-        """Return the edge of a match, which waits for nothing: by odometry, or without a pose."""
+        """
+        Return the edge of a match, which waits for nothing: by odometry, or without a pose.
+
+        :param pair: None = the place of a map can have no edge.
+        """
+        if self.method == 'none':
+            return Edge(Source.NONE, 'parameter relative_pose is none')
+        if pair is None:
+            return Edge(Source.NONE, NO_POSE)
         if self._estimator.verifier is not None:
             return Edge(Source.NONE, 'the loop closure of this header has it, verified')
-        if self._estimator.method == 'auto':
+        if self.method == 'auto':
             with suppress(InputError):
                 needed_by_pnp(pair, query_camera, place_camera)
                 return Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
-        if self.aligns:
+        if self.method in ('auto', 'aligned'):
             return align(pair)
-        return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
+        return Edge(Source.NONE, f'parameter relative_pose is {self.method}')
 
     def put(self, closure: WaitingClosure) -> None:
         """Publish a closure when its edge is ready."""

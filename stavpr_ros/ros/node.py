@@ -23,8 +23,7 @@ from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
 from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import STOP_TIMEOUT
-from stavpr_ros.ros.map_info import MapInfoPublisher
+from stavpr_ros.ros.output import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,
@@ -36,6 +35,7 @@ from stavpr_ros.ros.parameters import (
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
+from stavpr_ros.ros.worker import STOP_TIMEOUT
 from stavpr_ros.units import SECOND
 
 

@@ -15,14 +15,13 @@ import rclpy
 from rclpy.client import Client
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
-from stavpr_ros.errors import SettingsError, StavprError, UnavailableError
-from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
+from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.ros.rclpy_workarounds import PromptExecutor, ros_arguments_checked
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
 SPIN_SECONDS = 0.2  # until a signal is noticed
@@ -60,25 +59,13 @@ def prepare_transport() -> None:
     os.environ[PROFILES_VARIABLE] = str(profiles)
 
 
-@contextmanager
-def _ros_arguments_checked() -> Iterator[None]:
-    try:
-        yield
-    except (
-        rclpy_implementation.RCLError,
-        rclpy_implementation.RCLInvalidROSArgsError,
-        rclpy_implementation.UnknownROSArgsError,
-    ) as error:
-        raise SettingsError(f'the arguments after --ros-args are invalid: {error}') from error
-
-
 def own_arguments(arguments: Sequence[str]) -> list[str]:
     """
     Return the arguments that are not for ROS.
 
     :raises SettingsError: those after ``--ros-args`` are invalid.
     """
-    with _ros_arguments_checked():
+    with ros_arguments_checked():
         return list(remove_ros_args(arguments))
 
 
@@ -93,7 +80,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     :param arguments: without the program's name; the process's own if None.
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """
-    with _ros_arguments_checked():
+    with ros_arguments_checked():
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     left_behind = False
     try:

@@ -24,6 +24,7 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
+from stavpr_ros.errors import SettingsError
 
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
@@ -40,6 +41,23 @@ def until_shutdown(node: Node) -> Iterator[None]:
     except rclpy_implementation.RCLError:
         if node.context.ok():
             raise
+
+
+@contextmanager
+def ros_arguments_checked() -> Iterator[None]:
+    """
+    Raise invalid arguments after ``--ros-args`` as SettingsError.
+
+    No upstream issue was found: rclpy has no public names for these exceptions.
+    """
+    try:
+        yield
+    except (
+        rclpy_implementation.RCLError,
+        rclpy_implementation.RCLInvalidROSArgsError,
+        rclpy_implementation.UnknownROSArgsError,
+    ) as error:
+        raise SettingsError(f'the arguments after --ros-args are invalid: {error}') from error
 
 
 _warning_filters = threading.Lock()  # they belong to the process

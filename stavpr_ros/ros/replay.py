@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes the records of a bag at a pace, or each image after the result of the last one."""
 
-import array
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -23,13 +22,12 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
-from stavpr_ros.ros.output import time_message
+from stavpr_ros.ros.messages import record_message, time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.ros.receipts import Receipts
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
-from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 SPIN_SECONDS = 0.1  # until a signal is noticed
@@ -44,22 +42,6 @@ class NoSubscriberError(StavprError):
 
 class NoResultError(StavprError):
     """A published image got neither a result nor an acknowledgment in time."""
-
-
-def image_message(record: ImageRecord) -> Image:
-    """Return the message of a record, with the recorded header."""
-    message = Image(
-        header=Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id),
-        height=record.height,
-        width=record.width,
-        encoding=record.encoding,
-        is_bigendian=int(record.is_bigendian),
-        step=record.step,
-    )
-    data = array.array('B')  # the one type that rclpy does not check byte by byte
-    data.frombytes(memoryview(record.data).cast('B'))
-    message.data = data
-    return message
 
 
 def message_class(name: str) -> type:
@@ -197,7 +179,7 @@ class Replayer:
         if isinstance(record, MessageRecord):
             self._others[record.topic].publish(record.content)
             return
-        message = image_message(record)
+        message = record_message(record)
         self.receipts.sent(message.header)
         if self.options.lossless:
             self._send_until_answered(message)
