@@ -102,10 +102,11 @@ class Visualization:
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
+        if not self._is_requested(self._route):
+            return
         last, count, last_frame = self._published
         size = 0 if places is None else len(places)
-        same = places is last and frame == last_frame and count <= size < count * GROWTH + 1
-        if same or not self._is_requested(self._route):
+        if places is last and frame == last_frame and count <= size < count * GROWTH + 1:
             return
         self._published = places, size, frame
         message = Path(header=Header(frame_id=frame, stamp=self._node.get_clock().now().to_msg()))
