@@ -8,15 +8,15 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import add_parameter, make_parser, run_program
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
-from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME, default
 
 if TYPE_CHECKING:
     from stavpr_lab.demonstration.recordings import LoopTraverse, TraversePair
     from stavpr_ros.mapping import PlaceMap
 
-EXCLUDE_PLACES, GEOMETRIC_CHECK = 50, 'sift'  # defaults with --loop
+EXCLUDE_PLACES, GEOMETRIC_CHECK = default('exclude_places'), 'sift'  # defaults with --loop
 SYNTHETIC = 'synthetic'
 DRIFT = 0.7  # odometry of about 20 m after three laps
 
@@ -91,13 +91,10 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     add('--tolerance', type=int, default=3, help='places that a correct match may be off '
         '(%(default)s)')  # fmt: skip
-    add('--sequence-length', type=int, default=20, metavar='L', help='images in the window '
-        '(%(default)s)')  # fmt: skip
-    add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
-    add(
-        '--min-probability', type=float, default=BY_NAME['min_probability'].default, metavar='P',
-        help='of the node, mode robust: matches have a greater probability (%(default)g)',
-    )  # fmt: skip
+    add_parameter(parser, 'sequence_length', 'images in the window (%(default)s)', metavar='L')
+    add_parameter(parser, 'mode', 'of the node (%(default)s)')
+    least = 'of the node, mode robust: matches have a greater probability (%(default)g)'
+    add_parameter(parser, 'min_probability', least, metavar='P')
     add(
         '--threshold', type=float, metavar='DISTANCE',
         help='of the node, mode paper (estimated from the first traverse)',
@@ -107,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
         help=f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})',
     )  # fmt: skip
     add(
-        '--geometric-check', choices=('none', 'orb', 'sift'),
+        '--geometric-check', choices=BY_NAME['geometric_check'].choices,
         help=f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})',
     )  # fmt: skip
     add_feature_options(parser)
