@@ -151,7 +151,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'backend',
             'auto',
             'Device of feature extraction and image distances; auto: CUDA if it is available. '
-            'Loop closure matches on the CPU but for cuda.',
+            'Loop closure matches on the CPU, except with cuda.',
             choices=('auto', 'cpu', 'cuda'),
         ),
     ),

@@ -40,7 +40,7 @@ NOT_A_KEYFRAME = 'not a keyframe'
 
 class Pipeline:
     """
-    Processes image messages. All calls but those of properties must come from one thread.
+    Processes image messages. All calls except those of properties must come from one thread.
 
     :param operation: one of ``OPERATIONS``.
     :param open_journal: of recorded places; None = they are in memory only.
@@ -182,7 +182,7 @@ class Pipeline:
 
     def close_journals(self, delete_route: bool) -> list[str]:
         """
-        Close the journals at the end; return those that hold unsaved places.
+        Close the journals at the end; return those with unsaved places.
 
         :param delete_route: a route of loop closure is needed no longer.
         """
@@ -256,7 +256,7 @@ class Pipeline:
 
     def window_distances(self, places: np.ndarray) -> np.ndarray:
         """
-        Return the distances of the images in the window to some places.
+        Return the distances of the images in the window to given places.
 
         :param places: shape (k,), int64.
         :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
@@ -394,7 +394,7 @@ class Pipeline:
             save_state = SaveState(loaded.path, Base.of(loaded.path, loaded.places.stamps))
         operation = start_operation(name, settings, place_map, extractor)
         before = {self.save_state, self._map_save_state}
-        # in mapping, the growing map holds it
+        # in mapping, it is part of the growing map
         self._map = None if name == 'mapping' else place_map
         self._operation, self.operation = operation, name
         length = settings.sequence.length

@@ -113,7 +113,7 @@ def close_journals(pipeline: Pipeline, delete_route: bool, log: 'Logger | Any') 
 
 
 def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:
-    """Write the map to the path, or the first numbered name that is free or holds this map."""
+    """Write the map to the path, or the first numbered name that is free or of this map."""
     for name in map(str, numbered(path)):
         try:
             overwrite = pipeline.save_state.owned(name)

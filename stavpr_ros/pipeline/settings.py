@@ -31,7 +31,7 @@ class PipelineSettings:
     """
     Settings of the pipeline.
 
-    Fields that are not explained here are parameters, see :mod:`stavpr_ros.parameters`.
+    Fields that are not explained here are parameters (:mod:`stavpr_ros.parameters`).
 
     :param threshold: mode paper: a window is matched when its distance is below it; None = not
         set.
@@ -155,12 +155,12 @@ class PipelineSettings:
         if operation == 'mapping':
             return stages
         matching = self.matching_backend(operation)
-        held = self.precision
-        if held == 'int8' and matching == 'cpu':
+        precision = self.precision
+        if precision == 'int8' and matching == 'cpu':
             from stavpr_ros.alignment.cpu.int8 import INSTRUCTION
 
-            held = f'int8, {INSTRUCTION} kernel'
-        return f'{stages}, image distances on {matching} ({held}), sequences on {matching}'
+            precision = f'int8, {INSTRUCTION} kernel'
+        return f'{stages}, image distances on {matching} ({precision}), sequences on {matching}'
 
     def extractor(self) -> FeatureExtractor:
         """

@@ -128,8 +128,8 @@ def _image_faults(health: Health) -> Iterator[Finding]:
         remedy = health.odometry_fault or 'start it, compare its topic and its stamps'
         yield WARN, f'odometry, {need}, {state}: {remedy}'
     elif without := drops['no odometry']:
-        what = _of(without, 'image')
-        yield WARN, f'{what} without odometry at their stamps {RECENTLY}: compare both'
+        text = f'{_of(without, "image")} without odometry at their stamps {RECENTLY}'
+        yield WARN, f'{text}: compare both'
     if counts.received.rate and health.contrast < BLANK:
         text = f'the images show nothing (standard deviation {health.contrast:.1f} of 255)'
         remedy = 'check the lens cap, the exposure and the driver'

@@ -374,7 +374,7 @@ class AdaptiveSubscription:
             self._lost = lost
 
     def _finish_switch(self) -> None:
-        """Deliver what the previous subscription has received, and destroy it."""
+        """Deliver the remaining images of the previous subscription, and destroy it."""
         previous, self._previous = self._previous, None
         if previous is None:
             return

@@ -50,7 +50,7 @@ class Navigation:
         odometry_frame: str,
     ) -> None:
         """
-        Publish what one image implies, in operation localization; on the worker.
+        Publish transform and initial pose, in operation localization; on the worker.
 
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """

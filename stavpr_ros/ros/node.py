@@ -46,7 +46,7 @@ class PlaceRecognitionNode(ManagedNode):
     A lifecycle node: configuring loads the map and the model and compiles the kernels, activating
     subscribes, deactivating unsubscribes, cleaning up frees everything. With parameter
     ``autostart`` it configures and activates itself when it is spun. It needs an executor that
-    runs services on threads: see :data:`THREADS`.
+    runs services on ``THREADS`` threads.
 
     :raises StavprError: parameters that exclude each other, or a backend that is not available.
     """
@@ -332,7 +332,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._diagnostics.stop()
         timeout = 0.2 if self.ending.is_set() else STOP_TIMEOUT + 1  # spin_until has waited before
         self.ending.set()
-        # a thread that loads a large map or compiles may hold the lock: the end does not wait
+        # a thread that loads a large map or compiles may keep the lock: the end does not wait
         if self._lock.acquire(timeout=timeout):
             try:
                 self._free()

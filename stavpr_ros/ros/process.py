@@ -26,7 +26,7 @@ from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_
 
 SPIN_SECONDS = 0.2  # until a signal is noticed
 CALLBACK_SECONDS = 2.0  # for running callbacks at the end
-SERVICE_SECONDS = 2.0  # until a node shows its parameter service; some tools have none
+SERVICE_SECONDS = 2.0  # until a node shows its parameter service; tools may have none
 # read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
 PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 PROFILES_FILE = 'config/fastdds_large_images.xml'
@@ -36,7 +36,7 @@ AnyNode = TypeVar('AnyNode', bound=Node)
 
 def prepare_transport() -> None:
     """
-    Give this process shared memory that holds images; to be called before ``rclpy.init``.
+    Give this process shared memory for images; to be called before ``rclpy.init``.
 
     The default segment of 512 KiB is smaller than one 640x480 color image, and the publisher's
     segment is the one that counts. A profile set by the user stays; other middlewares ignore it.
@@ -74,8 +74,8 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     """
     Initialize ROS, make a node, and shut both down at the end.
 
-    rclpy's own signal handlers are not installed: they shut the context down at once (see
-    ros2/rclpy#1287), while the worker may be publishing and before the node has saved its map.
+    rclpy's own signal handlers are not installed: they shut the context down at once
+    (ros2/rclpy#1287), while the worker may be publishing and before the node has saved its map.
 
     :param arguments: without the program's name; the process's own if None.
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.

@@ -94,7 +94,7 @@ class Replayer:
     :param node: for the publishers, the services and the subscription of the results.
     :param notify: called with messages for the user: waiting for a subscriber, an image sent
         again.
-    :param topics: what is published beside the images, topic of the bag to topic of ROS.
+    :param topics: further topics, topic of the bag to topic of ROS.
     :raises UnavailableError: a message type is not installed.
     """
 

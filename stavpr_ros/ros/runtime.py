@@ -153,7 +153,7 @@ class Runtime:
         )
 
     def deactivate(self) -> None:
-        """Unsubscribe; publish what waits, images as dropped; save a recorded map."""
+        """Unsubscribe; publish waiting images as dropped, and waiting closures; save a map."""
         self._unsubscribe()
         self.worker.run(self._edges.flush)  # after the image in process
         self._save(self.worker.run)
@@ -235,7 +235,7 @@ class Runtime:
         """
         Load a map and use it; meanwhile the old one stays in use.
 
-        :param lock: held while the map comes into use, but not while its file is read.
+        :param lock: acquired to put the map into use, not to read its file.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
             old map stays in use.
         """

@@ -73,7 +73,7 @@ class Visualization:
         odometry: np.ndarray | None = None,
     ) -> None:
         """
-        Publish what is requested for one image; on the worker.
+        Publish the requested topics for one image; on the worker.
 
         :param frame: of the poses of the places.
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
