@@ -19,12 +19,13 @@ from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.pipeline.geometric_check import GeometricCheck
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, Operation, start_operation
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.recognition.verification import GeometricEvidence, PlaceVerifier
+from stavpr_ros.recognition.recognizer import SequenceRecognizer
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 
@@ -64,12 +65,10 @@ class Pipeline:
         self.operation = operation
         self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
-        self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
-        self._evidence = GeometricEvidence()
+        self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
-        # of the window, from its middle image on; None = the image came when none was needed
-        self._thumbnails: deque[np.ndarray | None] = deque()
-        self._poses: deque[np.ndarray | None] = deque()  # of the window
+        # thumbnail and pose of each image in the window; None = not needed, unknown
+        self._window: deque[tuple[np.ndarray | None, np.ndarray | None]] = deque()
         self.save_state = SaveState()  # of the places in use
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
@@ -99,6 +98,11 @@ class Pipeline:
         return operation.extractor if operation else self._extractor
 
     @property
+    def _recognizer(self) -> SequenceRecognizer | None:
+        operation = self._operation
+        return operation.recognizer if operation else None
+
+    @property
     def map_state(self) -> str:
         """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
         if self.operation == 'localization':
@@ -108,14 +112,14 @@ class Pipeline:
     @property
     def window_fill(self) -> int:
         """Return the number of images in the window of the recognizer."""
-        operation = self._operation
-        return operation.recognizer.window_fill if operation and operation.recognizer else 0
+        recognizer = self._recognizer
+        return recognizer.window_fill if recognizer else 0
 
     @property
     def stages(self) -> str:
         """Return how a time budget is kept; empty without one."""
-        operation = self._operation if self.operation == 'localization' else None
-        return operation.recognizer.stages if operation and operation.recognizer else ''
+        recognizer = self._recognizer
+        return recognizer.stages if recognizer and self.operation == 'localization' else ''
 
     @property
     def missing(self) -> str:
@@ -129,8 +133,8 @@ class Pipeline:
     @property
     def problem(self) -> str:
         """Return why places of the map cannot be reached; empty while they can."""
-        operation = self._operation
-        return operation.recognizer.problem if operation and operation.recognizer else ''
+        recognizer = self._recognizer
+        return recognizer.problem if recognizer else ''
 
     def change(
         self,
@@ -157,14 +161,14 @@ class Pipeline:
         if loaded is not None or name != self.operation:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
-        elif self._operation is not None and self._operation.recognizer and threshold is not None:
+        elif (recognizer := self._recognizer) is not None and threshold is not None:
             if before is None:
                 self.reset()  # images since then are not in the window
-            self._operation.recognizer.set_threshold(threshold)
+            recognizer.set_threshold(threshold)
         self.settings, self.threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
-        if settings.geometric != (self._verifier and self._verifier.settings):
-            self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
+        if settings.geometric != (self._check and self._check.settings):
+            self._check = GeometricCheck(settings.geometric) if settings.geometric else None
 
     def snapshot(self) -> MapSnapshot:
         """
@@ -199,11 +203,11 @@ class Pipeline:
         """Empty the window: the next images do not continue those before."""
         self._keyframes.reset()
         self._last = None
-        self._thumbnails.clear()
-        self._poses.clear()
-        self._evidence = GeometricEvidence()
-        if self._operation is not None and self._operation.recognizer:
-            self._operation.recognizer.reset()
+        self._window.clear()
+        if self._check is not None:
+            self._check.reset()
+        if (recognizer := self._recognizer) is not None:
+            recognizer.reset()
 
     def relocalize(self, count: int) -> Match:
         """
@@ -217,7 +221,7 @@ class Pipeline:
             raise InputError(
                 'operation mapping recognizes no places: set_operation localization first'
             )
-        recognizer = self._operation.recognizer if self._operation else None
+        recognizer = self._recognizer
         if recognizer is None or self._last is None or self._last.status is Status.WARMING_UP:
             raise InputError(
                 f'{self.window_fill} of {self.settings.sequence.length} images in the window'
@@ -231,25 +235,24 @@ class Pipeline:
         :param relative_pose: the parameter of this name.
         :returns: None without a match, or where the place of a map can have no edge.
         """
-        operation = self._operation
-        if not match.accepted or operation is None or operation.recognizer is None or match.cause:
+        places, recognizer = self.places, self._recognizer
+        if not match.accepted or match.cause or places is None or recognizer is None:
             return None
-        places, distances = operation.places, operation.recognizer.window_columns
         if self.operation == 'localization' and (
             relative_pose == 'none' or places.place(match.place_index).pose is None
         ):
             return None
-        aligned = relative_pose in ('auto', 'aligned')
+        distances = recognizer.window_columns if relative_pose in ('auto', 'aligned') else None
         unknown = np.full(7, np.nan)
-        poses = np.array([unknown if pose is None else pose for pose in self._poses])
-        query = self._thumbnails[0]
+        poses = np.array([unknown if pose is None else pose for _, pose in self._window])
+        query = self._window[match.position][0]
         if match.is_late:
             query = places.thumbnail(match.first_image_index)
-        return matched_pair(match, places, query, poses, distances if aligned else None)
+        return matched_pair(match, places, query, poses, distances)
 
     def newest_distances(self) -> np.ndarray:
         """Return the distances of the newest image to its places, (n,), float32; none before."""
-        recognizer = self._operation.recognizer if self._operation else None
+        recognizer = self._recognizer
         if recognizer is None or not recognizer.window_fill:
             return np.empty(0, np.float32)
         return recognizer.newest_row()
@@ -261,9 +264,9 @@ class Pipeline:
         :param places: shape (k,), int64.
         :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
         """
-        assert self._operation is not None
-        assert self._operation.recognizer is not None
-        return self._operation.recognizer.window_columns(places)
+        recognizer = self._recognizer
+        assert recognizer is not None
+        return recognizer.window_columns(places)
 
     def process(
         self,
@@ -296,7 +299,7 @@ class Pipeline:
         except StavprError as error:
             kind = error.kind if isinstance(error, ImageError) else type(error).__name__
             match = Match(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
-        recognizer = self._operation.recognizer
+        recognizer = self._recognizer
         if list_candidates and recognizer is not None and match.sequence is not None:
             match = match.with_candidates(recognizer.ranked(self.settings.candidates))
         return replace(match, threshold=threshold, stages=stages)
@@ -324,8 +327,7 @@ class Pipeline:
         with _timed(stages, 'matching'):
             thumbnail = thumbnail_of(image, width) if width else None
             match = _update(operation, features, thumbnail, stamp, pose)
-        self._thumbnails.append(thumbnail)
-        self._poses.append(pose)
+        self._window.append((thumbnail, pose))
         self._keyframes.accept(stamp, pose, image)
         if isinstance(operation.places, GrowingMap):
             operation.places.camera = operation.places.camera or camera
@@ -333,9 +335,12 @@ class Pipeline:
         if operation.recognizer is None:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
-            match = self._verified(match, operation.places, self._thumbnails[0])
-            if match.late is not None:
-                match = replace(match, late=self._verified_late(match, operation.places))
+            if self._check is not None:
+                middle, _ = self._window[(len(self._window) - 1) // 2]
+                is_weighed = match.relative and self.operation == 'localization'
+                match = self._check.checked(match, operation.places, middle, is_weighed)
+            if match.late and not (match.accepted and match.late.accepted):
+                match = replace(match, late=None)
         self._last = replace(match, image=image)
         return self._last
 
@@ -343,47 +348,8 @@ class Pipeline:
         """Return the width of the thumbnails that are needed, 0 = none is."""
         width = self.settings.thumbnail_width
         if self.operation == 'localization':
-            return (width or THUMBNAIL_WIDTH) if self._verifier or camera else 0
+            return (width or THUMBNAIL_WIDTH) if self._check or camera else 0
         return width
-
-    def _verified_late(self, match: Match, places: PlaceMap | GrowingMap) -> Match | None:
-        """Return the late match beside an accepted one, if it passes the same check."""
-        if not match.accepted or match.late is None:
-            return None
-        query = places.thumbnail(match.late.first_image_index)
-        late = self._verified(match.late, places, query)
-        return late if late.accepted else None
-
-    def _verified(
-        self, match: Match, places: PlaceMap | GrowingMap, query: np.ndarray | None
-    ) -> Match:
-        """
-        Check a match by the thumbnails of query and place; without these, nothing changes.
-
-        Matches with too few inliers are rejected. Localization in mode robust weighs the result
-        instead (:class:`GeometricEvidence`), where the match is doubtful.
-        """
-        if self._verifier is None or match.sequence is None:
-            return match
-        weighed = match.relative and self.operation == 'localization'
-        checked = self._evidence.wants(match.probability) if weighed else match.accepted
-        if not checked or query is None:
-            return match
-        inliers = self._verifier.inliers(query, places, match.sequence.middle)
-        if inliers is None:
-            return match
-        least = self._verifier.settings.min_inliers
-        match = replace(match, inliers=inliers)
-        if weighed:
-            return match.with_probability(
-                self._evidence.updated(match.probability, inliers >= least)
-            )
-        if inliers >= least:
-            return match
-        reason = (
-            f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
-        )
-        return replace(match, status=Status.NO_MATCH, reason=reason)
 
     def _start(self, name: str, settings: PipelineSettings, loaded: LoadedMap | None) -> None:
         """Start an operation; an error changes nothing."""
@@ -397,9 +363,7 @@ class Pipeline:
         # in mapping, it is part of the growing map
         self._map = None if name == 'mapping' else place_map
         self._operation, self.operation = operation, name
-        length = settings.sequence.length
-        self._thumbnails = deque(maxlen=length - (length - 1) // 2)
-        self._poses = deque(maxlen=length)
+        self._window = deque(maxlen=settings.sequence.length)
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
         self.save_state = SaveState() if name == 'loop_closure' else save_state
