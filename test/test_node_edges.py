@@ -190,7 +190,8 @@ def queue(monkeypatch):
         if message.query_index == LAST:
             last.set()
 
-    publisher, camera = EdgePublisher(EdgeEstimator(), publish, statistics, ending), object()
+    publisher = EdgePublisher(EdgeEstimator(), '', publish, statistics, ending)
+    camera = object()
     pair = SimpleNamespace(
         pose=lambda place: np.array([0, 0, 0, 0, 0, 0, 1.0]), place=0, query=object(),
         thumbnails={0: b'JPEG'}, source=object(), spacing=1e-9,

@@ -16,8 +16,6 @@ from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.journal import Base
-from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.saving import (
     close_journals,
@@ -31,11 +29,11 @@ from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
 from stavpr_ros.ros import REPORT_PERIOD
-from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
+from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus
 from stavpr_ros.ros.map_loading import MapLoader
-from stavpr_ros.ros.messages import loop_closure_message, map_info_message, nanoseconds, PoseFrames
+from stavpr_ros.ros.messages import map_info_message, nanoseconds, PoseFrames
 from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import is_requested, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
@@ -100,6 +98,7 @@ class Runtime:
         verifier = load_verifier(settings.verifier) if settings.verifier else None
         self._edges = EdgePublisher(
             EdgeEstimator(settings.relative_pose, verifier),
+            settings.robot_id,
             self._output.publish_closure,
             self._statistics,
             node.ending,
@@ -125,15 +124,17 @@ class Runtime:
 
     def _make_pipeline(self) -> Pipeline:
         limit_threads(self.settings.threads)
-        return Pipeline(self.settings.pipeline, self.settings.operation, self._open_journal)
+        log = self._node.get_logger()
+        return Pipeline(
+            self.settings.pipeline,
+            self.settings.operation,
+            lambda base, template: open_journal(self._journaled, base, template, log),
+        )
 
     @property
     def _journaled(self) -> Path:
         """Return the file whose name the journal of recorded places has."""
         return Path(self.settings.save_path or self.settings.maps_path / RECORDED)
-
-    def _open_journal(self, base: Base, template: PlaceMap) -> JournalWriter | None:
-        return open_journal(self._journaled, base, template, self._node.get_logger())
 
     # life cycle
 
@@ -381,25 +382,12 @@ class Runtime:
         camera: Camera | None,
     ) -> PlaceMatch:
         """Publish a match; its closure, and that of its late match, when their edges are ready."""
-        places, edge = self.pipeline.places, None
+        pipeline = self.pipeline
         if self._navigation is not None:
-            self._navigation.publish(header, match, places, pose, frames.odometry)
-        self._views.publish(header, match, self.pipeline, frames.frame, pose)
-        # a route has the camera of the query
-        place_camera = places.camera if isinstance(places, PlaceMap) else camera
-        closures = []
-        for each in (match, match.late):
-            pair = self.pipeline.matched_pair(each, self._edges.method) if each else None
-            if each is match and match.accepted:
-                edge = self._edges.immediate(pair, camera, place_camera)
-            if each is None or pair is None:
-                continue
-            query_pose = None if np.isnan(pair.query_pose).any() else pair.query_pose
-            robot_id = self.settings.robot_id
-            closure = loop_closure_message(header, each, pair.source, robot_id, frames, query_pose)
-            if closure is not None:
-                closures.append(WaitingClosure(closure, pair, camera, place_camera))
-        message = self._output.publish(header, match, places, frames, edge)
+            self._navigation.publish(header, match, pipeline.places, pose, frames.odometry)
+        self._views.publish(header, match, pipeline, frames.frame, pose)
+        edge, closures = self._edges.prepare(header, match, pipeline, frames, camera)
+        message = self._output.publish(header, match, pipeline.places, frames, edge)
         for closure in closures:
             self._edges.put(closure)
         return message
