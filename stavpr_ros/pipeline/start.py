@@ -17,7 +17,7 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
 
-BLANK = np.zeros((480, 640, 3), np.uint8)
+BLANK_IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def start_operation(
         return Operation(extractor, place_map, recognizer)
     extractor = extractor or settings.extractor()
     if name == 'mapping':
-        extractor.extract([BLANK])
+        extractor.extract([BLANK_IMAGE])
         if place_map is not None and place_map.partial:
             raise SettingsError(
                 'operation mapping does not extend the map of a fleet: record a map of its own, '
@@ -148,7 +148,7 @@ def _warm_up(
     images: int,
 ) -> None:
     """Compile and allocate everything, so that the first image is as fast as the others."""
-    features = extractor.extract([BLANK])
+    features = extractor.extract([BLANK_IMAGE])
     for _ in range(images):
         recognizer.update(features)
     recognizer.ranked(2)

@@ -24,7 +24,7 @@ from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.ros.rclpy_workarounds import PromptExecutor, ros_arguments_checked
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
-SPIN_SECONDS = 0.2  # until a signal is noticed
+SIGNAL_POLL = 0.2  # seconds until a signal is noticed
 CALLBACK_SECONDS = 2.0  # for running callbacks at the end
 SERVICE_SECONDS = 2.0  # until a node shows its parameter service; tools may have none
 # read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
@@ -114,7 +114,7 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     try:
         while node.context.ok() and not done():
             with signals_deferred():
-                executor.spin_once(timeout_sec=SPIN_SECONDS)
+                executor.spin_once(timeout_sec=SIGNAL_POLL)
     except ExternalShutdownException:
         pass
     finally:

@@ -30,9 +30,9 @@ from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_srvs.srv import Trigger
 
-SPIN_SECONDS = 0.1  # until a signal is noticed
+KEY_POLL = 0.1  # seconds until a signal, or a key, is noticed
 TRIES = 3  # how often one image is sent
-RELIABLE = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
+RELIABLE_QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 OTHERS_DEPTH = 1000  # messages of one topic between two images
 
 
@@ -107,7 +107,7 @@ class Replayer:
     ) -> None:
         self.node, self.notify, self.options = node, notify, options
         self.published = self.resent = self.dropped = 0
-        self.publisher = node.create_publisher(Image, 'image', RELIABLE)
+        self.publisher = node.create_publisher(Image, 'image', RELIABLE_QOS)
         self.receipts = Receipts(node)
         self._others = {topic.name: self._publish_on(topic, to) for topic, to in topics.items()}
         self._match_topic = node.resolve_topic_name('stavpr/match')
@@ -115,7 +115,7 @@ class Replayer:
         self._serve()
         self._clock: Publisher | None = None
         if options.clock:
-            self._clock = node.create_publisher(ClockMessage, '/clock', RELIABLE)
+            self._clock = node.create_publisher(ClockMessage, '/clock', RELIABLE_QOS)
             steady = Clock(clock_type=ClockType.STEADY_TIME)
             node.create_timer(1 / options.clock, self._publish_clock, clock=steady)
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -222,7 +222,7 @@ class Replayer:
     def _spin_once(self, seconds: float) -> None:
         """Serve one callback, or wait for one at most so long; read the keys."""
         with signals_deferred():
-            self._executor.spin_once(timeout_sec=min(seconds, SPIN_SECONDS))
+            self._executor.spin_once(timeout_sec=min(seconds, KEY_POLL))
         self._poll()
 
     def _missing(self) -> str:
