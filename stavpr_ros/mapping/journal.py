@@ -33,7 +33,7 @@ import torch
 
 FORMAT, VERSION = 'stavpr-journal', 1
 SUFFIX = '.journal'
-MAX_RECORD_BYTES = 2**28  # a longer record is damaged
+LONGEST = 2**28  # bytes of a record; a longer one is damaged
 _FRAME = struct.Struct('<II')
 _PLACE = struct.Struct('<qqHIB7d')  # number, stamp, lengths of id and thumbnail, has pose, pose
 _NO_POSE = (np.nan,) * 7
@@ -222,7 +222,7 @@ class JournalReader:
         if len(head) < _FRAME.size:
             return None
         length, checksum = _FRAME.unpack(head)
-        if length > min(MAX_RECORD_BYTES, self._left):
+        if length > min(LONGEST, self._left):
             return None
         content = self._file.read(length)
         if len(content) < length or zlib.crc32(content) != checksum:

@@ -28,7 +28,7 @@ from stavpr_ros.output_file import create_temporary, sync_folder
 SYNC_PERIOD = 1.0  # seconds between syncs, and between attempts after an error
 WAITING = 2**28  # most bytes that wait for room on the disk
 SLACK = 2**24  # bytes of forgotten places, and half of the file, before it is rewritten
-COPIED_BYTES = 2**20  # at a time
+PIECE = 2**20  # bytes copied at a time
 
 
 class JournalWriter:
@@ -233,8 +233,8 @@ class JournalWriter:
 
     def _copy(self, file: int, begin: int, end: int, moved: int) -> None:
         """Copy a part of this file to another, ``moved`` bytes nearer to its start."""
-        for at in range(begin, end, COPIED_BYTES):
-            _write(file, os.pread(self._file, min(COPIED_BYTES, end - at), at), at - moved)
+        for at in range(begin, end, PIECE):
+            _write(file, os.pread(self._file, min(PIECE, end - at), at), at - moved)
 
     def _report(self, error: Exception) -> None:
         """Log an error, unless it lasts; the lock is held."""

@@ -29,7 +29,7 @@ DTYPES = {
     'U32': np.uint32, 'F16': np.float16, 'BF16': np.uint16, 'I16': np.int16, 'U16': np.uint16,
     'I8': np.int8, 'U8': np.uint8, 'BOOL': np.bool_,
 }  # fmt: skip
-HASHED_BYTES = 2**22  # that have one hash
+PIECE = 2**22  # bytes that have one hash
 AT_ONCE = 2**20  # bytes hashed at a time
 BUILD_AGAIN = 'get it from a backup, or build it again'
 
@@ -41,7 +41,7 @@ class Part:
 
     :param dtype: key of :data:`DTYPES`.
     :param start: its first byte in the file.
-    :param hashes: SHA-256 of every ``HASHED_BYTES``.
+    :param hashes: SHA-256 of every ``PIECE`` bytes.
     :param content: what to write: contiguous arrays, one after the other.
     """
 
@@ -59,7 +59,7 @@ class Part:
     @property
     def pieces(self) -> int:
         """Return the number of hashes."""
-        return -(-self.size // HASHED_BYTES)
+        return -(-self.size // PIECE)
 
 
 class MapFile:
@@ -119,8 +119,8 @@ class MapFile:
         for name in names or self.parts:
             part = self.parts[name]
             for i, sha256 in enumerate(part.hashes):
-                start = part.start + i * HASHED_BYTES
-                end = min(start + HASHED_BYTES, part.start + part.size)
+                start = part.start + i * PIECE
+                end = min(start + PIECE, part.start + part.size)
                 if self._hash(start, end, rest) != sha256:
                     raise self.damaged(
                         f'is damaged: bytes {start} to {end}, of part {name}, do not match their '

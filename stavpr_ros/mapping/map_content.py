@@ -17,7 +17,7 @@ from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, record
 from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
-from stavpr_ros.mapping.stored_features import MAX_NORM, StoredFeatures, StoredThumbnails
+from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 import torch
 
 # parts that are read, and compared with their hashes, later
@@ -72,7 +72,7 @@ def map_content(file: MapFile) -> PlaceMap:
     cells = None if manifest['cells'] is None else (manifest['cells'][0], manifest['cells'][1])
     _require_dimension(settings, sizes.get('D', sizes['d']), cells, projection is None)
     weights = arrays['weights']
-    if weights.size and not (weights.min() >= 0 and weights.max() <= MAX_NORM):
+    if weights.size and not (weights.min() >= 0 and weights.max() <= LONGEST):
         raise ValueError('part weights is not between 0 and 1')
     n = sizes['n']
     ids = [''] * n

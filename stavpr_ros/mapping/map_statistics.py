@@ -12,7 +12,7 @@ from stavpr_ros.mapping.map_version2 import features_key
 STATISTICS = 'statistics'  # name of the section
 DATA = record({'method': text(128), 'features': text(64, SHA256)})
 CHANGES = 5  # places apart, at most, whose changes are kept
-LIMITS = {  # of the values in each part; norms may be 1.01, ``MAX_NORM``
+LIMITS = {  # of the values in each part; norms may be 1.01, see LONGEST
     'mean': (-1.01, 1.01),
     'directions': (-1.01, 1.01),
     'gains': (0.01, 1.01),

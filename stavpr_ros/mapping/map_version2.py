@@ -9,7 +9,7 @@ from typing import Any, IO
 
 import numpy as np
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping.map_container import DTYPES, HASHED_BYTES, MapFile, Part, read_json
+from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, PIECE, read_json
 from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, text
 
 FORMAT, VERSION = 'stavpr-map', 2
@@ -135,8 +135,8 @@ def write_parts(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, Part
 
 
 def _write(file: IO[bytes], arrays: Iterable[np.ndarray]) -> list[str]:
-    """Write arrays one after the other; return the hash of every ``HASHED_BYTES``."""
-    hashes, digest, room = [], hashlib.sha256(), HASHED_BYTES
+    """Write arrays one after the other; return the hash of every ``PIECE`` bytes."""
+    hashes, digest, room = [], hashlib.sha256(), PIECE
     for array in arrays:
         if not array.size:
             continue
@@ -148,8 +148,8 @@ def _write(file: IO[bytes], arrays: Iterable[np.ndarray]) -> list[str]:
             room -= len(piece)
             if not room:
                 hashes.append(digest.hexdigest())
-                digest, room = hashlib.sha256(), HASHED_BYTES
-    return hashes if room == HASHED_BYTES else [*hashes, digest.hexdigest()]
+                digest, room = hashlib.sha256(), PIECE
+    return hashes if room == PIECE else [*hashes, digest.hexdigest()]
 
 
 def _header(

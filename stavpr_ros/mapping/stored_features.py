@@ -12,7 +12,7 @@ from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 import torch
 
-MAX_NORM = 1.01  # norm of a strip; float16 rounds it
+LONGEST = 1.01  # norm of a strip; float16 rounds it
 CODES = f'{STATISTICS}/codes'
 PLACES_AT_ONCE = 512  # of one strip: they stay in the cache while they are checked
 
@@ -187,7 +187,7 @@ def _require_normalized(rows: torch.Tensor, name: str, place: int) -> None:
     for low in range(0, len(rows), PLACES_AT_ONCE):
         # by NumPy: torch would wake its threads for each of thousands of short blocks
         block = rows[low : low + PLACES_AT_ONCE].float().numpy()
-        if not (np.einsum('ij,ij->i', block, block) <= MAX_NORM**2).all():  # NaN included
+        if not (np.einsum('ij,ij->i', block, block) <= LONGEST**2).all():  # NaN included
             raise ValueError(
                 f'part {name}, from place {place + low} on: features are not finite, or longer '
                 'than 1'
