@@ -211,7 +211,7 @@ def write_page(found: list[dict[str, Any]], page: Path) -> None:
 
 
 def written_between(page: Path, begin: str, end: str, shown: list[str]) -> None:
-    """Replace what stands between two marks of a page."""
+    """Replace the text between two marks of a page."""
     before, rest = page.read_text(encoding='utf-8').split(begin)
     text = '\n'.join(['', '', *shown]).rstrip()
     page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')

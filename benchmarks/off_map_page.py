@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page docs/off_map.md from the rows that off_map.py measures."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from accuracy import FEATURES
@@ -11,6 +11,23 @@ from results import heading, table
 DAY, NIGHT = 'gardens_point', 'walk_night'
 LEVEL = 0.95  # declared probability whose precision the summary gives
 Results = dict[str, dict[str, Any]]
+TEXT = """\
+`make off-map` measures mode robust with its defaults on all data sets of the
+[accuracy table](../benchmarks/README.md#accuracy), on drives that differ from the recordings.
+[Robust mode](robust_mode.md) explains the method and its limits; every drive and all bins of the
+calibration are in [off_map.json](../benchmarks/results/off_map.json).
+
+* **Detours:** the map lacks a stretch that the query drives; stretches begin every {step} places
+  (Nordland {long_step}). Unseen images are more than 5 places from each place of the map.
+* **Other floors:** eight floors of a building that look alike; every match is wrong. "standstill":
+  each map has 200 more places, equal, in its middle.
+* **Speeds:** half speed repeats every image; "all speeds" also pools stops of 30 and 100 images
+  and dropped images. Best F1 is over all thresholds, precision is that of the default.
+* **Reverse order:** the last image of the query comes first; its direction is wrong.
+* **Start in the middle:** images until the first match is right; a window has 20.
+* **Calibration:** declared probability beside the share of right matches; the expected error is
+  the mean difference of both over ten bins.
+"""
 
 
 def percent(part: float, whole: float) -> str:
@@ -97,106 +114,13 @@ def summary_section(results: Results) -> list[str]:
     return table(['', *head], lines)
 
 
-def _drive_cells(row: dict[str, Any]) -> list[str]:
-    names = ('f1', 'precision', 'recall', 'recall_at_100_precision')
-    return [f'{row["images"]:,}', *(f'{row[name]:.3f}' for name in names)]
-
-
-def _detour_cells(row: dict[str, Any]) -> list[str]:
-    shares = [percent(row['unseen_matched'], row['unseen']), f'{row["worst"]:.1%}']
-    return [str(row['positions']), *shares, f'{row["precision"]:.3f}', f'{row["recall"]:.3f}']
-
-
-def _floor_cells(row: dict[str, Any]) -> list[str]:
-    worst = f'{row["worst"]:.1%} ({row["worst_pair"]})'
-    return [str(row['pairs']), percent(row['matched'], row['images']), worst]
-
-
-def _reverse_cells(row: dict[str, Any]) -> list[str]:
-    wrong = percent(row['wrong'], row['images'])
-    return [str(row['matched']), wrong, f'{row["precision"]:.3f}']
-
-
-def _start_cells(row: dict[str, Any]) -> list[str]:
-    counts = ['-' if row[name] is None else f'{row[name]:g}' for name in ('median', 'longest')]
-    return [str(row['starts']), str(row['right']), *counts]
-
-
-SECTIONS: tuple[tuple[str, str, str, str, Callable[..., list[str]]], ...] = (
-    (
-        'detours',
-        'Detours: a stretch is missing in the map',
-        'The map is made without a stretch, which the query drives all the same; all positions of '
-        'the stretch (steps of 10 places, Nordland 100) are pooled. Unseen are images more than 5 '
-        'places from each place of the map. Precision counts all matches, recall the images '
-        'whose place the map has.',
-        'map and query / places removed | positions | unseen images matched | worst position | '
-        'precision | recall',
-        _detour_cells,
-    ),
-    (
-        'floors',
-        'Floors on maps of other floors',
-        'Eight floors of a building that look alike; every match is wrong. "standstill": each map '
-        'has 200 more places, equal, in its middle.',
-        'data set | pairs | images matched | worst pair',
-        _floor_cells,
-    ),
-    (
-        'drives',
-        'Drives at other speeds, with stops and dropped images',
-        'Half speed shows every image twice; "stop" repeats the image in the middle so many '
-        'times; "drop" leaves images out with this probability; "all" pools the rows above it '
-        'but the stop of 1000. '
-        'Best F1 is over all thresholds, P and R are those of the default.',
-        'map and query / change | images | best F1 | P | R | R at 100 % P',
-        _drive_cells,
-    ),
-    (
-        'reverse',
-        'The route in reverse order',
-        'The images of the query, the last one first: places are right, the direction is not.',
-        'map and query | matched | wrong | precision',
-        _reverse_cells,
-    ),
-    (
-        'start',
-        'Start in the middle',
-        'Thirty images from a start on the route, with an empty window; images until the first '
-        'match is right (a window has 20). The small map has the places around the start.',
-        'map and query / map | starts | with a right match | median images | most images',
-        _start_cells,
-    ),
-)
-
-
-def calibration_section(results: Results) -> list[str]:
-    """Return the tables of declared probabilities."""
-    lines = []
-    for feature, name, values in _rows(results, 'calibration'):
-        for row in values['bins']:
-            cells = [f'{row["from"]:.1f} - {row["to"]:.1f}', f'{row["images"]:,}']
-            cells += [f'{row[key]:.3f}' for key in ('declared', 'right')]
-            lines.append([FEATURES[feature], name, *cells])
-    text = 'Probabilities that the best place of an image is right, beside the share that is.'
-    head = ('features', 'images of', 'declared', 'images', 'mean', 'right')
-    return ['## Calibration', '', text, '', *table(head, lines)]
-
-
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the page."""
-    lines = [
+    steps = about.get('steps', 1)
+    return [
         *heading('Off the map, at night, at other speeds', about),
-        'Mode robust with its defaults on all data sets, by `make off-map`. '
-        'Data sets: benchmarks/README.md; the method: [robust mode](robust_mode.md).',
+        TEXT.format(step=10 * steps, long_step=100 * steps),
+        *filter(None, [about.get('note', '')]),
         '',
+        *summary_section(results),
     ]
-    if (steps := about.get('steps', 1)) > 1:
-        lines += [f'Steps between positions are {steps} times as coarse as below.', '']
-    lines += summary_section(results)
-    for section, title, text, head, cells in SECTIONS:
-        rows = [[FEATURES[f], name, *cells(row)] for f, name, row in _rows(results, section)]
-        if rows:
-            columns = ['features', *head.split(' | ')]
-            lines += [f'## {title}', '', text, '', *table(columns, rows)]
-    return [*lines, *calibration_section(results)]

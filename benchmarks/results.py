@@ -13,6 +13,7 @@ from pathlib import Path
 import platform
 import re
 import subprocess
+import textwrap
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -156,8 +157,8 @@ def heading(title: str, about: dict[str, Any]) -> list[str]:
         f'# {title}',
         '',
         f'Commit {about["commit"]}, {about["date"]}.',
-        f'Machine: {machine}.',
-        f'Versions: {versions}.',
+        *textwrap.wrap(f'Machine: {machine}.', 120),
+        *textwrap.wrap(f'Versions: {versions}.', 120),
         'Method: benchmarks/README.md.',
         '',
     ]

@@ -161,7 +161,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
             thumbnail.error = InputError('no JPEG')
             assert pipeline.process(message(image), i).cause == 'invalid: InputError'
             thumbnail.error = None
-        with pytest.raises(InputError, match='quaternion of zeros'):
+        with pytest.raises(InputError, match='quaternion of norm 0'):
             pipeline.process(message(image), i, np.zeros(7))
         good, expected = (
             process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)

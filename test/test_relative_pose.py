@@ -278,7 +278,7 @@ def test_rays_are_without_distortion(model, coefficients):
         ({'center': (math.nan, 1.0)}, 'not finite'),
         ({'model': 'other', 'distortion': (0.1,) * 5}, "model 'other'"),
         ({'model': 'plumb_bob', 'distortion': (0.1,) * 7}, '7 coefficients'),
-        ({'mount': (0.0,) * 7}, 'quaternion of zeros'),
+        ({'mount': (0.0,) * 7}, 'quaternion of norm 0'),
     ],
 )
 def test_camera_with_invalid_numbers_is_rejected(changes, words):

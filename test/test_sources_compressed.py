@@ -88,6 +88,17 @@ def test_decode_compressed_of_damaged_image_fails(data, message):
     assert caught.value.kind == 'damaged'
 
 
+@pytest.mark.parametrize('length', [2**31 - 1, 2**32 - 1, 1000])
+def test_decode_compressed_of_png_with_long_chunk_allocates_nothing(monkeypatch, length):
+    data = bytearray(encoded('.png', NOISE))
+    first_chunk = 8 + 12 + 13  # behind the header's
+    data[first_chunk : first_chunk + 4] = length.to_bytes(4, 'big')
+    monkeypatch.setattr(files.cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    with pytest.raises(ImageError, match='is damaged or cut off') as caught:
+        decode_compressed(bytes(data[:500]))
+    assert caught.value.kind == 'damaged'
+
+
 def test_decode_compressed_of_cut_off_jpeg_fails():
     rgb = np.full((64, 64, 3), (200, 100, 30), np.uint8)
     small = encoded('.jpg', rgb[:8, :8])

@@ -187,8 +187,10 @@ def test_table_of_synthetic_route_has_every_section(monkeypatch):
     assert floors['matched'] >= 100  # the same place under another name
     about = results.environment(named_commit='abc')
     text = '\n'.join(off_map_page.markdown(about, json.loads(json.dumps(rows, allow_nan=False))))
-    for title in ('Detours', 'Floors', 'Drives', 'The route in reverse', 'Start', 'Calibration'):
-        assert f'## {title}' in text
+    unseen = detour['unseen_matched'] / 40
+    assert f'| detours: unseen images matched | {unseen:.1%} of 40 |' in text
+    for row in ('other floors', 'lowest precision', 'reverse order', 'start', 'calibration'):
+        assert f'\n| {row}' in text
 
 
 def test_first_right_match_counts_images_since_start():

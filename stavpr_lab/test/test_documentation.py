@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 import re
 import shlex
+import sys
 
 from evaluation_commands import write_images
 from fixtures import route_images
@@ -16,8 +17,13 @@ from stavpr_ros.parameters import PARAMETERS
 from stavpr_slam.ros.bridges.bridge import EdgeBridge
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
+RESULTS = ROOT / 'benchmarks' / 'results'
+PAGES = [
+    *(ROOT / name for name in ('README.md', 'CONTRIBUTING.md', 'benchmarks/README.md')),
+    *sorted((ROOT / 'docs').glob('*.md')),
+]
 NAMES = {row.name for row in PARAMETERS}
+WALKS = ('gardens_point', 'walk_night')
 
 
 @pytest.fixture(scope='module')
@@ -116,23 +122,117 @@ def test_links_between_pages_resolve(page):
         assert (page.parent / target).exists(), f'{page.name} links to {target}'
 
 
-def test_readme_results_are_those_of_accuracy_table():
-    results = ROOT / 'benchmarks/results/accuracy-198bcca.json'
-    table = json.loads(results.read_text())['results']
+def marked_tables() -> list:
+    """Every table below the name of its rows in tables.json, by page and name."""
+    mark = re.compile(r'<!-- tables.json: (.*) -->\n\n((?:\|.*\n)+)')
+    return [
+        pytest.param(name, text.splitlines(), id=f'{page.stem}-{name}')
+        for page in PAGES
+        for name, text in mark.findall(page.read_text())
+    ]
 
-    def f1(key: str) -> float:
-        return float(table[key]['sequence']['f1'])
 
-    speeds = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')
-    for mode in ('paper', 'robust'):
-        (row,) = re.findall(
-            rf'^\| `{mode}` (\| [.\d| ]+)$', (ROOT / 'README.md').read_text(), re.M
-        )
-        numbers = [float(cell) for cell in re.findall(r'[\d.]+', row)]
-        expected = [
-            f1(f'gardens_point/g/{mode}/same'),
-            min(f1(f'gardens_point/g/{mode}/{speed}') for speed in speeds),
-            f1(f'nordland/g/{mode}/same'),
-            f1(f'corridor/g/{mode}/same'),
-        ]
-        assert numbers == pytest.approx(expected, abs=0.0006)
+@pytest.mark.parametrize(('name', 'lines'), marked_tables())
+def test_numbers_of_tables_are_those_of_tables_json(name, lines):
+    head, _, *rows = ([cell.strip() for cell in line.split('|')[1:-1]] for line in lines)
+    measured = json.loads((RESULTS / 'tables.json').read_text())[name]['rows']
+    stored = [[number(str(row[column])) for column in head] for row in measured]
+    for row in rows:
+        assert [number(cell) for cell in row] in stored
+
+
+def number(cell: str) -> float | str:
+    """Value of a cell that is a number, else its text."""
+    try:
+        return float(cell.replace(',', ''))
+    except ValueError:
+        return cell
+
+
+def test_generated_tables_are_those_of_their_results():
+    sys.path.insert(0, str(ROOT / 'benchmarks'))
+    import city
+    import off_map_page
+    import projection
+
+    def load(name: str):
+        return json.loads((RESULTS / name).read_text())
+
+    performance = (ROOT / 'docs' / 'performance.md').read_text()
+    assert '\n'.join(projection.lines(load('projection.json'))).rstrip() in performance
+    for row in load('city.json'):
+        assert city.lines([row])[2] in performance
+    off_map = load('off_map.json')
+    page = '\n'.join(off_map_page.markdown(off_map, off_map['results'])).rstrip() + '\n'
+    assert page == (ROOT / 'docs' / 'off_map.md').read_text()
+
+
+def test_accuracy_of_pages_is_that_of_accuracy_table():
+    (path,) = RESULTS.glob('accuracy-*.json')
+    measured = json.loads(path.read_text())['results']
+
+    def f1(*drives: str, of: str = 'g/robust') -> list[float]:
+        keys = [drive.replace('/', f'/{of}/') for drive in drives]
+        return [measured[key]['sequence']['f1'] for key in keys]
+
+    def of_features(kind: str, paper: bool) -> list[float | None]:
+        """Recall of single images, F1 of mode robust and of mode paper (of the same features)."""
+        numbers = []
+        for drive in ('gardens_point/same', 'walk_night/same', 'corridor/same'):
+            robust = measured[drive.replace('/', f'/{kind}/robust/')]
+            (published,) = f1(drive, of=f'{kind}/paper')
+            numbers += [robust['single']['recall_at_1'], robust['sequence']['f1']]
+            numbers.append(published if paper else None)
+        return numbers
+
+    speeds = [f'gardens_point/{speed}' for speed in ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')]
+    walks = [f'{walk}/{speed}' for walk in WALKS for speed in ('same', 'vary')]
+    expected: dict[tuple[str, str], list[float | None]] = {
+        ('docs/robust_mode.md', '**robust**'): [*f1(*walks, 'corridor/same')],
+        ('docs/features.md', 'SqueezeNet `fire6/concat_1`, 7 strips'): of_features('o', True),
+        ('docs/features.md', '`gradient`, 7 strips (default)'): of_features('g', False),
+    }
+    for mode, name in (('paper', 'mode `paper`: STA-VPR'), ('robust', 'mode `robust`')):
+        of = f'g/{mode}'
+        same = f1('gardens_point/same', 'nordland/same', 'corridor/same', of=of)
+        worst = min(f1(*speeds, of=of))
+        expected['README.md', f'`{mode}`'] = [same[0], worst, *same[1:]]
+        expected['docs/evaluation.md', name] = [*same[:2]]
+    tables = json.loads((RESULTS / 'tables.json').read_text())
+    walk, *_, train = tables['place recognition networks']['rows'][:5]
+    expected['docs/evaluation.md', 'SeqSLAM'] = [walk['SeqSLAM'], train['SeqSLAM']]
+    for (page, row), values in expected.items():
+        text = (ROOT / page).read_text()
+        (line,) = re.findall(rf'^\| {re.escape(row)} (\| *\d*\.\d.*)$', text, re.M)
+        numbers = re.findall(r'\d*\.\d+', line)
+        for cell, value in zip(numbers[: len(values)], values, strict=True):
+            digits = len(cell.partition('.')[2])
+            if value is not None:
+                assert float(cell) == pytest.approx(value, abs=0.51 * 10**-digits), (page, row)
+
+
+def test_speed_in_readme_is_that_of_its_run():
+    run = json.loads((RESULTS / 'matching-amd-epyc-2-cores-512-bit.json').read_text())
+    frames = {
+        (row['n'], row['precision']): row
+        for row in run['rows']
+        if (row['stage'], row['mode'], row['d']) == ('frame', 'robust', 224)
+    }
+    readme = (ROOT / 'README.md').read_text()
+    for n in (2_000, 20_000, 100_000):
+        float32, int8 = frames[n, 'float32'], frames[n, 'int8']
+        (reading,) = (p['ratio'] for p in float32['peers'] if p['name'] == 'reading the map')
+        (line,) = re.findall(rf'^\| {n:,}, 224 .*', readme, re.M)
+        times = [float(text) for text in re.findall(r'([\d.]+) ms', line)]
+        expected = [1e3 * float32['median_s'], 1e3 * int8['median_s']]
+        assert times == pytest.approx(expected, abs=0.051)
+        assert float(line.split('|')[3]) == pytest.approx(1 / reading, rel=0.02)
+
+
+@pytest.mark.parametrize('page', [page for page in PAGES if page.stem != 'slam_measured'])
+def test_tables_of_accuracy_name_their_results(page):
+    """A table with numbers of three digits below 1 is generated, marked or compared above."""
+    checked = '<!-- tables.json: ', '<!-- written by benchmarks/', 'Commit ', '| `robust` |'
+    for before, table in re.findall(r'((?:^(?!\|).*\n)*)((?:^\|.*\n)+)', page.read_text(), re.M):
+        if re.search(r'\| *(1\.000|0?\.\d{3}) *\|', table):
+            assert any(mark in before + table for mark in (*checked, '| mode `robust` |')), table

@@ -5,6 +5,7 @@
 import base64
 from http.client import HTTPConnection
 import json
+import math
 import re
 import signal
 import threading
@@ -12,9 +13,12 @@ import threading
 import numpy as np
 from processes import Process, TIMEOUT
 import pytest
+import rclpy
 from robot import LENGTH
+from sensor_msgs.msg import Image
 from stavpr_lab.monitor.node import encode_row, History, KEPT, Monitor, span_of
 from stavpr_lab.monitor.server import MonitorServer
+from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
 
 
@@ -44,6 +48,13 @@ def test_history_keeps_the_last_samples_with_a_time_between_them(history):
     for i in range(2):
         history.add({'place': i})
     assert history.since(0, TIMEOUT)[1]['samples'] == [{'place': 0}]
+
+
+def test_history_has_no_number_that_json_lacks(history):
+    history.set('pose', [1.0, math.nan])
+    history.add({'probability': math.inf})
+    changes = history.since(0, TIMEOUT)[1]
+    assert changes == {'pose': [1.0, None], 'samples': [{'probability': None}]}
 
 
 def test_history_when_closed_wakes_those_who_wait(history):
@@ -141,7 +152,9 @@ def test_server_runs_commands_and_returns_their_errors(served):
         ('{"name": "stop"}', {'Content_Type': 'text/plain'}, 400),  # a page of another site can
         ('{"name": "stop"}', {'Content_Type': 'application/x-www-form-urlencoded'}, 400),
         ('{"name": "stop"}', {'Host': 'evil.org:80'}, 403),
+        ('{"name": "stop"}', {'Origin': 'http://evil.org'}, 403),
         ('[]', {}, 400),
+        ('[' * 9000, {}, 400),
         ('no JSON', {}, 400),
         ('{}', {'Content_Length': '99999'}, 400),
         ('{}', {'Content_Length': 'x'}, 400),
@@ -219,13 +232,21 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
 
 
 def test_monitor_without_a_node_refuses_commands(context, history):
-    import rclpy
-
     node = rclpy.create_node('lonely', context=context)
     monitor = Monitor(node, 'nobody', history)
     with pytest.raises(StavprError, match='/nobody is not running'):
         monitor.command('stop', '')
     assert history.since(0, TIMEOUT)[1]['state'] == 'not found'
+    node.destroy_node()
+
+
+def test_monitor_survives_messages_of_other_nodes(context, history):
+    node = rclpy.create_node('lonely', context=context)
+    monitor = Monitor(node, 'nobody', history)
+    monitor._on_match(PlaceMatch(status=200, probability=math.nan))
+    for data in (b'', b'12345'):
+        monitor._on_distances(Image(data=data))
+    assert history.since(0, TIMEOUT)[1]['samples'][0]['status'] == 'unknown'
     node.destroy_node()
 
 

@@ -3,7 +3,6 @@
 """Poses by their stamps, interpolated between them."""
 
 from bisect import bisect_left
-from math import isfinite
 from threading import Lock
 
 import numpy as np
@@ -12,6 +11,8 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.units import SECOND
 
 MAX_GAP = 5 * SECOND  # without odometry, across which interpolation would be a guess
+FARTHEST = 1e8  # meters of a coordinate: farther from the origin is no place on Earth
+NORMS = 1e-3, 1e3  # of a quaternion that is normalized
 
 
 def checked_pose(pose: np.ndarray) -> np.ndarray:
@@ -20,19 +21,24 @@ def checked_pose(pose: np.ndarray) -> np.ndarray:
 
     :param pose: x y z (meters) and quaternion x y z w, shape (7,).
     :returns: the same, float64.
-    :raises InputError: another shape, values that are not finite, or a quaternion of zeros.
+    :raises InputError: another shape, values that are not finite or beyond ``FARTHEST``, or a
+        quaternion of a norm outside ``NORMS``.
     """
     own = np.array(pose, np.float64)
     if own.shape != (7,):
         raise InputError(
             f'pose has shape {own.shape}: expected 7 numbers, x y z and quaternion x y z w'
         )
-    norm = float(np.linalg.norm(own[3:]))
-    if not np.isfinite(own).all() or not isfinite(norm):
-        raise InputError(f'pose {own.tolist()} is not finite: expected meters and a quaternion')
-    if norm == 0:
+    if not (np.abs(own) <= FARTHEST).all():  # NaN as well
         raise InputError(
-            f'pose {own.tolist()} has a quaternion of zeros: expected 0 0 0 1 for no rotation'
+            f'pose {own.tolist()} is not finite: expected meters up to {FARTHEST:g} and a '
+            'quaternion'
+        )
+    norm = float(np.linalg.norm(own[3:]))
+    if not NORMS[0] <= norm <= NORMS[1]:
+        raise InputError(
+            f'pose {own.tolist()} has a quaternion of norm {norm:g}: expected one of norm 1, '
+            '0 0 0 1 for no rotation'
         )
     own[3:] /= norm
     return own

@@ -27,7 +27,7 @@ from stavpr_ros.ros.worker import Worker
 from stavpr_ros.signals import time_left
 from std_msgs.msg import Header
 
-MOST_WAITING = 64  # closures; while there are more, the oldest goes without a relative pose
+MOST_WAITING = 16  # closures; while there are more, the oldest goes without a relative pose
 UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
 NO_POSE = 'the place has no pose: record maps and routes with odometry'
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits

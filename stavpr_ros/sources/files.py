@@ -18,6 +18,7 @@ MAX_PIXELS = 64_000_000
 JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
 """Markers before a segment (length and bytes), and the end; never within compressed pixels."""
 END_OF_JPEG = b'\xff\xd9'
+PNG_SIGNATURE, PNG_CHUNK = 8, 12  # bytes before the first chunk; of a chunk without its data
 
 JPEG_FORMATS = ('JPEG', 'MPO')  # MPO: several images, the first is read
 
@@ -116,12 +117,15 @@ def decode_file(
 def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
     image = cv2.imdecode(flat, mode)
     if image is None:
-        raise ImageError(
-            f'compressed image of {flat.size} bytes is damaged or cut off: copy or record it '
-            'again',
-            kind='damaged',
-        )
+        raise _damaged(flat.size)
     return np.asarray(image)
+
+
+def _damaged(size: int) -> ImageError:
+    return ImageError(
+        f'compressed image of {size} bytes is damaged or cut off: copy or record it again',
+        kind='damaged',
+    )
 
 
 def _check_file(flat: np.ndarray) -> Image.Image:
@@ -143,6 +147,8 @@ def _check_file(flat: np.ndarray) -> Image.Image:
         raise too_large(width, height)
     if header.format in JPEG_FORMATS:
         _check_end_of_jpeg(flat.tobytes())
+    if header.format == 'PNG':
+        _check_chunks_of_png(flat.data)
     return header
 
 
@@ -160,6 +166,16 @@ def _check_end_of_jpeg(data: bytes) -> None:
         'again',
         kind='cut off',
     )
+
+
+def _check_chunks_of_png(data: memoryview) -> None:
+    """Reject chunks longer than the file: OpenCV allocates a chunk before it reads it."""
+    at = PNG_SIGNATURE
+    while at + PNG_CHUNK <= len(data):
+        length = int.from_bytes(data[at : at + 4], 'big')
+        at += PNG_CHUNK + length
+        if at > len(data):
+            raise _damaged(len(data))
 
 
 def too_large(width: int, height: int) -> ImageError:

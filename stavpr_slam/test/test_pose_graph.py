@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from stavpr_slam.simulated_odometry import drifted
 
 SECOND = 10**9
 LAP = 100  # images of 2 m
+EXTREME = (np.nan, np.inf, 1e308, -1e308, 1e30, 1e-320, -1.0, 0.0)
 NOISE = np.diag([0.3, 0.3, 0.3, 0.02, 0.02, 0.02]) ** 2
 
 
@@ -122,6 +124,7 @@ def test_optimize_carried_robot_cuts_at_the_image():
     truth, odometry, closures = carried_drive()
     found, graph = solve(truth, closures, odometry)
     assert graph.splits == 1
+    assert 4 < graph.widest_break < 20  # images 134 to 136 of 2 m have no closure
     assert error(found, truth) < 1.5  # one image on the wrong side would be 2 m
 
 
@@ -196,6 +199,56 @@ def test_add_closure_invalid_is_counted(drive):
     with pytest.raises(InputError, match='positive definite'):
         graph.add_closure(bad)
     assert graph.counts['invalid'] == 1
+
+
+@pytest.mark.parametrize('field', ['pose', 'place_pose', 'covariance', 'odometry'])
+def test_update_after_extreme_values_is_finite(drive, field):
+    """Values are rejected, or the graph computes with them; later closures still count."""
+    truth, closures = drive
+    graph, odometry = PoseGraph(), odometry_of(truth)
+    rejected = 0
+    for i, pose in enumerate(odometry):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        if i < LAP:
+            continue
+        graph.add_closure(closures[i - LAP])
+        value = EXTREME[i % len(EXTREME)]
+        where = i % 6
+        try:
+            if field == 'odometry':
+                bad = pose.copy()
+                bad[where] = value
+                graph.add_odometry((i + 1) * SECOND + 1, bad)
+            else:
+                good = replace(closures[i - LAP], place_pose=pose, map_id='map')
+                bad = getattr(good, field).copy()
+                bad.flat[7 * where if field == 'covariance' else where] = value
+                graph.add_closure(replace(good, **{field: bad}))
+        except InputError:
+            rejected += 1
+        if i % 10 == 0:
+            graph.update()
+    assert rejected > 30
+    assert np.isfinite(graph.update()).all()
+    assert graph.accepted > 50
+
+
+def test_update_without_solution_leaves_new_closures_out(drive, monkeypatch):
+    truth, closures = drive
+    graph = PoseGraph()
+    for i, pose in enumerate(odometry_of(truth)):
+        graph.add_odometry((i + 1) * SECOND, pose)
+    for each in closures[:20]:
+        graph.add_closure(each)
+    graph.update()
+    accepted, solve_graph = graph.accepted, graph._solve
+    monkeypatch.setattr(graph, '_solve', Mock(side_effect=[RuntimeError, *[None] * 2]))
+    graph.add_closure(closures[20])
+    graph.update()
+    assert graph.counts['failed'] == 1
+    monkeypatch.setattr(graph, '_solve', solve_graph)
+    graph.update()
+    assert graph.accepted == accepted
 
 
 def test_update_closure_of_unknown_stamp_is_counted(drive):

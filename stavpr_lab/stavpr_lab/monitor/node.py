@@ -33,6 +33,7 @@ KEPT = 3000  # samples: four minutes
 SAMPLE_SECONDS = 0.08  # least time between two samples
 POLL_SECONDS = 0.5  # for the state of the node, and whether images are needed
 ROUTE_POINTS = 1000  # of the map's route, at most
+COLUMN_BYTES = 8  # of ``~/distances``: a distance and its place, float32
 TIMEOUT = 30.0  # seconds for a command: configuring loads the map
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STATUSES = (
@@ -73,7 +74,8 @@ class History:
                 self.viewers -= 1
 
     def set(self, name: str, value: Any) -> None:
-        """Replace a part, a value for JSON, if it has changed."""
+        """Replace a part if it has changed."""
+        value = for_json(value)
         with self._changed:
             if name not in self._parts or self._parts[name][1] != value:
                 self._version += 1
@@ -87,7 +89,7 @@ class History:
             if now - self._last >= self._sample_seconds:
                 self._last = now
                 self._version += 1
-                self._samples.append((self._version, sample))
+                self._samples.append((self._version, for_json(sample)))
                 self._changed.notify_all()
 
     def show(self, image: bytes) -> None:
@@ -226,13 +228,13 @@ class Monitor:
         self.history.add(
             {
                 'stamp': stamp.sec + stamp.nanosec / 1e9,
-                'status': STATUSES[message.status],
+                'status': dict(enumerate(STATUSES)).get(message.status, 'unknown'),
                 'reason': message.reason,
                 'place': message.newest_index,
                 'nearest': message.sequence_middle,
-                'probability': _number(message.probability),
-                'distance': _number(message.distance),
-                'threshold': _number(message.threshold),
+                'probability': message.probability,
+                'distance': message.distance,
+                'threshold': message.threshold,
                 'places': self._places,
                 # of the image before, where the messages have overtaken each other
                 'row': self._row if message.status in WITH_ROW else '',
@@ -241,6 +243,9 @@ class Monitor:
         )
 
     def _on_distances(self, message: Image) -> None:
+        size = len(message.data)
+        if not size or size % COLUMN_BYTES:
+            return
         distances, places = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
         self._row, self._span = encode_row(distances), span_of(places)
 
@@ -297,6 +302,10 @@ def encode_row(row: np.ndarray) -> str:
     return base64.b64encode(scaled.astype(np.uint8)).decode()
 
 
-def _number(value: float) -> float | None:
-    """Return a number for JSON, which has no NaN."""
-    return value if math.isfinite(value) else None
+def for_json(value: Any) -> Any:
+    """Return a value for JSON, which has no NaN and no infinity: None instead."""
+    if isinstance(value, dict):
+        return {key: for_json(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [for_json(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -20,6 +20,15 @@ from stavpr_ros.errors import StavprError, UnavailableError
 
 EVENT_SECONDS = 5.0  # most time between two events, so that a closed browser is noticed
 MAX_REQUEST = 10_000  # bytes
+PROTECTION = {
+    'Cache-Control': 'no-store',
+    'Content-Security-Policy': (
+        "default-src 'self'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+        "img-src 'self' data:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
+    ),
+    'X-Content-Type-Options': 'nosniff',
+    'X-Frame-Options': 'DENY',
+}
 NAMES = {'localhost', socket.gethostname().lower()}
 
 
@@ -107,7 +116,7 @@ class _Handler(BaseHTTPRequestHandler):
                 raise ValueError(f'{size} bytes')
             request = json.loads(self.rfile.read(size))
             name, value = str(request['name']), str(request.get('value', ''))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             self.close_connection = True
             self._send(HTTPStatus.BAD_REQUEST, 'text/plain', f'no command: {error}'.encode())
             return
@@ -121,13 +130,15 @@ class _Handler(BaseHTTPRequestHandler):
         """Log no requests."""
 
     def _is_allowed(self) -> bool:
-        """Refuse foreign names of this host: pages of other sites may use them (rebinding)."""
-        given = self.headers.get('Host', '')
+        """Refuse pages of other sites, and foreign names of this host, which they may use."""
+        given, origin = self.headers.get('Host', ''), self.headers.get('Origin')
         try:
             name = urlsplit(f'//{given}').hostname or ''
             allowed = name in NAMES or bool(ipaddress.ip_address(name))
         except ValueError:
             allowed = False
+        if origin is not None and origin.partition('://')[2] != given:
+            allowed, given = False, f'{given}, from {origin}'
         if not allowed:
             self.close_connection = True
             text = f'unknown host {given!r}: use the address of this machine'
@@ -138,7 +149,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header('Content-Type', kind)
         self.send_header('Content-Length', str(len(content)))
-        self.send_header('Cache-Control', 'no-store')
+        for header, value in PROTECTION.items():
+            self.send_header(header, value)
         self.end_headers()
         self.wfile.write(content)
 

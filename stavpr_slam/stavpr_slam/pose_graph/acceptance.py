@@ -33,9 +33,7 @@ class Acceptance:
     clusters that these confirm.
     """
 
-    def __init__(
-        self, chain: KeyframeChain, settings: ConsistencySettings, adapt: bool
-    ) -> None:
+    def __init__(self, chain: KeyframeChain, settings: ConsistencySettings, adapt: bool) -> None:
         self._chain, self._settings, self._adapt = chain, settings, adapt
         self._consistent = ConsistentSet(settings.support)
         self._scaled_at = 0
@@ -181,13 +179,13 @@ class Acceptance:
 
     def _estimate(self, candidates: np.ndarray) -> bool:
         """
-        Estimate the errors of the odometry, not from what the last estimate accepts.
+        Estimate the errors of the odometry, independent of the closures accepted until now.
 
         Large errors let wrong closures agree, which make the estimate too large: it is repeated
         with the closures that agree at the smaller errors.
         """
         before, scale, previous = self.scale, 1.0, np.inf
-        sample = [self.clusters[i] for i in _spread(candidates, SAMPLE) if i not in self._refuted]
+        sample = [self.clusters[i] for i in _spread(candidates, SAMPLE)]
         everything, session = range(len(sample)), self._chain.session
         while scale < previous:
             consistent = ConsistentSet(self._settings.support)

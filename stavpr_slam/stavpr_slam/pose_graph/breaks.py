@@ -12,9 +12,7 @@ from stavpr_slam.pose_graph.clusters import Cluster, ConsistencySettings
 from stavpr_slam.pose_graph.cycles import Cycles
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
-STANDING = math.log(
-    10
-)  # evidence of the odometry that stands: else it does in a tenth of the images
+STOPPED = math.log(10)  # evidence of a stop: elsewhere, one image in ten is of a stop
 PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
 MOST = 40  # places of a break that are tried
 CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
@@ -57,9 +55,10 @@ def neighbors(
     session = chain.session
     own = [each for each in accepted if session[each.members[0].query] == session[node]]
     own.sort(key=lambda each: each.members[0].at)
-    sides = [each for each in own if each.members[0].query < node], [
-        each for each in own if each.members[0].query >= node
-    ]
+    sides = (
+        [each for each in own if each.members[0].query < node],
+        [each for each in own if each.members[0].query >= node],
+    )
     for side in sides:
         length = side[-1].members[-1].at - side[0].members[0].at if side else 0.0
         weight = sum(each.weight for each in side)
@@ -79,7 +78,7 @@ def locate(
     """
     Return the break between clusters: at a pause, else where it is most probable.
 
-    There, the images change much, the odometry stands, as a robot that is carried does not drive,
+    There, the images change much, the odometry stops, as a robot that is carried does not drive,
     and few closures are on the wrong side. Changes are known in windows of closures only. Windows
     at the break have images of both sides, so that some closures are on the wrong side. Without
     any evidence, the break is in the middle.
@@ -97,14 +96,14 @@ def locate(
     own = np.flatnonzero((chain.session == session) & (chain.travelled >= low))
     own = own[chain.travelled[own] <= high]
     stamps = chain.stamps[own]
-    seen = {t: c for t, c in changes.items() if stamps[0] < t <= stamps[-1] and c > 0}
-    usual = float(np.median(list(seen.values()))) if seen else 1.0
-    evidence = dict.fromkeys(seen, 0.0)
+    changed = {t: c for t, c in changes.items() if stamps[0] < t <= stamps[-1] and c > 0}
+    usual = float(np.median(list(changed.values()))) if changed else 1.0
+    evidence = dict.fromkeys(changed, 0.0)
     least = np.median(np.diff(stamps)) / 2 if len(own) > 1 else math.inf
     for time, middle in chain.stood[own[1:]].tolist():
         if time >= least:
-            during = [t for t in seen if 0 < t - middle + time / 2 <= time] or [middle]
-            evidence |= dict.fromkeys(during, STANDING)
+            during = [t for t in changed if 0 < t - middle + time / 2 <= time] or [middle]
+            evidence |= dict.fromkeys(during, STOPPED)
     if evidence:
         near = [
             each
@@ -120,7 +119,7 @@ def locate(
 
         def probable(stamp: int) -> float:
             wrong = np.where(at >= stamp, CLEAR * old < new, CLEAR * new < old).sum()
-            change = math.log(seen.get(stamp, usual) / usual)
+            change = math.log(changed.get(stamp, usual) / usual)
             return change + evidence[stamp] - WRONG_SIDE * float(wrong)
 
         stamp = max(evidence, key=probable)

@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_slam.pose_graph.path_errors import LARGEST_COVARIANCE
+
+VARIANCES = 1e-10, 1e6  # m^2, rad^2: least and largest that the graph computes with
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,22 +41,31 @@ class Closure:
 
     def checked(self) -> 'Closure':
         """
-        Return this closure with a unit quaternion.
+        Return this closure with unit quaternions and a covariance that can be inverted.
 
         :raises InputError: values that are not finite, or no covariance.
         """
         covariance = np.array(self.covariance, np.float64)
-        if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-            raise InputError('the covariance of a closure is not finite: expected 6 x 6 numbers')
-        if np.linalg.eigvalsh((covariance + covariance.T) / 2)[0] <= 0:
+        if covariance.shape != (6, 6) or not (np.abs(covariance) <= LARGEST_COVARIANCE).all():
+            raise InputError(
+                'the covariance of a closure is not finite: expected 6 x 6 numbers up to '
+                f'{LARGEST_COVARIANCE:g}'
+            )
+        values, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+        if values[0] <= 0:
             raise InputError(
                 'the covariance of a closure is not positive definite: expected variances above 0'
             )
+        limited = values.clip(*VARIANCES)
+        if not np.array_equal(limited, values):
+            covariance = (axes * limited) @ axes.T
         if self.query_stamp <= 0 or self.place_stamp <= 0:
             raise InputError('a closure has a stamp of 0: expected those of the two images')
         if self.map_id and self.place_pose is None:
             raise InputError('a closure with a map has no pose of the place in the map')
-        return replace(self, pose=checked_pose(self.pose), covariance=covariance)
+        place = None if self.place_pose is None else checked_pose(self.place_pose)
+        pose = checked_pose(self.pose)
+        return replace(self, pose=pose, covariance=covariance, place_pose=place)
 
 
 @dataclass(frozen=True, eq=False)

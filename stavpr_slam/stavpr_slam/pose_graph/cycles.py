@@ -56,9 +56,7 @@ class Cycles:
         squared[same] = (error * solved).sum(axis=1)
         return squared
 
-    def _cycles(
-        self, i: int, others: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _cycles(self, i: int, others: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
         Return the logarithms of cycles with closure i, and their covariances, to first order.
 

@@ -63,12 +63,11 @@ class PoseGraph:
     def reset(self) -> None:
         """Forget everything."""
         self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
-        self._acceptance = Acceptance(
-            self.chain, self.settings.consistency, self.settings.adapt
-        )
+        self._acceptance = Acceptance(self.chain, self.settings.consistency, self.settings.adapt)
         self._solver.restart()
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
+        self._solved_closures = 0  # of them, in the last solution
         self._changes: dict[int, float] = {}  # of images by their stamps
         self._ties = Ties()
         self._edges: dict[int, ResolvedClosure] = {}
@@ -158,12 +157,29 @@ class PoseGraph:
         """
         Accept and reject closures, and solve.
 
+        New closures with which that fails are left out and counted.
+
         :param final: solve all at once, to convergence.
         :returns: transforms of all nodes in the map, shape (N, 4, 4).
         """
         self._resolve()
         if not len(self.chain):
             return self.solved
+        try:
+            self._update(final)
+            self._solved_closures = len(self._known)
+        except (RuntimeError, np.linalg.LinAlgError, FloatingPointError):
+            # GTSAM raises RuntimeError for a system that it cannot solve
+            failed = len(self._known) - self._solved_closures
+            if not failed:
+                raise
+            self.counts['failed'] += failed
+            del self._known[self._solved_closures :]
+            self._rebuild()
+            self._update(final)
+        return self.solved
+
+    def _update(self, final: bool) -> None:
         if self._acceptance.has_changed:
             self._decide()
         ties, initial = self._arranged()
@@ -177,7 +193,6 @@ class PoseGraph:
         self._solve(ties, initial, final)
         if self._acceptance.confirm(self.solved, ties):
             self._solve(ties, self.solved, final)
-        return self.solved
 
     def _decide(self) -> None:
         """Accept and reject clusters; begin a session where they prove a break."""
@@ -272,6 +287,19 @@ class PoseGraph:
     def splits(self) -> int:
         """Return the number of breaks that closures prove."""
         return len(self.chain.splits)
+
+    @property
+    def widest_break(self) -> float:
+        """Return the longest distance without accepted closures around a break, m; 0 = none."""
+        chain, widest = self.chain, 0.0
+        queries = np.array([edge.query for edge in self.edges if edge.accepted], int)
+        for node in chain.splits:
+            own = queries[chain.recording[queries] == chain.recording[node]]
+            behind = own >= node
+            at = chain.travelled[own]
+            if behind.any() and not behind.all():
+                widest = max(widest, float(at[behind].min() - at[~behind].max()))
+        return widest
 
     @property
     def pending(self) -> int:

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-All clusters together: what the others imply about each one.
+All clusters together: the prediction of each one by the others.
 
 Linearized, the misclosures of loops are jointly Gaussian: their covariance is that of the
 closures, and of the odometry that loops have in common. Each one is compared with its prediction
@@ -124,7 +124,7 @@ class Loops:
 
     def move(self, ends: np.ndarray, given: 'Given') -> None:
         """
-        Linearize at what loops imply.
+        Linearize at the poses that loops imply.
 
         :param ends: covariances of the ends with these loops, shape (2, 6 n, 6 m).
         """
@@ -157,7 +157,7 @@ class Given:
         self.pulled = precision @ (off - loose @ self.sessions)
 
     def deviations(self) -> np.ndarray:
-        """Return the squared deviations of the loops, each from what the others imply, (m,)."""
+        """Return squared deviations of the loops from the predictions by the others, (m,)."""
         m = len(self._off) // 6
         blocks = self._precision.reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
         weighed = self._weighed.reshape(m, 6, self._weighed.shape[1])
@@ -168,7 +168,7 @@ class Given:
         self, off: np.ndarray, own: np.ndarray, shared: np.ndarray, loose: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return how far another loop is from what these imply, (6,), and the covariance, (6, 6).
+        Return the deviation of another loop from its prediction, (6,), and the covariance, (6, 6).
 
         :param off, own: its misclosure, and the covariance of that.
         :param shared: covariance with these loops, shape (6, 6 m).
@@ -179,9 +179,7 @@ class Given:
         return off - shared @ self.pulled - loose @ self.sessions, covariance
 
 
-def refuted(
-    nodes: NodeErrors, edges: Sequence[ResolvedClosure], weights: np.ndarray
-) -> list[int]:
+def refuted(nodes: NodeErrors, edges: Sequence[ResolvedClosure], weights: np.ndarray) -> list[int]:
     """
     Return the edges that contradict the odometry and the others together.
 
@@ -240,7 +238,7 @@ def predicted(
     nodes: NodeErrors, edges: Sequence[ResolvedClosure], others: Sequence[ResolvedClosure]
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return how far edges are from what odometry and others imply, and the odds that they are right.
+    Return the deviations of edges from their predictions, and the odds that they are right.
 
     Odds by Bayes' rule: the density of the misclosure by the prediction, and that of a wrong
     place, which is anywhere on the map; as many of the edges are right as there are others.

@@ -14,7 +14,7 @@ from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
 from stavpr_slam.pose_graph.track import OdometryTrack
 
-STILL = 0.05  # meters that a standing robot moves at most
+STILL = 0.05  # meters that a robot moves at most while it is stopped
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,8 @@ class KeyframeChain:
             nodes = np.array(each.nodes)
             i = np.searchsorted(each.stamps, stamps, 'right') - 1
             for node, (cut, _) in self._cuts.items():
-                if node in each.nodes:  # what follows the cut is of the session that it begins
+                if node in each.nodes:
+                    # odometry behind the cut belongs to the session that begins there
                     at = each.nodes.index(node)
                     i[(i == at - 1) & (stamps >= cut)] = at
             known = nodes[i] < len(solved)

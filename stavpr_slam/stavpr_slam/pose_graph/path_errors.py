@@ -19,6 +19,8 @@ SHORTEST = 0.05  # meters that a step counts at least
 NEGLIGIBLE = 1e-6  # part of a covariance below which it is numerical noise
 LEAST = 1e-4  # part of the settings' covariance that given ones are increased by: planar ones
 
+LARGEST_COVARIANCE = 1e12  # element of a message's: drivers write such numbers for "unknown"
+
 
 @dataclass(frozen=True)
 class OdometryNoise:
@@ -67,9 +69,11 @@ def given_growth(
     Return how far covariances of messages grow in a step, in the axes of the start, (6, 6).
 
     :param before, after: as in ``geometry_msgs/PoseWithCovariance``, shape (6, 6).
-    :returns: None where they are unknown or do not grow as those of a filter.
+    :returns: None where they are unknown, or do not grow as those of a filter.
     """
-    if before is None or after is None or not np.isfinite(before + after).all():
+    if before is None or after is None:
+        return None
+    if not (np.abs([before, after]) <= LARGEST_COVARIANCE).all():  # NaN as well
         return None
     sums = []
     for covariance, pose in zip((before, after), ends, strict=True):
@@ -82,9 +86,7 @@ def given_growth(
     return grown if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None
 
 
-def path_errors(
-    chain: Nodes, start: np.ndarray, end: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def path_errors(chain: Nodes, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the errors of the motion between nodes of one session, in the axes of the start.
 

@@ -3,7 +3,7 @@
 """
 The graph as factors of GTSAM: iSAM2 with QR, or all at once.
 
-Only some nodes are variables: a run of the odometry between two of them is one factor, and the
+Few nodes are variables: a run of the odometry between two of them is one factor, and the
 nodes inside a run follow from its ends.
 """
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The odometry between keyframes: as much as the way needs, not each message."""
+"""The odometry between keyframes, without the poses that interpolation gives."""
 
 import math
 
@@ -49,7 +49,7 @@ class OdometryTrack:
             self._since *= not is_keyframe
 
     def _differ(self, a: np.ndarray, b: np.ndarray, share: float) -> bool:
-        """Return whether two poses are a share of the way between keyframes apart."""
+        """Return whether two poses are a share of the distance between keyframes apart."""
         moved = math.dist(a[:3].tolist(), b[:3].tolist())
         return moved > share * self._distance or (
             abs(float(a[3:] @ b[3:])) < math.cos(share * self._angle / 2)

@@ -13,7 +13,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry, Path
-import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
@@ -21,7 +20,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.ros.diagnostics import one_status
@@ -229,11 +229,12 @@ class PoseGraphNode(ManagedNode):
         covariance = given.tolist() if given.any() else None
         self.counts['odometry'] += 1
         self._graph.add(RobotOdometry(robot, stamp, pose.tolist(), covariance))
-        if not np.isfinite(pose).all() or not pose[3:].any():
+        try:
+            odometry = matrices(checked_pose(pose))
+        except InputError:
             return  # the graph counts it
         self._child_frames[robot] = message.child_frame_id
         self._silent.discard(robot)
-        odometry = matrices(pose)
         correction = self._corrections[robot].at(stamp, odometry)
         result = Odometry(child_frame_id=message.child_frame_id, twist=message.twist)
         result.header = Header(stamp=message.header.stamp, frame_id=self._frame)
