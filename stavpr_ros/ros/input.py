@@ -66,8 +66,7 @@ class ImageInput:
     :param reject: called with a message that exceeds ``max_rate``, and the reason.
     :param restart: called with the reason when the next images do not continue those before.
 
-    ``topic`` is the resolved topic, ``remedy`` the remedy for the last incompatible publisher, ''
-    = none.
+    ``topic`` is the resolved topic, ``remedy`` that for the last refused publisher, '' = none.
     """
 
     def __init__(
