@@ -26,10 +26,11 @@ from stavpr_ros.pipeline.saving import (
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
 from stavpr_ros.ros import REPORT_PERIOD
-from stavpr_ros.ros.edges import EdgePublisher
+from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus
 from stavpr_ros.ros.map_loading import MapLoader
@@ -386,7 +387,10 @@ class Runtime:
         if self._navigation is not None:
             self._navigation.publish(header, match, pipeline.places, pose, frames.odometry)
         self._views.publish(header, match, pipeline, frames.frame, pose)
-        edge, closures = self._edges.prepare(header, match, pipeline, frames, camera)
+        edge: Edge | None = None
+        closures: list[WaitingClosure] = []
+        if match.accepted:
+            edge, closures = self._edges.prepare(header, match, pipeline, frames, camera)
         message = self._output.publish(header, match, pipeline.places, frames, edge)
         for closure in closures:
             self._edges.put(closure)
