@@ -23,9 +23,9 @@ from rclpy.executors import SingleThreadedExecutor
 from results import commit, cpu_model
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
-from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.messages import pose_message, time_message
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_messages import pose_array
 from stavpr_slam.simulated_odometry import drifted

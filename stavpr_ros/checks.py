@@ -1,9 +1,45 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of arrays at the border of the public functions."""
+"""Checks of arguments and settings at the border of the public functions."""
+
+from collections.abc import Iterable
+import math
 
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.errors import InputError, SettingsError
+
+
+def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Raise SettingsError if a setting is none of the choices."""
+    choices = tuple(choices)
+    if value not in choices:
+        raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
+
+
+def require_at_least(name: str, value: float, least: float, unit: str = '') -> None:
+    """Raise SettingsError if a setting is less, or not finite."""
+    if not least <= value < math.inf:
+        raise SettingsError(f'{name} = {value} must be at least {least} {unit}'.rstrip())
+
+
+def require_between(name: str, value: float, low: float, high: float, unit: str = '') -> None:
+    """Raise SettingsError if a setting is outside of a closed interval."""
+    if not low <= value <= high:
+        raise SettingsError(f'{name} = {value} must be {low} to {high} {unit}'.rstrip())
+
+
+def require_above(name: str, value: float, bound: float, below: float = math.inf) -> None:
+    """Raise SettingsError if a setting is outside of an open interval."""
+    if not bound < value < below:
+        upper = '' if below == math.inf else f' and below {below}'
+        raise SettingsError(f'{name} = {value} must be above {bound}{upper}')
+
+
+def require_whole(name: str, value: float, least: int, unit: str = '') -> None:
+    """Raise SettingsError if a setting is less, or no whole number."""
+    require_at_least(name, value, least, unit)
+    if not float(value).is_integer():
+        raise SettingsError(f'{name} = {value} must be a whole number')
 
 
 def float_array(values: np.ndarray, name: str, ndim: int) -> np.ndarray:

@@ -4,7 +4,8 @@
 
 import importlib.util
 
-from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.checks import require_choice
+from stavpr_ros.errors import UnavailableError
 
 DEVICES = BACKENDS = ('auto', 'cpu', 'cuda')
 
@@ -18,8 +19,7 @@ def choose_device(requested: str) -> str:
     """
     import torch
 
-    if requested not in DEVICES:
-        raise SettingsError(f'device {requested!r} is unknown: take one of {", ".join(DEVICES)}')
+    require_choice('device', requested, DEVICES)
     available = torch.cuda.is_available()
     if requested == 'cuda' and not available:
         raise UnavailableError(
@@ -38,8 +38,7 @@ def choose_backend(requested: str) -> str:
     """
     if requested == 'auto':
         return 'cpu' if why_no_cuda() else 'cuda'
-    if requested not in BACKENDS:
-        raise SettingsError(f'backend {requested!r} is unknown: take one of {", ".join(BACKENDS)}')
+    require_choice('backend', requested, BACKENDS)
     if requested == 'cuda' and why_no_cuda():
         raise UnavailableError(f"backend 'cuda': {why_no_cuda()}; take 'cpu' or 'auto'")
     return requested

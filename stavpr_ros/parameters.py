@@ -151,7 +151,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'backend',
             'auto',
             'Device of feature extraction and image distances; auto: CUDA if it is available. '
-            'Loop closure matches on the CPU but for cuda.',
+            'Loop closure matches on the CPU, except with cuda.',
             choices=('auto', 'cpu', 'cuda'),
         ),
     ),
@@ -378,11 +378,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             bounds=(0.0, 60000.0),
         ),
         NodeParameter(
-            'threads',
-            0,
-            'Number of CPU threads of the numerics; 0 = all.',
-            'threads',
-            bounds=(0, 1024),
+            'threads', 0, 'CPU threads of the numerics; 0 = all.', 'threads', bounds=(0, 1024)
         ),
         NodeParameter(
             'autostart',
@@ -395,3 +391,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
 
 PARAMETERS = tuple(row for rows in GROUPS.values() for row in rows)
 BY_NAME = {row.name: row for row in PARAMETERS}
+
+
+def default(name: str) -> Any:
+    """Return the default of a parameter."""
+    return BY_NAME[name].default

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The order of the packages and their folders, cycles, and the files on an image's way."""
+"""The order of the packages and their folders, and cycles."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -8,9 +8,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-from pipelines import message, process, recorded, SECOND
 import pytest
-import stavpr_ros
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'stavpr_ros'
@@ -40,7 +38,6 @@ MAY_IMPORT = {
     'ros': CORE,
     'commands': {'ros', *CORE},
 }
-MOST_FILES = 18  # on an image's way through the pipeline, without compiled code
 MODULES = {
     '.'.join(path.relative_to(folder.parent).with_suffix('').parts).removesuffix('.__init__'): path
     for folder in FOLDERS.values()
@@ -123,33 +120,3 @@ def test_classes_have_unique_names():
             if isinstance(node, ast.ClassDef):
                 found.setdefault(node.name, []).append(module)
     assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}
-
-
-def files_called(function) -> set[str]:
-    """Return the package's files that a call runs through, imports at first use left out."""
-    found = set()
-    installed = Path(stavpr_ros.__file__).parent
-
-    def note(frame, event, _):
-        path = Path(frame.f_code.co_filename)
-        if event == 'call' and path.is_relative_to(installed):
-            found.add(path.relative_to(installed).as_posix())
-
-    sys.setprofile(note)
-    try:
-        function()
-    finally:
-        sys.setprofile(None)
-    return found
-
-
-def test_pipeline_of_one_image_calls_few_files(route):
-    """In mode robust with gradient features."""
-    pipeline = recorded(route, 'localization', mode='robust')
-    process(pipeline, route[:10])  # fills the window; modules are imported at first use
-    last = message(route[10])
-    matched = []
-    files = files_called(lambda: matched.append(pipeline.process(last, 11 * SECOND)))
-    assert matched[0].accepted
-    assert 'recognition/recognizer.py' in files
-    assert len(files) <= MOST_FILES, sorted(files)

@@ -46,7 +46,7 @@ def test_keyframe_settings_not_finite_or_negative_are_rejected(name, value):
 
 def test_keyframe_settings_out_of_range_are_rejected():
     for wrong in ({'angle': 180.1}, {'change': 2.1}):
-        with pytest.raises(SettingsError, match='no'):
+        with pytest.raises(SettingsError, match='must be 0 to'):
             KeyframeSettings(**wrong)
     KeyframeSettings(angle=180, change=2)
 

@@ -332,7 +332,7 @@ HAND_MADE = [
     ({}, _setting('strips', 2.0), r'strips is 2\.0'),
     ({}, _setting('feature_version', 2), 'gradient of version 2 are unknown'),
     ({}, _setting('projection', 'mine'), 'projection None is not that of the features, mine'),
-    ({}, _backbone('size', 10**6), 'size = 1000000 must be at most'),
+    ({}, _backbone('size', 10**6), 'size = 1000000 must be 1 to'),
     ({}, _backbone('signed', 1), 'signed is 1'),
     ({}, _backbone('orientations', 2**31), 'orientations'),
     ({}, network(model='/dev/zero'), "unknown 'model'"),

@@ -19,19 +19,19 @@ from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.pipeline import overlay
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.relative_pose.edge import Edge, Source
-from stavpr_ros.ros.map_info import map_info_message
-from stavpr_ros.ros.output import (
+from stavpr_ros.ros.messages import (
     candidates_message,
     image_message,
     loop_closure_message,
+    map_info_message,
     match_message,
     matched_pose_message,
     nanoseconds,
+    odometry_pose,
     pose_message,
     PoseFrames,
     time_message,
 )
-from stavpr_ros.ros.subscriptions import odometry_pose
 from std_msgs.msg import Header
 
 SECOND = 10**9
@@ -246,8 +246,8 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses, is_late
 
 def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):
     query = np.array([7.0, 8, 0, 0, 0, 0, 1])
-    frames = PoseFrames('map', 'base')
-    message = loop_closure_message(HEADER, accepted(), places, 'r2', frames, (query, 'odom'))
+    frames = PoseFrames('map', 'base', 'odom')
+    message = loop_closure_message(HEADER, accepted(), places, 'r2', frames, query)
     assert (message.query_index, message.place_index) == (-1, 32)
     assert (message.query_stamp, message.place_stamp) == (time_message(WINDOW[2]), Time(sec=33))
     assert {pair.query_index for pair in message.pairs} == {-1}

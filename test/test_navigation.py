@@ -12,8 +12,8 @@ from pipelines import at, LENGTH, localizing, message, SECOND
 import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import matrices
+from stavpr_ros.ros.messages import pose_message
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
-from stavpr_ros.ros.output import pose_message
 from test_visualization import header, Publishers
 
 

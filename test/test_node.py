@@ -14,7 +14,7 @@ from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.ros import output
-from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds
 from std_msgs.msg import Float32, Int32
 
 THRESHOLD = 0.2

@@ -19,8 +19,9 @@ from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.ros import edges
-from stavpr_ros.ros.camera import camera_of, mount_of
 from stavpr_ros.ros.edges import EdgePublisher, MOST_WAITING, WaitingClosure
+from stavpr_ros.ros.messages import camera_of
+from stavpr_ros.ros.sensors import mount_of
 
 LAST = MOST_WAITING + 3  # of so many closures that three are dropped
 MOUNT = '0.1 0 1.2 -1.5708 0 -1.5708'
@@ -189,7 +190,8 @@ def queue(monkeypatch):
         if message.query_index == LAST:
             last.set()
 
-    publisher, camera = EdgePublisher(EdgeEstimator(), publish, statistics, ending), object()
+    publisher = EdgePublisher(EdgeEstimator(), '', publish, statistics, ending)
+    camera = object()
     pair = SimpleNamespace(
         pose=lambda place: np.array([0, 0, 0, 0, 0, 0, 1.0]), place=0, query=object(),
         thumbnails={0: b'JPEG'}, source=object(), spacing=1e-9,

@@ -90,7 +90,7 @@ def test_features_that_are_not_finite_are_rejected(saved):
     ('changes', 'error', 'named'),
     [
         ({'layer': 'fire'}, SettingsError, r"no layer 'fire'.*y"),
-        ({'channels': 'hsv'}, SettingsError, 'must be'),
+        ({'channels': 'hsv'}, SettingsError, 'take one of rgb, bgr'),
         ({'sha256': '0' * 64}, FeatureMismatchError, 'sha256'),
         ({'path': Path(__file__)}, UnavailableError, 'no usable ONNX model'),
     ],

@@ -177,17 +177,31 @@ def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkey
     assert len(set(np.abs(matches))) < 4
 
 
-@pytest.mark.parametrize('missing', ['method', 'pose of the place', 'odometry'])
+@pytest.mark.parametrize(
+    ('relative_pose', 'has_odometry'), [('pnp', True), ('auto', False), ('aligned', False)]
+)
 def test_matched_pair_without_alignment_copies_nothing_of_the_window(
-    missing, small_map, route, tmp_path, monkeypatch
+    relative_pose, has_odometry, map_file, route, monkeypatch
 ):
-    poses = None if missing == 'pose of the place' else small_map.poses
+    pipeline = localizing(map_file)
+    match = process(pipeline, route[:LENGTH], poses=has_odometry)[-1]
+    monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
+    pair = pipeline.matched_pair(match, relative_pose)
+    assert (pair.place, pair.distances.size, len(pair.thumbnails)) == (match.place_index, 0, 8)
+
+
+@pytest.mark.parametrize('has_poses', [True, False])
+def test_matched_pair_is_not_made_where_a_map_has_no_edges(
+    has_poses, small_map, route, tmp_path, monkeypatch
+):
+    poses = small_map.poses if has_poses else None
     save_map(replace(small_map, poses=poses), tmp_path / 'map.stavpr')
     pipeline = localizing(str(tmp_path / 'map.stavpr'))
-    match = process(pipeline, route[:LENGTH], poses=missing != 'odometry')[-1]
+    match = process(pipeline, route[:LENGTH], poses=True)[-1]
+    assert match.accepted
     monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
-    pair = pipeline.matched_pair(match, aligned=missing != 'method')
-    assert (pair.place, pair.distances.size, len(pair.thumbnails)) == (match.place_index, 0, 8)
+    monkeypatch.setattr(type(pipeline.places.thumbnails), '__getitem__', pytest.fail)
+    assert pipeline.matched_pair(match, 'none' if has_poses else 'auto') is None
 
 
 # ------------------------------------------------ changes of operation and map

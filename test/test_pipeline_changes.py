@@ -147,7 +147,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     extract = Failing(pipeline.extractor.extract)
     monkeypatch.setattr(pipeline.extractor, 'extract', extract)
     thumbnail = Failing(lambda image: b'')
-    monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
+    monkeypatch.setattr('stavpr_ros.pipeline.pipeline.encode_thumbnail', thumbnail)
     cut_off = message(route[0])
     object.__setattr__(cut_off, 'data', cut_off.data[:100])
     for i, image in enumerate(route[:12] if operation != 'mapping' else route[30:42]):

@@ -25,8 +25,9 @@ from sensor_msgs.msg import Image
 from stavpr_ros.commands import replay
 from stavpr_ros.errors import SourceError, UnavailableError
 from stavpr_ros.ros import process
+from stavpr_ros.ros.messages import record_message
 from stavpr_ros.ros.playback import Playback
-from stavpr_ros.ros.replay import image_message, message_class, Replayer, ReplayOptions
+from stavpr_ros.ros.replay import message_class, Replayer, ReplayOptions
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_messages import list_topics, read_messages
 from stavpr_ros.sources.folder import FolderSource
@@ -202,7 +203,7 @@ def seconds(header):
 
 
 def test_image_message_has_the_encoding_and_byte_order_of_its_record():
-    message = image_message(ImageRecord(1, 2, 'camera', 1, 2, 'mono16', True, 4, b'abcd'))
+    message = record_message(ImageRecord(1, 2, 'camera', 1, 2, 'mono16', True, 4, b'abcd'))
     assert (message.encoding, message.is_bigendian, message.step) == ('mono16', 1, 4)
 
 

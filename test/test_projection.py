@@ -50,7 +50,7 @@ def test_apply_of_other_dimension_is_rejected():
 
 @pytest.mark.parametrize(
     ('arguments', 'text'),
-    [((0, 4), '0 -> 4'), ((6, 0), '6 -> 0'), ((6, -3), '-3'), ((6, 4, -1), 'seed -1')],
+    [((0, 4), 'features = 0'), ((6, 0), '= 0'), ((6, -3), '= -3'), ((6, 4, -1), 'seed .* = -1')],
 )
 def test_gaussian_out_of_range_is_rejected(arguments, text):
     with pytest.raises(SettingsError, match=text):

@@ -214,7 +214,7 @@ def test_pipeline_compares_the_pose_of_each_image(small_map, route, tmp_path):
 
 def test_invalid_settings_and_poses_are_rejected():
     places, query = corridor()
-    with pytest.raises(SettingsError, match='odometry_error = 1\\.5 must be a share'):
+    with pytest.raises(SettingsError, match='odometry_error = 1\\.5 must be 0 to 1'):
         settings_of(odometry_error=1.5)
     one = PlaceRecognizer(driven_map(places, track()), settings_of())
     with pytest.raises(InputError, match='pose has shape'):

@@ -234,7 +234,7 @@ def test_write_bag_never_overwrites_nor_leaves_parts(tmp_path):
     write_bag(tmp_path / 'bag', '/image', records())
     with pytest.raises(OutputError, match='exists already'):
         write_bag(tmp_path / 'bag', '/image', records())
-    with pytest.raises(SettingsError, match="'zip': expected one of sqlite3, mcap"):
+    with pytest.raises(SettingsError, match="'zip' is unknown: take one of sqlite3, mcap"):
         write_bag(tmp_path / 'other', '/image', records(), 'zip')
 
 

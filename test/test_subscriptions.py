@@ -11,8 +11,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
+from stavpr_ros.ros.input import AdaptiveSubscription
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.ros.subscriptions import AdaptiveSubscription
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 OVERRIDE = 'qos_overrides./image.subscription.reliability'

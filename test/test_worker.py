@@ -7,7 +7,7 @@ import threading
 
 import pytest
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.input import Worker
+from stavpr_ros.ros.worker import Worker
 
 TIMEOUT = 30
 

@@ -153,7 +153,7 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
         (['--odometry', '/odom'], 2, 'is no bag'),
         (['--odometry', '/odom', '--poses', 'x.csv'], 2, 'give one'),
         (['--no-thumbnails', '--thumbnail-width', '9'], 2, 'give one'),
-        (['--thumbnail-width', '0'], 2, 'width 0'),
+        (['--thumbnail-width', '0'], 2, 'width = 0'),
     ],
 )
 def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, code, word):

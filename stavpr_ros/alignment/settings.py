@@ -5,6 +5,7 @@
 from dataclasses import dataclass
 import math
 
+from stavpr_ros.checks import require_above, require_at_least, require_choice, require_whole
 from stavpr_ros.errors import SettingsError
 
 STRATEGIES = ('adaptive', 'vanilla', 'sliding_window', 'none')
@@ -31,17 +32,10 @@ class SpatialSettings:
     vertical: bool = False
 
     def __post_init__(self) -> None:
-        if self.strategy not in STRATEGIES:
-            raise SettingsError(
-                f'strategy {self.strategy!r} is unknown: take one of {", ".join(STRATEGIES)}'
-            )
-        if not (math.isfinite(self.sigma) and self.sigma >= 0):
-            raise SettingsError(f'sigma = {self.sigma} must be a finite number >= 0')
-        if self.xi is not None and not (self.xi >= 1 and float(self.xi).is_integer()):
-            raise SettingsError(
-                f'xi = {self.xi} must be a whole number >= 1, or None for no restriction'
-            )
-
+        require_choice('strategy', self.strategy, STRATEGIES)
+        require_at_least('sigma', self.sigma, 0)
+        if self.xi is not None:
+            require_whole('xi', self.xi, 1, 'strip')
         if self.vertical and self.strategy not in ('adaptive', 'vanilla'):
             raise SettingsError(
                 f'strategy {self.strategy!r} has no vertical alignment: take adaptive or vanilla'
@@ -71,10 +65,8 @@ class SequenceSettings:
     beta: float = 2.0
 
     def __post_init__(self) -> None:
-        if not (self.length >= 2 and float(self.length).is_integer()):
-            raise SettingsError(f'sequence length l = {self.length} must be a whole number >= 2')
-        if not (math.isfinite(self.beta) and self.beta > 1):
-            raise SettingsError(f'beta = {self.beta} must be a finite number > 1')
+        require_whole('sequence length l', self.length, 2, 'images')
+        require_above('beta', self.beta, 1)
 
     @property
     def k(self) -> int:

@@ -139,12 +139,12 @@ class _Images:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other, before anything is read."""
+    from stavpr_ros.checks import require_at_least
     from stavpr_ros.sources.bag_file import is_bag
 
     moving = arguments.keyframe_distance or arguments.keyframe_angle
     bag = is_bag(Path(arguments.input))
-    if arguments.every < 1:
-        raise SettingsError(f'--every {arguments.every} must be at least 1')
+    require_at_least('--every', arguments.every, 1)
     if arguments.poses and arguments.skip_bad_images:
         raise SettingsError(
             '--poses and --skip-bad-images: a skipped image would shift the poses; give one'
@@ -242,6 +242,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
 def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
     """Return a map of descriptors that another program computed."""
     import numpy as np
+    from stavpr_ros.checks import require_at_least
     from stavpr_ros.commands.feature_options import require_descriptors_alone
     from stavpr_ros.features.descriptors import read_descriptors
     from stavpr_ros.mapping import descriptor_map
@@ -255,8 +256,7 @@ def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
                 f'--{name.replace("_", "-")}: {arguments.input} holds descriptors, not images; '
                 'leave it out'
             )
-    if arguments.every < 1:
-        raise SettingsError(f'--every {arguments.every} must be at least 1')
+    require_at_least('--every', arguments.every, 1)
     features = read_descriptors(arguments.input, arguments.descriptors_source or '')
     poses = _poses(arguments, len(features))
     assert poses is None or isinstance(poses, np.ndarray)

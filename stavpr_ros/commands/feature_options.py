@@ -9,6 +9,7 @@ from typing import Any, TYPE_CHECKING
 from stavpr_ros.devices import DEVICES
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import kinds, settings_class
+from stavpr_ros.parameters import default
 
 if TYPE_CHECKING:
     from stavpr_ros.features import FeatureExtractor
@@ -44,7 +45,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind."""
     add = parser.add_argument_group('features').add_argument
     kind_help = 'kind of features (%(default)s)'
-    add('--features', choices=kinds(), default='gradient', help=kind_help)
+    add('--features', choices=kinds(), default=default('features'), help=kind_help)
     strips = 'vertical strips of an image (7; 1 if the features are one vector)'
     add('--strips', type=int, metavar='W', help=strips)
     projection = 'each strip to D dimensions by a random projection; build_map: pca:D, by the '
@@ -57,12 +58,12 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
         for row in dataclasses.fields(settings_class(kind)):
             required = row.default is dataclasses.MISSING
             example = '' if required else row.default
-            default = 'required' if required else str(example).strip('()') or 'none'
+            shown = 'required' if required else str(example).strip('()') or 'none'
             group.add_argument(
                 _option(kind, row.name),
                 type=CONVERTERS.get(type(example), type(example)),
                 metavar=row.name.upper(),
-                help=f'{row.metadata["help"]} ({default})'.replace('%', '%%'),
+                help=f'{row.metadata["help"]} ({shown})'.replace('%', '%%'),
             )
 
 

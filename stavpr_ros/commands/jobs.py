@@ -40,7 +40,7 @@ class Job:
     is_new: bool = False
 
     def again(self) -> 'Job':
-        """Return the job for another try; what is there now is its own, if it was new."""
+        """Return the job for another try; outputs that were not there before are its own."""
         return replace(self, arguments=(*self.arguments, '--force')) if self.is_new else self
 
 
@@ -70,7 +70,7 @@ def job_names(inputs: Sequence[str]) -> list[str]:
 
 
 def other_arguments(args: Sequence[str], *several: str) -> list[str]:
-    """Return the arguments of a command line but these options, and those of the jobs."""
+    """Return the arguments of a command line except these options, and those of the jobs."""
     parser = argparse.ArgumentParser(add_help=False)
     for option in several:
         parser.add_argument(option, nargs='+')
@@ -114,7 +114,7 @@ def run_jobs(jobs: Sequence[Job], processes: int | None, ray: str | None) -> int
 
 @contextmanager
 def _processes(count: int) -> Iterator[Callable[[Job], Future[Result]]]:
-    """Yield what starts a job in a process of its own, so many at a time."""
+    """Yield a function that starts a job in a process of its own, so many at a time."""
     threads = str(max(1, (os.cpu_count() or 1) // count))
     environment = {'OMP_NUM_THREADS': threads, 'NUMBA_NUM_THREADS': threads} | os.environ
 
@@ -137,7 +137,7 @@ def _processes(count: int) -> Iterator[Callable[[Job], Future[Result]]]:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Callable[[Job], Future[Result]]]:
-    """Yield what starts a job on a Ray cluster."""
+    """Yield a function that starts a job on a Ray cluster."""
     try:
         import ray
     except ImportError as error:

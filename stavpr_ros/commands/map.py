@@ -14,6 +14,7 @@ from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError
 from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_replaceable
+from stavpr_ros.units import SECOND
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
@@ -61,7 +62,9 @@ def _parser() -> argparse.ArgumentParser:
 
     force = 'replace an existing output file'
     halves = 'of the features; float16 halves the file (as it is; float32 for a merged map)'
-    action = add('info', _info, 'Show what a map holds.', 'map', force='replace an existing plot')
+    action = add(
+        'info', _info, 'Show the contents of a map.', 'map', force='replace an existing plot'
+    )
     action.add_argument(
         '--plot',
         metavar='PNG',
@@ -85,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     action.add_argument(
         '--drop-duplicates',
         action='store_true',
-        help='without places that show what the one before shows, where the camera stood; of a '
+        help='without places at which the camera did not move since the place before; of a '
         'map without poses, also those of a drive through the dark',
     )
     action.add_argument(
@@ -96,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     action.add_argument(
         '--codes',
         action='store_true',
-        help='also as precision int8 holds them, for its fastest start; of 1,000 places or more',
+        help='also the codes of precision int8, for its fastest start; of 1,000 places or more',
     )
     add('export', _export, 'Write the arrays of a map for NumPy.', 'map', 'output', force=force)
     text = 'Write images, pairs and poses of a map to a folder for COLMAP and hloc.'
@@ -131,13 +134,13 @@ def _parser() -> argparse.ArgumentParser:
         'each session once on a map of those before it',
     )
     add_storage(action, '', halves)
-    text = 'Write some sessions of a map to another map.'
+    text = 'Write selected sessions of a map to another map.'
     action = add('sessions', _sessions, text, 'map', 'output', force=force)
     chosen = action.add_mutually_exclusive_group(required=True)
     chosen.add_argument('--keep', metavar='ID', help='only the places of this session')
-    chosen.add_argument('--remove', metavar='ID', help='all places but those of this session')
+    chosen.add_argument('--remove', metavar='ID', help='all places except those of this session')
     text = 'Write a map to the home of a fleet, docs/fleet.md.'
-    action = add('upload', _upload, text, 'map', force='replace what is there')
+    action = add('upload', _upload, text, 'map', force='replace the map that is there')
     action.add_argument(
         'address',
         metavar='ADDRESS',
@@ -171,7 +174,7 @@ def _tool(name: str) -> Callable[..., Any]:
 
 
 def describe(place_map: 'PlaceMap', path: Path) -> str:
-    """Return what an opened map holds, a line each."""
+    """Return the contents of an opened map, a line each."""
     import numpy as np
     from stavpr_ros.mapping.map_container import printable
     from stavpr_ros.mapping.map_version2 import VERSION
@@ -218,7 +221,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
 
 
 def _time(stamp: int) -> str:
-    return datetime.fromtimestamp(stamp // 10**9, UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
+    return datetime.fromtimestamp(stamp // SECOND, UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
 
 
 def _verify(arguments: argparse.Namespace) -> int:

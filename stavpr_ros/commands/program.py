@@ -6,8 +6,10 @@ import argparse
 from collections.abc import Callable, Mapping
 import sys
 from types import MappingProxyType
+from typing import Any
 
 from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
@@ -22,6 +24,22 @@ def make_parser(name: str, description: str, epilog: str) -> argparse.ArgumentPa
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def add_parameter(group: Any, name: str, text: str, **changes: Any) -> None:
+    """
+    Add the option of a command that is a parameter of the node: its name, type and default.
+
+    :param group: of options, or a parser.
+    :param text: help of the option; ``%(default)s`` is its default.
+    :param changes: other arguments of ``add_argument`` than those of the table.
+    """
+    row = BY_NAME[name]
+    if isinstance(row.default, bool):
+        own: dict[str, Any] = {'action': 'store_true'}
+    else:
+        own = {'type': type(row.default), 'default': row.default, 'choices': row.choices or None}
+    group.add_argument(f'--{name.replace("_", "-")}', help=text, **own | changes)
 
 
 def run_program(

@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Run the command.
 
     :param arguments: without the program's name; the process's own if None.
-    :returns: exit code, see ``--help``.
+    :returns: exit code, one of those in ``--help``.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     codes: dict[type[StavprError], int] = {

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from stavpr_ros.checks import require_at_least
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.projection import Projection
 from stavpr_ros.features.registry import (
@@ -49,8 +50,7 @@ class FeatureSettings:
                 f'features {self.kind} of version {self.feature_version} are unknown, expected '
                 '1: update this program'
             )
-        if self.strips < 1:
-            raise SettingsError(f'strips W = {self.strips} must be at least 1')
+        require_at_least('strips W', self.strips, 1)
 
     def to_json(self) -> str:
         """Return the settings as one line of JSON."""

@@ -7,7 +7,8 @@ from functools import cached_property
 import hashlib
 
 import numpy as np
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.checks import require_at_least
+from stavpr_ros.errors import InputError
 import torch
 
 
@@ -30,11 +31,9 @@ class Projection:
 
         :raises SettingsError: a dimension below 1, or a negative seed.
         """
-        if dimension_in < 1 or dimension < 1 or seed < 0:
-            raise SettingsError(
-                f'projection {dimension_in} -> {dimension}, seed {seed}: expected dimensions >= '
-                '1, seed >= 0'
-            )
+        require_at_least('dimension of the features', dimension_in, 1)
+        require_at_least('dimension of the projection', dimension, 1)
+        require_at_least('seed of the projection', seed, 0)
         matrix = np.random.default_rng(seed).standard_normal((dimension_in, dimension))
         return cls(
             np.ascontiguousarray(matrix / np.sqrt(dimension), np.float32),

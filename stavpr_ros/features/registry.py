@@ -13,6 +13,7 @@ import json
 from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
 from stavpr_ros import plugins
+from stavpr_ros.checks import require_at_least, require_between, require_choice
 from stavpr_ros.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -42,13 +43,6 @@ def setting(
     return dataclasses.field(default=default, metadata={'help': help}, compare=identity)
 
 
-def _check_resize(method: str, size: int) -> None:
-    if size > MOST_PIXELS:
-        raise SettingsError(f'size = {size} must be at most {MOST_PIXELS} pixels')
-    if method not in RESIZE_METHODS:
-        raise SettingsError(f'resize = {method!r} must be one of {", ".join(RESIZE_METHODS)}')
-
-
 @dataclass(frozen=True)
 class GradientSettings:
     """Settings of the oriented-gradient features."""
@@ -66,14 +60,14 @@ class GradientSettings:
     )
 
     def __post_init__(self) -> None:
-        _check_resize(self.resize, self.size)
+        require_choice('resize', self.resize, RESIZE_METHODS)
+        require_between('size', self.size, 1, MOST_PIXELS, 'pixels')
         if self.cell < 2 or self.size < 2 * self.cell or self.size % self.cell:
             raise SettingsError(
                 f'size {self.size} and cell {self.cell}: size must be a multiple of cell, at '
                 'least twice it'
             )
-        if not 2 <= self.orientations <= 360:
-            raise SettingsError(f'orientations = {self.orientations} must be 2 to 360')
+        require_between('orientations', self.orientations, 2, 360)
 
     @property
     def cells(self) -> int:
@@ -99,13 +93,11 @@ class NetworkSettings:
     )
 
     def __post_init__(self) -> None:
-        _check_resize(self.resize, self.size)
-        if self.pooling not in POOLINGS:
-            raise SettingsError(f'pooling = {self.pooling!r} must be one of {", ".join(POOLINGS)}')
+        require_choice('resize', self.resize, RESIZE_METHODS)
+        require_between('size', self.size, self.LEAST_SIZE, MOST_PIXELS, 'pixels')
+        require_choice('pooling', self.pooling, POOLINGS)
         if self.sha256 and (len(self.sha256) != 64 or set(self.sha256) - set('0123456789abcdef')):
             raise SettingsError(f'sha256 = {self.sha256!r} must be empty or 64 digits 0-9 a-f')
-        if self.size < self.LEAST_SIZE:
-            raise SettingsError(f'size = {self.size} must be at least {self.LEAST_SIZE} pixels')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,14 +133,12 @@ class OnnxSettings(NetworkSettings):
         super().__post_init__()
         object.__setattr__(self, 'mean', tuple(float(v) for v in self.mean))
         object.__setattr__(self, 'std', tuple(float(v) for v in self.std))
-        if self.channels not in ('rgb', 'bgr'):
-            raise SettingsError(f"channels = {self.channels!r} must be 'rgb' or 'bgr'")
+        require_choice('channels', self.channels, ('rgb', 'bgr'))
         if len(self.mean) != 3 or len(self.std) != 3 or not all(self.std):
             raise SettingsError(
                 f'mean {self.mean} and std {self.std} must be three numbers each, std not 0'
             )
-        if self.prefix_tokens < 0:
-            raise SettingsError(f'prefix_tokens = {self.prefix_tokens} must be at least 0')
+        require_at_least('prefix_tokens', self.prefix_tokens, 0)
         if self.vector and self.vector == self.layer:
             raise SettingsError(
                 f'vector = {self.vector!r} is what the strips are made of: leave it out'

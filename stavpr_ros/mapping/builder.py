@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from stavpr_ros.checks import require_at_least
 from stavpr_ros.errors import InputError, JournalError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, SUFFIX
@@ -181,8 +182,8 @@ def _extracted(
         raise SettingsError(
             'keyframe distance or angle without poses: give poses, or leave them out'
         )
-    if thumbnail_width is not None and thumbnail_width < 1:
-        raise SettingsError(f'thumbnail width {thumbnail_width} must be at least 1 pixel')
+    if thumbnail_width is not None:
+        require_at_least('thumbnail width', thumbnail_width, 1, 'pixel')
     total = len(frames) if isinstance(frames, Sized) else None
     places = _places(_with_poses(frames, poses), selector, thumbnail_width, last)
     with (

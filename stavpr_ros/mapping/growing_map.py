@@ -7,7 +7,8 @@ import dataclasses
 import itertools
 
 import numpy as np
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.checks import require_at_least
+from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import (
@@ -49,8 +50,7 @@ class GrowingMap:
         cells: tuple[int, int] | None = None,
         held_features: Callable[[], LocalFeatures] | None = None,
     ) -> None:
-        if limit < 1:
-            raise SettingsError(f'limit = {limit} must be at least 1 place')
+        require_at_least('limit', limit, 1, 'place')
         require_projection(projection, settings)
         self.settings, self.projection, self.limit = settings, projection, limit
         self._cells, self._held_features = cells, held_features

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keyframes: the images of a traverse that become places, by time, motion and image change."""
 
-import dataclasses
 from dataclasses import dataclass
-from math import isfinite
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation, SECOND
+from stavpr_ros.checks import require_at_least, require_between
+from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
+from stavpr_ros.units import SECOND
 
 OUT_OF_ORDER = SECOND // 10  # images later than this after a newer one: the clock jumped back
 SIZE = (32, 24)  # width and height of the images compared: averages noise out, but not motion
@@ -37,14 +36,10 @@ class KeyframeSettings:
     change: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not (isfinite(value) and value >= 0):
-                raise SettingsError(f'keyframe {field.name} = {value} must be 0 (off) or more')
-        if self.angle > 180:
-            raise SettingsError(f'keyframe angle = {self.angle}: no rotation exceeds 180 degrees')
-        if self.change > 2:
-            raise SettingsError(f'keyframe change = {self.change}: no two images exceed 2')
+        require_at_least('keyframe interval', self.interval, 0, 'seconds')
+        require_at_least('keyframe distance', self.distance, 0, 'meters')
+        require_between('keyframe angle', self.angle, 0, 180, 'degrees')
+        require_between('keyframe change', self.change, 0, 2)
 
     @property
     def any(self) -> bool:

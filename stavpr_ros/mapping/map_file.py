@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.checks import require_choice
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
@@ -92,8 +92,7 @@ def _part(name: str, array: np.ndarray, dtype: str = '') -> Part:
 def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
     features, projection, n = place_map.features, place_map.projection, len(place_map)
     stored = features.storage if isinstance(features, StoredFeatures) else 'float32'
-    if (storage or stored) not in STORAGE:
-        raise SettingsError(f'storage {storage!r} is unknown: take one of {", ".join(STORAGE)}')
+    require_choice('storage', storage or stored, STORAGE)
     dtype = STORAGE[storage or stored]
     shape = (place_map.settings.strips, n, features.dimension)
     strips = _strips(features, np.dtype(DTYPES[dtype]))

@@ -14,6 +14,7 @@ from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import is_thumbnail, MOST_PIXELS
+from stavpr_ros.units import SECOND
 
 THUMBNAIL_WIDTH = 192  # pixels
 MOST_SECONDS = 2**31  # of a stamp, since 1970: those of ROS messages
@@ -108,7 +109,7 @@ class PlaceMap:
             raise InputError(
                 f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none'
             )
-        seconds = self.stamps // 10**9
+        seconds = self.stamps // SECOND
         if n and not -MOST_SECONDS <= seconds.min() <= seconds.max() < MOST_SECONDS:
             raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
         _require_texts(self.ids)

@@ -11,7 +11,7 @@ from stavpr_ros.features.extractor import normalize
 from stavpr_ros.mapping.place_map import PlaceMap
 import torch
 
-PIECE = 1024  # places at a time: those of an opened map stay in its file
+BLOCK_PLACES = 1024  # at a time: those of an opened map stay in its file
 STRIPS_A_DIRECTION = 3  # of fewer, directions follow chance (docs/performance.md)
 
 
@@ -44,8 +44,10 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
         matrix, name = before.matrix @ matrix, f'{before.name}, {name}'
     projection = Projection(np.ascontiguousarray(matrix), name)
     strips = torch.empty((W, n, dimension))
-    for low in range(0, n, PIECE):
-        strips[:, low : low + PIECE], _ = normalize(features[low : low + PIECE].strips @ basis)
+    for low in range(0, n, BLOCK_PLACES):
+        strips[:, low : low + BLOCK_PLACES], _ = normalize(
+            features[low : low + BLOCK_PLACES].strips @ basis
+        )
     settings = replace(place_map.settings, projection=projection.identity)
     return replace(
         place_map,
@@ -66,8 +68,8 @@ def _directions(features: LocalFeatures, d: int) -> torch.Tensor:
         return (directions / directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)).T
     total = torch.zeros((W, d), dtype=torch.float64)
     squares = torch.zeros((d, d), dtype=torch.float64)
-    for low in range(0, n, PIECE):
-        strips = features[low : low + PIECE].strips
+    for low in range(0, n, BLOCK_PLACES):
+        strips = features[low : low + BLOCK_PLACES].strips
         total += strips.sum(dim=1)
         squares += strips.flatten(0, 1).T @ strips.flatten(0, 1)
     _, vectors = torch.linalg.eigh(squares - total.T @ total / max(n, 1))

@@ -8,8 +8,8 @@ from threading import Lock
 import numpy as np
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError
+from stavpr_ros.units import SECOND
 
-SECOND = 1_000_000_000
 MAX_GAP = 5 * SECOND  # without odometry, across which interpolation would be a guess
 FARTHEST = 1e8  # meters of a coordinate: farther from the origin is no place on Earth
 NORMS = 1e-3, 1e3  # of a quaternion that is normalized

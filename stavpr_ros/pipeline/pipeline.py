@@ -12,19 +12,20 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, StavprError
-from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap, thumbnail_of
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.pipeline.operations import Localization, Mapping, Observation, Operation
+from stavpr_ros.pipeline.geometric_check import GeometricCheck
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
-from stavpr_ros.pipeline.start import LoadedMap, start_operation
+from stavpr_ros.pipeline.start import LoadedMap, Operation, start_operation
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.recognition.verification import GeometricEvidence, PlaceVerifier
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.recognizer import SequenceRecognizer
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 
@@ -40,7 +41,7 @@ NOT_A_KEYFRAME = 'not a keyframe'
 
 class Pipeline:
     """
-    Processes image messages. All calls but those of properties must come from one thread.
+    Processes image messages. All calls except those of properties must come from one thread.
 
     :param operation: one of ``OPERATIONS``.
     :param open_journal: of recorded places; None = they are in memory only.
@@ -64,12 +65,10 @@ class Pipeline:
         self.operation = operation
         self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
-        self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
-        self._evidence = GeometricEvidence()
+        self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
-        # of the window, from its middle image on; None = the image came when none was needed
-        self._thumbnails: deque[np.ndarray | None] = deque()
-        self._poses: deque[np.ndarray | None] = deque()  # of the window
+        # thumbnail and pose of each image in the window; None = not needed, unknown
+        self._window: deque[tuple[np.ndarray | None, np.ndarray | None]] = deque()
         self.save_state = SaveState()  # of the places in use
         # of the map, where loop closure has places of its own
         self._map_save_state = self.save_state
@@ -99,23 +98,28 @@ class Pipeline:
         return operation.extractor if operation else self._extractor
 
     @property
+    def _recognizer(self) -> SequenceRecognizer | None:
+        operation = self._operation
+        return operation.recognizer if operation else None
+
+    @property
     def map_state(self) -> str:
         """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
         if self.operation == 'localization':
             return 'loaded' if self._map is not None else 'none'
-        return 'full' if self._is_full(self._operation) else 'growing'
+        return 'full' if self._is_full else 'growing'
 
     @property
     def window_fill(self) -> int:
         """Return the number of images in the window of the recognizer."""
-        operation = self._operation
-        return operation.recognizer.window_fill if operation and operation.recognizer else 0
+        recognizer = self._recognizer
+        return recognizer.window_fill if recognizer else 0
 
     @property
     def stages(self) -> str:
         """Return how a time budget is kept; empty without one."""
-        operation = self._operation
-        return operation.recognizer.stages if isinstance(operation, Localization) else ''
+        recognizer = self._recognizer
+        return recognizer.stages if recognizer and self.operation == 'localization' else ''
 
     @property
     def missing(self) -> str:
@@ -129,8 +133,8 @@ class Pipeline:
     @property
     def problem(self) -> str:
         """Return why places of the map cannot be reached; empty while they can."""
-        operation = self._operation
-        return operation.recognizer.problem if operation and operation.recognizer else ''
+        recognizer = self._recognizer
+        return recognizer.problem if recognizer else ''
 
     def change(
         self,
@@ -157,14 +161,14 @@ class Pipeline:
         if loaded is not None or name != self.operation:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
-        elif self._operation is not None and self._operation.recognizer and threshold is not None:
+        elif (recognizer := self._recognizer) is not None and threshold is not None:
             if before is None:
                 self.reset()  # images since then are not in the window
-            self._operation.recognizer.set_limits(settings.threshold, settings.min_probability)
+            recognizer.set_limits(settings.threshold, settings.min_probability)
         self.settings, self.threshold = settings, threshold
         self._keyframes.settings = settings.keyframes
-        if settings.geometric != (self._verifier and self._verifier.settings):
-            self._verifier = PlaceVerifier(settings.geometric) if settings.geometric else None
+        if settings.geometric != (self._check and self._check.settings):
+            self._check = GeometricCheck(settings.geometric) if settings.geometric else None
 
     def snapshot(self) -> MapSnapshot:
         """
@@ -182,7 +186,7 @@ class Pipeline:
 
     def close_journals(self, delete_route: bool) -> list[str]:
         """
-        Close the journals at the end; return those that hold unsaved places.
+        Close the journals at the end; return those with unsaved places.
 
         :param delete_route: a route of loop closure is needed no longer.
         """
@@ -199,11 +203,11 @@ class Pipeline:
         """Empty the window: the next images do not continue those before."""
         self._keyframes.reset()
         self._last = None
-        self._thumbnails.clear()
-        self._poses.clear()
-        self._evidence = GeometricEvidence()
-        if self._operation is not None and self._operation.recognizer:
-            self._operation.recognizer.reset()
+        self._window.clear()
+        if self._check is not None:
+            self._check.reset()
+        if (recognizer := self._recognizer) is not None:
+            recognizer.reset()
 
     def relocalize(self, count: int) -> Match:
         """
@@ -217,47 +221,52 @@ class Pipeline:
             raise InputError(
                 'operation mapping recognizes no places: set_operation localization first'
             )
-        recognizer = self._operation.recognizer if self._operation else None
+        recognizer = self._recognizer
         if recognizer is None or self._last is None or self._last.status is Status.WARMING_UP:
             raise InputError(
                 f'{self.window_fill} of {self.settings.sequence.length} images in the window'
             )
         return self._last.with_candidates(recognizer.ranked(count))
 
-    def matched_pair(self, match: Match, aligned: bool = True) -> MatchedPair | None:
+    def matched_pair(self, match: Match, relative_pose: str = 'auto') -> MatchedPair | None:
         """
-        Return the pair of the newest match, or its late one, for its edge; None without.
+        Return the pair of the newest match, or its late one, for its edge.
 
-        :param aligned: the edge may be aligned by odometry, which needs distances of the window.
+        :param relative_pose: the parameter of this name.
+        :returns: None without a match, or where the place of a map can have no edge.
         """
-        operation = self._operation
-        if not match.accepted or operation is None or operation.recognizer is None or match.cause:
+        places, recognizer = self.places, self._recognizer
+        if not match.accepted or match.cause or places is None or recognizer is None:
             return None
-        places, distances = operation.places, operation.recognizer.window_columns
+        if self.operation == 'localization' and (
+            relative_pose == 'none' or places.place(match.place_index).pose is None
+        ):
+            return None
+        distances = recognizer.window_columns if relative_pose in ('auto', 'aligned') else None
         unknown = np.full(7, np.nan)
-        poses = np.array([unknown if pose is None else pose for pose in self._poses])
-        query = self._thumbnails[0]
+        poses = np.array([unknown if pose is None else pose for _, pose in self._window])
+        query = self._window[match.position][0]
         if match.is_late:
             query = places.thumbnail(match.first_image_index)
-        return matched_pair(match, places, query, poses, distances if aligned else None)
+        return matched_pair(match, places, query, poses, distances)
 
     def newest_distances(self) -> np.ndarray:
         """Return the distances of the newest image to its places, (n,), float32; none before."""
-        recognizer = self._operation.recognizer if self._operation else None
+        recognizer = self._recognizer
         if recognizer is None or not recognizer.window_fill:
             return np.empty(0, np.float32)
         return recognizer.newest_row()
 
     def window_distances(self, places: np.ndarray) -> np.ndarray:
         """
-        Return the distances of the images in the window to some places.
+        Return the distances of the images in the window to given places.
 
         :param places: shape (k,), int64.
         :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
         """
-        assert self._operation is not None
-        assert self._operation.recognizer is not None
-        return self._operation.recognizer.window_columns(places)
+        recognizer = self._recognizer
+        assert recognizer is not None
+        return recognizer.window_columns(places)
 
     def process(
         self,
@@ -290,7 +299,7 @@ class Pipeline:
         except StavprError as error:
             kind = error.kind if isinstance(error, ImageError) else type(error).__name__
             match = Match(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
-        recognizer = self._operation.recognizer
+        recognizer = self._recognizer
         if list_candidates and recognizer is not None and match.sequence is not None:
             match = match.with_candidates(recognizer.ranked(self.settings.candidates))
         return replace(match, threshold=threshold, stages=stages)
@@ -304,80 +313,43 @@ class Pipeline:
         pose: np.ndarray | None,
         camera: Camera | None,
     ) -> Match:
-        width = self._thumbnail_width(operation, camera)
+        width = self._thumbnail_width(camera)
         with _timed(stages, 'decoding'):
             image = decode_message(message, _needed_size(operation, width))
             self.contrast = _contrast(image)
             if reason := self._keyframes.too_alike(image):
                 return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
-        if self._is_full(operation):
+        if self._is_full:
             reason = f'the map is full: parameter max_places = {self.settings.max_places}'
             return Match(Status.NOT_READY, reason, image=image, cause='map full')
         with _timed(stages, 'extraction'):
             features = operation.extractor.extract([image])
         with _timed(stages, 'matching'):
             thumbnail = thumbnail_of(image, width) if width else None
-            match = operation.update(Observation(features, thumbnail, stamp, pose))
-        self._thumbnails.append(thumbnail)
-        self._poses.append(pose)
+            match = _update(operation, features, thumbnail, stamp, pose)
+        self._window.append((thumbnail, pose))
         self._keyframes.accept(stamp, pose, image)
-        if not isinstance(operation, Localization):
+        if isinstance(operation.places, GrowingMap):
             operation.places.camera = operation.places.camera or camera
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
             return replace(match, image=image)
         with _timed(stages, 'verification'):
-            match = self._verified(match, operation.places, self._thumbnails[0])
-            if match.late is not None:
-                match = replace(match, late=self._verified_late(match, operation.places))
+            if self._check is not None:
+                middle, _ = self._window[(len(self._window) - 1) // 2]
+                is_weighed = not math.isnan(match.probability) and self.operation == 'localization'
+                match = self._check.checked(match, operation.places, middle, is_weighed)
+            if match.late and not (match.accepted and match.late.accepted):
+                match = replace(match, late=None)
         self._last = replace(match, image=image)
         return self._last
 
-    def _thumbnail_width(self, operation: Operation, camera: Camera | None) -> int:
+    def _thumbnail_width(self, camera: Camera | None) -> int:
         """Return the width of the thumbnails that are needed, 0 = none is."""
         width = self.settings.thumbnail_width
-        if isinstance(operation, Localization):
-            return (width or THUMBNAIL_WIDTH) if self._verifier or camera else 0
+        if self.operation == 'localization':
+            return (width or THUMBNAIL_WIDTH) if self._check or camera else 0
         return width
-
-    def _verified_late(self, match: Match, places: PlaceMap | GrowingMap) -> Match | None:
-        """Return the late match beside an accepted one, if it passes the same check."""
-        if not match.accepted or match.late is None:
-            return None
-        query = places.thumbnail(match.late.first_image_index)
-        late = self._verified(match.late, places, query)
-        return late if late.accepted else None
-
-    def _verified(
-        self, match: Match, places: PlaceMap | GrowingMap, query: np.ndarray | None
-    ) -> Match:
-        """
-        Check a match by the thumbnails of query and place; without these, nothing changes.
-
-        Matches with too few inliers are rejected. Localization in mode robust weighs the result
-        instead (:class:`GeometricEvidence`), where the match is doubtful.
-        """
-        if self._verifier is None or match.sequence is None:
-            return match
-        weighed = not math.isnan(match.probability) and self.operation == 'localization'
-        checked = self._evidence.wants(match.probability) if weighed else match.accepted
-        if not checked or query is None:
-            return match
-        inliers = self._verifier.inliers(query, places, match.sequence.middle)
-        if inliers is None:
-            return match
-        least = self._verifier.settings.min_inliers
-        match = replace(match, inliers=inliers)
-        if weighed:
-            return match.with_probability(
-                self._evidence.updated(match.probability, inliers >= least)
-            )
-        if inliers >= least:
-            return match
-        reason = (
-            f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
-        )
-        return replace(match, status=Status.NO_MATCH, reason=reason)
 
     def _start(self, name: str, settings: PipelineSettings, loaded: LoadedMap | None) -> None:
         """Start an operation; an error changes nothing."""
@@ -388,12 +360,10 @@ class Pipeline:
             save_state = SaveState(loaded.path, Base.of(loaded.path, loaded.places.stamps))
         operation = start_operation(name, settings, place_map, extractor)
         before = {self.save_state, self._map_save_state}
-        # in mapping, the growing map holds it
+        # in mapping, it is part of the growing map
         self._map = None if name == 'mapping' else place_map
         self._operation, self.operation = operation, name
-        length = settings.sequence.length
-        self._thumbnails = deque(maxlen=length - (length - 1) // 2)
-        self._poses = deque(maxlen=length)
+        self._window = deque(maxlen=settings.sequence.length)
         self._extractor = operation.extractor if operation is not None else extractor
         self._map_save_state = save_state
         self.save_state = SaveState() if name == 'loop_closure' else save_state
@@ -423,9 +393,36 @@ class Pipeline:
             return self._map
         return places.snapshot() if isinstance(places, GrowingMap) else places
 
-    @staticmethod
-    def _is_full(operation: Operation | None) -> bool:
-        return isinstance(operation, Mapping) and operation.places.full
+    @property
+    def _is_full(self) -> bool:
+        """Whether mapping stops here; a full route of loop closure evicts places instead."""
+        places = self.places
+        return self.operation == 'mapping' and isinstance(places, GrowingMap) and places.full
+
+
+def _update(
+    operation: Operation,
+    features: LocalFeatures,
+    thumbnail: np.ndarray | None,
+    stamp: int,
+    pose: np.ndarray | None,
+) -> Match:
+    """Match the window that ends with an image, and add the image to growing places."""
+    places, recognizer = operation.places, operation.recognizer
+    jpeg = b''
+    if isinstance(places, GrowingMap) and thumbnail is not None:
+        # first, since it may fail: recognizer and route stay in step
+        jpeg = encode_thumbnail(thumbnail)
+    match = Match(Status.MAPPED)
+    if recognizer is not None:
+        match = recognizer.update(features, stamp, pose)
+    if not isinstance(places, GrowingMap):
+        return match
+    if isinstance(recognizer, LoopCloser):  # it evicts the oldest places
+        places.forget(recognizer.first - places.first)
+    index = places.add(features, stamp, pose=pose, thumbnail=jpeg)
+    late = match.late and replace(match.late, image_index=index)
+    return replace(match, image_index=index, late=late)
 
 
 def _needed_size(operation: Operation, thumbnail_width: int) -> tuple[int, int] | None:

@@ -19,7 +19,7 @@ OpenJournal = Callable[[Base, PlaceMap], JournalWriter | None]
 @dataclass(eq=False)
 class SaveState:
     """
-    Files that hold a map, and the number of its recorded places that are in none.
+    The files of a map, and the number of its recorded places that are in none.
 
     :param path: file that the map was loaded from or last saved to, '' = none.
     :param base: its places, which recorded ones continue.
@@ -44,11 +44,11 @@ class SaveState:
         return self.recorded - self.saved
 
     def own(self, path: str) -> None:
-        """Remember a file that holds this map now."""
+        """Remember a file that contains this map now."""
         self._files[os.path.abspath(path)] = FileVersion.of(path)
 
     def owned(self, path: str) -> Force:
-        """Return the version of a file that holds, or held, this map and may be replaced."""
+        """Return the version of a file that contains this map, or did, and may be replaced."""
         return self._files.get(os.path.abspath(path)) or False
 
     def record(

@@ -7,9 +7,11 @@ from logging import Logger
 from pathlib import Path
 from typing import Any
 
-from stavpr_ros.errors import OutputTakenError, StavprError
-from stavpr_ros.mapping import save_map
+from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
+from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
+from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.recognition.prepared_map import statistics_of_map
@@ -94,8 +96,33 @@ def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -
     return latest
 
 
+def open_journal(
+    target: Path, base: Base, template: PlaceMap, log: 'Logger | Any'
+) -> JournalWriter | None:
+    """
+    Open the journal of the first unsaved place; None, and an error in the log, if it fails.
+
+    :param target: file that the map is saved to.
+    :param base: saved places that the recorded ones continue; template: a map of the new place.
+    """
+    try:
+        return JournalWriter.create(target, base, template, log.error)
+    except JournalError as error:
+        log.error(f'recorded places are in memory only: {error}')
+        return None
+
+
+def close_journals(pipeline: Pipeline, delete_route: bool, log: 'Logger | Any') -> None:
+    """Close the journals of a pipeline that ends; log those with unsaved places."""
+    for path in pipeline.close_journals(delete_route):
+        log.warning(
+            f'places that are in no map stay in {path}: the next start of the node makes '
+            'a map of them, or `stavpr map recover`'
+        )
+
+
 def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:
-    """Write the map to the path, or the first numbered name that is free or holds this map."""
+    """Write the map to the path, or the first numbered name that is free or of this map."""
     for name in map(str, numbered(path)):
         try:
             overwrite = pipeline.save_state.owned(name)

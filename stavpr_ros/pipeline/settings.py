@@ -9,20 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.checks import require_choice
 from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import kinds, settings_class, settings_from_json
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.mapping.stores import is_address
-from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME, default
 from stavpr_ros.pipeline.maps_folder import maps_folder
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import choose_loop_backend, least_limit
-from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of
+from stavpr_ros.recognition.robust import options_of
 from stavpr_ros.recognition.verification import GeometricSettings
 
-OPERATIONS = ('localization', 'mapping', 'loop_closure')
+OPERATIONS = BY_NAME['operation'].choices
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class PipelineSettings:
     """
     Settings of the pipeline.
 
-    Fields that are not explained here are parameters, see :mod:`stavpr_ros.parameters`.
+    Fields that are not explained here are parameters (:mod:`stavpr_ros.parameters`).
 
     :param threshold: mode paper: a window is matched when its distance is below it; None = not
         set.
@@ -43,23 +44,23 @@ class PipelineSettings:
     """
 
     threshold: float | None = None
-    min_probability: float = MIN_PROBABILITY
+    min_probability: float = default('min_probability')
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
-    nms_radius: int = 20
-    odometry_error: float = 0.1
-    mode: str = 'robust'
-    backend: str = 'auto'
-    precision: str = 'float32'
-    time_budget_ms: float = 0.0
-    model_path: str = ''
-    features: str = 'gradient'
-    feature_settings: str = ''
-    exclude_places: int = 50
-    exclude_seconds: float = 0.0
-    max_places: int = 20000
-    thumbnail_width: int = 192
-    candidates: int = 10
+    nms_radius: int = default('nms_radius')
+    odometry_error: float = default('odometry_error')
+    mode: str = default('mode')
+    backend: str = default('backend')
+    precision: str = default('precision')
+    time_budget_ms: float = default('time_budget_ms')
+    model_path: str = default('model_path')
+    features: str = default('features')
+    feature_settings: str = default('feature_settings')
+    exclude_places: int = default('exclude_places')
+    exclude_seconds: float = default('exclude_seconds')
+    max_places: int = default('max_places')
+    thumbnail_width: int = default('thumbnail_width')
+    candidates: int = default('candidates')
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     geometric: GeometricSettings | None = None
 
@@ -108,10 +109,7 @@ class PipelineSettings:
 
         :raises SettingsError: names the settings.
         """
-        if operation not in OPERATIONS:
-            raise SettingsError(
-                f'operation {operation!r} is unknown: take one of {", ".join(OPERATIONS)}'
-            )
+        require_choice('operation', operation, OPERATIONS)
         if self.geometric is not None and operation != 'localization' and not self.thumbnail_width:
             raise SettingsError(
                 f'geometric_check = {self.geometric.method} with thumbnail_width = 0 and '
@@ -151,12 +149,12 @@ class PipelineSettings:
         if operation == 'mapping':
             return stages
         matching = self.matching_backend(operation)
-        held = self.precision
-        if held == 'int8' and matching == 'cpu':
+        precision = self.precision
+        if precision == 'int8' and matching == 'cpu':
             from stavpr_ros.alignment.cpu.int8 import INSTRUCTION
 
-            held = f'int8, {INSTRUCTION} kernel'
-        return f'{stages}, image distances on {matching} ({held}), sequences on {matching}'
+            precision = f'int8, {INSTRUCTION} kernel'
+        return f'{stages}, image distances on {matching} ({precision}), sequences on {matching}'
 
     def extractor(self) -> FeatureExtractor:
         """
@@ -238,9 +236,9 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     :raises UnavailableError: the backend is not available.
     """
     for name, value in values.items():
-        choices = kinds(from_images=True) if name == 'features' else BY_NAME[name].choices
-        if choices and value not in choices:
-            raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
+        allowed = kinds(from_images=True) if name == 'features' else BY_NAME[name].choices
+        if allowed:
+            require_choice(name, value, allowed)
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
     values |= {name: absolute_path(values[name]) for name in ('map_path', 'save_path')}
     values['model_path'] = os.path.expanduser(values['model_path'])  # or a word: cached, download

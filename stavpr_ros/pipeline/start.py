@@ -12,13 +12,12 @@ from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
 from stavpr_ros.mapping.stores import is_address, store_of
-from stavpr_ros.pipeline.operations import Localization, LoopClosing, Mapping, Operation
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
 
-BLANK = np.zeros((480, 640, 3), np.uint8)
+BLANK_IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -28,6 +27,20 @@ class LoadedMap:
     path: str
     places: PlaceMap
     extractor: FeatureExtractor
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """
+    The state of an operation.
+
+    :param places: a fixed map in localization, otherwise a growing one.
+    :param recognizer: of these places; None in mapping.
+    """
+
+    extractor: FeatureExtractor
+    places: PlaceMap | GrowingMap
+    recognizer: SequenceRecognizer | None = None
 
 
 @runtime_checkable
@@ -73,10 +86,10 @@ def start_operation(
             return None
         recognizer = _recognizer(settings, place_map)
         _warm_up(recognizer, extractor, settings.sequence.length)
-        return Localization(extractor, place_map, recognizer)
+        return Operation(extractor, place_map, recognizer)
     extractor = extractor or settings.extractor()
     if name == 'mapping':
-        extractor.extract([BLANK])
+        extractor.extract([BLANK_IMAGE])
         if place_map is not None and place_map.partial:
             raise SettingsError(
                 'operation mapping does not extend the map of a fleet: record a map of its own, '
@@ -89,7 +102,7 @@ def start_operation(
             if place_map is None
             else GrowingMap.from_map(place_map, settings.max_places)
         )
-        return Mapping(extractor, growing)
+        return Operation(extractor, growing)
     closer = _loop_closer(settings, settings.exclude_places, extractor)
     # a closer that excludes next to nothing needs few images to warm up
     _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
@@ -99,7 +112,7 @@ def start_operation(
         settings.max_places,
         held_features=closer.features,
     )
-    return LoopClosing(extractor, route, closer)
+    return Operation(extractor, route, closer)
 
 
 def _recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
@@ -130,12 +143,12 @@ def _loop_closer(
 
 
 def _warm_up(
-    recognizer: SequenceRecognizer | LoopCloser,
+    recognizer: SequenceRecognizer,
     extractor: FeatureExtractor,
     images: int,
 ) -> None:
     """Compile and allocate everything, so that the first image is as fast as the others."""
-    features = extractor.extract([BLANK])
+    features = extractor.extract([BLANK_IMAGE])
     for _ in range(images):
         recognizer.update(features)
     recognizer.ranked(2)

@@ -11,11 +11,12 @@ import threading
 import time
 from typing import Any
 
+from stavpr_ros.units import SECOND
+
 RECENT = 10  # seconds behind rates, recent counts and times
 SHORTEST_SPAN = 0.5  # seconds of a rate at least: two images of a burst are not a thousand Hz
 WAITING = 'waiting'  # stage before the worker takes an image: in the total, not in the work
-NANOSECONDS = 1_000_000_000
-REORDERING_SECONDS = 0.1  # images less than this out of order were reordered on the way
+REORDERING_SECONDS = 0.1  # images less than this out of order were reordered in transport
 INTERVALS = 40  # pauses between images for the period of a camera, which needs half of them
 REGULAR = 0.75  # share of them near a multiple of the period, from which on a camera has one
 LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
@@ -130,7 +131,7 @@ class Statistics:
             self._counts.edge_reason = reason
 
     def stepped(self, ahead: float, missing: int) -> None:
-        """Count a gap or jump back of the stamps, and missing images, see :class:`StampWatch`."""
+        """Count a gap or jump back of the stamps, and missing images (:class:`StampWatch`)."""
         with self._lock:
             counts = self._counts
             if missing:
@@ -209,14 +210,14 @@ class StampWatch:
             return 0.0, 0
         last, newest = self._last, self._newest
         self._last = self._newest = stamp
-        ahead = (stamp - newest) / NANOSECONDS if newest else 0.0
+        ahead = (stamp - newest) / SECOND if newest else 0.0
         if ahead <= -REORDERING_SECONDS:
             self._last = 0
             self._intervals.clear()
             return ahead, 0
         if ahead < 0:
             self._newest = newest
-        missing = self._missing((stamp - last) / NANOSECONDS) if last else 0
+        missing = self._missing((stamp - last) / SECOND) if last else 0
         return (ahead if 0 < self.gap < ahead else 0.0), missing
 
     def _missing(self, interval: float) -> int:

@@ -4,10 +4,10 @@
 
 from collections import deque
 from dataclasses import replace
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -82,10 +82,7 @@ class LoopCloser(SequenceRecognizer):
         precision: str = 'float32',
     ) -> None:
         _require_fitting(settings, exclude, limit, exclude_seconds)
-        if precision not in PRECISIONS:
-            raise SettingsError(
-                f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
-            )
+        require_choice('precision', precision, PRECISIONS)
         backend = choose_loop_backend(backend)
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
         window = _route_window(settings, backend)
@@ -229,10 +226,8 @@ def _require_fitting(
     settings: RecognizerSettings, exclude: int, limit: int | None, exclude_seconds: float
 ) -> None:
     """Reject invalid settings."""
-    if exclude < 1:
-        raise SettingsError(f'exclude = {exclude} must be at least 1 image')
-    if not (math.isfinite(exclude_seconds) and exclude_seconds >= 0):
-        raise SettingsError(f'exclude_seconds = {exclude_seconds} must be a finite number >= 0')
+    require_at_least('exclude', exclude, 1, 'image')
+    require_at_least('exclude_seconds', exclude_seconds, 0)
     if limit is not None:
         least = least_limit(exclude, settings.sequence.length)
         if limit < least:

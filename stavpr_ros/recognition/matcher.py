@@ -5,6 +5,7 @@
 from typing import Protocol
 
 from stavpr_ros.alignment.settings import SpatialSettings
+from stavpr_ros.checks import require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.int8_features import Int8Features
@@ -60,10 +61,7 @@ def make_matcher(
     :raises InputError: vertical alignment of features whose cells are not known.
     :raises UnavailableError: the backend is not available.
     """
-    if precision not in PRECISIONS:
-        raise SettingsError(
-            f'precision {precision!r} is unknown: take one of {", ".join(PRECISIONS)}'
-        )
+    require_choice('precision', precision, PRECISIONS)
     spatial.band(features.settings.strips)
     if backend == 'cuda' and spatial.vertical:
         raise SettingsError("backend 'cuda' has no vertical alignment: take 'cpu'")

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import reassociating_kernel
-from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_statistics import MapStatistics
 from stavpr_ros.recognition.blocks import (
@@ -72,8 +72,7 @@ class RobustOptions:
         """
         known = [field.name for field in fields(self)]
         for name in names:
-            if name not in known:
-                raise SettingsError(f'option {name!r} is unknown: take one of {", ".join(known)}')
+            require_choice('option', name, known)
         return replace(self, **dict.fromkeys(names, False))
 
 
@@ -87,8 +86,7 @@ def options_of(mode: str) -> RobustOptions:
 
     :raises SettingsError: no such mode.
     """
-    if mode not in MODES:
-        raise SettingsError(f'mode {mode!r} is unknown: take one of {", ".join(MODES)}')
+    require_choice('mode', mode, MODES)
     return ROBUST if mode == 'robust' else PAPER
 
 

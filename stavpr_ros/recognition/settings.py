@@ -3,9 +3,9 @@
 """Settings of the recognizers."""
 
 from dataclasses import dataclass, field
-import math
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.checks import require_above, require_at_least, require_between
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of, RobustOptions
 
@@ -50,18 +50,10 @@ class RecognizerSettings:
             raise SettingsError(
                 f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
             )
-        if not 0 < self.min_probability < 1:
-            raise SettingsError(
-                f'min_probability = {self.min_probability} must be above 0 and below 1'
-            )
-        if self.nms_radius < 0:
-            raise SettingsError(f'nms_radius = {self.nms_radius} must be at least 0 places')
-        if not 0 <= self.odometry_error <= 1:
-            raise SettingsError(
-                f'odometry_error = {self.odometry_error} must be a share of the distance, 0 to 1'
-            )
-        if not 0 <= self.time_budget_ms < math.inf:
-            raise SettingsError(f'time_budget_ms = {self.time_budget_ms} must be at least 0')
+        require_above('min_probability', self.min_probability, 0, below=1)
+        require_at_least('nms_radius', self.nms_radius, 0, 'places')
+        require_between('odometry_error', self.odometry_error, 0, 1, '(share of the distance)')
+        require_at_least('time_budget_ms', self.time_budget_ms, 0)
         with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
         if self.time_budget_ms and not (self.has_probability and with_dtw):
             raise SettingsError(

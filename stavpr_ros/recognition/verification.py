@@ -9,12 +9,12 @@ place that looks alike has matches as well; one geometry explains few of them.
 
 from collections import OrderedDict
 from dataclasses import dataclass
-import math
 from typing import Any
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.checks import require_above, require_at_least, require_between, require_choice
+from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 
 METHODS = ('orb', 'sift')
@@ -56,22 +56,13 @@ class GeometricSettings:
     width: int = 320
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise SettingsError(
-                f'method {self.method!r} is unknown: take one of {", ".join(METHODS)}'
-            )
-        for name, value in (('min_inliers', self.min_inliers), ('features', self.features)):
-            if value < LEAST_MATCHES:
-                raise SettingsError(
-                    f'{name} = {value} must be at least {LEAST_MATCHES}: a fundamental matrix '
-                    'fits any seven'
-                )
-        if not 0 < self.ratio <= 1:
-            raise SettingsError(f'ratio = {self.ratio} must lie above 0 and be at most 1')
-        if not (math.isfinite(self.pixels) and self.pixels > 0):
-            raise SettingsError(f'pixels = {self.pixels} must be a finite number above 0')
-        if self.width < 32:
-            raise SettingsError(f'width = {self.width} must be at least 32 pixels')
+        require_choice('method', self.method, METHODS)
+        require_at_least('min_inliers', self.min_inliers, LEAST_MATCHES)
+        require_at_least('features', self.features, LEAST_MATCHES)
+        require_above('ratio', self.ratio, 0)
+        require_between('ratio', self.ratio, 0, 1)
+        require_above('pixels', self.pixels, 0)
+        require_at_least('width', self.width, 32, 'pixels')
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
+from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.health import findings, Health
 from std_msgs.msg import Header
 
@@ -48,7 +49,8 @@ class DiagnosticsPublisher:
                 self._publisher.publish(diagnostic_array(self._health(), name, stamp))
             except Exception as error:  # the next report may succeed
                 self._node.get_logger().error(
-                    f'no diagnostics: {type(error).__name__}: {error}', throttle_duration_sec=10.0
+                    f'no diagnostics: {type(error).__name__}: {error}',
+                    throttle_duration_sec=REPORT_PERIOD,
                 )
 
 

@@ -9,20 +9,27 @@ import threading
 import time
 import traceback
 
+import numpy as np
 from rclpy.logging import get_logger
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.statistics import Statistics
+from stavpr_ros.recognition import Match
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator, needed_by_pnp
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair
-from stavpr_ros.ros.input import Worker
-from stavpr_ros.ros.output import relative_pose_message
+from stavpr_ros.ros.messages import loop_closure_message, PoseFrames, relative_pose_message
+from stavpr_ros.ros.worker import Worker
 from stavpr_ros.signals import time_left
+from std_msgs.msg import Header
 
 MOST_WAITING = 16  # closures; while there are more, the oldest goes without a relative pose
+UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
+NO_POSE = 'the place has no pose: record maps and routes with odometry'
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
 
 
@@ -41,36 +48,74 @@ class EdgePublisher:
     Publishes loop closures in their order, each when its edge is ready; images never wait.
 
     :param estimator: makes the edges, on the thread.
+    :param robot_id: the parameter of this name.
     :param publish: called with each closure, on the thread.
     :param statistics: counts the edges by source.
     :param ending: set when the node ends.
-
-    ``aligns``: edges may be aligned by odometry.
     """
 
     def __init__(
         self,
         estimator: EdgeEstimator,
+        robot_id: str,
         publish: Callable[[LoopClosure], None],
         statistics: Statistics,
         ending: threading.Event,
     ) -> None:
-        self._estimator, self._publish = estimator, publish
-        self.aligns = estimator.method in ('auto', 'aligned')
+        self._estimator, self._robot_id, self._publish = estimator, robot_id, publish
         self._statistics = statistics
-        self._worker = Worker(self._complete, 2**31, ending)
+        self._worker = Worker(self._complete, UNLIMITED, ending, 'edges')
 
-    def immediate(
-        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+    def prepare(
+        self,
+        header: Header,
+        match: Match,
+        pipeline: Pipeline,
+        frames: PoseFrames,
+        camera: Camera | None,
+    ) -> tuple[Edge | None, list[WaitingClosure]]:
+        """
+        Copy all that edges need, on the thread of the pipeline: the next image changes it.
+
+        :param frames: of the poses of the places and of the odometry.
+        :param camera: of the image; None = unknown.
+        :returns: the edge for the message of the match, None without a match; the closures of the
+            match and of its late match.
+        """
+        places, edge, closures = pipeline.places, None, []
+        # a route has the camera of the query
+        place_camera = places.camera if isinstance(places, PlaceMap) else camera
+        for each in filter(None, (match, match.late)):
+            pair = pipeline.matched_pair(each, self._estimator.method)
+            if each is match and match.accepted:
+                edge = self._immediate(pair, camera, place_camera)
+            if pair is None:
+                continue
+            pose = None if np.isnan(pair.query_pose).any() else pair.query_pose
+            message = loop_closure_message(header, each, pair.source, self._robot_id, frames, pose)
+            if message is not None:
+                closures.append(WaitingClosure(message, pair, camera, place_camera))
+        return edge, closures
+
+    def _immediate(
+        self, pair: MatchedPair | None, query_camera: Camera | None, place_camera: Camera | None
     ) -> Edge:
-        """Return the edge of a match, which waits for nothing: by odometry, or without a pose."""
+        """
+        Return the edge of a match, which waits for nothing: by odometry, or without a pose.
+
+        :param pair: None = the place of a map can have no edge.
+        """
+        if self._estimator.method == 'none':
+            return Edge(Source.NONE, 'parameter relative_pose is none')
+        if pair is None:
+            return Edge(Source.NONE, NO_POSE)
         if self._estimator.verifier is not None:
             return Edge(Source.NONE, 'the loop closure of this header has it, verified')
         if self._estimator.method == 'auto':
             with suppress(InputError):
                 needed_by_pnp(pair, query_camera, place_camera)
                 return Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
-        if self.aligns:
+        if self._estimator.method in ('auto', 'aligned'):
             return align(pair)
         return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
 

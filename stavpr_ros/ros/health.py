@@ -20,7 +20,7 @@ SILENCE = 2.0  # seconds without an image from which on the input of an active n
 BUSY = 0.8  # share of its time that the worker is busy; below it, a full queue is due to a burst
 MISSING = 0.05  # share of the received images; from this estimate on missing ones are reported
 HOPELESS = 5  # windows' lengths of images without any match, from which on the limit is suspect
-BLANK = 3.0  # standard deviation of an image, of 255; the darkest tunnels of Nordland have 3
+BLANK_CONTRAST = 3.0  # standard deviation of 255; the darkest tunnels of Nordland have 3
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
 INVALID = 'invalid: '  # first word of the causes of images that cannot be decoded
 RECENTLY = f'in the last {RECENT} s'
@@ -128,9 +128,9 @@ def _image_faults(health: Health) -> Iterator[Finding]:
         remedy = health.odometry_fault or 'start it, compare its topic and its stamps'
         yield WARN, f'odometry, {need}, {state}: {remedy}'
     elif without := drops['no odometry']:
-        what = _of(without, 'image')
-        yield WARN, f'{what} without odometry at their stamps {RECENTLY}: compare both'
-    if counts.received.rate and health.contrast < BLANK:
+        text = f'{_of(without, "image")} without odometry at their stamps {RECENTLY}'
+        yield WARN, f'{text}: compare both'
+    if counts.received.rate and health.contrast < BLANK_CONTRAST:
         text = f'the images show nothing (standard deviation {health.contrast:.1f} of 255)'
         remedy = 'check the lens cap, the exposure and the driver'
         yield WARN, f'{text}: {remedy}, look at them with rqt_image_view'

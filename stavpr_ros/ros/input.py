@@ -1,33 +1,46 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The subscription to images, and the worker: one thread does the heavy work."""
+"""The subscription to images, as reliable as possible: stamps, rate and losses."""
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, InvalidStateError, wait
-from contextlib import suppress
 from dataclasses import dataclass
 import threading
 import time
-import traceback
-from typing import Any, TypeVar
+from typing import Any
 
-from rclpy.logging import get_logger
-from rclpy.qos import qos_check_compatible, QoSCompatibility
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.qos import (
+    qos_check_compatible,
+    qos_policy_name_from_kind,
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CompressedImage, Image
-from stavpr_ros.errors import StavprError
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import StampWatch, Statistics
-from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.ros.subscriptions import AdaptiveSubscription, qos_remedy
-from stavpr_ros.signals import time_left
+from stavpr_ros.units import SECOND
 
-STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end
 QUEUE = 10  # images in the middleware while the executor is busy
-END_POLL = 0.2  # seconds until a waiting caller detects the end of the node
-
-Result = TypeVar('Result')
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+_REMEDIES = {
+    'RELIABILITY': 'remove qos_overrides.{topic}.subscription.reliability, or make the publisher '
+    'reliable',
+    'DURABILITY': 'set qos_overrides.{topic}.subscription.durability to volatile, or make the '
+    'publisher transient local',
+}
+OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
+MEMORY = 32  # images that are remembered, so that none is delivered by two subscriptions in turn
 
 
 @dataclass(frozen=True)
@@ -53,8 +66,7 @@ class ImageInput:
     :param reject: called with a message that exceeds ``max_rate``, and the reason.
     :param restart: called with the reason when the next images do not continue those before.
 
-    ``topic`` is the resolved topic, ``remedy`` the remedy for the last incompatible publisher, ''
-    = none.
+    ``topic`` is the resolved topic, ``remedy`` that for the last refused publisher, '' = none.
     """
 
     def __init__(
@@ -144,7 +156,7 @@ class ImageInput:
         """Return why an image exceeds ``max_rate``, by stamps, or by arrival without them."""
         if not self.max_rate:
             return ''
-        now, last = stamp / 1e9 if stamp else arrival, self._last
+        now, last = stamp / SECOND if stamp else arrival, self._last
         # a tolerance of a tenth of the period: a camera of exactly this rate has jitter; an image
         # that was overtaken in transport, and has an earlier stamp, must not restart the count
         if last is not None and abs(now - last) < 0.9 / self.max_rate:
@@ -155,117 +167,233 @@ class ImageInput:
         return ''
 
 
-class Worker:
+def qos_remedy(topic: str, policy: str) -> str:
+    """Return the remedy for a publisher with an incompatible quality of service."""
+    remedy = _REMEDIES.get(policy, f'make the publisher offer at least the requested {policy}')
+    return f'a publisher of {topic} offers another {policy.lower()}: ' + remedy.format(topic=topic)
+
+
+def subscribe(
+    node: Node,
+    message_type: type,
+    topic: str,
+    callback: Callable[..., None],
+    qos: QoSProfile,
+    *,
+    overridable: tuple[QoSPolicyKind, ...] = (*OVERRIDABLE, QoSPolicyKind.RELIABILITY),
+    group: CallbackGroup | None = None,
+    **events: Callable[[Any], None],
+) -> Subscription:
     """
-    A thread that processes items; when the queue is full, the oldest item is dropped.
+    Subscribe, in a callback group of its own unless one is given; qos_overrides change the QoS.
 
-    Calls, such as a change of the map, run on the same thread before the next item: objects that
-    the thread owns need no lock.
+    :param qos: of the caller; rclpy writes the overrides into it.
+    :param events: callbacks of the middleware; those that it does not support are left out.
+    :raises SettingsError: invalid qos_overrides.
+    """
+    group = group or MutuallyExclusiveCallbackGroup()
+    while True:
+        try:
+            return node.create_subscription(
+                message_type,
+                topic,
+                callback,
+                qos,
+                callback_group=group,
+                event_callbacks=SubscriptionEventCallbacks(**events),
+                qos_overriding_options=QoSOverridingOptions(overridable),
+            )
+        except UnsupportedEventTypeError:
+            events.popitem()
+        except (RuntimeError, ParameterException) as error:
+            name = node.resolve_topic_name(topic)
+            raise SettingsError(
+                f'cannot subscribe to {name}: {error}; correct qos_overrides.{name}.subscription '
+                'and start again'
+            ) from error
 
-    :param ending: set when callers must not wait any longer.
+
+class AdaptiveSubscription:
+    """
+    A subscription that is reliable when every publisher offers it, and best effort otherwise.
+
+    A reliable one receives nothing of best-effort publishers, and a best-effort one loses large
+    images of reliable publishers. The publishers are followed as they come and go: a second
+    subscription is made first, and the old one is destroyed when the new one is matched. Without
+    a publisher the last choice stays, at first reliable: then no image of a reliable publisher is
+    lost before it is discovered. The parameter qos_overrides...reliability takes precedence.
+
+    :param depth: of the queue of the middleware.
+    :param callback: called with each image once, in the order of arrival.
+    :param on_lost: called with the number of images lost between publisher and subscription.
+    :param on_refused: called with the policy of an incompatible publisher.
+    :raises SettingsError: invalid qos_overrides.
     """
 
     def __init__(
-        self, process: Callable[[Any], None], capacity: int, ending: threading.Event
+        self,
+        node: ManagedNode,
+        message_type: type,
+        topic: str,
+        depth: int,
+        callback: Callable[[Any], None],
+        on_lost: Callable[[int], None],
+        on_refused: Callable[[str], None],
     ) -> None:
-        self._process, self._capacity, self._ending = process, capacity, ending
-        self._items: deque[Any] = deque()
-        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
-        self._running: Future[Any] | None = None
-        self._changed = threading.Condition()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name='recognition', daemon=True)
-        self._thread.start()
+        self._node, self._type, self._depth = node, message_type, depth
+        self._callback, self._on_lost, self._on_refused = callback, on_lost, on_refused
+        self.topic = node.resolve_topic_name(topic)
+        self._override = f'qos_overrides.{self.topic}.subscription.reliability'
+        self.overridden = self._override in node.parameter_overrides
+        self._group = MutuallyExclusiveCallbackGroup()
+        self._seen: deque[tuple[int, int | None]] = deque(maxlen=MEMORY)
+        self._sequence: int | None = None  # number of the last image of the only publisher
+        self._publishers = 0  # that are matched
+        self._reported = self._missing = self._lost = 0  # images
+        self._closed = False
+        self._newest = 0  # number of the current subscription
+        self._previous: Subscription | None = None  # until the current one is matched
+        self._lock = threading.RLock()  # events come on other threads, even before this returns
+        with self._lock:
+            reliability, self._reason = self._choose(RELIABLE)
+            self._current = self._subscribe(reliability)
+            self._log()
 
     @property
-    def waiting(self) -> int:
-        """Return the number of waiting items."""
-        return len(self._items)
+    def qos(self) -> QoSProfile:
+        """Return the requested quality of service."""
+        return self._current.qos_profile
 
-    def put(self, item: Any) -> Any | None:
-        """Enqueue an item; return the item that was dropped for it, if any."""
-        with self._changed:
-            dropped = self._items.popleft() if len(self._items) >= self._capacity else None
-            self._items.append(item)
-            self._changed.notify()
-        return dropped
+    @property
+    def choice(self) -> str:
+        """Return the reliability in use, and the reason."""
+        return f'{self.qos.reliability.name.lower().replace("_", " ")}, {self._reason}'
 
-    def clear(self) -> list[Any]:
-        """Remove the waiting items and return them."""
-        with self._changed:
-            items = list(self._items)
-            self._items.clear()
-        return items
+    @property
+    def loss_remedy(self) -> str:
+        """Return the first remedy for lost images."""
+        if self.qos.reliability == RELIABLE:
+            return 'give the publisher more shared memory'
+        if self.overridden:
+            return f'remove {self._override}'
+        return 'make the camera driver (the publisher) reliable, or give it more shared memory'
 
-    def call(self, function: Callable[[], Any]) -> Future[Any]:
-        """Call a function on the thread; after :meth:`stop`, the future is cancelled."""
-        future: Future[Any] = Future()
-        with self._changed:
-            if self._stopping:
-                future.cancel()
-            else:
-                self._calls.append((future, function))
-                self._changed.notify()
-        return future
+    def follow(self) -> None:
+        """Choose again; also called regularly, as an event may come before the publisher."""
+        with self._lock:
+            if self._closed or self._previous is not None:
+                return
+            before = self._reason
+            reliability, self._reason = self._choose(self.qos.reliability)
+            if reliability != self.qos.reliability:
+                self._previous, self._current = self._current, self._subscribe(reliability)
+            if before != self._reason:
+                self._log()
 
-    def run(self, function: Callable[[], Result]) -> Result:
+    def close(self) -> None:
+        """Unsubscribe."""
+        with self._lock:
+            self._closed = True
+            self._finish_switch()
+            self._node.destroy_subscription(self._current)
+
+    def _choose(self, now: ReliabilityPolicy) -> tuple[ReliabilityPolicy, str]:
+        """Return the reliability for the publishers that are known, and the reason."""
+        if self.overridden:
+            return now, f'set by {self._override}'
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        refusing = sum(info.qos_profile.reliability != RELIABLE for info in infos)
+        if not infos:
+            return now, 'no publisher is known'
+        if refusing:
+            return BEST_EFFORT, f'{refusing} of {len(infos)} publishers are best effort'
+        return RELIABLE, 'every publisher offers it'
+
+    def _log(self) -> None:
+        self._node.get_logger().info(f'subscription to {self.topic}: {self.choice}')
+
+    def _subscribe(self, reliability: ReliabilityPolicy) -> Subscription:
+        self._newest += 1
+        number = self._newest  # of this subscription
+        extra = (QoSPolicyKind.RELIABILITY,) if self.overridden else ()
+        return subscribe(
+            self._node,
+            self._type,
+            self.topic,
+            lambda message, info: self._on_message(number, message, info),
+            QoSProfile(depth=self._depth, reliability=reliability),
+            overridable=(*OVERRIDABLE, *extra),
+            group=self._group,
+            incompatible_qos=lambda event: self._on_incompatible(number, event),
+            matched=lambda event: self._on_matched(number, event),
+            message_lost=self._on_message_lost,
+        )
+
+    def _on_message(self, number: int, message: Any, info: Any) -> None:
+        with self._lock:
+            if number == self._newest:
+                self._finish_switch()
+            if not self._closed:
+                self._deliver(message, info)
+
+    def _on_matched(self, number: int, event: Any) -> None:
+        with self._lock:
+            if number == self._newest:
+                self._finish_switch()
+                self._publishers = event.current_count
+                if event.current_count_change < 0:
+                    self._sequence = None
+                    self._reported = self._missing = self._lost
+            self.follow()
+
+    def _on_incompatible(self, number: int, event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        with self._lock:
+            if number == self._newest:
+                self._finish_switch()
+            self.follow()
+        if policy != 'RELIABILITY' or self.overridden:
+            self._on_refused(policy)
+
+    def _on_message_lost(self, event: Any) -> None:
+        with self._lock:
+            self._reported += event.total_count_change
+            self._count_lost()
+
+    def _count_lost(self) -> None:
         """
-        Call a function on the thread and return its result.
+        Call back with new losses: reported by the middleware, or missing in the sequence.
 
-        :raises StavprError: the thread was stopped, or the node ends, before the call is done.
+        Neither has all: the middleware does not report images that another one displaced in a
+        queue, and the sequence has no end.
         """
-        future = self.call(function)
-        while not future.done():
-            wait([future], END_POLL)
-            if self._ending.is_set() and not future.done():
-                raise StavprError('the node ends')
-        try:
-            return future.result()
-        except CancelledError:
-            raise StavprError('the node is no longer configured') from None
-        except TimeoutError as error:  # abandoned by stop()
-            raise StavprError(str(error)) from error
+        lost = max(self._reported, self._missing)
+        if lost > self._lost:
+            self._on_lost(lost - self._lost)
+            self._lost = lost
 
-    def stop(self) -> bool:
-        """
-        Finish the work in progress, cancel the rest, and end the thread or abandon it.
+    def _finish_switch(self) -> None:
+        """Deliver the remaining images of the previous subscription, and destroy it."""
+        previous, self._previous = self._previous, None
+        if previous is None:
+            return
+        with previous.handle:
+            while not self._closed and (
+                taken := previous.handle.take_message(previous.msg_type, False)
+            ):
+                self._deliver(*taken)
+        self._node.destroy_subscription(previous)
 
-        :returns: whether the thread has ended.
-        """
-        with self._changed:
-            self._stopping = True
-            self._changed.notify()
-        if threading.current_thread() is not self._thread:
-            self._thread.join(time_left(STOP_TIMEOUT))
-        for future, _ in self._calls:
-            future.cancel()
-        if self._thread.is_alive() and self._running is not None and not self._running.done():
-            self._running.set_exception(
-                TimeoutError(f'the node ended; not done within {STOP_TIMEOUT:g} s')
-            )
-        return not self._thread.is_alive()
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._stopping or self._items or self._calls)
-                if self._stopping:
-                    return
-                call = self._calls.popleft() if self._calls else None
-                item = None if call else self._items.popleft()
-            if call is not None:
-                self._call(*call)
-                continue
-            try:
-                self._process(item)
-            except Exception:  # must not end the thread, and with it all later items
-                get_logger('stavpr_worker').error(f'an item was lost: {traceback.format_exc()}')
-
-    def _call(self, future: Future[Any], function: Callable[[], Any]) -> None:
-        self._running = future
-        with suppress(InvalidStateError):  # stop() has abandoned the call
-            try:
-                future.set_result(function())
-            except Exception as error:
-                future.set_exception(error)
-        self._running = None
+    def _deliver(self, message: Any, info: Any) -> None:
+        """Call back with an image, unless it was; count those between it and the last one."""
+        written, sequence = info['source_timestamp'], info['publication_sequence_number']
+        if written and (written, sequence) in self._seen:
+            return
+        self._seen.append((written, sequence))
+        # the numbers of several publishers are mixed
+        before = self._sequence if self._publishers == 1 else None
+        self._sequence = sequence if self._publishers == 1 else None
+        if before is not None and sequence is not None and sequence > before:
+            self._missing += sequence - before - 1
+            self._count_lost()
+        self._callback(message)

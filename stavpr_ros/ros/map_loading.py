@@ -11,12 +11,12 @@ import time
 from stavpr_ros.errors import MapFileError, StavprError
 from stavpr_ros.mapping import GrowingMap, PlaceMap, verify_map
 from stavpr_ros.pipeline.start import LoadedMap
-from stavpr_ros.ros.input import END_POLL
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.ros.worker import END_POLL
 from stavpr_ros.threads import call_on_thread
 
 LOAD_TIMEOUT = 120.0  # seconds to read a map
-REST = 20.0  # times what it works, the thread that compares hashes leaves the processor to images
+REST = 20.0  # pauses of the thread that compares hashes, as multiples of its computing time
 
 
 class MapLoader:
@@ -52,7 +52,7 @@ class MapLoader:
         """
         Load a map and use it; its hashes are compared later, on a thread.
 
-        :param lock: held while the map comes into use, but not while its file is read.
+        :param lock: acquired to put the map into use, not to read its file.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long.
         """
         with self._lock:
@@ -81,7 +81,7 @@ class MapLoader:
             self._verifying.start()
 
     def stop(self) -> None:
-        """End the comparison of hashes, which holds the map."""
+        """End the comparison of hashes, which keeps the map in memory."""
         self._ended.set()
         if self._verifying.is_alive():
             self._verifying.join(END_POLL)

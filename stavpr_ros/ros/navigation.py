@@ -12,7 +12,7 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.recognition import Match
-from stavpr_ros.ros.output import matched_pose_message, pose_message
+from stavpr_ros.ros.messages import matched_pose_message, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
 
@@ -50,7 +50,7 @@ class Navigation:
         odometry_frame: str,
     ) -> None:
         """
-        Publish what one image implies, in operation localization; on the worker.
+        Publish transform and initial pose, in operation localization; on the worker.
 
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
@@ -91,16 +91,6 @@ def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     """
     turn = Rotation.from_quat(place[3:]) * Rotation.from_quat(odometry[3:]).inv()
     return np.concatenate([place[:3] - turn.apply(odometry[:3]), turn.as_quat()])
-
-
-def transform_message(pose: np.ndarray, parent: str, child: str) -> TransformStamped:
-    """Return a pose of a frame, shape (7,), as a transform without a stamp."""
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id = parent
-    moved = message.transform.translation
-    moved.x, moved.y, moved.z = map(float, pose[:3])
-    message.transform.rotation = pose_message(pose).orientation
-    return message
 
 
 def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:

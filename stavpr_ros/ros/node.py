@@ -23,8 +23,7 @@ from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
 from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import STOP_TIMEOUT
-from stavpr_ros.ros.map_info import MapInfoPublisher
+from stavpr_ros.ros.output import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,
@@ -36,6 +35,8 @@ from stavpr_ros.ros.parameters import (
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
+from stavpr_ros.ros.worker import STOP_TIMEOUT
+from stavpr_ros.units import SECOND
 
 
 class PlaceRecognitionNode(ManagedNode):
@@ -45,7 +46,7 @@ class PlaceRecognitionNode(ManagedNode):
     A lifecycle node: configuring loads the map and the model and compiles the kernels, activating
     subscribes, deactivating unsubscribes, cleaning up frees everything. With parameter
     ``autostart`` it configures and activates itself when it is spun. It needs an executor that
-    runs services on threads: see :data:`THREADS`.
+    runs services on ``THREADS`` threads.
 
     :raises StavprError: parameters that exclude each other, or a backend that is not available.
     """
@@ -298,7 +299,7 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _on_clock_jump(self, jump: Any) -> None:
         if (runtime := self._runtime) is not None:
-            runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / 1e9:.3f} s')
+            runtime.restart(f'the clock jumped back by {-jump.delta.nanoseconds / SECOND:.3f} s')
 
     def _health(self) -> Health:
         self._publish_map_info()
@@ -331,7 +332,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._diagnostics.stop()
         timeout = 0.2 if self.ending.is_set() else STOP_TIMEOUT + 1  # spin_until has waited before
         self.ending.set()
-        # a thread that loads a large map or compiles may hold the lock: the end does not wait
+        # a thread that loads a large map or compiles may keep the lock: the end does not wait
         if self._lock.acquire(timeout=timeout):
             try:
                 self._free()

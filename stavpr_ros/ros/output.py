@@ -1,292 +1,36 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of results, and their publishers."""
+"""The publishers of results and of the description of the map."""
 
-import array
-from dataclasses import dataclass
-import math
+from collections.abc import Callable
+import threading
 from typing import Any
 
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
-import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from stavpr_msgs.msg import (
-    AlignedPair,
-    AlignedPlaces,
-    LoopClosure,
-    PlaceCandidate,
-    PlaceCandidates,
-    PlaceMatch,
-    RelativePose,
-)
+from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.overlay import draw_match
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.recognition import Match
 from stavpr_ros.relative_pose.edge import Edge
+from stavpr_ros.ros.messages import (
+    candidates_message,
+    image_message,
+    match_message,
+    matched_pose_message,
+    NO_FRAMES,
+    PoseFrames,
+)
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
 from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-SECOND = 1_000_000_000
-MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
-
-
-@dataclass(frozen=True)
-class PoseFrames:
-    """Frame in which the poses of places are, and the child whose poses they are; '' = unknown."""
-
-    frame: str = ''
-    child: str = ''
-
-
-NO_FRAMES = PoseFrames()
-
-
-def time_message(nanoseconds: int) -> Time:
-    """Return a time as a message; 0 means unknown."""
-    return Time(sec=int(nanoseconds) // SECOND, nanosec=int(nanoseconds) % SECOND)
-
-
-def nanoseconds(time: Time) -> int:
-    """Return a time in nanoseconds."""
-    return int(time.sec) * SECOND + int(time.nanosec)
-
-
-def pose_message(pose: np.ndarray) -> Pose:
-    """Return x y z and quaternion x y z w, shape (7,), as a message."""
-    message = Pose()
-    message.position.x, message.position.y, message.position.z = map(float, pose[:3])
-    o = message.orientation
-    o.x, o.y, o.z, o.w = map(float, pose[3:])
-    return message
-
-
-def origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str]:
-    """Return the fields that name the robot, and the map that indices refer to."""
-    return {'robot_id': robot_id, 'map_id': '' if places is None else places.map_id}
-
-
-def match_message(
-    header: Header,
-    match: Match,
-    places: PlaceMap | GrowingMap | None = None,
-    robot_id: str = '',
-    edge: Edge | None = None,
-    frame: str = '',
-) -> PlaceMatch:
-    """
-    Return the message of a match.
-
-    :param places: the map that the indices of the match refer to.
-    :param robot_id: the parameter of this name.
-    :param edge: of the middle pair, None = none; frame: of the base.
-    """
-    message = PlaceMatch(
-        header=header,
-        **origin(robot_id, places),
-        status=match.status,
-        reason=match.reason,
-        place_index=match.place_index,
-        newest_index=match.image_index if match.status is Status.MAPPED else match.newest_index,
-        distance=match.distance,
-        threshold=match.threshold,
-        probability=match.probability,
-        sequence_first=-1,
-        sequence_last=-1,
-        sequence_middle=-1,
-        window_first=header.stamp,
-        window_middle=header.stamp,
-        window_last=header.stamp,
-        second_best_index=-1,
-        second_best_distance=math.nan,
-        inliers=match.inliers,
-        relative_pose=no_edge(),
-    )
-    if match.window_stamps:
-        stamps = match.window_stamps
-        message.window_first = time_message(stamps[0])
-        message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
-    if match.sequence is not None:
-        sequence = match.sequence
-        message.sequence_first, message.sequence_last = sequence.first, sequence.last
-        message.sequence_middle = sequence.middle
-        message.path_probabilities = match.path_probabilities.tolist()
-        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
-        message.second_best_index = sequence.second_best_index
-        message.second_best_distance = sequence.second_best_distance
-    if match.accepted and places is not None:
-        place, newest = places.place(match.place_index), places.place(match.newest_index)
-        message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
-        message.session = place.session
-        message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
-        if edge is not None:
-            message.has_relative_pose = edge.has_pose
-            first, length = match.first_image_index, len(match.window_stamps)
-            pair = AlignedPlaces(
-                query_index=first + (length - 1) // 2 if first >= 0 else -1,
-                query_stamp=message.window_middle,
-                place_index=message.place_index,
-                place_stamp=message.place_stamp,
-            )
-            message.relative_pose = relative_pose_message(edge, pair, frame)
-    return message
-
-
-def candidates_message(
-    header: Header, match: Match, places: PlaceMap | GrowingMap | None, robot_id: str = ''
-) -> PlaceCandidates | None:
-    """Return the message of the candidates of a match, None without any."""
-    if not match.candidates or places is None:
-        return None
-    message = PlaceCandidates(header=header, **origin(robot_id, places), threshold=match.threshold)
-    for candidate in match.candidates:
-        place = places.place(candidate.place)
-        message.candidates.append(
-            PlaceCandidate(
-                place_index=candidate.place,
-                distance=candidate.distance,
-                probability=candidate.probability,
-                place_stamp=time_message(place.stamp),
-                place_id=place.identifier,
-                session=place.session,
-            )
-        )
-    return message
-
-
-def loop_closure_message(
-    header: Header,
-    match: Match,
-    places: PlaceMap | GrowingMap | None,
-    robot_id: str = '',
-    frames: PoseFrames = NO_FRAMES,
-    query: tuple[np.ndarray | None, str] = (None, ''),
-) -> LoopClosure | None:
-    """
-    Return the loop closure of a match, without its edge; None without a match.
-
-    :param places: the route, whose places the images of the window are, or a map.
-    :param frames: of the poses of the places.
-    :param query: pose of the image that matched, shape (7,), and its frame; for maps only,
-        a route has it.
-    """
-    if not match.accepted or places is None:
-        return None
-    first = match.first_image_index
-    is_route = first >= 0
-    stamps = match.window_stamps
-    pairs = [
-        AlignedPlaces(
-            query_index=first + q if is_route else -1,
-            query_stamp=time_message(places.place(first + q).stamp if is_route else stamps[q]),
-            place_index=m,
-            place_stamp=time_message(places.place(m).stamp),
-            query_change=match.window_changes[q] if match.window_changes else math.nan,
-        )
-        for q, m in match.path.tolist()
-    ]
-    middle = match.position
-    query_stamp, place = stamps[middle], places.place(match.place_index)
-    if is_route:
-        own = places.place(first + middle)
-        query_stamp, query = own.stamp, (own.pose, frames.frame)
-    message = LoopClosure(
-        header=header,
-        **origin(robot_id, places),
-        query_index=first + middle if is_route else -1,
-        query_stamp=time_message(query_stamp),
-        is_late=match.is_late,
-        place_session=place.session,
-        place_index=match.place_index,
-        place_stamp=time_message(place.stamp),
-        distance=match.distance,
-        threshold=match.threshold,
-        probability=match.probability,
-        inliers=match.inliers,
-        relative_pose=no_edge(),
-        pairs=pairs,
-    )
-    if query[0] is not None and place.pose is not None:
-        message.has_poses = True
-        message.pose_frame, message.pose_child_frame = frames.frame, frames.child
-        message.query_pose_frame = query[1]
-        message.query_pose, message.place_pose = pose_message(query[0]), pose_message(place.pose)
-    return message
-
-
-def relative_pose_message(
-    edge: Edge, pair: AlignedPlaces | LoopClosure, frame: str
-) -> RelativePose:
-    """Return an edge as a message, with the indices and stamps of a pair; frame: of the base."""
-    message = RelativePose(
-        source=edge.source,
-        reason=edge.reason,
-        query_index=pair.query_index,
-        query_stamp=pair.query_stamp,
-        place_index=pair.place_index,
-        place_stamp=pair.place_stamp,
-        frame=frame,
-        is_independent=edge.independent,
-        inliers=edge.inliers,
-        reprojection_error=edge.error,
-    )
-    message.pose.pose = pose_message(edge.pose)
-    message.pose.covariance = edge.covariance.ravel()
-    return message
-
-
-def no_edge() -> RelativePose:
-    """Return the message where there is no pair."""
-    return RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_error=math.nan)
-
-
-def matched_pose_message(
-    header: Header, match: Match, places: PlaceMap | GrowingMap | None, frame: str
-) -> PoseWithCovarianceStamped | None:
-    """
-    Return the pose of the place of the newest image; None without a match or a known pose.
-
-    The covariance is diagonal: the variance of each coordinate over the poses of the two places
-    before and after it, since a match may be off by a place, and at least (0.1 m)^2 and (0.1
-    rad)^2. Rotations are rotation vectors about the axes of the map. Place recognition does not
-    observe a lateral offset of the camera from the mapped route; the covariance does not include
-    it.
-
-    :param frame: of the poses of the map.
-    """
-    if not match.accepted or places is None:
-        return None
-    newest = match.newest_index
-    pose = places.place(newest).pose
-    if pose is None:
-        return None
-    first = places.first if isinstance(places, GrowingMap) else 0
-    around = range(max(first, newest - 2), min(first + len(places), newest + 3))
-    near = np.array([near for near in (places.place(i).pose for i in around) if near is not None])
-    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
-    variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
-    message = PoseWithCovarianceStamped()
-    message.header.stamp, message.header.frame_id = header.stamp, frame
-    message.pose.pose = pose_message(pose)
-    message.pose.covariance[::7] = np.maximum(variances, MIN_VARIANCE)
-    return message
-
-
-def image_message(header: Header, image: np.ndarray, encoding: str = 'rgb8') -> Image:
-    """Return an image, shape (h, w, channels) in the type of the encoding, as a message."""
-    height, width = image.shape[:2]
-    message = Image(header=header, height=height, width=width, encoding=encoding)
-    message.step = image.nbytes // height
-    message.data = array.array('B', image.tobytes())
-    return message
 
 
 def is_requested(node: Node, publisher: Publisher) -> bool:
@@ -375,3 +119,26 @@ class Output:
         """Destroy the publishers."""
         for publisher in self._publishers:
             self._node.destroy_lifecycle_publisher(publisher)
+
+
+class MapInfoPublisher:
+    """Publishes ``~/map_info`` when it has changed, in the order of the changes."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(MapInfo, '~/map_info', LATCHED)
+        self._lock = threading.RLock()
+        self.last: MapInfo | None = None
+
+    def publish(self, describe: Callable[[], MapInfo | None]) -> None:
+        """Publish the description if it differs from the last one; None = there is none."""
+        with self._lock:
+            info = describe()
+            if info is None:
+                return
+            info.header.stamp = self._node.get_clock().now().to_msg()
+            last, self.last = self.last, info
+            if last is not None:
+                last.header = info.header  # a new stamp alone is no change
+            if last != info and self._node.context.ok():
+                self._publisher.publish(info)

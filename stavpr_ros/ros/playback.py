@@ -12,7 +12,7 @@ import termios
 import time
 import tty
 
-SECOND = 1_000_000_000
+from stavpr_ros.units import SECOND
 
 
 class Playback:

@@ -15,19 +15,18 @@ import rclpy
 from rclpy.client import Client
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
-from stavpr_ros.errors import SettingsError, StavprError, UnavailableError
-from stavpr_ros.ros.rclpy_workarounds import PromptExecutor
+from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.ros.rclpy_workarounds import PromptExecutor, ros_arguments_checked
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
-SPIN_SECONDS = 0.2  # until a signal is noticed
+SIGNAL_POLL = 0.2  # seconds until a signal is noticed
 CALLBACK_SECONDS = 2.0  # for running callbacks at the end
-SERVICE_SECONDS = 2.0  # until a node shows its parameter service; some tools have none
+SERVICE_SECONDS = 2.0  # until a node shows its parameter service; tools may have none
 # read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
 PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 PROFILES_FILE = 'config/fastdds_large_images.xml'
@@ -37,7 +36,7 @@ AnyNode = TypeVar('AnyNode', bound=Node)
 
 def prepare_transport() -> None:
     """
-    Give this process shared memory that holds images; to be called before ``rclpy.init``.
+    Give this process shared memory for images; to be called before ``rclpy.init``.
 
     The default segment of 512 KiB is smaller than one 640x480 color image, and the publisher's
     segment is the one that counts. A profile set by the user stays; other middlewares ignore it.
@@ -60,25 +59,13 @@ def prepare_transport() -> None:
     os.environ[PROFILES_VARIABLE] = str(profiles)
 
 
-@contextmanager
-def _ros_arguments_checked() -> Iterator[None]:
-    try:
-        yield
-    except (
-        rclpy_implementation.RCLError,
-        rclpy_implementation.RCLInvalidROSArgsError,
-        rclpy_implementation.UnknownROSArgsError,
-    ) as error:
-        raise SettingsError(f'the arguments after --ros-args are invalid: {error}') from error
-
-
 def own_arguments(arguments: Sequence[str]) -> list[str]:
     """
     Return the arguments that are not for ROS.
 
     :raises SettingsError: those after ``--ros-args`` are invalid.
     """
-    with _ros_arguments_checked():
+    with ros_arguments_checked():
         return list(remove_ros_args(arguments))
 
 
@@ -87,13 +74,13 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     """
     Initialize ROS, make a node, and shut both down at the end.
 
-    rclpy's own signal handlers are not installed: they shut the context down at once (see
-    ros2/rclpy#1287), while the worker may be publishing and before the node has saved its map.
+    rclpy's own signal handlers are not installed: they shut the context down at once
+    (ros2/rclpy#1287), while the worker may be publishing and before the node has saved its map.
 
     :param arguments: without the program's name; the process's own if None.
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """
-    with _ros_arguments_checked():
+    with ros_arguments_checked():
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     left_behind = False
     try:
@@ -127,7 +114,7 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     try:
         while node.context.ok() and not done():
             with signals_deferred():
-                executor.spin_once(timeout_sec=SPIN_SECONDS)
+                executor.spin_once(timeout_sec=SIGNAL_POLL)
     except ExternalShutdownException:
         pass
     finally:

@@ -24,6 +24,7 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
+from stavpr_ros.errors import SettingsError
 
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
@@ -42,6 +43,23 @@ def until_shutdown(node: Node) -> Iterator[None]:
             raise
 
 
+@contextmanager
+def ros_arguments_checked() -> Iterator[None]:
+    """
+    Raise invalid arguments after ``--ros-args`` as SettingsError.
+
+    No upstream issue was found: rclpy has no public names for these exceptions.
+    """
+    try:
+        yield
+    except (
+        rclpy_implementation.RCLError,
+        rclpy_implementation.RCLInvalidROSArgsError,
+        rclpy_implementation.UnknownROSArgsError,
+    ) as error:
+        raise SettingsError(f'the arguments after --ros-args are invalid: {error}') from error
+
+
 _warning_filters = threading.Lock()  # they belong to the process
 
 
@@ -57,7 +75,7 @@ class PromptExecutor(Executor):
     were observed. The node needs threads all the same, or a service that loads a map stops the
     images.
 
-    Waits also for ros2/rclpy#1590, see ros2/rclpy#1355: what is destroyed on another thread while
+    Waits also for ros2/rclpy#1590 (issue #1355): an entity that another thread destroys while
     the executor collects its entities raises ``InvalidHandle`` out of ``spin_once``.
 
     Callbacks that raise are logged; upstream ends the process.
@@ -101,7 +119,7 @@ def repeat_responses(service: Service) -> None:
     client's reader, at the start or on a busy machine. rmw_fastrtps then drops the response after
     0.1 s, and the client waits forever; a transition requested by a life-cycle manager is made but
     counts as failed. A longer ``max_blocking_time`` in the profile (ros2/rmw_fastrtps#704) is no
-    substitute: rclpy holds the interpreter lock meanwhile (measured: no other thread ran for the
+    substitute: rclpy keeps the interpreter lock meanwhile (measured: no other thread ran for the
     whole second of the setting).
     """
     send = service.send_response
@@ -127,7 +145,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
     """
     Lifecycle node that rejects invalid transitions instead of ending the process.
 
-    Waits for ros2/rclpy#1319 (see #1209; merged for later distributions): a transition that the
+    Waits for ros2/rclpy#1319 (issue #1209; merged for later distributions): a transition that the
     current state does not have raises out of the service and out of ``trigger_...``.
 
     Its services are reentrant, so that the state can be read during a transition; hence the lock
@@ -160,7 +178,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         Return the parameters that were given, declared or not, by name.
 
         No upstream issue was found: rclpy ignores those that no one declares, and has no public
-        way to list them.
+        function that lists them.
         """
         return dict(self._parameter_overrides)
 

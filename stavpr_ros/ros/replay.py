@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes the records of a bag at a pace, or each image after the result of the last one."""
 
-import array
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -23,18 +22,17 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
-from stavpr_ros.ros.output import time_message
+from stavpr_ros.ros.messages import record_message, time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.ros.receipts import Receipts
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
-from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-SPIN_SECONDS = 0.1  # until a signal is noticed
+KEY_POLL = 0.1  # seconds until a signal, or a key, is noticed
 TRIES = 3  # how often one image is sent
-RELIABLE = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
+RELIABLE_QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 OTHERS_DEPTH = 1000  # messages of one topic between two images
 
 
@@ -44,22 +42,6 @@ class NoSubscriberError(StavprError):
 
 class NoResultError(StavprError):
     """A published image got neither a result nor an acknowledgment in time."""
-
-
-def image_message(record: ImageRecord) -> Image:
-    """Return the message of a record, with the recorded header."""
-    message = Image(
-        header=Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id),
-        height=record.height,
-        width=record.width,
-        encoding=record.encoding,
-        is_bigendian=int(record.is_bigendian),
-        step=record.step,
-    )
-    data = array.array('B')  # the one type that rclpy does not check byte by byte
-    data.frombytes(memoryview(record.data).cast('B'))
-    message.data = data
-    return message
 
 
 def message_class(name: str) -> type:
@@ -112,7 +94,7 @@ class Replayer:
     :param node: for the publishers, the services and the subscription of the results.
     :param notify: called with messages for the user: waiting for a subscriber, an image sent
         again.
-    :param topics: what is published beside the images, topic of the bag to topic of ROS.
+    :param topics: further topics, topic of the bag to topic of ROS.
     :raises UnavailableError: a message type is not installed.
     """
 
@@ -125,7 +107,7 @@ class Replayer:
     ) -> None:
         self.node, self.notify, self.options = node, notify, options
         self.published = self.resent = self.dropped = 0
-        self.publisher = node.create_publisher(Image, 'image', RELIABLE)
+        self.publisher = node.create_publisher(Image, 'image', RELIABLE_QOS)
         self.receipts = Receipts(node)
         self._others = {topic.name: self._publish_on(topic, to) for topic, to in topics.items()}
         self._match_topic = node.resolve_topic_name('stavpr/match')
@@ -133,7 +115,7 @@ class Replayer:
         self._serve()
         self._clock: Publisher | None = None
         if options.clock:
-            self._clock = node.create_publisher(ClockMessage, '/clock', RELIABLE)
+            self._clock = node.create_publisher(ClockMessage, '/clock', RELIABLE_QOS)
             steady = Clock(clock_type=ClockType.STEADY_TIME)
             node.create_timer(1 / options.clock, self._publish_clock, clock=steady)
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -197,7 +179,7 @@ class Replayer:
         if isinstance(record, MessageRecord):
             self._others[record.topic].publish(record.content)
             return
-        message = image_message(record)
+        message = record_message(record)
         self.receipts.sent(message.header)
         if self.options.lossless:
             self._send_until_answered(message)
@@ -240,7 +222,7 @@ class Replayer:
     def _spin_once(self, seconds: float) -> None:
         """Serve one callback, or wait for one at most so long; read the keys."""
         with signals_deferred():
-            self._executor.spin_once(timeout_sec=min(seconds, SPIN_SECONDS))
+            self._executor.spin_once(timeout_sec=min(seconds, KEY_POLL))
         self._poll()
 
     def _missing(self) -> str:

@@ -13,42 +13,39 @@ from typing import Any
 
 import numpy as np
 from stavpr_msgs.msg import MapInfo, PlaceMatch
-from stavpr_ros.errors import JournalError, SettingsError
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.journal import Base
-from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
-from stavpr_ros.pipeline.saving import recover_maps, save_recorded_map
+from stavpr_ros.pipeline.saving import (
+    close_journals,
+    open_journal,
+    recover_maps,
+    save_recorded_map,
+)
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
-from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.relative_pose.verification import load_verifier
-from stavpr_ros.ros.camera import CameraInput
+from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
 from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import ImageInput, InputStatus, STOP_TIMEOUT, Worker
-from stavpr_ros.ros.map_info import map_info_message
+from stavpr_ros.ros.input import ImageInput, InputStatus
 from stavpr_ros.ros.map_loading import MapLoader
+from stavpr_ros.ros.messages import map_info_message, nanoseconds, PoseFrames
 from stavpr_ros.ros.navigation import Navigation
-from stavpr_ros.ros.output import (
-    is_requested,
-    loop_closure_message,
-    nanoseconds,
-    Output,
-    PoseFrames,
-)
+from stavpr_ros.ros.output import is_requested, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.ros.subscriptions import OdometryInput
+from stavpr_ros.ros.sensors import CameraInput, OdometryInput
 from stavpr_ros.ros.visualization import Visualization
+from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
 from std_msgs.msg import Header
 
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
-REPORT_PERIOD = 10.0  # seconds between repeated warnings
 
 
 @dataclass(frozen=True)
@@ -94,12 +91,15 @@ class Runtime:
             lambda: self.pipeline.places,
             on_map_change,
         )
-        self._navigation = Navigation(node, settings)
+        self._navigation: Navigation | None = None
+        if settings.publish_tf or settings.publish_initialpose:
+            self._navigation = Navigation(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
         verifier = load_verifier(settings.verifier) if settings.verifier else None
         self._edges = EdgePublisher(
             EdgeEstimator(settings.relative_pose, verifier),
+            settings.robot_id,
             self._output.publish_closure,
             self._statistics,
             node.ending,
@@ -128,21 +128,17 @@ class Runtime:
 
     def _make_pipeline(self) -> Pipeline:
         limit_threads(self.settings.threads)
-        return Pipeline(self.settings.pipeline, self.settings.operation, self._open_journal)
+        log = self._node.get_logger()
+        return Pipeline(
+            self.settings.pipeline,
+            self.settings.operation,
+            lambda base, template: open_journal(self._journaled, base, template, log),
+        )
 
     @property
     def _journaled(self) -> Path:
         """Return the file whose name the journal of recorded places has."""
         return Path(self.settings.save_path or self.settings.maps_path / RECORDED)
-
-    def _open_journal(self, base: Base, template: PlaceMap) -> JournalWriter | None:
-        """Open the journal of the first unsaved place; None, and an error, if it is impossible."""
-        log = self._node.get_logger()
-        try:
-            return JournalWriter.create(self._journaled, base, template, log.error)
-        except JournalError as error:
-            log.error(f'recorded places are in memory only: {error}')
-            return None
 
     # life cycle
 
@@ -162,7 +158,7 @@ class Runtime:
         )
 
     def deactivate(self) -> None:
-        """Unsubscribe; publish what waits, images as dropped; save a recorded map."""
+        """Unsubscribe; publish waiting images as dropped, and waiting closures; save a map."""
         self._unsubscribe()
         self.worker.run(self._edges.flush)  # after the image in process
         self._save(self.worker.run)
@@ -176,10 +172,13 @@ class Runtime:
             if not (self.worker.stop() & self._edges.stop()):
                 self._node.left_behind = True
             self._maps.stop()
-            self._close_journals()
+            if self._pipeline is not None:
+                delete_route = not self.settings.save_path
+                close_journals(self._pipeline, delete_route, self._node.get_logger())
             self._output.close()
             self._views.close()
-            self._navigation.close()
+            if self._navigation is not None:
+                self._navigation.close()
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
@@ -190,14 +189,6 @@ class Runtime:
             log, path = self._node.get_logger(), self.settings.save_path
             if not save_recorded_map(self._pipeline, on_worker, path, log):
                 self._node.failed = True
-
-    def _close_journals(self) -> None:
-        if self._pipeline is not None:
-            for path in self._pipeline.close_journals(not self.settings.save_path):
-                self._node.get_logger().warning(
-                    f'places that are in no map stay in {path}: the next start of the node makes '
-                    'a map of them, or `stavpr map recover`'
-                )
 
     def _unsubscribe(self) -> None:
         for subscription in (self.images, self.odometry, self.camera):
@@ -249,7 +240,7 @@ class Runtime:
         """
         Load a map and use it; meanwhile the old one stays in use.
 
-        :param lock: held while the map comes into use, but not while its file is read.
+        :param lock: acquired to put the map into use, not to read its file.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
             old map stays in use.
         """
@@ -342,34 +333,12 @@ class Runtime:
             self.pipeline.reset()
         waited = time.monotonic() - item.arrival
         header = item.message.header
-        stamp = nanoseconds(header.stamp)
-        odometry = self.odometry  # another thread may unsubscribe
-        pose, frames, odometry_frame = None, PoseFrames(self.settings.map_frame), ''
-        if odometry is not None:
-            pose, odometry_frame = odometry.trajectory.at(stamp), odometry.frame
-            # places of a route have the poses of the odometry
-            own = self.pipeline.operation != 'localization'
-            frames = PoseFrames(odometry_frame if own else frames.frame, odometry.child_frame)
-        candidates = (
-            is_requested(self._node, self._output.candidates) or self._views.needs_candidates
-        )
-        camera, camera_input = None, self.camera
-        if camera_input is not None:
-            camera = camera_input.camera(frames.child, header.frame_id)
-        try:
-            match = self.pipeline.process(item.message, stamp, pose, camera, candidates)
-        except Exception as error:
-            self._node.get_logger().error(
-                f'an image could not be processed: {traceback.format_exc()}'
-            )
-            reason = f'internal error: {type(error).__name__}: {error}'
-            match = Match(Status.INVALID_IMAGE, reason, cause='internal error')
-        self._navigation.publish(header, match, self.pipeline.places, pose, odometry_frame)
-        if match.status is Status.NOT_READY and (path := self._maps.path):
-            match = replace(match, reason=f'map {path} is being loaded')
+        pose, frames = self._pose_at(nanoseconds(header.stamp))
+        camera_input = self.camera  # another thread may unsubscribe
+        camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
+        match = self._match(item.message, pose, camera)
         began = time.monotonic()
-        self._views.publish(header, match, self.pipeline, frames.frame, pose)
-        message = self._publish(header, match, frames, camera)
+        message = self._publish(header, match, pose, frames, camera)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
         if match.cause:
             self._statistics.dropped(match.cause)
@@ -379,50 +348,56 @@ class Runtime:
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
 
-    def _publish(
-        self, header: Header, match: Match, frames: PoseFrames, camera: Camera | None
-    ) -> PlaceMatch:
-        """Publish a match; its closure, and that of its late match, when their edges are ready."""
-        pair = self.pipeline.matched_pair(match, self._edges.aligns)
-        edge = None
-        if pair is not None:
-            edge = self._edges.immediate(pair, camera, self._place_camera(pair, camera))
-        message = self._output.publish(header, match, self.pipeline.places, frames, edge)
-        self._put_closure(header, match, frames, pair, camera)
-        if match.late is not None:
-            pair = self.pipeline.matched_pair(match.late, self._edges.aligns)
-            self._put_closure(header, match.late, frames, pair, camera)
-        return message
+    def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
+        """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""
+        map_frame, odometry = self.settings.map_frame, self.odometry
+        if odometry is None:
+            return None, PoseFrames(map_frame)
+        # places of a route have the poses of the odometry
+        frame = map_frame if self.pipeline.operation == 'localization' else odometry.frame
+        return odometry.trajectory.at(stamp), PoseFrames(
+            frame, odometry.child_frame, odometry.frame
+        )
 
-    def _put_closure(
+    def _match(self, message: Any, pose: np.ndarray | None, camera: Camera | None) -> Match:
+        """Process an image; an internal error is logged, and invalidates this image only."""
+        candidates = (
+            is_requested(self._node, self._output.candidates) or self._views.needs_candidates
+        )
+        stamp = nanoseconds(message.header.stamp)
+        try:
+            match = self.pipeline.process(message, stamp, pose, camera, candidates)
+        except Exception as error:
+            self._node.get_logger().error(
+                f'an image could not be processed: {traceback.format_exc()}'
+            )
+            reason = f'internal error: {type(error).__name__}: {error}'
+            return Match(Status.INVALID_IMAGE, reason, cause='internal error')
+        if match.status is Status.NOT_READY and (path := self._maps.path):
+            return replace(match, reason=f'map {path} is being loaded')
+        return match
+
+    def _publish(
         self,
         header: Header,
         match: Match,
+        pose: np.ndarray | None,
         frames: PoseFrames,
-        pair: MatchedPair | None,
         camera: Camera | None,
-    ) -> None:
-        """Publish the loop closure of a match, if it has a pair, when its edge is ready."""
-        if pair is None:
-            return
-        places, odometry = pair.source, self.odometry
-        is_map = self.pipeline.operation == 'localization'
-        if is_map and (
-            self.settings.relative_pose == 'none' or places.place(pair.place).pose is None
-        ):
-            return
-        known = odometry is not None and not np.isnan(pair.query_pose).any()
-        query = (pair.query_pose, odometry.frame) if known and odometry else (None, '')
-        message = loop_closure_message(
-            header, match, places, self.settings.robot_id, frames, query
-        )
-        if message is not None:
-            place_camera = self._place_camera(pair, camera)
-            self._edges.put(WaitingClosure(message, pair, camera, place_camera))
-
-    def _place_camera(self, pair: MatchedPair, camera: Camera | None) -> Camera | None:
-        """Return the camera of the map; a route has that of the query."""
-        return pair.source.camera if self.pipeline.operation == 'localization' else camera
+    ) -> PlaceMatch:
+        """Publish a match; its closure, and that of its late match, when their edges are ready."""
+        pipeline = self.pipeline
+        if self._navigation is not None:
+            self._navigation.publish(header, match, pipeline.places, pose, frames.odometry)
+        self._views.publish(header, match, pipeline, frames.frame, pose)
+        edge: Edge | None = None
+        closures: list[WaitingClosure] = []
+        if match.accepted:
+            edge, closures = self._edges.prepare(header, match, pipeline, frames, camera)
+        message = self._output.publish(header, match, pipeline.places, frames, edge)
+        for closure in closures:
+            self._edges.put(closure)
+        return message
 
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""

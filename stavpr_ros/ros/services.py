@@ -13,7 +13,7 @@ from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.ros.output import candidates_message, match_message
+from stavpr_ros.ros.messages import candidates_message, match_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
 from std_msgs.msg import Header

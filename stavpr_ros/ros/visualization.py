@@ -20,7 +20,8 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
 from stavpr_ros.recognition import Match
-from stavpr_ros.ros.output import image_message, is_requested, LATCHED, pose_message
+from stavpr_ros.ros.messages import image_message, pose_message
+from stavpr_ros.ros.output import is_requested, LATCHED
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -72,7 +73,7 @@ class Visualization:
         odometry: np.ndarray | None = None,
     ) -> None:
         """
-        Publish what is requested for one image; on the worker.
+        Publish the requested topics for one image; on the worker.
 
         :param frame: of the poses of the places.
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
@@ -101,10 +102,11 @@ class Visualization:
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
+        if not self._is_requested(self._route):
+            return
         last, count, last_frame = self._published
         size = 0 if places is None else len(places)
-        same = places is last and frame == last_frame and count <= size < count * GROWTH + 1
-        if same or not self._is_requested(self._route):
+        if places is last and frame == last_frame and count <= size < count * GROWTH + 1:
             return
         self._published = places, size, frame
         message = Path(header=Header(frame_id=frame, stamp=self._node.get_clock().now().to_msg()))

@@ -11,7 +11,8 @@ import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag, reading
 from stavpr_ros.sources.encodings import decode_message
-from stavpr_ros.sources.frame import Frame, ImageRecord, SECOND
+from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.units import SECOND
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'

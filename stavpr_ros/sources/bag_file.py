@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError, StavprError
 from stavpr_ros.regular_file import require_regular
-from stavpr_ros.sources.frame import SECOND
+from stavpr_ros.units import SECOND
 
 METADATA = 'metadata.yaml'
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})

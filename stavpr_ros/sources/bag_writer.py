@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.checks import require_choice
 from stavpr_ros.output_file import atomic_folder
 from stavpr_ros.sources.bag import RAW
-from stavpr_ros.sources.frame import ImageRecord, MessageRecord, SECOND
+from stavpr_ros.sources.frame import ImageRecord, MessageRecord
+from stavpr_ros.units import SECOND
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
 VERSION: int = 9
@@ -36,9 +37,8 @@ def write_bag(
     :returns: number of images written.
     :raises OutputError: the folder exists, or cannot be written.
     """
-    plugin = STORAGES.get(storage)
-    if plugin is None:
-        raise SettingsError(f'storage {storage!r}: expected one of {", ".join(STORAGES)}')
+    require_choice('storage', storage, STORAGES)
+    plugin = STORAGES[storage]
     typestore = get_typestore(Stores.ROS2_JAZZY)
     types = typestore.types
     count = 0

@@ -11,7 +11,8 @@ import re
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.sources.files import decode_file
-from stavpr_ros.sources.frame import Frame, ImageRecord, SECOND
+from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.units import SECOND
 
 SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
 

@@ -7,8 +7,6 @@ from typing import Any, Self
 
 import numpy as np
 
-SECOND = 1_000_000_000  # ns
-
 
 @dataclass(frozen=True, eq=False)
 class Frame:

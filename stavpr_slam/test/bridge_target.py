@@ -20,7 +20,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import circle, LAP, planar_poses, SECOND
 from test_pose_graph_node import odometry_message

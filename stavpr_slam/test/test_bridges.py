@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds
 from stavpr_slam.commands.bridge import main
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.ros.bridges.bridge import Bridge, interfaces

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from stavpr_ros.commands.map import main
 from stavpr_ros.mapping import save_map
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.files import save_graph
 from test_pose_graph import circle, closure, LAP, solve
 

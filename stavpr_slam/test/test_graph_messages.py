@@ -11,7 +11,7 @@ from processes import SECOND
 import pytest
 from rclpy.serialization import deserialize_message
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
 from std_msgs.msg import Header

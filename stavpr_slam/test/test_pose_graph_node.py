@@ -22,7 +22,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.mapping.transforms import matrices, to_poses
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_messages import pose_array
 from std_srvs.srv import Trigger

@@ -13,8 +13,8 @@ import rclpy
 from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure, RelativePose
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.camera import CameraInput
-from stavpr_ros.ros.output import time_message
+from stavpr_ros.ros.messages import time_message
+from stavpr_ros.ros.sensors import CameraInput
 from stavpr_slam.pose_graph import PoseGraph
 from stavpr_slam.pose_graph.false_places import FalsePlaces, NEAR, RUN
 from stavpr_slam.ros.false_closures import FalseClosures

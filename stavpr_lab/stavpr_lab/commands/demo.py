@@ -8,15 +8,15 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import add_parameter, make_parser, run_program
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
-from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME, default
 
 if TYPE_CHECKING:
     from stavpr_lab.demonstration.recordings import LoopTraverse, TraversePair
     from stavpr_ros.mapping import PlaceMap
 
-EXCLUDE_PLACES, GEOMETRIC_CHECK = 50, 'sift'  # defaults with --loop
+EXCLUDE_PLACES, GEOMETRIC_CHECK = default('exclude_places'), 'sift'  # defaults with --loop
 SYNTHETIC = 'synthetic'
 DRIFT = 0.7  # odometry of about 20 m after three laps
 
@@ -66,18 +66,17 @@ def _parser() -> argparse.ArgumentParser:
     add('--truth', metavar='identity|FILE', help=truth)
     tolerance = 'places that a correct match may be off (%(default)s)'
     add('--tolerance', type=int, default=3, help=tolerance)
-    length = 'images in the window (%(default)s)'
-    add('--sequence-length', type=int, default=20, metavar='L', help=length)
-    add('--mode', default='robust', choices=('paper', 'robust'), help='of the node (%(default)s)')
+    add_parameter(parser, 'sequence_length', 'images in the window (%(default)s)', metavar='L')
+    add_parameter(parser, 'mode', 'of the node (%(default)s)')
     least = 'of the node, mode robust: matches have a greater probability (%(default)g)'
-    default = BY_NAME['min_probability'].default
-    add('--min-probability', type=float, default=default, metavar='P', help=least)
+    add_parameter(parser, 'min_probability', least, metavar='P')
     limit = 'of the node, mode paper (estimated from the first traverse)'
     add('--threshold', type=float, metavar='DISTANCE', help=limit)
     exclude = f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})'
     add('--exclude-places', type=int, metavar='N', help=exclude)
     check = f'with --loop: verification of matches by keypoints ({GEOMETRIC_CHECK})'
-    add('--geometric-check', choices=('none', 'orb', 'sift'), help=check)
+    checks = BY_NAME['geometric_check'].choices
+    add('--geometric-check', choices=checks, help=check)
     add = parser.add_argument_group('options of --slam').add_argument
     add('--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)')
     add('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')

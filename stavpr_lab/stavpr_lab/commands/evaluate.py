@@ -9,10 +9,10 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import add_parameter, make_parser, run_program
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
-from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.parameters import default
 
 if TYPE_CHECKING:
     from stavpr_lab.commands.evaluate_sequences import Sequences
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from stavpr_ros.recognition import RecognizerSettings
 
 OUTPUT = 'evaluation_output'
-EXCLUDE_PLACES = 50  # as the node's parameter
+EXCLUDE_PLACES = default('exclude_places')
 
 DESCRIPTION = """
 Recognizes a second traverse on the map of a first one, image by image as the node does, and
@@ -138,29 +138,25 @@ def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_method_options(parser: argparse.ArgumentParser) -> None:
-    from stavpr_ros.alignment.settings import STRATEGIES
-
-    add = parser.add_argument_group('method').add_argument
+    group = parser.add_argument_group('method')
     mode = 'paper: as published; robust: with mitigations of failure modes (%(default)s)'
-    add('--mode', choices=('paper', 'robust'), default='robust', help=mode)
+    add_parameter(group, 'mode', mode)
     least = 'mode robust: matches have a greater probability (%(default)g)'
-    default = BY_NAME['min_probability'].default
-    add('--min-probability', type=float, default=default, metavar='P', help=least)
-    length = 'images in a window (%(default)s)'
-    add('--sequence-length', type=int, default=20, metavar='L', help=length)
-    add('--beta', type=float, default=2.0, help='places per image of a window (%(default)g)')
-    spatial = 'spatial alignment (%(default)s)'
-    add('--strategy', choices=STRATEGIES, default='adaptive', help=spatial)
-    add('--sigma', type=float, default=1.0, help='of the adaptive weight (%(default)g)')
-    add('--xi', type=int, help='restricted alignment: largest shift in strips (none)')
-    add('--vertical', action='store_true', help='align the cells of two strips vertically first')
+    add_parameter(group, 'min_probability', least, metavar='P')
+    add_parameter(group, 'sequence_length', 'images in a window (%(default)s)', metavar='L')
+    add_parameter(group, 'beta', 'places per image of a window (%(default)g)')
+    add_parameter(group, 'strategy', 'spatial alignment (%(default)s)')
+    add_parameter(group, 'sigma', 'of the adaptive weight (%(default)g)')
+    add_parameter(
+        group, 'xi', 'restricted alignment: largest shift in strips (none)', default=None
+    )
+    add_parameter(group, 'vertical', 'align the cells of two strips vertically first')
     radius = 'other candidates are farther from the match than this (%(default)s)'
-    add('--nms-radius', type=int, default=20, metavar='PLACES', help=radius)
-    add('--backend', choices=('auto', 'cpu', 'cuda'), default='cpu', help='(%(default)s)')
+    add_parameter(group, 'nms_radius', radius, metavar='PLACES')
+    add_parameter(group, 'backend', '(%(default)s)', default='cpu')
     budget = 'for an image; a coarse first stage where it takes longer; 0 = exact (%(default)g)'
-    add('--time-budget-ms', type=float, default=0.0, metavar='MS', help=budget)
-    precision = 'of the map (%(default)s)'
-    add('--precision', choices=('float32', 'int8'), default='float32', help=precision)
+    add_parameter(group, 'time_budget_ms', budget, metavar='MS')
+    add_parameter(group, 'precision', 'of the map (%(default)s)')
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

@@ -17,11 +17,11 @@ from stavpr_lab.demonstration.street.laps import intrinsics, LapDrive
 from stavpr_lab.demonstration.street.traverses import SIZE
 from stavpr_lab.evaluation.plots import titled_page
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.output_file import JSON, write_output
-from stavpr_ros.ros.output import pose_message, time_message
+from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.files import TUM, tum_text
 from stavpr_slam.pose_graph.transforms import planar_poses
 from std_msgs.msg import Header

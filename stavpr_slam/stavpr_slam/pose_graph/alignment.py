@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import SECOND
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.output_file import FileKind, Force, write_output
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.graph import PoseGraph
 from stavpr_slam.pose_graph.path_errors import path_errors
 

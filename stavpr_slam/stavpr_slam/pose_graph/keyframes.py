@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import checked_pose, SECOND
+from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.mapping.transforms import inverse, matrices
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
 from stavpr_slam.pose_graph.track import OdometryTrack
 

@@ -4,8 +4,8 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from stavpr_ros.mapping.trajectory import SECOND
 from stavpr_ros.mapping.transforms import inverse
+from stavpr_ros.units import SECOND
 
 LEVER = 2.0  # meters from the robot: points within move at most as fast as the robot
 MAX_SECONDS = 1.0  # between two stamps; longer pauses of the odometry count as this

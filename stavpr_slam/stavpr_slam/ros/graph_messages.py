@@ -9,8 +9,8 @@ from typing import Any
 from geometry_msgs.msg import Point
 import numpy as np
 from stavpr_msgs.msg import LoopClosure, RelativePose
-from stavpr_ros.mapping.trajectory import SECOND
-from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.pose_graph.alignment import APPEARANCE, IDENTITY
 from std_msgs.msg import ColorRGBA

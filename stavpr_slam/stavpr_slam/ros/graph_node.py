@@ -25,10 +25,14 @@ from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.navigation import tf_message, transform_message
-from stavpr_ros.ros.output import nanoseconds, pose_message
+from stavpr_ros.ros.messages import (
+    nanoseconds,
+    odometry_pose,
+    pose_message,
+    transform_message,
+)
+from stavpr_ros.ros.navigation import tf_message
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
-from stavpr_ros.ros.subscriptions import odometry_pose
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings
 from stavpr_slam.pose_graph.solver import load_gtsam
 from stavpr_slam.ros.correction import LEVER, LimitedCorrection

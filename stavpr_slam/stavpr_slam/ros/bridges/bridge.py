@@ -16,8 +16,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.output import nanoseconds
-from stavpr_ros.ros.subscriptions import odometry_pose
+from stavpr_ros.ros.messages import nanoseconds, odometry_pose
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.ros.bridges.external_keyframes import (
     ExternalKeyframes,

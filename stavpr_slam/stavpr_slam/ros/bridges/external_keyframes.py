@@ -6,8 +6,9 @@ from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
-from stavpr_ros.mapping.trajectory import SECOND, Trajectory
+from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.mapping.transforms import inverse, matrices
+from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 
 MAX_KEYFRAMES = 1_000_000

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.transforms import to_poses
-from stavpr_ros.ros.output import nanoseconds, pose_message
+from stavpr_ros.ros.messages import nanoseconds, pose_message
 from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import KeyframeEdge
 from std_msgs.msg import Header

@@ -7,9 +7,10 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.mapping.trajectory import checked_pose, SECOND
+from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
-from stavpr_ros.ros.output import nanoseconds, pose_message
+from stavpr_ros.ros.messages import nanoseconds, pose_message
+from stavpr_ros.units import SECOND
 from stavpr_slam.ros.bridges.bridge import Bridge
 from stavpr_slam.ros.graph_messages import closure_of, pose_array
 

@@ -8,7 +8,7 @@ from geometry_msgs.msg import Transform, Vector3
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.transforms import to_poses
-from stavpr_ros.ros.output import nanoseconds, pose_message
+from stavpr_ros.ros.messages import nanoseconds, pose_message
 from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import body_information, KeyframeEdge
 from stavpr_slam.ros.bridges.poses import PoseBridge

@@ -5,7 +5,7 @@
 from typing import Any, ClassVar
 
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.ros.output import nanoseconds
+from stavpr_ros.ros.messages import nanoseconds
 from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import KeyframeEdge
 from stavpr_slam.ros.bridges.rtabmap import transform_of

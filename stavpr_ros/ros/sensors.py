@@ -1,66 +1,98 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The camera of the images: intrinsics from camera_info, and its place on the robot."""
+"""The subscriptions to odometry and to camera_info, and the camera's place on the robot."""
 
 import math
+import time
 from typing import Any
 
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping.camera import Camera, FORWARD
-from stavpr_ros.ros.subscriptions import subscribe
+from stavpr_ros.mapping.trajectory import Trajectory
+from stavpr_ros.ros import REPORT_PERIOD
+from stavpr_ros.ros.input import BEST_EFFORT, subscribe
+from stavpr_ros.ros.messages import camera_of, nanoseconds, odometry_pose
 
-IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-REPORT_PERIOD = 10.0  # seconds between repeated warnings
+ODOMETRY = 'nav_msgs/msg/Odometry'
+AT_THE_BASE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of a camera without an offset
 
 
-def mount_of(text: str) -> tuple[float, ...] | None:
+class OdometryInput:
     """
-    Return the pose that parameter camera_transform states, None for an empty one.
+    The subscription to odometry, on the topic ``odom``.
 
-    :param text: x y z and roll pitch yaw (fixed axes, radians), or a quaternion x y z w.
-    :raises SettingsError: something else.
+    :param timeout: seconds for which the newest pose is valid.
+
+    ``frame`` is the frame of the poses, ``child_frame`` the one whose poses they are.
     """
-    if not text.strip():
-        return None
-    try:
-        numbers = [float(word) for word in text.replace(',', ' ').split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) == 6:
-        numbers[3:] = Rotation.from_euler('xyz', numbers[3:]).as_quat().tolist()
-    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or not any(numbers[3:]):
-        raise SettingsError(
-            f'camera_transform = {text!r}: expected x y z roll pitch yaw, or x y z and a '
-            'quaternion x y z w'
-        )
-    return tuple(numbers)
+
+    def __init__(self, node: Node, timeout: float) -> None:
+        self.trajectory = Trajectory(timeout)
+        self._node, self._timeout = node, timeout
+        self._arrived: float | None = None
+        self.frame = self.child_frame = ''
+        qos = QoSProfile(depth=50, reliability=BEST_EFFORT)
+        self._subscription = subscribe(node, Odometry, 'odom', self._on_odometry, qos)
+
+    def freshness(self) -> str:
+        """Return ``fresh``, ``stale`` or ``never``, for the diagnostics."""
+        if self._arrived is None:
+            return 'never'
+        return 'fresh' if time.monotonic() - self._arrived < max(2.0, self._timeout) else 'stale'
+
+    def fault(self) -> str:
+        """Return why nothing can arrive, as a wrong remapping; empty = nothing known."""
+        fresh = self.freshness() == 'fresh'
+        return '' if fresh else misdirected(self._node, self._subscription.topic_name)
+
+    def close(self) -> None:
+        """Unsubscribe from odometry."""
+        self._node.destroy_subscription(self._subscription)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            self.trajectory.add(nanoseconds(message.header.stamp), odometry_pose(message))
+        except InputError as error:
+            self._node.get_logger().warning(
+                f'odometry rejected: {error}', throttle_duration_sec=REPORT_PERIOD
+            )
+            return
+        self._arrived = time.monotonic()
+        self.frame, self.child_frame = message.header.frame_id, message.child_frame_id
 
 
-def camera_of(info: CameraInfo, mount: tuple[float, ...]) -> Camera:
+def misdirected(node: Node, topic: str) -> str:
     """
-    Return the camera that a message describes, as its images are: binned, and cut out.
+    Return why no odometry can arrive on a topic; empty if it can, or if there is none anywhere.
 
-    :raises InputError: it is not calibrated, or the numbers are invalid.
+    Odometry beside a topic ``map_to_odom`` is that of a pose graph: its corrections, made from the
+    loop closures, must not come back as odometry.
+
+    :param topic: after remapping.
     """
-    bins, roi, k = (max(info.binning_x, 1), max(info.binning_y, 1)), info.roi, info.k
-    distorted = any(info.d)
-    return Camera(
-        width=(roi.width or info.width) // bins[0],
-        height=(roi.height or info.height) // bins[1],
-        focal=(float(k[0]) / bins[0], float(k[4]) / bins[1]),
-        center=(  # centers of pixels are whole numbers
-            (float(k[2]) - roi.x_offset + 0.5) / bins[0] - 0.5,
-            (float(k[5]) - roi.y_offset + 0.5) / bins[1] - 0.5,
-        ),
-        model=info.distortion_model if distorted else '',
-        distortion=tuple(map(float, info.d)) if distorted else (),
-        mount=mount,
-    )
+    publishers = node.get_publishers_info_by_topic(topic)
+    types = sorted({info.topic_type for info in publishers})
+    if ODOMETRY in types:
+        return ''
+    found = f'{", ".join(types)} is published' if types else 'nothing is published'
+    topics = dict(node.get_topic_names_and_types())
+    others = [
+        name
+        for name, kinds in topics.items()
+        if ODOMETRY in kinds
+        and node.count_publishers(name)
+        and f'{name.rpartition("/")[0]}/map_to_odom' not in topics
+    ]
+    if not (types or others):
+        return ''
+    hint = f', odometry is on {", ".join(others)}' if others else ''
+    return f'{found} on {topic}{hint}: remap odom to the topic of the odometry'
 
 
 class CameraInput:
@@ -82,7 +114,7 @@ class CameraInput:
         self.assumed = False
         topic = _topic(node)
         self.problem = f'nothing was received on {topic}'
-        qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        qos = QoSProfile(depth=1, reliability=BEST_EFFORT)
         self._subscription = subscribe(node, CameraInfo, topic, self._on_info, qos)
         self._tf: Any = None
         self._listener: Any = None
@@ -137,7 +169,7 @@ class CameraInput:
         if self._given is not None:
             return self._given
         if base == frame:
-            return IDENTITY
+            return AT_THE_BASE
         if self._tf is not None:
             return self._from_tf(base, frame)
         if not self.assumed:
@@ -168,3 +200,26 @@ def _topic(node: Node) -> str:
     plain = f'{node.get_namespace().rstrip("/")}/camera_info'
     beside = node.resolve_topic_name('image').rpartition('/')[0] + '/camera_info'
     return own if own != plain else beside
+
+
+def mount_of(text: str) -> tuple[float, ...] | None:
+    """
+    Return the pose that parameter camera_transform states, None for an empty one.
+
+    :param text: x y z and roll pitch yaw (fixed axes, radians), or a quaternion x y z w.
+    :raises SettingsError: something else.
+    """
+    if not text.strip():
+        return None
+    try:
+        numbers = [float(word) for word in text.replace(',', ' ').split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 6:
+        numbers[3:] = Rotation.from_euler('xyz', numbers[3:]).as_quat().tolist()
+    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or not any(numbers[3:]):
+        raise SettingsError(
+            f'camera_transform = {text!r}: expected x y z roll pitch yaw, or x y z and a '
+            'quaternion x y z w'
+        )
+    return tuple(numbers)

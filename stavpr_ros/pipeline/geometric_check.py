@@ -1,0 +1,75 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The geometric check of matches: the thumbnails of query and place, by keypoints."""
+
+from dataclasses import replace
+
+import numpy as np
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.recognition import Match, Status
+from stavpr_ros.recognition.verification import (
+    GeometricEvidence,
+    GeometricSettings,
+    PlaceVerifier,
+)
+
+
+class GeometricCheck:
+    """Checks matches; it learns from those since the last reset how often right ones pass."""
+
+    def __init__(self, settings: GeometricSettings) -> None:
+        self.settings = settings
+        self._verifier = PlaceVerifier(settings)
+        self._evidence = GeometricEvidence()
+
+    def reset(self) -> None:
+        """Forget the passes of earlier matches."""
+        self._evidence = GeometricEvidence()
+
+    def checked(
+        self,
+        match: Match,
+        places: PlaceMap | GrowingMap,
+        query: np.ndarray | None,
+        is_weighed: bool,
+    ) -> Match:
+        """
+        Return a match, and its late match, after the check; without thumbnails, as they are.
+
+        Matches with too few inliers are rejected.
+
+        :param query: thumbnail of the middle image of the window, RGB (h, w, 3) uint8; None =
+            unknown.
+        :param is_weighed: the result changes the probability instead (:class:`GeometricEvidence`),
+            where the match is doubtful.
+        """
+        match = self._checked(match, places, query, is_weighed)
+        if match.late is None or not match.accepted:
+            return match
+        query = places.thumbnail(match.late.first_image_index)
+        return replace(match, late=self._checked(match.late, places, query, is_weighed))
+
+    def _checked(
+        self,
+        match: Match,
+        places: PlaceMap | GrowingMap,
+        query: np.ndarray | None,
+        is_weighed: bool,
+    ) -> Match:
+        if match.sequence is None or query is None:
+            return match
+        if not (self._evidence.wants(match.probability) if is_weighed else match.accepted):
+            return match
+        inliers = self._verifier.inliers(query, places, match.sequence.middle)
+        if inliers is None:
+            return match
+        least, match = self.settings.min_inliers, replace(match, inliers=inliers)
+        if is_weighed:
+            probability = self._evidence.updated(match.probability, inliers >= least)
+            return match.with_probability(probability)
+        if inliers >= least:
+            return match
+        reason = (
+            f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
+        )
+        return replace(match, status=Status.NO_MATCH, reason=reason)

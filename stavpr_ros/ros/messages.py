@@ -1,0 +1,381 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Conversions between messages and the types of the library; no publishers."""
+
+import array
+from dataclasses import dataclass
+import math
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+from stavpr_msgs.msg import (
+    AlignedPair,
+    AlignedPlaces,
+    LoopClosure,
+    MapInfo,
+    PlaceCandidate,
+    PlaceCandidates,
+    PlaceMatch,
+    RelativePose,
+)
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.map_version2 import VERSION
+from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.edge import Edge
+from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.units import SECOND
+from std_msgs.msg import Header
+
+MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
+
+
+@dataclass(frozen=True)
+class PoseFrames:
+    """
+    Names of frames, '' = unknown.
+
+    :param frame: of the poses of the places.
+    :param child: of the base, whose poses they are.
+    :param odometry: of the poses of the odometry.
+    """
+
+    frame: str = ''
+    child: str = ''
+    odometry: str = ''
+
+
+NO_FRAMES = PoseFrames()
+
+
+def time_message(nanoseconds: int) -> Time:
+    """Return a time as a message; 0 means unknown."""
+    return Time(sec=int(nanoseconds) // SECOND, nanosec=int(nanoseconds) % SECOND)
+
+
+def nanoseconds(time: Time) -> int:
+    """Return a time in nanoseconds."""
+    return int(time.sec) * SECOND + int(time.nanosec)
+
+
+def pose_message(pose: np.ndarray) -> Pose:
+    """Return x y z and quaternion x y z w, shape (7,), as a message."""
+    message = Pose()
+    message.position.x, message.position.y, message.position.z = map(float, pose[:3])
+    o = message.orientation
+    o.x, o.y, o.z, o.w = map(float, pose[3:])
+    return message
+
+
+def origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str]:
+    """Return the fields that name the robot, and the map that indices refer to."""
+    return {'robot_id': robot_id, 'map_id': '' if places is None else places.map_id}
+
+
+def match_message(
+    header: Header,
+    match: Match,
+    places: PlaceMap | GrowingMap | None = None,
+    robot_id: str = '',
+    edge: Edge | None = None,
+    frame: str = '',
+) -> PlaceMatch:
+    """
+    Return the message of a match.
+
+    :param places: the map that the indices of the match refer to.
+    :param robot_id: the parameter of this name.
+    :param edge: of the middle pair, None = none; frame: of the base.
+    """
+    message = PlaceMatch(
+        header=header,
+        **origin(robot_id, places),
+        status=match.status,
+        reason=match.reason,
+        place_index=match.place_index,
+        newest_index=match.image_index if match.status is Status.MAPPED else match.newest_index,
+        distance=match.distance,
+        threshold=match.threshold,
+        probability=match.probability,
+        sequence_first=-1,
+        sequence_last=-1,
+        sequence_middle=-1,
+        window_first=header.stamp,
+        window_middle=header.stamp,
+        window_last=header.stamp,
+        second_best_index=-1,
+        second_best_distance=math.nan,
+        inliers=match.inliers,
+        relative_pose=no_edge(),
+    )
+    if match.window_stamps:
+        stamps = match.window_stamps
+        message.window_first = time_message(stamps[0])
+        message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
+    if match.sequence is not None:
+        sequence = match.sequence
+        message.sequence_first, message.sequence_last = sequence.first, sequence.last
+        message.sequence_middle = sequence.middle
+        message.path_probabilities = match.path_probabilities.tolist()
+        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
+        message.second_best_index = sequence.second_best_index
+        message.second_best_distance = sequence.second_best_distance
+    if match.accepted and places is not None:
+        place, newest = places.place(match.place_index), places.place(match.newest_index)
+        message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
+        message.session = place.session
+        message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
+        if edge is not None:
+            message.has_relative_pose = edge.has_pose
+            first, length = match.first_image_index, len(match.window_stamps)
+            pair = AlignedPlaces(
+                query_index=first + (length - 1) // 2 if first >= 0 else -1,
+                query_stamp=message.window_middle,
+                place_index=message.place_index,
+                place_stamp=message.place_stamp,
+            )
+            message.relative_pose = relative_pose_message(edge, pair, frame)
+    return message
+
+
+def candidates_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None, robot_id: str = ''
+) -> PlaceCandidates | None:
+    """Return the message of the candidates of a match, None without any."""
+    if not match.candidates or places is None:
+        return None
+    message = PlaceCandidates(header=header, **origin(robot_id, places), threshold=match.threshold)
+    for candidate in match.candidates:
+        place = places.place(candidate.place)
+        message.candidates.append(
+            PlaceCandidate(
+                place_index=candidate.place,
+                distance=candidate.distance,
+                probability=candidate.probability,
+                place_stamp=time_message(place.stamp),
+                place_id=place.identifier,
+                session=place.session,
+            )
+        )
+    return message
+
+
+def loop_closure_message(
+    header: Header,
+    match: Match,
+    places: PlaceMap | GrowingMap | None,
+    robot_id: str = '',
+    frames: PoseFrames = NO_FRAMES,
+    query_pose: np.ndarray | None = None,
+) -> LoopClosure | None:
+    """
+    Return the loop closure of a match, without its edge; None without a match.
+
+    :param places: the route, whose places the images of the window are, or a map.
+    :param query_pose: of the odometry, at the image that matched, shape (7,); for maps only, a
+        route has it.
+    """
+    if not match.accepted or places is None:
+        return None
+    first = match.first_image_index
+    is_route = first >= 0
+    stamps = match.window_stamps
+    pairs = [
+        AlignedPlaces(
+            query_index=first + q if is_route else -1,
+            query_stamp=time_message(places.place(first + q).stamp if is_route else stamps[q]),
+            place_index=m,
+            place_stamp=time_message(places.place(m).stamp),
+            query_change=match.window_changes[q] if match.window_changes else math.nan,
+        )
+        for q, m in match.path.tolist()
+    ]
+    middle = match.position
+    query_stamp, query_frame = stamps[middle], frames.odometry
+    place = places.place(match.place_index)
+    if is_route:
+        own = places.place(first + middle)
+        query_stamp, query_pose, query_frame = own.stamp, own.pose, frames.frame
+    message = LoopClosure(
+        header=header,
+        **origin(robot_id, places),
+        query_index=first + middle if is_route else -1,
+        query_stamp=time_message(query_stamp),
+        is_late=match.is_late,
+        place_session=place.session,
+        place_index=match.place_index,
+        place_stamp=time_message(place.stamp),
+        distance=match.distance,
+        threshold=match.threshold,
+        probability=match.probability,
+        inliers=match.inliers,
+        relative_pose=no_edge(),
+        pairs=pairs,
+    )
+    if query_pose is not None and place.pose is not None:
+        message.has_poses = True
+        message.pose_frame, message.pose_child_frame = frames.frame, frames.child
+        message.query_pose_frame = query_frame
+        message.query_pose, message.place_pose = pose_message(query_pose), pose_message(place.pose)
+    return message
+
+
+def relative_pose_message(
+    edge: Edge, pair: AlignedPlaces | LoopClosure, frame: str
+) -> RelativePose:
+    """Return an edge as a message, with the indices and stamps of a pair; frame: of the base."""
+    message = RelativePose(
+        source=edge.source,
+        reason=edge.reason,
+        query_index=pair.query_index,
+        query_stamp=pair.query_stamp,
+        place_index=pair.place_index,
+        place_stamp=pair.place_stamp,
+        frame=frame,
+        is_independent=edge.independent,
+        inliers=edge.inliers,
+        reprojection_error=edge.error,
+    )
+    message.pose.pose = pose_message(edge.pose)
+    message.pose.covariance = edge.covariance.ravel()
+    return message
+
+
+def no_edge() -> RelativePose:
+    """Return the message where there is no pair."""
+    return RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_error=math.nan)
+
+
+def matched_pose_message(
+    header: Header, match: Match, places: PlaceMap | GrowingMap | None, frame: str
+) -> PoseWithCovarianceStamped | None:
+    """
+    Return the pose of the place of the newest image; None without a match or a known pose.
+
+    The covariance is diagonal: the variance of each coordinate over the poses of the two places
+    before and after it, since a match may be off by a place, and at least (0.1 m)^2 and (0.1
+    rad)^2. Rotations are rotation vectors about the axes of the map. Place recognition does not
+    observe a lateral offset of the camera from the mapped route; the covariance does not include
+    it.
+
+    :param frame: of the poses of the map.
+    """
+    if not match.accepted or places is None:
+        return None
+    newest = match.newest_index
+    pose = places.place(newest).pose
+    if pose is None:
+        return None
+    first = places.first if isinstance(places, GrowingMap) else 0
+    around = range(max(first, newest - 2), min(first + len(places), newest + 3))
+    near = np.array([near for near in (places.place(i).pose for i in around) if near is not None])
+    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
+    variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
+    message = PoseWithCovarianceStamped()
+    message.header.stamp, message.header.frame_id = header.stamp, frame
+    message.pose.pose = pose_message(pose)
+    message.pose.covariance[::7] = np.maximum(variances, MIN_VARIANCE)
+    return message
+
+
+def image_message(header: Header, image: np.ndarray, encoding: str = 'rgb8') -> Image:
+    """Return an image, shape (h, w, channels) in the type of the encoding, as a message."""
+    height, width = image.shape[:2]
+    message = Image(header=header, height=height, width=width, encoding=encoding)
+    message.step = image.nbytes // height
+    message.data = array.array('B', image.tobytes())
+    return message
+
+
+def record_message(record: ImageRecord) -> Image:
+    """Return the message of a record, with the recorded header."""
+    message = Image(
+        header=Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id),
+        height=record.height,
+        width=record.width,
+        encoding=record.encoding,
+        is_bigendian=int(record.is_bigendian),
+        step=record.step,
+    )
+    data = array.array('B')  # the one type that rclpy does not check byte by byte
+    data.frombytes(memoryview(record.data).cast('B'))
+    message.data = data
+    return message
+
+
+def odometry_pose(message: Odometry) -> np.ndarray:
+    """Return the pose of an odometry message, shape (7,), float64."""
+    p, o = message.pose.pose.position, message.pose.pose.orientation
+    return np.array([p.x, p.y, p.z, o.x, o.y, o.z, o.w])
+
+
+def transform_message(pose: np.ndarray, parent: str, child: str) -> TransformStamped:
+    """Return a pose of a frame, shape (7,), as a transform without a stamp."""
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    moved = message.transform.translation
+    moved.x, moved.y, moved.z = map(float, pose[:3])
+    message.transform.rotation = pose_message(pose).orientation
+    return message
+
+
+def camera_of(info: CameraInfo, mount: tuple[float, ...]) -> Camera:
+    """
+    Return the camera that a message describes, as its images are: binned, and cut out.
+
+    :raises InputError: it is not calibrated, or the numbers are invalid.
+    """
+    bins, roi, k = (max(info.binning_x, 1), max(info.binning_y, 1)), info.roi, info.k
+    distorted = any(info.d)
+    return Camera(
+        width=(roi.width or info.width) // bins[0],
+        height=(roi.height or info.height) // bins[1],
+        focal=(float(k[0]) / bins[0], float(k[4]) / bins[1]),
+        center=(  # centers of pixels are whole numbers
+            (float(k[2]) - roi.x_offset + 0.5) / bins[0] - 0.5,
+            (float(k[5]) - roi.y_offset + 0.5) / bins[1] - 0.5,
+        ),
+        model=info.distortion_model if distorted else '',
+        distortion=tuple(map(float, info.d)) if distorted else (),
+        mount=mount,
+    )
+
+
+def map_info_message(
+    operation: str,
+    state: str,
+    path: str,
+    places: PlaceMap | GrowingMap | None,
+    extractor: FeatureExtractor | None,
+    stamp: Time,
+    robot_id: str = '',
+) -> MapInfo:
+    """Return the description of the map in use."""
+    message = MapInfo(
+        header=Header(stamp=stamp),
+        **origin(robot_id, places),
+        operation=operation,
+        state=state,
+        path=path,
+        format_version=VERSION,
+    )
+    if extractor is not None:
+        settings = extractor.settings
+        message.features, message.settings = settings.kind, settings.to_json()
+        message.feature_version = settings.feature_version
+        message.strips = settings.strips
+        message.projected = settings.projection is not None
+    if places is not None:
+        message.places = len(places)
+        message.sessions = [session.id for session in places.sessions]
+        if len(places):
+            message.dimension = places.dimension
+        message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)
+        message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
+        message.has_thumbnails = any(places.thumbnails)
+    return message
