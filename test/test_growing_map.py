@@ -163,7 +163,7 @@ def test_growing_map_equals_plain_list(steps):
         ((features(1, count=2),), InputError, 'features of 2 images'),
         ((features(1, count=0),), InputError, 'features of 0 images'),
         ((features(float('nan')),), InputError, 'not finite'),
-        ((features(1), 0, '', np.zeros(7)), InputError, 'zeros'),
+        ((features(1), 0, '', np.zeros(7)), InputError, 'norm 0'),
         ((features(1), 0, '', np.zeros(6)), InputError, 'shape'),
         ((features(1), 2**64), OverflowError, 'int'),
     ],

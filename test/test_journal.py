@@ -116,16 +116,19 @@ def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path,
     """Copies of the journal without a write, with half of it, and with zeros in its stead."""
     monkeypatch.setattr(journal_writer, 'SYNC_PERIOD', 0.01)
     journal, places = journal_of(target), list(places_of(small_map))[:20]
-    appended = synced = forgotten = 0
+    number = appended = synced = forgotten = 0
     writes, pwrite, fsync = [], os.pwrite, os.fsync
 
     def is_journal(file):
         return journal.exists() and os.path.samestat(os.fstat(file), journal.stat())
 
     def logged_pwrite(file, content, offset):
+        nonlocal appended
         written = bytes(content) if is_journal(file) else b''  # else of the file that replaces it
         writes.append((journal.read_bytes(), offset, written, forgotten, synced))
-        return pwrite(file, content, offset)
+        size = pwrite(file, content, offset)
+        appended = number if written else appended
+        return size
 
     def logged_fsync(file):
         nonlocal synced
@@ -136,11 +139,11 @@ def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path,
     monkeypatch.setattr(os, 'pwrite', logged_pwrite)
     monkeypatch.setattr(os, 'fsync', logged_fsync)
     writer = JournalWriter.create(target, Base(), small_map, print)
-    for appended, place in enumerate(places, 1):
+    for number, place in enumerate(places, 1):
         writer.append(place)
-        if appended % 4 == 0:
-            wait_until(lambda count=appended: synced == count)
-        if appended == 10:
+        if number % 4 == 0:
+            wait_until(lambda count=number: synced == count)
+        if number == 10:
             forgotten, inode = 8, journal.stat().st_ino
             writer.forget(forgotten, Base())
             wait_until(lambda inode=inode: journal.stat().st_ino != inode)

@@ -18,7 +18,8 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from stavpr_ros.ros import rclpy_workarounds
+from stavpr_ros.errors import OutputError
+from stavpr_ros.ros import process, rclpy_workarounds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, PromptExecutor, repeat_responses
 from std_srvs.srv import Trigger
 
@@ -252,3 +253,16 @@ def test_destroyed_managed_node_destroys_its_state_machine(context, monkeypatch)
     monkeypatch.setattr(node, '_state_machine', spy)
     node.destroy_node()
     spy.destroy_when_not_in_use.assert_called_once_with()
+
+
+def test_spin_until_survives_errors_of_callbacks_except_its_own(node):
+    errors = iter(
+        [ValueError('a message of another node'), KeyError('another'), OutputError('full')]
+    )
+
+    def fail():
+        raise next(errors)
+
+    node.create_timer(0.01, fail)
+    with pytest.raises(OutputError, match='full'):
+        process.spin_until(node)

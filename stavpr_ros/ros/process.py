@@ -7,6 +7,7 @@ from contextlib import contextmanager
 import os
 from pathlib import Path
 import time
+import traceback
 from typing import Any, TypeVar
 
 from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
@@ -21,7 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 from stavpr_ros.errors import StavprError, UnavailableError
-from stavpr_ros.ros.rclpy_workarounds import PromptExecutor, ros_arguments_checked
+from stavpr_ros.ros.rclpy_workarounds import log_failure, PromptExecutor, ros_arguments_checked
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
 SIGNAL_POLL = 0.2  # seconds until a signal is noticed
@@ -100,7 +101,8 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     """
     Spin until ``done`` returns True or the context is shut down.
 
-    A signal raises KeyboardInterrupt.
+    A signal raises KeyboardInterrupt. Errors of callbacks are logged, except those of this
+    package, which are raised.
 
     :param node: if it has an event ``ending``, that is set at the end.
     :param threads: for callbacks; 1 = all on this one.
@@ -113,8 +115,15 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     executor.add_node(node)
     try:
         while node.context.ok() and not done():
-            with signals_deferred():
-                executor.spin_once(timeout_sec=SIGNAL_POLL)
+            try:
+                with signals_deferred():
+                    executor.spin_once(timeout_sec=SIGNAL_POLL)
+            except (StavprError, ExternalShutdownException):
+                raise
+            except Exception:
+                if interrupted():  # inside a foreign library it may be raised as another error
+                    raise
+                log_failure(traceback.format_exc())
     except ExternalShutdownException:
         pass
     finally:

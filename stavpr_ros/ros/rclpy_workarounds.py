@@ -107,8 +107,12 @@ class PromptExecutor(Executor):
 def _run(task: Any) -> None:
     task()
     if task.done() and (error := task.exception()) is not None:
-        text = ''.join(traceback.format_exception(error))
-        get_logger('stavpr_executor').error(f'a callback failed: {text}')
+        log_failure(''.join(traceback.format_exception(error)))
+
+
+def log_failure(text: str) -> None:
+    """Log the traceback of a callback."""
+    get_logger('stavpr_executor').error(f'a callback failed: {text}')
 
 
 def repeat_responses(service: Service) -> None:

@@ -210,7 +210,7 @@ def driving(truth):
 def test_break_is_where_odometry_stands(monkeypatch):
     truth, odometry, closures = carried_drive()
     assert ratio(truth, odometry, unseen(closures))[0] < 0.03
-    monkeypatch.setattr(breaks, 'STANDING', 0.0)
+    monkeypatch.setattr(breaks, 'STOPPED', 0.0)
     assert ratio(truth, odometry, unseen(closures))[0] > 0.1
 
 
