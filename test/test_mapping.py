@@ -92,7 +92,7 @@ def test_build_map_scales_thumbnails(route):
     assert built.thumbnails[0] == encode_thumbnail(image, 320)
     narrow = build_map(traverse([image]), FeatureExtractor(), progress=False)
     assert narrow.thumbnail(0).shape == (144, 192, 3)
-    with pytest.raises(SettingsError, match='width 0'):
+    with pytest.raises(SettingsError, match='width = 0'):
         build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=0)
 
 
