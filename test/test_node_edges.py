@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import LoopClosure, PlaceMatch, RelativePose
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.camera import FORWARD
+from stavpr_ros.mapping.camera import FORWARD, mount_of
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.relative_pose.edge import Edge, Source
@@ -21,7 +21,6 @@ from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.ros import edges
 from stavpr_ros.ros.edges import EdgePublisher, MOST_WAITING, WaitingClosure
 from stavpr_ros.ros.messages import camera_of
-from stavpr_ros.ros.sensors import mount_of
 
 LAST = MOST_WAITING + 3  # of so many closures that three are dropped
 MOUNT = '0.1 0 1.2 -1.5708 0 -1.5708'

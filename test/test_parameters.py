@@ -107,6 +107,7 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
             {'threshold': 0.8},
             'threshold = 0.8 is of mode paper: .* min_probability = 0.5; set that',
         ),
+        ({'camera_transform': 'x'}, "camera_transform = 'x': expected x y z roll pitch yaw"),
         ({'min_probability': 0.0}, 'min_probability = 0.0 must be above 0 and below 1'),
         ({'min_probability': 1.0}, 'min_probability = 1.0 must be above 0 and below 1'),
         ({'operation': 'loop_closure', 'strategy': 'none'}, 'take strategy adaptive or vanilla'),

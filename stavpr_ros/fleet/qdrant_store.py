@@ -17,6 +17,7 @@ from pathlib import Path
 import shutil
 import tempfile
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import numpy as np
 from stavpr_ros.errors import (
@@ -33,6 +34,7 @@ import torch
 
 INDEX_POINT = 2**40
 TIMEOUT = 5  # seconds that the server may take for a response
+LOOPBACK = {'localhost', '127.0.0.1', '::1'}  # hosts to which a key is sent without TLS
 AT_ONCE = 256  # places of a request of the upload
 VERSION = 1
 
@@ -73,6 +75,11 @@ class ServerPoints:
             ) from error
         self._models, self._name, self._url = models, collection, url
         key = os.environ.get('QDRANT_API_KEY')
+        if key and url.startswith('http:') and urlsplit(url).hostname not in LOOPBACK:
+            raise SettingsError(
+                f'{url}: QDRANT_API_KEY would be sent without encryption: take qdrant+https://, '
+                'or unset it'
+            )
         self._client = QdrantClient(
             url=url, api_key=key, timeout=TIMEOUT, check_compatibility=False
         )

@@ -7,7 +7,8 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import InputError
+from scipy.spatial.transform import Rotation
+from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping.trajectory import checked_pose
 
 MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
@@ -86,3 +87,26 @@ class Camera:
         if self.model == 'equidistant':
             return np.asarray(cv2.fisheye.undistortPoints(full, matrix, coefficients))[:, 0]
         return np.asarray(cv2.undistortPoints(full, matrix, coefficients))[:, 0]
+
+
+def mount_of(text: str) -> tuple[float, ...] | None:
+    """
+    Return the pose that parameter camera_transform states, None for an empty one.
+
+    :param text: x y z and roll pitch yaw (fixed axes, radians), or a quaternion x y z w.
+    :raises SettingsError: something else.
+    """
+    if not text.strip():
+        return None
+    try:
+        numbers = [float(word) for word in text.replace(',', ' ').split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 6:
+        numbers[3:] = Rotation.from_euler('xyz', numbers[3:]).as_quat().tolist()
+    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or not any(numbers[3:]):
+        raise SettingsError(
+            f'camera_transform = {text!r}: expected x y z roll pitch yaw, or x y z and a '
+            'quaternion x y z w'
+        )
+    return tuple(numbers)

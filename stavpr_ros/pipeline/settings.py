@@ -14,6 +14,7 @@ from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import kinds, settings_class, settings_from_json
+from stavpr_ros.mapping.camera import mount_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.mapping.stores import is_address
 from stavpr_ros.parameters import BY_NAME, default
@@ -205,6 +206,7 @@ class NodeSettings:
 
     def __post_init__(self) -> None:
         self.pipeline.require_operation(self.operation)
+        mount_of(self.camera_transform)  # rejects an invalid one
 
     @property
     def maps_path(self) -> Path:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The subscriptions to odometry and to camera_info, and the camera's place on the robot."""
 
-import math
 import time
 from typing import Any
 
@@ -10,10 +9,9 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo
-from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.mapping.camera import Camera, FORWARD
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of
 from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.input import BEST_EFFORT, subscribe
@@ -200,26 +198,3 @@ def _topic(node: Node) -> str:
     plain = f'{node.get_namespace().rstrip("/")}/camera_info'
     beside = node.resolve_topic_name('image').rpartition('/')[0] + '/camera_info'
     return own if own != plain else beside
-
-
-def mount_of(text: str) -> tuple[float, ...] | None:
-    """
-    Return the pose that parameter camera_transform states, None for an empty one.
-
-    :param text: x y z and roll pitch yaw (fixed axes, radians), or a quaternion x y z w.
-    :raises SettingsError: something else.
-    """
-    if not text.strip():
-        return None
-    try:
-        numbers = [float(word) for word in text.replace(',', ' ').split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) == 6:
-        numbers[3:] = Rotation.from_euler('xyz', numbers[3:]).as_quat().tolist()
-    if len(numbers) != 7 or not all(map(math.isfinite, numbers)) or not any(numbers[3:]):
-        raise SettingsError(
-            f'camera_transform = {text!r}: expected x y z roll pitch yaw, or x y z and a '
-            'quaternion x y z w'
-        )
-    return tuple(numbers)
