@@ -4,7 +4,7 @@
 Where the camera was: states of the place filter followed back over the latest images.
 
 For each image, an origin of every state is kept. Two of them share a byte, that of an even speed
-in the lower half and that of the next speed in the upper one:
+in the lower half and that of the next speed in the upper one::
 
     origin = 3 * step + speed    step 0: as far as the speed, 1: one place more, 2: one less
                                  speed 0: the same, 1: one lower, 2: one higher
