@@ -95,7 +95,7 @@ class TraverseResults:
 @dataclass(frozen=True)
 class Evaluation:
     """
-    Metrics of a traverse.
+    Metrics of a traverse; without ground truth, only its results are meaningful.
 
     :param sequence_length: images in a window, l.
     :param sequence_without_ends, single_without_ends: of the images in :attr:`centered`.
@@ -131,10 +131,13 @@ class Evaluation:
         """
         Return the share of unknown images that are accepted; empty without any.
 
-        By ``sequence`` and ``single``, at the threshold of the best F1 of each.
+        By ``sequence`` and ``single``, at the threshold of the best F1 of each; without ground
+        truth by ``sequence`` alone, as the recognizer decides.
         """
         if self.unknown is None:
             return {}
+        if not self.ground_truth.kind:
+            return {'sequence': float(np.mean(self.unknown.accepted))}
         sequence = self.unknown.sequence.scores < self.sequence.best.threshold
         single = self.unknown.single.scores < self.single.best.threshold
         return {'sequence': float(np.mean(sequence)), 'single': float(np.mean(single))}
@@ -144,13 +147,17 @@ class Evaluation:
         """Return the distances of the windows' matches, by group."""
         scores = self.results.sequence.scores
         groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct]}
+        if not self.ground_truth.kind:
+            groups = {'match': scores}
         if self.unknown is not None:
             groups['unknown places'] = self.unknown.sequence.scores
         return groups
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Return the calibration of the declared probabilities; None without any."""
+        """Return the calibration of the declared probabilities; None without any or the truth."""
+        if not self.ground_truth.kind:
+            return None
         return calibrate(self.results.probabilities, self.correct, self.ground_truth.has_match)
 
 
