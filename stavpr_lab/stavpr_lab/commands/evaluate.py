@@ -3,7 +3,6 @@
 """``ros2 run stavpr_lab evaluate``: matches of one traverse on the map of another, and metrics."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 import sys
 import time
@@ -11,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import add_parameter, make_parser, run_program
-from stavpr_ros.errors import InputError, SettingsError, SourceError
+from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
 from stavpr_ros.parameters import default
 
@@ -174,14 +173,13 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--query is required')
     if not dataset and (arguments.map is None) != loop:
         parser.error('give --map or, for the query on its own past, --loop-closure')
-    if arguments.exclude_places is not None and not loop:
-        parser.error('--exclude-places goes with --loop-closure')
-    if arguments.late_closures and not loop:
-        parser.error('--late-closures goes with --loop-closure')
+    if (arguments.exclude_places is not None or arguments.late_closures) and not loop:
+        parser.error('--exclude-places and --late-closures: each goes with --loop-closure')
     if loop:
         _check_loop_closure(parser, arguments)
-    if arguments.tolerance is not None and not (dataset or arguments.truth):
-        parser.error('--tolerance is that of a ground truth: give --truth identity, poses or FILE')
+    compares = arguments.tolerance is not None or arguments.unknown or arguments.mode == 'paper'
+    if compares and not (dataset or arguments.truth):
+        parser.error('--tolerance, --unknown and --mode paper need --truth identity|poses|FILE')
     if arguments.tolerance is not None and arguments.tolerance < 0:
         parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
     of_map = arguments.map_poses and not arguments.odometry
@@ -200,8 +198,8 @@ def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Nam
         parser.error(
             '--loop-closure is computed on the query alone: leave --crop-map and --map-poses out'
         )
-    if arguments.truth == 'identity' or (arguments.truth is None and arguments.mode == 'paper'):
-        parser.error('--loop-closure goes with --truth FILE or poses; mode robust without, too')
+    if arguments.truth == 'identity':
+        parser.error('--loop-closure goes with --truth FILE or poses')
     if arguments.exclude_places < 1:
         parser.error(f'--exclude-places {arguments.exclude_places} must be at least 1')
 
@@ -271,21 +269,13 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_lab.commands.evaluate_sequences import load_sequences
     from stavpr_lab.evaluation.report import Report
-    from stavpr_ros.recognition.threshold import suggest_threshold
 
     began = time.perf_counter()
     settings = node_settings(arguments)
     sequences = load_sequences(arguments)
     truth = sequences.drive.truth.kind
-    recognition = settings.recognition()
-    if not truth and arguments.mode == 'paper' and sequences.reference is not None:
-        try:
-            threshold = suggest_threshold(sequences.reference)
-        except InputError as error:
-            raise SettingsError(f'{error}; give --truth, or --mode robust') from error
-        recognition = replace(recognition, threshold=threshold)
     loaded = time.perf_counter()
-    evaluation = _evaluate(arguments, sequences, recognition)
+    evaluation = _evaluate(arguments, sequences, settings.recognition())
     ended = time.perf_counter()
     milliseconds = sorted(evaluation.results.seconds * 1e3)
     times = {
@@ -303,7 +293,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         settings=_settings_json(arguments, sequences),
         times=times,
         drive=sequences.drive,
-        default_threshold=recognition.applied_threshold,
+        default_threshold=settings.applied_threshold,
         window=arguments.window,
     )
 
@@ -323,9 +313,6 @@ def _print_report(report: 'Report') -> None:
     print(
         f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images{wrong}'
     )
-    if report.evaluation.unknown is not None and not report.has_truth:
-        rate = report.evaluation.false_alarm_rates['sequence']
-        print(f'matched of the images of unknown places: {100 * rate:.1f} %')
     print(
         f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
         f'{report.times["total_s"]:.1f} s in all'

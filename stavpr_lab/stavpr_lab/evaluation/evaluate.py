@@ -131,13 +131,10 @@ class Evaluation:
         """
         Return the share of unknown images that are accepted; empty without any.
 
-        By ``sequence`` and ``single``, at the threshold of the best F1 of each; without ground
-        truth by ``sequence`` alone, as the recognizer decides.
+        By ``sequence`` and ``single``, at the threshold of the best F1 of each.
         """
         if self.unknown is None:
             return {}
-        if not self.ground_truth.kind:
-            return {'sequence': float(np.mean(self.unknown.accepted))}
         sequence = self.unknown.sequence.scores < self.sequence.best.threshold
         single = self.unknown.single.scores < self.single.best.threshold
         return {'sequence': float(np.mean(sequence)), 'single': float(np.mean(single))}

@@ -44,13 +44,9 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers for a JSON file; undefined ones are None."""
-        evaluation = self.evaluation
         numbers: dict[str, Any] = {'decision': self.decision()}
         if self.has_truth:
             numbers |= self._metrics()
-        if evaluation.unknown is not None:
-            numbers['false_alarm_rate'] = evaluation.false_alarm_rates['sequence']
-            numbers['unknown_images'] = len(evaluation.unknown.single)
         numbers |= {'images': len(self.query), 'places': len(self.reference)}
         numbers['map_id'] = self.reference.map_id
         numbers |= {'settings': self.settings, 'times': self.times}
@@ -116,8 +112,11 @@ class Report:
             numbers['default_threshold'] = self._at_default()
         numbers['unseen'] = self.unseen()
         numbers['calibration'] = None if calibration is None else calibration.to_json()
-        for kind, rate in evaluation.false_alarm_rates.items():
-            numbers[kind]['false_alarm_rate'] = rate
+        if evaluation.unknown is not None:
+            for kind, rate in evaluation.false_alarm_rates.items():
+                numbers[kind]['false_alarm_rate'] = rate
+            numbers['false_alarm_rate'] = evaluation.false_alarm_rates['sequence']
+            numbers['unknown_images'] = len(evaluation.unknown.single)
         return numbers
 
     def _at_default(self) -> dict[str, Any]:
