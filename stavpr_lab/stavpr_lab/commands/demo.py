@@ -170,9 +170,7 @@ def _run(arguments: argparse.Namespace) -> None:
     for name in ('map', 'query', 'loop', 'truth'):
         given = getattr(arguments, name)
         if given and folder.resolve() in Path(given).resolve().parents:
-            raise SettingsError(
-                f'--{name} {given} is in {folder}, which is emptied: give another --output'
-            )
+            raise SettingsError(f'--{name} {given} is in {folder}: give another --output')
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _remove_earlier(folder)

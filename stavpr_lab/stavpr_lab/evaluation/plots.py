@@ -104,8 +104,7 @@ def reduced_matrix(
 
     :param distances: shape (rows, columns); NaN where there is none.
     :param shape: queries N and places n.
-    :param truth: whether a block has a true place, of the shape of ``distances``, bool; None =
-        unknown.
+    :param truth: whether a block has a true place, shape as ``distances``; None = unknown.
     :param matches: (query, place) of accepted matches, shape (count, 2), by outcome.
     :returns: where the axes are.
     """
