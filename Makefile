@@ -11,8 +11,9 @@ EXTRAS ?=
 MAP ?=
 QUERY ?=
 LOOP ?=
+TRUTH ?=
 ARGS ?=
-export MAP QUERY LOOP SLAM
+export MAP QUERY LOOP SLAM TRUTH
 
 # -E: a sourced ROS adds its own packages to PYTHONPATH
 SETUP = $(PYTHON) -E tools/setup_venv.py
@@ -34,6 +35,7 @@ help: ## list the targets (the default)
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
 	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, hdf5, faiss, fleet, ray, cuda, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
+	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
 	@echo '  SLAM=world                 demo: three laps, odometry corrected by a pose graph'
 	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
@@ -49,12 +51,13 @@ demo: override EXTRAS += slam
 endif
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
 	@$(RUN) $(LAB)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
-		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") $(ARGS)
+		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") \
+		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
 
 evaluate: override EXTRAS += evaluation
-evaluate: build ## evaluate the recognition of QUERY= on MAP=: metrics, plots, a report (ARGS=)
+evaluate: build ## report the matches of QUERY= on MAP=; metrics with TRUTH= (ARGS=)
 	@$(RUN) $(LAB)/evaluate $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
-		$(ARGS)
+		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
 
 test: lint docs ## lint, build the documentation, and run the tests but the long ones (ARGS=)
 	@$(TEST) -m 'not long' $(ARGS)

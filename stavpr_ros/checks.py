@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable
 import math
+import numbers
 
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
@@ -16,20 +17,35 @@ def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
         raise SettingsError(f'{name} = {value!r} is unknown: take one of {", ".join(choices)}')
 
 
+def require_type(name: str, value: object, kind: type | tuple[type, ...], remedy: str) -> None:
+    """Raise InputError if an argument is of another type; the remedy is what to give."""
+    if not isinstance(value, kind):
+        raise InputError(f'{name} is of type {type(value).__name__}: expected {remedy}')
+
+
+def require_number(name: str, value: object) -> None:
+    """Raise SettingsError if a setting is no number."""
+    if not isinstance(value, numbers.Real):
+        raise SettingsError(f'{name} = {value!r} is {type(value).__name__}: expected a number')
+
+
 def require_at_least(name: str, value: float, least: float, unit: str = '') -> None:
     """Raise SettingsError if a setting is less, or not finite."""
+    require_number(name, value)
     if not least <= value < math.inf:
         raise SettingsError(f'{name} = {value} must be at least {least} {unit}'.rstrip())
 
 
 def require_between(name: str, value: float, low: float, high: float, unit: str = '') -> None:
     """Raise SettingsError if a setting is outside of a closed interval."""
+    require_number(name, value)
     if not low <= value <= high:
         raise SettingsError(f'{name} = {value} must be {low} to {high} {unit}'.rstrip())
 
 
 def require_above(name: str, value: float, bound: float, below: float = math.inf) -> None:
     """Raise SettingsError if a setting is outside of an open interval."""
+    require_number(name, value)
     if not bound < value < below:
         upper = '' if below == math.inf else f' and below {below}'
         raise SettingsError(f'{name} = {value} must be above {bound}{upper}')

@@ -16,9 +16,10 @@ from stavpr_ros.alignment import (
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.window import SequenceBuffer
+from stavpr_ros.sources import open_source
 import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -106,9 +107,41 @@ def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, m
         with pytest.raises(InputError, match='features of the image are not finite'):
             call(damaged[:1])
     for i in range(3, 6):
-        assert repr(one.update(features[i : i + 1])) == repr(other.update(features[i : i + 1]))
+        found, expected = (each.update(features[i : i + 1]) for each in (one, other))
+        assert repr(vars(found)) == repr(vars(expected))
     with pytest.raises(InputError, match='features of the map are not finite'):
         recognizer(replace(small_map, features=damaged))
+
+
+def test_arguments_of_wrong_types_are_rejected_with_the_expected_one(small_map):
+    one, settings, image = recognizer(small_map), RecognizerSettings(0.5), np.zeros((9, 9, 3))
+    for call, error, words in (
+        (lambda: PlaceRecognizer('route.stavpr', settings), InputError, 'a PlaceMap, as of load_'),
+        (
+            lambda: PlaceRecognizer(small_map, 0.5),
+            InputError,
+            r'float: expected RecognizerSettings',
+        ),
+        (lambda: one.update(image), InputError, 'expected the LocalFeatures of one image'),
+        (lambda: build_map('monday/', FeatureExtractor()), InputError, 'expected open_source'),
+        (lambda: build_map([], 'gradient'), InputError, 'str: expected a FeatureExtractor'),
+        (lambda: open_source(None), InputError, 'NoneType: expected the path of a folder'),
+        (lambda: load_map(3), InputError, 'int: expected the path of a map file'),
+        (lambda: RecognizerSettings('0.5'), SettingsError, "'0.5' is str: expected a number"),
+        (lambda: RecognizerSettings(nms_radius='2'), SettingsError, "nms_radius = '2' is str"),
+    ):
+        with pytest.raises(error, match=words):
+            call()
+
+
+def test_match_and_map_are_shown_on_one_line(small_map):
+    text = repr(recognize_all(recognizer(small_map), small_map.features[:5])[-1])
+    assert text.startswith('Match(MATCH, place_index=2, newest_index=4, distance=')
+    assert repr(recognizer(small_map).update(small_map.features[:1])) == (
+        "Match(WARMING_UP, reason='1 of 5 images in the window')"
+    )
+    assert repr(small_map).startswith(f'PlaceMap({len(small_map)} places, LocalFeatures(gradient')
+    assert max(len(text), len(repr(small_map))) < 160
 
 
 def test_recognizer_settings_out_of_range_are_rejected(small_map):

@@ -91,6 +91,66 @@ def test_command_help_lists_exit_codes(name, run):
     assert 'exit codes' in result.out
 
 
+def test_command_help_names_the_command_as_called(run, monkeypatch):
+    monkeypatch.setattr('shutil.which', lambda name: f'/usr/bin/{name}')
+    for program, name in (
+        ('/usr/bin/stavpr', 'stavpr build_map'),
+        ('/ws/install/stavpr_ros/lib/stavpr_ros/build_map', 'ros2 run stavpr_ros build_map'),
+        ('build_map.py', 'build_map'),
+    ):
+        monkeypatch.setattr('sys.argv', [program])
+        text = run(build_map, '--help').out
+        assert text.startswith(f'usage: {name} --input FOLDER|BAG|ARRAY')
+        assert text.partition('examples:')[2].count(f'\n  {name} ') == 6
+        assert '--onnx-layer' not in text.partition('examples:')[0]
+    assert '--onnx-layer LAYER' in run(build_map, '--help-features').out
+
+
+@pytest.mark.parametrize(
+    ('command', 'arguments', 'words'),
+    [
+        (build_map, ['--inptu', 'x', '--output', 'y'], 'did you mean --input?'),
+        (stavpr, ['bild_map'], 'did you mean build_map?'),
+        (stavpr, ['map', 'ifno', 'x'], 'did you mean info?'),
+        (stavpr, ['map', 'info', 'x', '--plto', 'y'], 'did you mean --plot?'),
+    ],
+)
+def test_command_with_a_misspelled_word_suggests_another(run, command, arguments, words):
+    result = run(command, *arguments)
+    assert (result.code, words in result.err) == (2, True), result.err
+    assert len(result.err.splitlines()) < 5
+
+
+def test_build_map_continues_after_a_bad_image_with_the_option_that_skips_it(
+    run, tmp_path, monkeypatch
+):
+    folder, output = write_images(tmp_path / 'images', route_images(40)), tmp_path / 'map.stavpr'
+    (folder / '036.png').write_bytes(b'no image')
+    result = run(build_map, '--input', folder, '--output', output)
+    assert (result.code, '036.png' in result.err) == (1, True)
+    assert 'the same command with --skip-bad-images continues' in result.err
+    journal = tmp_path / 'map.stavpr.journal'
+    assert journal.stat().st_size > 32 * 7 * 224 * 4
+    monkeypatch.setattr('stavpr_ros.mapping.builder.JournalWriter.create', None)  # no new one
+    result = run(build_map, '--input', folder, '--output', output, '--skip-bad-images')
+    assert (result.code, load_map(output).ids[36:]) == (0, ('037.png', '038.png', '039.png'))
+    assert not journal.exists()
+
+
+def test_demo_removes_the_files_of_an_earlier_one_and_no_others(run, tmp_path):
+    (tmp_path / 'laps').mkdir()
+    for name, text in (('mine.png', ''), ('loop.png', ''), ('.demo', 'laps\nloop.png\n../x')):
+        (tmp_path / name).write_text(text)
+    (tmp_path.parent / 'x').touch()
+    result = run(demo, '--map', '/missing', '--query', '/missing', '--output', tmp_path)
+    assert (result.code, '/missing' in result.err) == (1, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['.demo', 'mine.png']
+    assert (tmp_path.parent / 'x').exists()
+    paths = ['--map', tmp_path / 'a', '--query', '/missing']
+    result = run(demo, *paths, '--output', tmp_path)
+    assert (result.code, 'give another --output' in result.err) == (2, True)
+
+
 def test_build_map_with_options_writes_map(run, traverse, poses, tmp_path):
     output = tmp_path / 'map.stavpr'
     options = ['--every', 2, '--poses', poses, '--projection', 32, '--strips', 5]
@@ -221,11 +281,12 @@ def test_loop_closure_record_is_plain_json():
     plain = loop_closure_record(message)
     assert json.loads(json.dumps(plain)) == plain
     assert (plain['stamp'], plain['query_index'], plain['place_stamp']) == (3 * SECOND, 9, 7)
-    assert plain['pairs'] == [[8, 2 * SECOND, 1, 0, 0.5]]
+    expected = {'query_index': 8, 'query_stamp': 2 * SECOND, 'place_index': 1, 'place_stamp': 0}
+    assert plain['pairs'] == [expected | {'query_change': 0.5}]
     assert (plain['distance'], plain['query_pose']) == (None, None)
     message.has_poses = True
     message.place_pose.position.y = 2.0
-    assert loop_closure_record(message)['place_pose'] == [0, 2, 0, 0, 0, 0, 1]
+    assert loop_closure_record(message)['place_pose']['position'] == {'x': 0, 'y': 2, 'z': 0}
 
 
 def test_match_record_names_every_status():
@@ -316,7 +377,7 @@ def test_demo_of_loop_closure_reports_closures(run, tmp_path):
     assert len(on_time) == sum(match['status'] == 'MATCH' for match in records) > 20
     last = on_time[-1]
     assert (last['query_index'], last['place_index']) == (67, 31)  # the fourth of 64 to 71
-    assert [pair[0] - pair[2] for pair in last['pairs']] == [36] * len(last['pairs'])
+    assert {pair['query_index'] - pair['place_index'] for pair in last['pairs']} == {36}
     assert last['query_pose'] is None
     assert last['probability'] > 0.9
     correct = sum(c['query_index'] - c['place_index'] == 36 for c in closures)
@@ -348,10 +409,14 @@ def test_read_result_counts_images_not_places():
     names = ['WARMING_UP', 'SKIPPED', 'NO_MATCH', 'NO_MATCH', 'MATCH', 'MATCH']
     statuses = [{'status': name} for name in names]
     truth = GroundTruth.from_pairs([4, 5], [0, 3], 6, 6)
-    pairs = {3: [[3, 9, 0, 9], [2, 9, 0, 9]], 4: [[4, 9, 0, 9]]}
     closures = [
-        {'query_index': query, 'place_index': 0, 'distance': 0.5, 'pairs': listed}
-        for query, listed in pairs.items()
+        {
+            'query_index': query,
+            'place_index': 0,
+            'distance': 0.5,
+            'pairs': [{'query_index': image, 'place_index': 0} for image in images],
+        }
+        for query, images in ((3, (3, 2)), (4, (4,)))
     ]
     result = read_result(statuses, closures, truth, 2)
     assert result.closures.tolist() == [[4, 0], [5, 0]]
@@ -364,7 +429,7 @@ def test_read_result_counts_images_not_places():
 
 
 def plain_match(status, place=-1):
-    path = [[0, place - 1], [1, place], [2, place + 1]] if place >= 0 else []
+    path = [{'query_index': i, 'place_index': place - 1 + i} for i in range(3 * (place >= 0))]
     match = {'status': status, 'sequence_middle': place, 'distance': 0.1, 'path': path}
     return match | {'received': 0, 'probability': 0.9, 'path_probabilities': []}
 

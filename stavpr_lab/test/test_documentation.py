@@ -83,8 +83,8 @@ def test_readme_python_example_runs(run):
 def test_build_map_and_evaluate_examples_run(run, workspace):
     examples = [
         'build_map --input monday/ --output monday.stavpr',
-        'evaluate --map summer/ --query winter/ --warp vary --crop-map 0.3 --crop-query 0.1 '
-        '--json result.json',
+        'evaluate --map summer/ --query winter/ --truth identity --warp vary --crop-map 0.3 '
+        '--crop-query 0.1 --json result.json',
         'evaluate --map monday/ --query tuesday/ --truth pairs.csv --unknown another_town/ '
         '--json unknown.json',
     ]
@@ -101,10 +101,12 @@ def test_documented_options_exist(run):
     commands = documented_commands()
     assert len(commands) > 8
     helps = {name: run(stavpr.main, [name, '--help']) for name in {words[0] for words in commands}}
+    features = run(stavpr.main, ['build_map', '--help-features'])
     for name, *words in commands:
         for word in words:
             if word.startswith('--') and word != '--ros-args':
-                assert re.search(rf'{re.escape(word)}\b', helps[name]), f'{name} has no {word}'
+                text = helps[name] + features
+                assert re.search(rf'{re.escape(word)}\b', text), f'{name} has no {word}'
 
 
 def test_documented_parameters_exist():

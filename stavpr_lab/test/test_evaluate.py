@@ -58,7 +58,7 @@ def numbers(run, tmp_path):
 
 
 def pair(folders):
-    return ['--map', folders / 'map', '--query', folders / 'query']
+    return ['--map', folders / 'map', '--query', folders / 'query', '--truth', 'identity']
 
 
 def page_data(page):
@@ -103,7 +103,7 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     """Every image through the recognizer, windows assigned to their middles, best F1."""
     options = [*options, '--mode', 'paper', '--warp', '2x', '--tolerance', 2]
     options += ['--sequence-length', 8, '--beta', 1.5]
-    found = numbers('--map', folders / 'map', '--query', folders / 'shifted', *options)
+    found = numbers(*pair(folders), '--query', folders / 'shifted', *options)
     extractor = FeatureExtractor()
     place_map = build_map(open_source(folders / 'map'), extractor, progress=False)
     query = build_map(open_source(folders / 'shifted'), extractor, progress=False).features[::2]
@@ -145,7 +145,7 @@ def test_evaluate_with_crop_equals_images_cropped_before(folders, numbers, tmp_p
 
     first, second = crop('map', slice(128 - 38)), crop('query', slice(13, None))
     found = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
-    assert found == numbers('--map', first, '--query', second)['sequence']
+    assert found == numbers('--map', first, '--query', second, '--truth', 'identity')['sequence']
 
 
 def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run):
@@ -155,8 +155,8 @@ def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run
         save_map(place_map, tmp_path / f'{name}.stavpr')
     saved, query, options = tmp_path / 'map.stavpr', folders / 'query', ['--tolerance', 0]
     of_folders = numbers(*pair(folders), '--projection', 32, *options)
-    mixed = numbers('--map', saved, '--query', query, *options)
-    both = numbers('--map', saved, '--query', tmp_path / 'query.stavpr', *options)
+    mixed = numbers(*pair(folders), '--map', saved, *options)
+    both = numbers(*pair(folders), '--map', saved, '--query', tmp_path / 'query.stavpr', *options)
     assert of_folders['sequence'] == mixed['sequence'] == both['sequence']
     for wrong, word in (
         (['--features', 'onnx'], 'was made with gradient'),
@@ -287,7 +287,8 @@ def test_evaluate_mirrored_equals_images_mirrored_before(folders, report, run, t
     """No match of them is right; the map's images are not mirrored."""
     files = sorted((folders / 'query').iterdir())
     images = [cv2.imread(str(file))[:, ::-1, ::-1] for file in files]
-    before = report('--map', folders / 'map', '--query', write_images(tmp_path / 'm', images))[1]
+    paths = [*pair(folders), '--query', write_images(tmp_path / 'm', images)]
+    before = report(*paths)[1]
     found, rows, _ = report(*pair(folders), '--mirror')
     assert [row['sequence_distance'] for row in rows] == [r['sequence_distance'] for r in before]
     assert found['sequence']['queries_with_match'] == 0
@@ -370,7 +371,10 @@ LOOP, PAIR = '--query x --loop-closure --truth y', '--map x --query y'
         ('--dataset ua=x --map y', 2, 'leave'),
         ('--query x', 2, '--loop-closure'),
         ('--map /missing --query /missing', 1, '/missing'),
-        ('--query x --loop-closure', 2, '--truth'),
+        (f'{PAIR} --mode paper', 2, 'need --truth'),
+        (f'{PAIR} --tolerance 3', 2, 'need --truth identity'),
+        (f'{PAIR} --tolerence 3', 2, 'did you mean --tolerance?'),
+        (f'{PAIR} --mode robst', 2, 'did you mean robust?'),
         (f'{LOOP} --exclude-places 0', 2, 'at least 1'),
         (f'{LOOP} --warp 2x', 2, '--speed needs a --map'),
         (f'{LOOP} --remove-from-map 3:4', 2, '--remove-from-map needs a --map'),
@@ -378,7 +382,7 @@ LOOP, PAIR = '--query x --loop-closure --truth y', '--map x --query y'
         (f'{PAIR} --remove-from-map 3-4', 2, "'3-4': expected two whole"),
         (f'{PAIR} --exclude-places 9', 2, 'goes with --loop-closure'),
         (f'{PAIR} --late-closures', 2, 'goes with --loop-closure'),
-        (f'{PAIR} --tolerance -1', 2, '--tolerance'),
+        (f'{PAIR} --truth identity --tolerance -1', 2, 'at least 0'),
         (f'{PAIR} --nms-radius -1', 2, 'nms_radius'),
         (f'{PAIR} --map-poses z', 2, '--truth poses'),
         (f'{PAIR} --json /missing/x.json', 1, 'does not exist'),
@@ -402,6 +406,35 @@ def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
         found, _, errors = run(*pair(folders), *options)
         assert (found, word in errors) == (code, True), errors
     assert not folder.exists()
+
+
+def test_evaluate_without_truth_reports_matches_of_unequal_traverses(folders, run, tmp_path):
+    paths = ['--map', folders / 'map', '--query', folders / 'elsewhere']
+    code, output, errors = run(*paths, '--output', tmp_path / 'report')
+    assert code == 0, errors
+    assert output.splitlines()[0] == 'elsewhere on the map map, no ground truth'
+    assert 'matched, default: ' in output
+    found = read_json((tmp_path / 'report' / 'results.json').read_text())
+    assert found['decision'].keys() == {'rule', 'images', 'matched'}
+    assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & found.keys()
+    with (tmp_path / 'report' / 'answers.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 40
+    assert {rows[0][name] for name in ('true_place', 'sequence_right', 'in_map')} == {''}
+    assert sum(int(row['accepted']) for row in rows) == found['decision']['matched']
+    page = (tmp_path / 'report' / 'report.html').read_text()
+    assert 'no ground truth</h1>' in page
+    assert not re.search('worst mistakes</h2>|All numbers|Yellow is', page)
+    views = page_data(page)['views']
+    assert {view['right'] for view in views} == {None}
+    assert all(0 <= view['probability'] <= 1 for view in views)
+
+
+def test_evaluate_with_truth_names_its_kind_first(folders, run, tmp_path):
+    output = run(*pair(folders), '--output', tmp_path / 'report')[1]
+    title = 'query on the map map, ground truth: identity +- 3 places'
+    assert output.splitlines()[0] == title
+    assert f'<h1>{title}</h1>' in (tmp_path / 'report' / 'report.html').read_text()
 
 
 def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data_folder, numbers):

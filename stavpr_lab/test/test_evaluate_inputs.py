@@ -36,7 +36,7 @@ def pair(tmp_path, vectors):
     noise = np.random.default_rng(3).normal(0, 0.5, vectors.shape)
     np.savez(tmp_path / 'query.npz', query=vectors + noise)
     paths = ['--map', tmp_path / 'map.npy', '--query', f'{tmp_path}/query.npz:query']
-    return [*paths, '--sequence-length', 5]
+    return [*paths, '--sequence-length', 5, '--truth', 'identity']
 
 
 def test_evaluate_of_descriptors_and_of_exported_ones_are_equal(run, pair, tmp_path):

@@ -67,7 +67,7 @@ def test_node_on_gardens_point_equals_library(
     for record, core in zip(records, offline, strict=True):
         assert record['place_index'] == core.place_index
         assert record['newest_index'] == core.newest_index
-        assert record['path'] == core.path.tolist()
+        assert [list(pair.values()) for pair in record['path']] == core.path.tolist()
         if core.sequence is not None:
             assert record['second_best_index'] == core.sequence.second_best_index
     f1 = best_f1(live.distances, live.within(truth, TOLERANCE)).f1

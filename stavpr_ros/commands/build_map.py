@@ -47,7 +47,8 @@ examples:
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
   build_map --input drives/*.bag --output maps/ --processes 4
 
-An interrupted command leaves MAP.journal, and the same command continues it.
+An interrupted command leaves MAP.journal, and the same command continues it, after an image that
+cannot be read with --skip-bad-images.
 
 exit codes: 0 the map is written; 1 it is not (the reason is printed, an earlier map is untouched);
 2 usage; 130 interrupted (it prints whether the map is written)
@@ -200,7 +201,12 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
 
     skipped = []
 
-    def skip(error: ImageError) -> None:
+    def bad_image(error: ImageError) -> None:
+        if arguments.poses:
+            raise error
+        if not arguments.skip_bad_images:
+            text = f'{error}; the same command with --skip-bad-images continues without it'
+            raise ImageError(text, kind=error.kind)
         skipped.append(error)
         print(f'skipped: {error}', file=sys.stderr)
 
@@ -210,9 +216,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     learned = isinstance(projection, str)
     plain = argparse.Namespace(**vars(arguments) | ({'projection': None} if learned else {}))
     extractor = make_extractor(plain)
-    source = open_source(
-        arguments.input, arguments.topic, skip if arguments.skip_bad_images else None
-    )
+    source = open_source(arguments.input, arguments.topic, bad_image)
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
     journal = build_journal(
@@ -266,7 +270,9 @@ def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
 def _source_of(arguments: argparse.Namespace) -> str:
     """Describe the images and the options: only the same are continued after an interruption."""
     given = vars(arguments) | {'input': str(Path(arguments.input).resolve())}
-    return json.dumps({name: given[name] for name in sorted(given.keys() - {'output', 'force'})})
+    # places of a journal without skipped images are also the first ones with skipping
+    decisive = given.keys() - {'output', 'force', 'skip_bad_images'}
+    return json.dumps({name: given[name] for name in sorted(decisive)})
 
 
 def _known_poses(place_map: 'PlaceMap') -> str:

@@ -42,7 +42,11 @@ def principal_dimension(projection: str) -> int:
 
 
 def add_feature_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind."""
+    """
+    Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind.
+
+    The help of the latter is in ``--help-features``.
+    """
     add = parser.add_argument_group('features').add_argument
     kind_help = 'kind of features (%(default)s)'
     add('--features', choices=kinds(), default=default('features'), help=kind_help)
@@ -53,18 +57,23 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     add('--projection', type=_projection, metavar='[pca:]D', help=projection)
     add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
     add('--device', default='auto', choices=DEVICES, help='where features are computed')
+    listed = argparse.ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
     for kind in kinds():
-        group = parser.add_argument_group(f'features {kind}')
+        shown = listed.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
             required = row.default is dataclasses.MISSING
             example = '' if required else row.default
-            shown = 'required' if required else str(example).strip('()') or 'none'
-            group.add_argument(
-                _option(kind, row.name),
-                type=CONVERTERS.get(type(example), type(example)),
-                metavar=row.name.upper(),
-                help=f'{row.metadata["help"]} ({shown})'.replace('%', '%%'),
-            )
+            default_text = 'required' if required else str(example).strip('()') or 'none'
+            text = f'{row.metadata["help"]} ({default_text})'.replace('%', '%%')
+            for group, words in ((parser, argparse.SUPPRESS), (shown, text)):
+                group.add_argument(
+                    _option(kind, row.name),
+                    type=CONVERTERS.get(type(example), type(example)),
+                    metavar=row.name.upper(),
+                    help=words,
+                )
+    more = 'show the options of each kind of features, as of networks, and exit'
+    add('--help-features', action='version', version=listed.format_help(), help=more)
 
 
 def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':

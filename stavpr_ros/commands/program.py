@@ -3,10 +3,13 @@
 """The frame of the commands: parser, signals, exit codes."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+import difflib
+from pathlib import Path
+import shutil
 import sys
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn
 
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.parameters import BY_NAME
@@ -16,14 +19,61 @@ from stavpr_ros.threads import wait_passively
 DONE, FAILED, BAD_USAGE, INTERRUPTED = 0, 1, 2, 130
 
 
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Texts as they are written, and a usage of the required arguments."""
+
+    def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: str | None = None) -> None:
+        """Leave out the options; argparse takes an empty prefix for the names of subcommands."""
+        if prefix != '':
+            required = [each for each in actions if each.required or not each.option_strings]
+            actions = [*required, argparse.Action((), 'option', '?', metavar='OPTION ...')]
+        super().add_usage(usage, actions, (), prefix)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Suggests the nearest option or subcommand where one is unknown."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Reject unknown options here, where a subcommand knows its own."""
+        self._given: Sequence[str] = sys.argv[1:] if args is None else args
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage, the error and a suggestion, and exit."""
+        options = [name for action in self._actions for name in action.option_strings]
+        for word in self._given:
+            name = word.partition('=')[0]
+            if name.startswith('--') and not any(each.startswith(name) for each in options):
+                message += suggestion(name, options)
+            for action in self._actions:
+                if f'invalid choice: {word!r}' in message:
+                    message += suggestion(word, map(str, action.choices or ()))
+        super().error(f'{message} (options: {self.prog} --help)')
+
+
+def suggestion(word: str, names: Iterable[str]) -> str:
+    """Return ``; did you mean NAME?`` with the name that is most similar, '' without one."""
+    return ''.join(f'; did you mean {name}?' for name in difflib.get_close_matches(word, names, 1))
+
+
+def called_name(name: str) -> str:
+    """Return the words that called a command, by the program of this process."""
+    program = Path(sys.argv[0])
+    if program.stem == 'stavpr':
+        return f'stavpr {name}'
+    if program.name == name and program.parent.parent.name == 'lib' and shutil.which('ros2'):
+        return f'ros2 run {program.parent.name} {name}'
+    return name
+
+
 def make_parser(name: str, description: str, epilog: str) -> argparse.ArgumentParser:
-    """Return a parser whose help shows both texts as they are written."""
-    return argparse.ArgumentParser(
-        prog=name,
-        description=description,
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """Return a parser that shows both texts as they are written, with the command as called."""
+    program = called_name(name)
+    epilog = epilog.replace(f'\n  {name} ', f'\n  {program} ')
+    return _Parser(prog=program, description=description, epilog=epilog, formatter_class=_Help)
 
 
 def add_parameter(group: Any, name: str, text: str, **changes: Any) -> None:

@@ -30,10 +30,9 @@ TOPICS = {MATCHES: 'stavpr/match', LOOP_CLOSURES: 'stavpr/loop_closure'}
 
 EPILOG = """
 The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures
-those of stavpr_msgs/LoopClosure. Stamps are in nanoseconds, missing numbers are null; the path is
-a list of [query_index, place_index], pairs are [query_index, query_stamp, place_index,
-place_stamp, query_change], a pose is [x, y, z, qx, qy, qz, qw], null without odometry. received is
-the time of arrival (ns, system clock).
+those of stavpr_msgs/LoopClosure; nested messages are objects with the names of their fields.
+Stamps are in nanoseconds; missing numbers, and poses without odometry, are null. received is the
+time of arrival (ns, system clock).
 
 exit codes: 0 stopped by a signal, 1 the file cannot be written, 2 usage, 130 stopped by a signal
 before the start
@@ -47,31 +46,25 @@ def match_record(message: 'PlaceMatch') -> dict[str, Any]:
 
 def loop_closure_record(message: 'LoopClosure') -> dict[str, Any]:
     """Return a loop closure as plain values for JSON."""
-    poses = {name: _pose(getattr(message, name)) for name in ('query_pose', 'place_pose')}
-    return _record(message) | (poses if message.has_poses else dict.fromkeys(poses))
+    unknown = () if message.has_poses else ('query_pose', 'place_pose')
+    return _record(message) | dict.fromkeys(unknown)
 
 
 def _record(message: Any) -> dict[str, Any]:
     """Return the fields of a message, its header as ``stamp`` and ``frame_id``."""
-    header = {'stamp': _plain(message.header.stamp), 'frame_id': message.header.frame_id}
-    names = [name for name in message.get_fields_and_field_types() if name != 'header']
-    return header | {name: _plain(getattr(message, name)) for name in names}
+    fields: dict[str, Any] = _plain(message)
+    return fields.pop('header') | fields
 
 
 def _plain(value: Any) -> Any:
-    """Return stamps as nanoseconds, other messages as lists of their fields, NaN as None."""
+    """Return stamps as nanoseconds, other messages as their fields by name, NaN as None."""
     if hasattr(value, 'nanosec'):
         return int(value.sec) * SECOND + int(value.nanosec)
     if hasattr(value, 'get_fields_and_field_types'):
-        return [_plain(getattr(value, name)) for name in value.get_fields_and_field_types()]
+        return {name: _plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if isinstance(value, np.ndarray | Sequence) and not isinstance(value, str):
         return [_plain(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def _pose(pose: Any) -> list[float]:
-    position, orientation = _plain(pose)
-    return [*position, *orientation]
 
 
 def main(args: list[str] | None = None) -> int:

@@ -9,6 +9,7 @@ import sys
 import stavpr_ros
 from stavpr_ros import plugins
 from stavpr_ros.commands import Command, COMMANDS
+from stavpr_ros.commands.program import suggestion
 
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
@@ -76,7 +77,9 @@ def main(args: list[str] | None = None) -> int:
         return 0
     command = COMMANDS.get(name) or all_commands().get(name)
     if command is None:
-        reason = f'unknown command {name!r}; choose from {", ".join(all_commands())}'
+        names = all_commands()
+        reason = f'unknown command {name!r}; choose from {", ".join(names)}'
+        reason += suggestion(name, names)
         if name in PACKAGES:
             reason = f'{name} is in the package {PACKAGES[name]}, which is not installed'
         print(f'stavpr: {reason}', file=sys.stderr)

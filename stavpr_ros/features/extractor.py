@@ -80,6 +80,13 @@ class LocalFeatures:
     def __len__(self) -> int:
         return self.strips.shape[1]
 
+    def __repr__(self) -> str:
+        strips, images, dimension = self.strips.shape
+        return (
+            f'LocalFeatures({self.settings.kind} of {images} images, {strips} strips of '
+            f'{dimension} dimensions)'
+        )
+
     @property
     def dimension(self) -> int:
         """Return the number d of dimensions of a strip."""

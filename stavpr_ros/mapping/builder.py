@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from stavpr_ros.checks import require_at_least
+from stavpr_ros.checks import require_at_least, require_type
 from stavpr_ros.errors import InputError, JournalError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, SUFFIX
@@ -73,9 +73,13 @@ def build_map(
     :param progress: show a progress bar.
     :param keyframes: minimum differences between places; None = every image is one.
     :param thumbnail_width: pixels.
-    :raises InputError: no images, no places, or poses that do not fit.
+    :raises InputError: no images, no places, poses that do not fit, or another type of argument.
     :raises SettingsError: a rule of motion without poses.
     """
+    given: object = frames
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise InputError(f'frames is {given!r}: expected open_source(path), or another sequence')
+    require_type('extractor', extractor, FeatureExtractor, 'a FeatureExtractor(...)')
     features: list[LocalFeatures] = []
     found: list[tuple[Place, bytes]] = []
     options = keyframes, thumbnail_width if thumbnails else None

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stavpr_ros.checks import require_choice
+from stavpr_ros.checks import require_choice, require_type
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
@@ -160,6 +160,7 @@ def open_map(path: str | Path) -> PlaceMap:
 
     :raises MapFileError: see :func:`load_map`.
     """
+    require_type('path', path, (str, Path), 'the path of a map file')
     path = Path(path)
     with errors_of(path):
         file = MapFile(open_regular(path), path)

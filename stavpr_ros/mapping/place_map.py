@@ -3,7 +3,7 @@
 """The reference map: local features, stamps, identifiers, poses, thumbnails of places."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 import math
 from typing import ClassVar
@@ -84,7 +84,7 @@ class PlaceMap:
     stamps: np.ndarray
     ids: tuple[str, ...]
     poses: np.ndarray | None = None
-    thumbnails: Sequence[bytes] = field(default=(), repr=False)
+    thumbnails: Sequence[bytes] = ()
     sessions: tuple[Session, ...] = ()
     session_index: np.ndarray | None = None
     camera: Camera | None = None
@@ -119,6 +119,15 @@ class PlaceMap:
 
     def __len__(self) -> int:
         return len(self.features)
+
+    def __repr__(self) -> str:
+        kept = {
+            'poses': self.has_poses,
+            'thumbnails': len(self.thumbnails),
+            'sessions': len(self.sessions),
+        }
+        names = ''.join(f', {name}' for name, value in kept.items() if value)
+        return f'PlaceMap({len(self)} places, {self.features!r}{names})'
 
     @property
     def settings(self) -> FeatureSettings:

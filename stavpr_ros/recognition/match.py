@@ -131,21 +131,30 @@ class Match:
     reason: str = ''
     threshold: float = math.nan
     sequence: SequenceMatch | None = None
-    path: np.ndarray = field(default_factory=lambda: NO_PATH, repr=False)
+    path: np.ndarray = field(default_factory=lambda: NO_PATH)
     distance: float = math.nan
     probability: float = math.nan
     min_probability: float = math.nan
-    path_ratios: np.ndarray = field(default_factory=lambda: NO_SHARES, repr=False)
+    path_ratios: np.ndarray = field(default_factory=lambda: NO_SHARES)
     is_late: bool = False
-    late: 'Match | None' = field(default=None, repr=False)
-    window_stamps: tuple[int, ...] = field(default=(), repr=False)
-    window_changes: tuple[float, ...] = field(default=(), repr=False)
+    late: 'Match | None' = None
+    window_stamps: tuple[int, ...] = ()
+    window_changes: tuple[float, ...] = ()
     image_index: int = -1
     inliers: int = -1
     candidates: tuple[Candidate, ...] = ()
     cause: str = ''
-    stages: Mapping[str, float] = field(default_factory=dict, repr=False)
-    image: np.ndarray | None = field(default=None, repr=False)
+    stages: Mapping[str, float] = field(default_factory=dict)
+    image: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        fields = [self.status.name]
+        if self.accepted:
+            fields += [f'place_index={self.place_index}', f'newest_index={self.newest_index}']
+        for name in ('probability', 'distance'):
+            if not math.isnan(getattr(self, name)):
+                fields.append(f'{name}={getattr(self, name):.4g}')
+        return f'Match({", ".join(fields + [f"reason={self.reason!r}"] * bool(self.reason))})'
 
     @property
     def accepted(self) -> bool:

@@ -9,6 +9,7 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
+from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -163,6 +164,8 @@ class SequenceRecognizer(ABC):
         return buffer.at(columns[None])[buffer.length - len(buffer) :]
 
     def _require_one_image(self, features: LocalFeatures, where: str) -> None:
+        expected = 'the LocalFeatures of one image, as of place_map.extractor().extract([image])'
+        require_type('features', features, LocalFeatures, expected)
         features.require_same_settings(self._feature_settings, where)
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images: expected those of one')
@@ -212,7 +215,7 @@ class PlaceRecognizer(SequenceRecognizer):
         :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
-    :raises InputError: features of the map are not finite.
+    :raises InputError: features of the map are not finite, or an argument of another type.
     """
 
     def __init__(
@@ -222,6 +225,9 @@ class PlaceRecognizer(SequenceRecognizer):
         backend: str = 'cpu',
         precision: str = 'float32',
     ) -> None:
+        maps, given = 'a PlaceMap, as of load_map() or build_map()', 'RecognizerSettings(...)'
+        require_type('place_map', place_map, PlaceMap, maps)
+        require_type('settings', settings, RecognizerSettings, given)
         backend = choose_backend(backend)
         features, options = place_map.features, settings.applied_options
         poses = place_map.poses if place_map.has_poses else None

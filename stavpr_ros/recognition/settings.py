@@ -5,7 +5,7 @@
 from dataclasses import dataclass, field
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.checks import require_above, require_at_least, require_between
+from stavpr_ros.checks import require_above, require_at_least, require_between, require_number
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of, RobustOptions
 
@@ -46,6 +46,7 @@ class RecognizerSettings:
 
     def __post_init__(self) -> None:
         options_of(self.mode)  # rejects an unknown mode
+        require_number('threshold', 1 if self.threshold is None else self.threshold)
         if self.threshold is not None and not self.threshold > 0:
             raise SettingsError(
                 f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stavpr_ros.checks import require_type
 from stavpr_ros.errors import ImageError, SourceError
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def open_source(
     from stavpr_ros.sources.bag_file import is_bag, reading
     from stavpr_ros.sources.folder import FolderSource
 
+    require_type('path', path, (str, Path), 'the path of a folder of images or of a bag')
     path = Path(path)
     with reading(path):
         exists = path.exists()

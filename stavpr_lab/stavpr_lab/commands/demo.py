@@ -4,6 +4,7 @@
 
 import argparse
 from pathlib import Path
+import shutil
 import sys
 import time
 from typing import Any, TYPE_CHECKING
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 EXCLUDE_PLACES, GEOMETRIC_CHECK = default('exclude_places'), 'sift'  # defaults with --loop
 SYNTHETIC = 'synthetic'
+WRITTEN = '.demo'  # lists the files of a demonstration in its folder
 DRIFT = 0.7  # odometry of about 20 m after three laps
 
 DESCRIPTION = """
@@ -52,7 +54,8 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = make_parser('demo', DESCRIPTION, EPILOG)
     add = parser.add_argument
-    add('--output', default='demo_output', metavar='FOLDER', help='output folder (%(default)s)')
+    output = 'output folder, where the files of an earlier demo are removed (%(default)s)'
+    add('--output', default='demo_output', metavar='FOLDER', help=output)
     add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
     add('--query', metavar='FOLDER|BAG', help='second traverse: it is replayed')
     loop = f'a traverse that passes places again ({SYNTHETIC})'
@@ -164,17 +167,38 @@ def _require_all(place_map: 'PlaceMap', images: int) -> None:
 def _run(arguments: argparse.Namespace) -> None:
     began = time.monotonic()
     folder = Path(arguments.output)
+    for name in ('map', 'query', 'loop', 'truth'):
+        given = getattr(arguments, name)
+        if given and folder.resolve() in Path(given).resolve().parents:
+            raise SettingsError(f'--{name} {given} is in {folder}: give another --output')
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _remove_earlier(folder)
+        others = set(folder.iterdir())
     except OSError as error:
-        raise SourceError(f'folder {folder} cannot be made: {error}') from error
-    if arguments.slam is not None:
-        _slam(arguments, folder)
-    elif arguments.loop is None:
-        _localization(arguments, folder)
-    else:
-        _loop_closure(arguments, folder)
+        raise SourceError(f'folder {folder} cannot be made or emptied: {error}') from error
+    try:
+        if arguments.slam is not None:
+            _slam(arguments, folder)
+        elif arguments.loop is None:
+            _localization(arguments, folder)
+        else:
+            _loop_closure(arguments, folder)
+    finally:
+        written = sorted(path.name for path in set(folder.iterdir()) - others)
+        (folder / WRITTEN).write_text('\n'.join(written))
     _print(f'   {time.monotonic() - began:.0f} s in all')
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove the files of an earlier demonstration, which it has listed, and no others."""
+    listed = folder / WRITTEN
+    names = listed.read_text().splitlines() if listed.exists() else []
+    for path in [path for path in folder.iterdir() if path.name in names]:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair':

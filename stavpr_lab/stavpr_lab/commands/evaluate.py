@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_lab evaluate``: metrics of recognizing one traverse on the map of another."""
+"""``ros2 run stavpr_lab evaluate``: matches of one traverse on the map of another, and metrics."""
 
 import argparse
 from pathlib import Path
@@ -25,18 +25,18 @@ OUTPUT = 'evaluation_output'
 EXCLUDE_PLACES = default('exclude_places')
 
 DESCRIPTION = """
-Recognizes a second traverse on the map of a first one, image by image as the node does, and
-compares the matches with the ground truth: precision and recall, F1, average precision, recall@k,
-recall at 100 % precision, false alarms, calibration; for sequences and for single images. Writes
-JSON, CSV, plots and an HTML page.
+Recognizes a second traverse on the map of a first one, image by image as the node does, and writes
+the matches, their probabilities and paths as JSON, CSV, plots and an HTML page with the images.
+With --truth, also compares them with the ground truth: precision and recall, F1, average
+precision, recall@k, recall at 100 % precision, calibration; for sequences and single images.
 """
 
 EPILOG = """
 traverses: images, a bag, a saved map, or an array of descriptors that any program computed, .npy
 .npz .csv .mat, or FILE:NAME for one of several: (n, D), one vector an image, or (n, W, D)
 
-ground truth (--truth):
-  identity     image i of the query shows place i of the map (the default); --tolerance is 3 then
+ground truth (--truth), none by default:
+  identity     image i of the query shows place i of the map; --tolerance is 3 then
   poses        places within --meters and --degrees of the query's pose
   FILE         .csv: accepted pairs, query,place, from 0; .npy, .npz: a matrix, queries by places,
                pairs, or a place a query; an image: white at row i, column j accepts place j for
@@ -53,11 +53,11 @@ another drive (they combine; applied in the order speed, stop, reverse, drop):
 examples:
   evaluate --map summer/ --query winter/
   evaluate --map route.stavpr --query tuesday.bag --truth pairs.csv --mode paper --json result.json
-  evaluate --map summer/ --query winter/ --crop-map 0.3 --crop-query 0.1 --speed vary
+  evaluate --map summer/ --query winter/ --truth identity --crop-map 0.3 --speed vary
   evaluate --map monday/ --query tuesday/ --unknown another_town/ --output report/
-  evaluate --map monday/ --query tuesday/ --remove-from-map 40:90 --remove-from-map 200:260
+  evaluate --map monday/ --query tuesday/ --truth pairs.csv --remove-from-map 40:90
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
-  evaluate --map summer.csv --query netvlad.mat:winter --tolerance 2
+  evaluate --map summer.csv --query netvlad.mat:winter --truth identity --tolerance 2
   evaluate --map summer/ --query winter/ --export arrays/
   evaluate --map summer/ --query drives/*.bag --output reports/ --processes 4
   evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
@@ -129,7 +129,7 @@ def _pair(text: str) -> tuple[int, int]:
 
 def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('ground truth').add_argument
-    add('--truth', default='identity', metavar='identity|poses|FILE', help='see below')
+    add('--truth', metavar='identity|poses|FILE', help='see below')
     add('--tolerance', type=int, metavar='T', help='places that a correct match may be off')
     add('--query-poses', metavar='CSV', help='x,y,z[,qx,qy,qz,qw] of every query image')
     add('--map-poses', metavar='CSV', help='the same of every place (those of the saved map)')
@@ -162,7 +162,7 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other."""
     loop, dataset = arguments.loop_closure, arguments.dataset is not None
-    if dataset and (arguments.map or arguments.query or arguments.truth != 'identity' or loop):
+    if dataset and (arguments.map or arguments.query or arguments.truth or loop):
         parser.error(
             '--dataset has map, query and ground truth: leave --map, --query, --truth and '
             '--loop-closure out'
@@ -173,12 +173,13 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('--query is required')
     if not dataset and (arguments.map is None) != loop:
         parser.error('give --map or, for the query on its own past, --loop-closure')
-    if arguments.exclude_places is not None and not loop:
-        parser.error('--exclude-places goes with --loop-closure')
-    if arguments.late_closures and not loop:
-        parser.error('--late-closures goes with --loop-closure')
+    if (arguments.exclude_places is not None or arguments.late_closures) and not loop:
+        parser.error('--exclude-places and --late-closures: each goes with --loop-closure')
     if loop:
         _check_loop_closure(parser, arguments)
+    compares = arguments.tolerance is not None or arguments.unknown or arguments.mode == 'paper'
+    if compares and not (dataset or arguments.truth):
+        parser.error('--tolerance, --unknown and --mode paper need --truth identity|poses|FILE')
     if arguments.tolerance is not None and arguments.tolerance < 0:
         parser.error(f'--tolerance {arguments.tolerance} must be at least 0')
     of_map = arguments.map_poses and not arguments.odometry
@@ -198,7 +199,7 @@ def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Nam
             '--loop-closure is computed on the query alone: leave --crop-map and --map-poses out'
         )
     if arguments.truth == 'identity':
-        parser.error('--loop-closure needs --truth FILE or poses')
+        parser.error('--loop-closure goes with --truth FILE or poses')
     if arguments.exclude_places < 1:
         parser.error(f'--exclude-places {arguments.exclude_places} must be at least 1')
 
@@ -272,6 +273,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     began = time.perf_counter()
     settings = node_settings(arguments)
     sequences = load_sequences(arguments)
+    truth = sequences.drive.truth.kind
     loaded = time.perf_counter()
     evaluation = _evaluate(arguments, sequences, settings.recognition())
     ended = time.perf_counter()
@@ -287,7 +289,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         evaluation=evaluation,
         query=sequences.query,
         reference=sequences.reference or sequences.query,
-        title=sequences.title,
+        title=f'{sequences.title}, {_truth_text(truth, sequences.tolerance)}',
         settings=_settings_json(arguments, sequences),
         times=times,
         drive=sequences.drive,
@@ -296,10 +298,30 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     )
 
 
+def _truth_text(kind: str, tolerance: int) -> str:
+    """Return the kind of a ground truth for the title."""
+    around = f' +- {tolerance} places' if tolerance else ''
+    return f'ground truth: {kind}{around}' if kind else 'no ground truth'
+
+
+def _print_report(report: 'Report') -> None:
+    print(report.title)
+    if report.has_truth:
+        _print_metrics(report)
+    decision = report.decision()
+    wrong = f', {decision["wrongly_matched"]} of them wrongly' if report.has_truth else ''
+    print(
+        f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images{wrong}'
+    )
+    print(
+        f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
+        f'{report.times["total_s"]:.1f} s in all'
+    )
+
+
 def _print_metrics(report: 'Report') -> None:
     from stavpr_lab.evaluation.report import METRICS
 
-    print(report.title)
     print(f'{"":28}{"sequences":>12}{"no ends":>12}{"single":>12}{"no ends":>12}')
     numbers = [getattr(report.evaluation, name).to_json() for name in METRICS]
     rows = ('f1', 'threshold', 'average_precision', 'recall_at_1', 'recall_at_5', 'recall_at_10')
@@ -309,11 +331,7 @@ def _print_metrics(report: 'Report') -> None:
         )
     if alarms := report.evaluation.false_alarm_rates:
         print(f'{"false alarm rate":28}{alarms["sequence"]:12.4f}{alarms["single"]:24.4f}')
-    decision, calibration = report.decision(), report.evaluation.calibration
-    print(
-        f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images, '
-        f'{decision["wrongly_matched"]} of them wrongly'
-    )
+    calibration = report.evaluation.calibration
     for stretch in report.unseen():
         print(
             f'without places {stretch["first"]} .. {stretch["last"] - 1}: {stretch["matched"]} of '
@@ -324,10 +342,6 @@ def _print_metrics(report: 'Report') -> None:
             f'declared probability: expected calibration error {calibration.expected_error:.4f}, '
             f'recall at 100 precision {calibration.recall_at_full_precision:.4f}'
         )
-    print(
-        f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
-        f'{report.times["total_s"]:.1f} s in all'
-    )
 
 
 def _export(report: 'Report', folder: Path, force: bool) -> None:
@@ -359,7 +373,7 @@ def _run(arguments: argparse.Namespace) -> None:
             require_replaceable(Path(arguments.export) / f'{name}.npy', NPY, arguments.force)
     report = _report(arguments)
     chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
-    _print_metrics(report)
+    _print_report(report)
     if arguments.export:
         _export(report, Path(arguments.export), arguments.force)
     if arguments.json:

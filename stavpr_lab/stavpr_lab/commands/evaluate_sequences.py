@@ -227,6 +227,8 @@ def _ground_truth(
     arguments: argparse.Namespace, query: PlaceMap, reference: PlaceMap, tolerance: int
 ) -> GroundTruth:
     N, n = len(query), len(reference)
+    if arguments.truth is None:
+        return GroundTruth.unknown(N, n)
     if arguments.truth == 'identity':
         return GroundTruth.identity(N, n, tolerance)
     if arguments.truth != 'poses':

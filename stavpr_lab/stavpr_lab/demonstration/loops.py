@@ -86,7 +86,11 @@ def read_result(
     in_window = [i for i, match in enumerate(matches) if match['status'] in IN_WINDOW]
     images = np.array(in_window, np.int64)
     ends = [[closure['query_index'], closure['place_index']] for closure in closures]
-    pairs = [[pair[0], pair[2]] for closure in closures for pair in closure['pairs']]
+    pairs = [
+        [pair['query_index'], pair['place_index']]
+        for closure in closures
+        for pair in closure['pairs']
+    ]
     return LoopResult(
         len(matches),
         images[np.array(ends, np.int64).reshape(-1, 2)],

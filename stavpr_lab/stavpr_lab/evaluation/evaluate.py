@@ -95,7 +95,7 @@ class TraverseResults:
 @dataclass(frozen=True)
 class Evaluation:
     """
-    Metrics of a traverse.
+    Metrics of a traverse; without ground truth, only its results are meaningful.
 
     :param sequence_length: images in a window, l.
     :param sequence_without_ends, single_without_ends: of the images in :attr:`centered`.
@@ -144,13 +144,17 @@ class Evaluation:
         """Return the distances of the windows' matches, by group."""
         scores = self.results.sequence.scores
         groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct]}
+        if not self.ground_truth.kind:
+            groups = {'match': scores}
         if self.unknown is not None:
             groups['unknown places'] = self.unknown.sequence.scores
         return groups
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Return the calibration of the declared probabilities; None without any."""
+        """Return the calibration of the declared probabilities; None without any or the truth."""
+        if not self.ground_truth.kind:
+            return None
         return calibrate(self.results.probabilities, self.correct, self.ground_truth.has_match)
 
 

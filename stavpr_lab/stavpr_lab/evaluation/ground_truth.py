@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ground truth: which places of the map are correct for each query image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Self
@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from stavpr_lab.evaluation.ground_truth_files import read_pairs
 from stavpr_ros.errors import InputError
+from stavpr_ros.sources.folder import text_of
 
 LISTED = 10  # images that an error names
 
@@ -25,11 +26,18 @@ class GroundTruth:
     :param N: number of query images.
     :param n: number of places of the map.
     :param keys: query * n + place of each accepted pair, sorted, each once, shape (M,), int64.
+    :param kind: where the pairs come from; '' = there is no ground truth.
     """
 
     N: int
     n: int
     keys: np.ndarray
+    kind: str = 'pairs'
+
+    @classmethod
+    def unknown(cls, N: int, n: int) -> Self:
+        """Return the absence of a ground truth: without pairs and without a kind."""
+        return cls(N, n, np.zeros(0, np.int64), '')
 
     @classmethod
     def from_pairs(
@@ -68,9 +76,11 @@ class GroundTruth:
         if n != N:
             raise InputError(
                 f'{N} query images and {n} places: the same index is the ground truth only of '
-                'equally many; give a file of accepted pairs'
+                'equally many; give a file of accepted pairs (--truth FILE), or no ground truth'
             )
-        return cls.from_pairs(np.arange(N), np.arange(n), N, n, tolerance)
+        return replace(
+            cls.from_pairs(np.arange(N), np.arange(n), N, n, tolerance), kind='identity'
+        )
 
     @classmethod
     def from_file(cls, path: str | Path, N: int, n: int, tolerance: int = 0) -> Self:
@@ -89,9 +99,10 @@ class GroundTruth:
         """
         queries, places = read_pairs(Path(path), N, n)
         try:
-            return cls.from_pairs(queries, places, N, n, tolerance)
+            found = cls.from_pairs(queries, places, N, n, tolerance)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
+        return replace(found, kind=text_of(Path(path).name))
 
     @classmethod
     def from_poses(
@@ -128,7 +139,9 @@ class GroundTruth:
             angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
             similar = angles <= degrees + 1e-5  # acos is inexact near 1
             queries, places = queries[similar], places[similar]
-        return cls.from_pairs(queries, places, len(query), len(place))
+        found = cls.from_pairs(queries, places, len(query), len(place))
+        limit = '' if degrees is None else f' and {degrees:g} degrees'
+        return replace(found, kind=f'poses within {meters:g} m{limit}')
 
     @property
     def pairs(self) -> np.ndarray:
@@ -193,7 +206,7 @@ class GroundTruth:
         around = places[:, None] + np.arange(-int(tolerance), int(tolerance) + 1)
         inside = (around >= 0) & (around < self.n)
         keys = (queries[:, None] * self.n + around)[inside]
-        return type(self)(self.N, self.n, np.unique(keys))
+        return replace(self, keys=np.unique(keys))
 
     def select(self, indices: np.ndarray) -> Self:
         """
@@ -206,7 +219,7 @@ class GroundTruth:
         # position of each pair in keys: that of its query's first pair, plus its rank in the query
         at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
         rows = np.repeat(np.arange(len(indices)), counts)
-        return type(self)(len(indices), self.n, rows * self.n + self.keys[at] % self.n)
+        return replace(self, N=len(indices), keys=rows * self.n + self.keys[at] % self.n)
 
     def on_places(self, places: np.ndarray) -> Self:
         """
@@ -218,7 +231,7 @@ class GroundTruth:
         number[places] = np.arange(len(places))
         queries, found = self.keys // self.n, number[self.keys % self.n]
         kept = found >= 0
-        return type(self)(self.N, len(places), queries[kept] * len(places) + found[kept])
+        return replace(self, n=len(places), keys=queries[kept] * len(places) + found[kept])
 
     def loop_closures(self, exclude: int = 0) -> Self:
         """
@@ -238,7 +251,7 @@ class GroundTruth:
         pairs = self.pairs
         later, earlier = pairs.max(axis=1), pairs.min(axis=1)
         past = later - earlier > exclude
-        return type(self)(self.N, self.n, np.unique(later[past] * self.n + earlier[past]))
+        return replace(self, keys=np.unique(later[past] * self.n + earlier[past]))
 
 
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:

@@ -96,7 +96,7 @@ def reduced_matrix(
     path: Path,
     distances: np.ndarray,
     shape: tuple[int, int],
-    truth: np.ndarray,
+    truth: np.ndarray | None,
     matches: Mapping[str, np.ndarray],
 ) -> Box:
     """
@@ -104,7 +104,7 @@ def reduced_matrix(
 
     :param distances: shape (rows, columns); NaN where there is none.
     :param shape: queries N and places n.
-    :param truth: whether a block has a true place, of the shape of ``distances``, bool.
+    :param truth: whether a block has a true place, shape as ``distances``; None = unknown.
     :param matches: (query, place) of accepted matches, shape (count, 2), by outcome.
     :returns: where the axes are.
     """
@@ -137,13 +137,13 @@ def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> B
 
 
 def distance_histogram(
-    path: Path, groups: Mapping[str, tuple[str, np.ndarray]], threshold: float
+    path: Path, groups: Mapping[str, tuple[str, np.ndarray]], threshold: float | None
 ) -> None:
     """
     Draw the distribution of the distances of correct, wrong and unknown matches.
 
     :param groups: color and distances of each group, by name; infinite distances are left out.
-    :param threshold: drawn as a line.
+    :param threshold: drawn as a line; None = none.
     """
     finite = {name: values[np.isfinite(values)] for name, (_, values) in groups.items()}
     everything = np.concatenate([*finite.values(), np.zeros(0)])
@@ -159,7 +159,7 @@ def distance_histogram(
             stacked=True,
             rwidth=0.9,
         )
-        if low <= threshold <= high + 1e-3 * (high - low):
+        if threshold is not None and low <= threshold <= high + 1e-3 * (high - low):
             axes.axvline(
                 threshold, color=INK, lw=1.3, ls=(0, (5, 3)), label=f'threshold {threshold:.3g}'
             )
@@ -211,7 +211,8 @@ def drive(
     index = np.arange(len(matched))
     with page(path, 10, 4.2) as figure:
         axes = figure.add_subplot()
-        axes.plot(truth[:, 0], truth[:, 1], '.', color=TRUTH, ms=3, mew=0, label='true place')
+        if len(truth):
+            axes.plot(*truth.T, '.', color=TRUTH, ms=3, mew=0, label='true place')
         shade_runs(axes, unseen, 'unseen')
         rejected = -0.04 * places  # below the axis of the places
         for outcome, color in COLORS.items():

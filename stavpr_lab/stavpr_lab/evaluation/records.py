@@ -71,7 +71,8 @@ class TraverseEvaluation:
 
 def match_of(record: dict[str, Any]) -> Match:
     """Return the match of a record that the command ``record`` wrote."""
-    path = np.array(record['path'], np.int32).reshape(-1, 2)
+    pairs = [(pair['query_index'], pair['place_index']) for pair in record['path']]
+    path = np.array(pairs, np.int32).reshape(-1, 2)
     sequence = None
     if record['sequence_middle'] >= 0:
         first, last = path[[0, -1], 1].tolist()

@@ -44,24 +44,18 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """Return all numbers for a JSON file; undefined ones are None."""
-        evaluation = self.evaluation
-        numbers: dict[str, Any] = {name: getattr(evaluation, name).to_json() for name in METRICS}
-        numbers['recommended_threshold'] = evaluation.sequence.best.threshold
-        if self.default_threshold is not None:
-            numbers['default_threshold'] = self._at_default()
-        numbers['decision'] = self.decision()
-        numbers['unseen'] = self.unseen()
-        calibration = evaluation.calibration
-        numbers['calibration'] = None if calibration is None else calibration.to_json()
-        if evaluation.unknown is not None:
-            for kind, rate in evaluation.false_alarm_rates.items():
-                numbers[kind]['false_alarm_rate'] = rate
-            numbers['false_alarm_rate'] = evaluation.false_alarm_rates['sequence']
-            numbers['unknown_images'] = len(evaluation.unknown.single)
+        numbers: dict[str, Any] = {'decision': self.decision()}
+        if self.has_truth:
+            numbers |= self._metrics()
         numbers |= {'images': len(self.query), 'places': len(self.reference)}
         numbers['map_id'] = self.reference.map_id
         numbers |= {'settings': self.settings, 'times': self.times}
         return jsonable(numbers)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether there is a ground truth, and the metrics are meaningful."""
+        return bool(self.evaluation.ground_truth.kind)
 
     @cached_property
     def accepted(self) -> np.ndarray:
@@ -82,12 +76,16 @@ class Report:
         return accepted_counts(self.accepted, self.evaluation.correct, has_match)
 
     def decision(self) -> dict[str, Any]:
-        """Return how many images are matched, and how many of them wrongly."""
+        """Return how many images are matched and, with ground truth, how many of them wrongly."""
         counts = self.counts
-        return {
+        decision: dict[str, Any] = {
             'rule': 'best F1' if self.default_threshold is None else 'default',
             'images': len(self.accepted),
             'matched': counts.accepted,
+        }
+        if not self.has_truth:
+            return decision
+        return decision | {
             'wrongly_matched': counts.false_positives,
             'precision': counts.precision,
             'recall': counts.recall,
@@ -104,6 +102,22 @@ class Report:
             }
             for (first, last), mask in zip(self.drive.removed, self.drive.unseen(), strict=True)
         ]
+
+    def _metrics(self) -> dict[str, Any]:
+        """Return the numbers that compare the matches with the ground truth."""
+        evaluation, calibration = self.evaluation, self.evaluation.calibration
+        numbers: dict[str, Any] = {name: getattr(evaluation, name).to_json() for name in METRICS}
+        numbers['recommended_threshold'] = evaluation.sequence.best.threshold
+        if self.default_threshold is not None:
+            numbers['default_threshold'] = self._at_default()
+        numbers['unseen'] = self.unseen()
+        numbers['calibration'] = None if calibration is None else calibration.to_json()
+        if evaluation.unknown is not None:
+            for kind, rate in evaluation.false_alarm_rates.items():
+                numbers[kind]['false_alarm_rate'] = rate
+            numbers['false_alarm_rate'] = evaluation.false_alarm_rates['sequence']
+            numbers['unknown_images'] = len(evaluation.unknown.single)
+        return numbers
 
     def _at_default(self) -> dict[str, Any]:
         counts, unknown = self.counts, self.evaluation.unknown
@@ -129,8 +143,10 @@ def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
     """
     Choose wrong matches: those a window off or more first, then by distance, half a window apart.
 
-    :returns: up to ``count`` images, the worst first.
+    :returns: up to ``count`` images, the worst first; none without ground truth.
     """
+    if not evaluation.ground_truth.kind:
+        return []
     matches, true = evaluation.results.sequence, evaluation.ground_truth.middles
     wrong = ~evaluation.correct & np.isfinite(matches.scores)
     near = (true >= 0) & (np.abs(matches.best - true) < evaluation.sequence_length)

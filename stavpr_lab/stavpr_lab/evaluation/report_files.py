@@ -48,9 +48,11 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
         raise SourceError(f'the report cannot be written into {folder}: {error}') from error
     require_replaceable(page, HTML, force)
     _write_matches(report, folder / 'answers.csv')
-    _write_curves(report.evaluation, folder / 'curves.csv')
     boxes = _draw(report, folder)
-    embedded = ['precision_recall', 'distances', 'similarity_matrix', 'drive']
+    embedded = ['distances', 'similarity_matrix', 'drive']
+    if report.has_truth:
+        _write_curves(report.evaluation, folder / 'curves.csv')
+        embedded.append('precision_recall')
     if report.evaluation.calibration is not None:
         embedded.append('calibration')
     contents = {name: (folder / f'{name}.png').read_bytes() for name in embedded}
@@ -78,6 +80,9 @@ def _write_matches(report: Report, path: Path) -> None:
         'probability': results.probabilities.tolist(),
         'recorded_image': report.drive.images.tolist(),
     }
+    if not report.has_truth:
+        unknown = ('in_map', 'true_place', 'sequence_right', 'single_right')
+        columns |= dict.fromkeys(unknown, [''] * len(report.query))
     _write_csv(path, list(columns), zip(*columns.values(), strict=True))
 
 
@@ -103,11 +108,10 @@ def _draw(report: Report, folder: Path) -> dict[str, Box]:
     :returns: where the axes of ``curves`` and ``matrix`` are in their plots.
     """
     evaluation = report.evaluation
-    boxes = {
-        'curves': _draw_curves(evaluation, folder / 'precision_recall.png'),
-        'matrix': _draw_matrix(evaluation, folder / 'similarity_matrix.png'),
-    }
-    _draw_distances(evaluation, folder / 'distances.png')
+    boxes = {'matrix': _draw_matrix(report, folder / 'similarity_matrix.png')}
+    if report.has_truth:
+        boxes['curves'] = _draw_curves(evaluation, folder / 'precision_recall.png')
+    _draw_distances(report, folder / 'distances.png')
     _draw_drive(report, folder / 'drive.png')
     if evaluation.calibration is not None:
         plots.reliability(folder / 'calibration.png', evaluation.calibration)
@@ -128,23 +132,26 @@ def _draw_curves(evaluation: Evaluation, path: Path) -> Box:
     return plots.precision_recall(path, kinds)
 
 
-def _draw_distances(evaluation: Evaluation, path: Path) -> None:
-    colors = (plots.COLORS['right'], plots.COLORS['wrong'], plots.UNKNOWN)
+def _draw_distances(report: Report, path: Path) -> None:
+    colors = {'correct': 'right', 'wrong': 'wrong', 'match': 'match'}
     groups = {
-        name: (color, distances)
-        for color, (name, distances) in zip(colors, evaluation.distances.items(), strict=False)
+        name: (plots.COLORS[colors[name]] if name in colors else plots.UNKNOWN, distances)
+        for name, distances in report.evaluation.distances.items()
     }
-    plots.distance_histogram(path, groups, evaluation.sequence.best.threshold)
+    best, default = report.evaluation.sequence.best.threshold, report.default_threshold
+    plots.distance_histogram(path, groups, best if report.has_truth else default)
 
 
 def _draw_drive(report: Report, path: Path) -> None:
     truth, places = report.evaluation.ground_truth, report.evaluation.results.sequence.best
     unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
-    outcomes = plots.outcomes(report.accepted, report.evaluation.correct, truth.has_match)
+    correct = report.evaluation.correct if report.has_truth else None
+    outcomes = plots.outcomes(report.accepted, correct, truth.has_match)
     plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
 
 
-def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
+def _draw_matrix(report: Report, path: Path) -> Box:
+    evaluation = report.evaluation
     reduced, truth = evaluation.results.distances, evaluation.ground_truth
     true_blocks = np.zeros(reduced.values.shape, bool)
     rows, columns = (truth.pairs // reduced.block).T
@@ -152,4 +159,7 @@ def _draw_matrix(evaluation: Evaluation, path: Path) -> Box:
     pairs = np.stack([np.arange(truth.N), evaluation.results.sequence.best], axis=1)
     accepted, correct = evaluation.best_accepted, evaluation.correct
     matches = {'right': pairs[accepted & correct], 'wrong': pairs[accepted & ~correct]}
-    return plots.reduced_matrix(path, reduced.values, (truth.N, truth.n), true_blocks, matches)
+    if not report.has_truth:
+        matches = {'match': pairs[report.accepted]}
+    known = true_blocks if report.has_truth else None
+    return plots.reduced_matrix(path, reduced.values, (truth.N, truth.n), known, matches)

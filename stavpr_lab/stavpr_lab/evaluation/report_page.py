@@ -45,8 +45,8 @@ def html_page(
     Return the page.
 
     :param mistakes: images whose wrong matches are shown, the worst first.
-    :param plots: PNG files ``precision_recall``, ``distances``, ``similarity_matrix``, ``drive``
-        and, where probabilities are declared, ``calibration``.
+    :param plots: PNG files ``distances``, ``similarity_matrix``, ``drive`` and, with ground truth,
+        ``precision_recall`` and, where probabilities are declared, ``calibration``.
     :param boxes: where the axes of ``curves`` and ``matrix`` are.
     """
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
@@ -55,14 +55,15 @@ def html_page(
     evaluation = report.evaluation
     return environment.from_string(template).render(
         title=report.title,
+        has_truth=report.has_truth,
         images=len(report.query),
         best=evaluation.sequence.best,
         single=evaluation.single.best,
         false_alarms=evaluation.false_alarm_rates,
         colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
-        cards=_cards(evaluation),
+        cards=_cards(evaluation) if report.has_truth else [],
         decision=report.decision(),
-        unseen=report.unseen(),
+        unseen=report.unseen() if report.has_truth else [],
         unseen_distance=UNSEEN_DISTANCE,
         calibration=evaluation.calibration and evaluation.calibration.to_json(),
         plots={name: _data_url(content, 'png') for name, content in plots.items()},
@@ -140,7 +141,7 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
     windows = evaluation.results.windows
     kept = set(evenly(len(windows), VIEWS).tolist())
     shown = [window for i, window in enumerate(windows) if i in kept or window.image in mistakes]
-    views = [_view(evaluation, window) for window in shown]
+    views = [_view(report, window) for window in shown]
     places = {view[name] for view in views for name in ('place', 'true')}
     curves = {'sequences': evaluation.sequence.curve, 'single images': evaluation.single.curve}
     return {
@@ -158,8 +159,10 @@ def _points(curve: np.ndarray) -> list[list[float]]:
     return np.round(curve[evenly(len(curve), POINTS)], 6).tolist()
 
 
-def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:
+def _view(report: Report, window: WindowDistances) -> dict[str, Any]:
     """Return a window for the script; its distances as bytes: 0 near, 254 far, 255 none."""
+    evaluation = report.evaluation
+    accepted = evaluation.best_accepted if report.has_truth else report.accepted
     matches, truth = evaluation.results.sequence, evaluation.ground_truth
     rows, columns = window.distances.shape
     low, high = np.nanmin(window.distances), np.nanmax(window.distances)
@@ -177,8 +180,9 @@ def _view(evaluation: Evaluation, window: WindowDistances) -> dict[str, Any]:
         'place': int(matches.best[window.image]),
         'single': int(evaluation.results.single.best[window.image]),
         'true': int(truth.middles[window.image]),
-        'right': bool(evaluation.correct[window.image]),
-        'accepted': bool(evaluation.best_accepted[window.image]),
+        'right': bool(evaluation.correct[window.image]) if report.has_truth else None,
+        'accepted': bool(accepted[window.image]),
+        'probability': float(evaluation.results.probabilities[window.image]),
         'score': float(matches.scores[window.image]),
     }
 
