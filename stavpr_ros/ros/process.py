@@ -144,8 +144,15 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
     :param parameters: names that a misspelled option may stand for.
     :raises SettingsError: names the arguments, and the command line to write.
     """
-    words = own_arguments(arguments)
-    if not words:
+    words, of_ros = [], False
+    for word in arguments:
+        if word in ('--ros-args', '--'):
+            of_ros = word == '--ros-args'
+        elif not of_ros:
+            words.append(word)
+    # rcl takes NAME:=VALUE alone as a remapping, of a parameter without effect
+    remapped = {word.partition(':=')[0] for word in words}
+    if not own_arguments(arguments) and remapped.isdisjoint(parameters):
         return
     line = ['--ros-args']
     for word in words:
