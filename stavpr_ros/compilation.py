@@ -116,10 +116,12 @@ progress = _Progress()
 """Set its ``announce`` to log one line instead of the progress bar."""
 
 event.register('numba:compile', progress)
-_folder = cache_folder()
-if _folder is not None:
-    nb.config.CACHE_DIR = str(_folder)
-_cached = _folder is not None
+CACHE = cache_folder()
+"""Folder of the compiled kernels, None = none can be written."""
+
+if CACHE is not None:
+    nb.config.CACHE_DIR = str(CACHE)
+_cached = CACHE is not None
 
 kernel = nb.njit(cache=_cached, nogil=True, error_model='numpy')
 parallel_kernel = nb.njit(cache=_cached, nogil=True, parallel=True, error_model='numpy')

@@ -23,15 +23,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(_: object) -> None:
     import numpy as np
-    from stavpr_ros.compilation import nb
+    from stavpr_ros.compilation import CACHE
     from stavpr_ros.errors import OutputError
     from stavpr_ros.mapping import build_map
     from stavpr_ros.pipeline import PipelineSettings
     from stavpr_ros.pipeline.start import start_operation
     from stavpr_ros.sources.frame import Frame
 
-    folder = nb.config.CACHE_DIR
-    if not folder:
+    if CACHE is None:
         raise OutputError('no cache folder can be written: set NUMBA_CACHE_DIR to one that can be')
     images = np.random.default_rng(0).integers(0, 256, (40, 96, 128, 3), np.uint8)
     frames = [Frame(image, number, str(number)) for number, image in enumerate(images)]
@@ -42,7 +41,7 @@ def _run(_: object) -> None:
             route = build_map(frames, extractor, progress=False)
             start_operation('localization', settings, route, extractor)
             start_operation('loop_closure', settings, None, extractor)
-    print(f'the kernels are in {folder}')
+    print(f'the kernels are in {CACHE}')
 
 
 if __name__ == '__main__':
