@@ -34,7 +34,7 @@ def test_arguments_of_ros_are_accepted(arguments):
 
 def test_log_directory_that_cannot_be_written_is_named(monkeypatch):
     monkeypatch.setenv('ROS_LOG_DIR', '/proc/log')
-    expected = pytest.raises(UnavailableError, match='/proc/log cannot be written: set ROS_LOG_DIR')
+    expected = pytest.raises(UnavailableError, match='/proc/log cannot be written: set ROS_LOG')
     with expected, ros_arguments_checked():
         raise rclpy_implementation.RCLError('failed to initialize logging: no folder')
 

@@ -141,7 +141,7 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
     """
     Reject arguments that are not for ROS, for a node that has no others.
 
-    :param parameters: names that a misspelled option may stand for.
+    :param parameters: names with which misspelled options are compared.
     :raises SettingsError: names the arguments, and the command line to write.
     """
     words, of_ros = [], False
