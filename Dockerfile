@@ -1,6 +1,6 @@
 # ROS 2 Jazzy with stavpr_ros, for amd64 and arm64:
 #   docker build -t stavpr_ros .
-#   docker run --rm --network host -v "$PWD:/data" stavpr_ros \
+#   docker run --rm --network host --ipc=host -v "$PWD:/data" stavpr_ros \
 #       ros2 run stavpr_ros node --ros-args -p map_path:=/data/route.stavpr -r image:=/camera/image_raw
 # Two stages: `development` has all dependencies (the devcontainer uses it), `runtime` the build.
 
@@ -39,6 +39,7 @@ USER 1000:1000
 FROM development AS runtime
 COPY --chown=1000:1000 . src/stavpr_ros
 RUN . "/opt/ros/$ROS_DISTRO/setup.bash" \
-    && python3 -m colcon build --base-paths src/stavpr_ros src/stavpr_ros/stavpr_{msgs,slam}
+    && python3 -m colcon build --base-paths src/stavpr_ros src/stavpr_ros/stavpr_{msgs,slam} \
+    && . install/setup.bash && stavpr warm
 ENTRYPOINT ["/bin/bash", "-c", ". /ros_ws/install/setup.bash && exec \"$@\"", "--"]
 CMD ["ros2", "run", "stavpr_ros", "node"]

@@ -25,7 +25,7 @@ SIBLINGS = ('stavpr_slam', 'stavpr_lab')
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
 
 # Commands of other packages print there where they are.
-EXECUTABLES = ('node', 'build_map', 'map', 'replay', 'record')
+EXECUTABLES = ('node', 'build_map', 'map', 'replay', 'record', 'warm')
 MOVED = (
     'weights', 'monitor', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph', 'bridge'
 )  # fmt: skip

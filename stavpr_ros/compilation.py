@@ -2,17 +2,131 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compilation of the kernels: cached on disk, without the interpreter's lock, IEEE numbers."""
 
+from collections.abc import Callable
+import logging
+import multiprocessing
+import os
+from pathlib import Path
+import shutil
+import tempfile
+
 import numba as nb
+from numba.core import event
+from tqdm import tqdm
+
+COMPILING = 'compiling kernels, once, about 30 s'
+KERNELS = 215  # that `stavpr warm` compiles, for the progress bar
 
 # Of numba's threading layers, the default's fallback aborts the process when two threads meet in
 # it.
 if nb.config.THREADING_LAYER == 'default':
     nb.config.THREADING_LAYER = 'threadsafe'
 
-kernel = nb.njit(cache=True, nogil=True, error_model='numpy')
-parallel_kernel = nb.njit(cache=True, nogil=True, parallel=True, error_model='numpy')
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+def _temporary_folder(filled: Path | None) -> Path | None:
+    """
+    Return the user's temporary folder of kernels, at first a copy of a filled one; None = none.
+
+    A folder of another user is not taken: numba unpickles the files in it.
+    """
+    try:
+        folder = Path(tempfile.gettempdir()) / f'stavpr_kernels_{os.getuid()}'
+        if not folder.exists():
+            copy = Path(tempfile.mkdtemp())
+            if filled is not None:
+                shutil.copytree(filled, copy, dirs_exist_ok=True)
+            copy.chmod(0o700)
+            copy.rename(folder)
+        status = folder.lstat()
+    except (OSError, shutil.Error):
+        return None
+    is_own = status.st_uid == os.getuid() and not status.st_mode & 0o022
+    return folder if is_own and not folder.is_symlink() and _is_writable(folder) else None
+
+
+def cache_folder() -> Path | None:
+    """
+    Return the folder of the compiled kernels, None = none can be written.
+
+    NUMBA_CACHE_DIR, or else the first that can be written of the package's and the user's cache;
+    otherwise a temporary one, which is logged.
+    """
+    if given := os.environ.get('NUMBA_CACHE_DIR'):
+        folders = [Path(given)]
+    else:
+        user = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+        folders = [Path(__file__).parent / '__pycache__' / 'kernels', Path(user) / 'stavpr']
+    for folder in folders:
+        if folder.is_absolute() and _is_writable(folder):
+            return folder
+    found = _temporary_folder(next(filter(Path.is_dir, folders), None))
+    if multiprocessing.parent_process() is None:
+        logging.getLogger('stavpr_ros').warning(
+            'no cache folder of kernels can be written (%s): %s; set NUMBA_CACHE_DIR to a folder '
+            'that can be, and run `stavpr warm` once',
+            ', '.join(map(str, folders)),
+            f'{found} is used' if found else 'they are compiled at each start',
+        )
+    return found
+
+
+class _Progress(event.Listener):
+    """Reports the compilation of kernels that are not in the cache."""
+
+    def __init__(self) -> None:
+        self.announce: Callable[[str], object] | None = None
+        self._bar: tqdm | None = None
+        self._depth = self._compiled = 0
+
+    def on_start(self, event: event.Event) -> None:
+        """Show a progress bar, or announce the first kernel."""
+        if self._depth == 0 and self.announce is None:
+            self._bar = tqdm(
+                desc=COMPILING,
+                total=KERNELS,
+                initial=self._compiled,
+                unit='kernel',
+                leave=False,
+                disable=None,
+            )
+        elif self._compiled == self._depth == 0 and self.announce is not None:
+            self.announce(COMPILING)
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        """Count a kernel."""
+        self._depth -= 1
+        self._compiled += 1
+        if self._bar is not None:
+            self._bar.update()
+            if self._depth == 0:
+                self._bar.close()
+
+
+progress = _Progress()
+"""Set its ``announce`` to log one line instead of the progress bar."""
+
+event.register('numba:compile', progress)
+CACHE = cache_folder()
+"""Folder of the compiled kernels, None = none can be written."""
+
+if CACHE is not None:
+    nb.config.CACHE_DIR = str(CACHE)
+_cached = CACHE is not None
+
+kernel = nb.njit(cache=_cached, nogil=True, error_model='numpy')
+parallel_kernel = nb.njit(cache=_cached, nogil=True, parallel=True, error_model='numpy')
 # Sums in any order, products fused into them: dot products over lanes. Infinities and NaN stay as
 # they are.
 reassociating_kernel = nb.njit(
-    cache=True, nogil=True, error_model='numpy', fastmath={'reassoc', 'contract', 'nsz'}
+    cache=_cached, nogil=True, error_model='numpy', fastmath={'reassoc', 'contract', 'nsz'}
 )

@@ -230,7 +230,25 @@ def test_limit_of_threads_can_be_removed(make_node):
         assert node.trigger_cleanup() == SUCCESS
 
 
-def test_misspelled_parameter_is_logged(make_node, capfd):
-    make_node(sequence_lenght=5)
+def test_misspelled_parameter_is_logged_and_not_set(make_node, capfd):
+    node = make_node(sequence_lenght=5)
     words = "parameter 'sequence_lenght' is unknown: did you mean sequence_length?"
     assert words in capfd.readouterr().err
+    assert set_parameter(node, 'sequence_lenght', 5).reason == words
+
+
+def test_lost_images_are_logged_once_with_their_remedy(make_node, capfd):
+    node = make_node(diagnostics_period=0.1)
+    node.statistics.dropped('lost in transport', 3)
+    published = threading.Event()
+    publish, reports = node._diagnostics._publisher.publish, []
+
+    def count(message):
+        publish(message)
+        reports.append(message)
+        if len(reports) == 4:
+            published.set()
+
+    node._diagnostics._publisher.publish = count
+    assert published.wait(10)
+    assert capfd.readouterr().err.count('3 images lost in transport in the last 10 s: ') == 1

@@ -34,4 +34,5 @@ COMMANDS = {
     'record': Command(
         'stavpr_ros.commands.record', 'write matches or loop closures to a JSON Lines file', True
     ),
+    'warm': Command('stavpr_ros.commands.warm', 'compile the kernels into their cache, once'),
 }

@@ -4,7 +4,7 @@
 
 import sys
 
-from stavpr_ros.parameters import PARAMETERS
+from stavpr_ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.signals import run_until_signal
 from stavpr_ros.threads import wait_passively
 
@@ -52,7 +52,7 @@ def _run(args: list[str] | None) -> int:
     from stavpr_ros.ros.node import PlaceRecognitionNode
     from stavpr_ros.ros.process import run_node
 
-    return run_node(PlaceRecognitionNode, args)
+    return run_node(PlaceRecognitionNode, args, BY_NAME)
 
 
 if __name__ == '__main__':

@@ -12,11 +12,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
 from stavpr_ros.ros import REPORT_PERIOD
-from stavpr_ros.ros.health import findings, Health
+from stavpr_ros.ros.health import findings, Health, loss
 from std_msgs.msg import Header
 
 # first words of the causes shown with the input; the others are shown with the processing
 INPUT_CAUSES = ('invalid', 'lost in transport', 'no odometry')
+
+LOSS_PERIOD = 60.0  # seconds between two warnings of lost images in the log
 
 Value = str | int | float | None
 
@@ -46,7 +48,10 @@ class DiagnosticsPublisher:
             try:
                 stamp = self._node.get_clock().now().to_msg()
                 name = self._node.get_fully_qualified_name()
-                self._publisher.publish(diagnostic_array(self._health(), name, stamp))
+                health = self._health()
+                self._publisher.publish(diagnostic_array(health, name, stamp))
+                if lost := loss(health):
+                    self._node.get_logger().warning(lost, throttle_duration_sec=LOSS_PERIOD)
             except Exception as error:  # the next report may succeed
                 self._node.get_logger().error(
                     f'no diagnostics: {type(error).__name__}: {error}',

@@ -88,8 +88,9 @@ def _silence(health: Health) -> Iterator[Finding]:
     refused = f'{_of(source.incompatible, "publisher")} refused for QoS'
     qos = source.remedy or f"compare 'ros2 topic info --verbose {source.topic}'"
     if silent and not source.publishers:
-        remedy = "find the camera's topic with 'ros2 topic list', remap to it"
-        yield WARN, f'{nothing}no publisher; {remedy} with --ros-args -r image:=TOPIC'
+        find = "find the camera's topic with 'ros2 topic list', remap to it"
+        remedy = source.remedy or f'{find} with --ros-args -r image:=TOPIC'
+        yield WARN, f'{nothing}no publisher; {remedy}'
     elif silent and source.incompatible:
         yield ERROR, f'{nothing}{refused}: {qos}'
     elif silent and source.mistyped:
@@ -101,6 +102,13 @@ def _silence(health: Health) -> Iterator[Finding]:
     elif source.incompatible and source.publishers > 1 and age is not None:
         # a single publisher is not the refused one: images arrive
         yield WARN, f'{refused}, while images of others arrive: {qos}'
+
+
+def loss(health: Health) -> str:
+    """Return the finding on images that were lost in transport, '' = none."""
+    lost = health.counts.dropped.recent['lost in transport']
+    remedy = f'{health.input.loss_remedy} (docs/troubleshooting.md, images are lost)'
+    return f'{_of(lost, "image")} lost in transport {RECENTLY}: {remedy}' if lost else ''
 
 
 def _image_faults(health: Health) -> Iterator[Finding]:
@@ -115,9 +123,8 @@ def _image_faults(health: Health) -> Iterator[Finding]:
         else:
             yield ERROR, f'all images {text}, and docs/node.md for the supported encodings'
     missing = counts.missing.recent.total()
-    if lost := drops['lost in transport']:
-        remedy = f'{health.input.loss_remedy} (docs/troubleshooting.md, images are lost)'
-        yield WARN, f'{_of(lost, "image")} lost in transport {RECENTLY}: {remedy}'
+    if lost := loss(health):
+        yield WARN, lost
     elif missing > MISSING * RECENT * counts.received.rate:
         remedy = 'none was lost in transport: check the camera driver, its cable and its exposure'
         yield WARN, f'about {_of(missing, "image")} missing by their stamps {RECENTLY}; {remedy}'

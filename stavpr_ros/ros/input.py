@@ -28,6 +28,7 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import StampWatch, Statistics
 from stavpr_ros.ros.messages import nanoseconds
+from stavpr_ros.ros.parameters import transport_remedy
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.units import SECOND
 
@@ -51,7 +52,7 @@ class InputStatus:
     publishers: int = 0  # of any QoS and type
     incompatible: int = 0  # not received because of their QoS
     mistyped: str = ''  # other message types on the topic
-    remedy: str = ''  # for the incompatible publishers
+    remedy: str = ''  # for incompatible publishers, or those of the other transport
     loss_remedy: str = ''  # for lost images
     reliability: str = ''  # of the subscription, with the reason
 
@@ -119,7 +120,7 @@ class ImageInput:
             len(infos),
             incompatible,
             mistyped,
-            self.remedy,
+            self.remedy or ('' if infos else transport_remedy(self._node, self.topic)),
             subscription.loss_remedy,
             subscription.choice,
         )

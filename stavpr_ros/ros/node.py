@@ -17,6 +17,7 @@ from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
+from stavpr_ros.compilation import progress
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline import node_settings, NodeSettings
@@ -59,6 +60,7 @@ class PlaceRecognitionNode(ManagedNode):
         super().__init__('stavpr', **options)
         for warning in unknown_parameters(self.parameter_overrides):
             self.get_logger().warning(warning)
+        progress.announce = self.get_logger().info
         self.settings = node_settings(declare_parameters(self))
         self._verbosity = 'default'
         self._apply_verbosity(self.settings.verbosity)
@@ -214,6 +216,8 @@ class PlaceRecognitionNode(ManagedNode):
     def set_parameters_atomically(self, parameters: list[Parameter]) -> SetParametersResult:
         """Set parameters, all or none, one thread at a time."""
         try:
+            if unknown := unknown_parameters(row.name for row in parameters):
+                raise SettingsError('; '.join(unknown))
             with self._lock:
                 folder = self.settings.maps_path
                 given = [inside_maps_folder(typed(row), self, folder) for row in parameters]

@@ -103,6 +103,18 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         )
 
 
+def transport_remedy(node: ManagedNode, topic: str) -> str:
+    """
+    Return the remedy for images that are published in the other transport only, '' = none.
+
+    :param topic: of the images, resolved.
+    """
+    raw = topic.removesuffix('/compressed')
+    transport, other = ('compressed', f'{raw}/compressed') if topic == raw else ('raw', raw)
+    published = node.count_publishers(other)
+    return f'{other} is published: set image_transport to {transport}' if published else ''
+
+
 def inside_maps_folder(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:
     """
     Return a parameter that is set after the start, with the absolute path of the file it names.

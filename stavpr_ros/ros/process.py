@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transport, start, spinning, discovery and end of every executable with a ROS node."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+import difflib
 import os
 from pathlib import Path
+import sys
 import time
 import traceback
 from typing import Any, TypeVar
@@ -21,7 +23,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
-from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.errors import SettingsError, StavprError, UnavailableError
 from stavpr_ros.ros.rclpy_workarounds import log_failure, PromptExecutor, ros_arguments_checked
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
@@ -135,16 +137,55 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
         executor.shutdown()
 
 
-def run_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> int:
+def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = ()) -> None:
+    """
+    Reject arguments that are not for ROS, for a node that has no others.
+
+    :param parameters: names with which misspelled options are compared.
+    :raises SettingsError: names the arguments, and the command line to write.
+    """
+    words, of_ros = [], False
+    for word in arguments:
+        if word in ('--ros-args', '--'):
+            of_ros = word == '--ros-args'
+        elif not of_ros:
+            words.append(word)
+    # rcl takes NAME:=VALUE alone as a remapping, of a parameter without effect
+    remapped = {word.partition(':=')[0] for word in words}
+    if not own_arguments(arguments) and remapped.isdisjoint(parameters):
+        return
+    line = ['--ros-args']
+    for word in words:
+        name, _, value = word.lstrip('-').partition('=')
+        near = difflib.get_close_matches(name.replace('-', '_'), parameters, 1, 0.5)
+        if word.startswith('--') and near:
+            line += ['-p', f'{near[0]}:={value}']
+        elif ':=' in word and line[-1] not in ('-p', '-r', '--param', '--remap'):
+            line += ['-p', word]
+        elif line[-1].endswith(':=') and not word.startswith('-'):
+            line[-1] += word
+        else:
+            line.append(word)
+    raise SettingsError(
+        f'nothing reads the arguments {" ".join(words)!r}: write {" ".join(line)} (parameters and '
+        'remappings are arguments of ROS)'
+    )
+
+
+def run_node(
+    make: Callable[[], AnyNode], arguments: Sequence[str] | None, parameters: Iterable[str] = ()
+) -> int:
     """
     Run a node until a signal stops the process; return the exit code.
 
     :param make: returns the node; it has ``THREADS`` for callbacks, 1 by default, and ``failed``
         if its end may lose something.
-    :param arguments: without the program's name; the process's own if None.
+    :param arguments: without the program's name; the process's own if None. All are for ROS.
+    :param parameters: names of the node's parameters, to correct misspelled arguments.
     """
     node = None
     try:
+        require_ros_arguments(sys.argv[1:] if arguments is None else arguments, parameters)
         with ros_node(make, arguments) as node:
             spin_until(node, threads=getattr(node, 'THREADS', 1))
     except (StavprError, ParameterException) as error:

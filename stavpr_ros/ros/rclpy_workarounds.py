@@ -10,6 +10,7 @@ when upstream is fixed, and the workaround can go.
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+import os
 import threading
 import time
 import traceback
@@ -24,7 +25,7 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, UnavailableError
 
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
@@ -46,9 +47,11 @@ def until_shutdown(node: Node) -> Iterator[None]:
 @contextmanager
 def ros_arguments_checked() -> Iterator[None]:
     """
-    Raise invalid arguments after ``--ros-args`` as SettingsError.
+    Raise invalid arguments after ``--ros-args`` as SettingsError, and a missing log directory.
 
     No upstream issue was found: rclpy has no public names for these exceptions.
+
+    :raises UnavailableError: the log directory cannot be written.
     """
     try:
         yield
@@ -57,6 +60,13 @@ def ros_arguments_checked() -> Iterator[None]:
         rclpy_implementation.RCLInvalidROSArgsError,
         rclpy_implementation.UnknownROSArgsError,
     ) as error:
+        if 'initialize logging' in str(error):
+            home = os.environ.get('ROS_HOME') or '~/.ros'
+            folder = os.environ.get('ROS_LOG_DIR') or os.path.join(home, 'log')
+            raise UnavailableError(
+                f'the log directory {os.path.expanduser(folder)} cannot be written: set '
+                'ROS_LOG_DIR to a folder that can be'
+            ) from error
         raise SettingsError(f'the arguments after --ros-args are invalid: {error}') from error
 
 

@@ -14,15 +14,15 @@ facing the camera.
 
 from math import floor, sqrt
 
-from numba import njit
 from stavpr_lab.demonstration.street.street import CAR, CELL, LAMP, TREE, VAN
 from stavpr_lab.demonstration.street.surfaces import hash01, noise
+from stavpr_ros.compilation import kernel
 
 _LAMPS, _FOLIAGE, _SUN, _AMBIENT = 5, 8, 0, 4  # of the array of light; see rendering.py
 NEAREST = 0.9  # meters; nearer parts of a thing are not drawn
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def draw_things(color, depth, things, line, camera, light, fine):
     """
     Draw the things over the scene; they come sorted from far to near.
@@ -37,7 +37,7 @@ def draw_things(color, depth, things, line, camera, light, fine):
             _draw_card(color, depth, things[k], line, camera, light, fine)
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _from_camera(line, along, ahead, across):
     """Return the depth of a point of the street, and meters to the right of its tangent."""
     cell = max(0, min(int(ahead / CELL), len(line) - 1))
@@ -47,7 +47,7 @@ def _from_camera(line, along, ahead, across):
     return z, right + beyond * sine + across * cosine
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _draw_card(color, depth, thing, line, camera, light, fine):
     """Draw a tree, lamp or sign as a card that faces the camera."""
     along, across, eye, focal, horizon, yaw, _ = camera
@@ -82,7 +82,7 @@ def _draw_card(color, depth, thing, line, camera, light, fine):
                 depth[y, x] = z
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _tree(u, h, seed, foliage, scale):
     """Paint a tree of unit size: trunk, then ragged leaves; `foliage` 0 is summer, 1 autumn."""
     trunk = 0.13 + 0.09 * hash01(1, 1, seed) + max(0.0, 0.35 - h) * 0.2
@@ -105,7 +105,7 @@ def _tree(u, h, seed, foliage, scale):
     return False, 0.0, 0.0, 0.0
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _lamp(u, h, right, lamps):
     """Paint a street lamp whose arm reaches over the road."""
     u = -u if right else u
@@ -118,7 +118,7 @@ def _lamp(u, h, right, lamps):
     return False, 0.0, 0.0, 0.0
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _sign(u, h, seed):
     """Paint a traffic sign: a disc, a triangle or a plate."""
     shape = int(hash01(1, 2, seed) * 3)
@@ -142,7 +142,7 @@ def _sign(u, h, seed):
     return False, 0.0, 0.0, 0.0
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _draw_car(color, depth, thing, line, camera, light, fine):
     """Draw a car or van: its shadow, its body and its cabin."""
     along, across, eye, focal, horizon, yaw, _ = camera
@@ -162,7 +162,7 @@ def _draw_car(color, depth, thing, line, camera, light, fine):
         _draw_box(color, depth, u, half, z, z + length, 0.24, 0.9, 0, seed, lens, light)
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _draw_shadow(color, depth, u, half, z0, z1, lens):
     """Darken the ground below a car."""
     focal, horizon, yaw, eye, fine = lens
@@ -186,7 +186,7 @@ def _draw_shadow(color, depth, u, half, z0, z1, lens):
                 color[y, x, 2] *= dark
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _draw_box(color, depth, u, half, z0, z1, low, high, part, seed, lens, light):
     """Draw the visible faces of a box: the one behind, one side and the top."""
     focal, horizon, yaw, eye, fine = lens
@@ -229,7 +229,7 @@ def _draw_box(color, depth, u, half, z0, z1, low, high, part, seed, lens, light)
             depth[row, x] = enter
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _car_paint(face, place, h, part, seed, lamps):
     """
     Paint a point of a car.

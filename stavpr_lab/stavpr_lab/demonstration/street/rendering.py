@@ -14,12 +14,12 @@ relative to the camera: a bend turns the street, or only moves it sideways with 
 
 from math import atan, cos, exp, hypot, pi, sin
 
-from numba import njit
 import numpy as np
 from stavpr_lab.demonstration.street.objects import draw_things
 from stavpr_lab.demonstration.street.street import CELL, SIDE_STREET, Street, VIEW
 from stavpr_lab.demonstration.street.surfaces import ground, hash01, noise, sky
 from stavpr_lab.demonstration.street.walls import roof_height, wall
+from stavpr_ros.compilation import kernel
 
 # Rays per pixel, one above the other: most lines lean, and upright ones need no smoothing.
 SAMPLES = 2
@@ -101,7 +101,7 @@ def center_line_ahead(street: Street, along: float) -> np.ndarray:
     ])  # fmt: skip
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _find_walls(lots, lot_of, line, along, across, slope, eye, walls):
     """Walk along one column's plane; return the number of visible walls."""
     count, highest = 0, -FAR
@@ -146,7 +146,7 @@ def _find_walls(lots, lot_of, line, along, across, slope, eye, walls):
     return count
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _on_ground(line, along, across, slope, z):
     """Return meters along the street from the camera, and across, of a point at a depth z."""
     first, last = int(along / CELL), len(line) - 1
@@ -162,7 +162,7 @@ def _on_ground(line, along, across, slope, z):
     return ahead, u
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def sunlit(lots, lot_of, along, across, height, light):
     """Return how much of the sun reaches a point: 0 in the shadow of a building, else up to 1."""
     right = light[SUN_RIGHT]
@@ -178,7 +178,7 @@ def sunlit(lots, lot_of, along, across, height, light):
     return min(1.0, max(0.0, above * 1.5 + 0.5))
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _lit_wall(lots, lot_of, walls, k, height, street_along, light):
     """Paint and light one point of a wall."""
     lot, front, row = int(walls[k, WALL_LOT]), walls[k, WALL_FRONT] > 0, int(walls[k, WALL_ROW])
@@ -196,7 +196,7 @@ def _lit_wall(lots, lot_of, walls, k, height, street_along, light):
     return r * power, g * power, b * power
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _lit_ground(lots, lot_of, seed, along, across, depth, light):
     """Paint and light one point of the ground."""
     lot = lot_of[1 if across > 0 else 0, min(max(int(along / CELL), 0), lot_of.shape[1] - 1)]
@@ -208,7 +208,7 @@ def _lit_ground(lots, lot_of, seed, along, across, depth, light):
     return r * power, g * power, b * power
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _draw_scene(color, depth, lots, lot_of, line, seed, camera, light):
     """Fill the samples with sky, ground and walls, and their depths."""
     along, across, eye, focal, horizon, yaw, heading = camera
@@ -266,7 +266,7 @@ def _draw_scene(color, depth, lots, lot_of, line, seed, camera, light):
             depth[y, x] = z
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _expose(color, depth, light, seed, image):
     """Average the samples of each pixel and let fog, lens and sensor act on them."""
     rows, columns, _ = image.shape
@@ -294,7 +294,7 @@ def _expose(color, depth, light, seed, image):
                 image[y, x, channel] = int(min(255.0, max(0.0, value * 255.0 + 0.5)))
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _streak(image, rain, seed):
     """Draw drops that fall through the image while the shutter is open."""
     rows, columns, _ = image.shape

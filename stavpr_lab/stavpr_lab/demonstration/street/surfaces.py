@@ -13,8 +13,8 @@ machine. The arithmetic is float64 because it is scalar: float32 would be no fas
 
 from math import floor, sin, sqrt
 
-from numba import njit
 from stavpr_lab.demonstration.street.street import PARK, ROAD_HALF_WIDTH, SIDE_STREET
+from stavpr_ros.compilation import kernel
 
 _X, _Y, _SEED, _MIX = (
     0x2545F4914F6CDD1D,
@@ -25,26 +25,26 @@ _X, _Y, _SEED, _MIX = (
 _HALF = ROAD_HALF_WIDTH
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def part(x):
     """Return the fraction of a number; several times as fast as `x % 1`."""
     return x - floor(x)
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _mix(h):
     """Scramble an integer, which may have overflowed, to [0, 1)."""
     h = (h ^ (h >> 32)) * _MIX
     return ((h ^ (h >> 29)) >> 20 & 0xFFFFFF) / 16777216.0
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def hash01(x, y, seed):
     """Hash three integers to [0, 1)."""
     return _mix(x * _X + y * _Y + seed * _SEED)
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def noise(x, y, seed):
     """Interpolate hashed values between the whole numbers; in [0, 1)."""
     ix, iy = floor(x), floor(y)
@@ -57,7 +57,7 @@ def noise(x, y, seed):
     return low + (high - low) * v
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def ground(along, across, kind, seed, far):
     """Paint a point of road, pavement, side street or park; `kind`: of the lot beside it."""
     fine = max(0.0, 1.0 - far / 30.0)
@@ -80,7 +80,7 @@ def ground(along, across, kind, seed, far):
     return tile, tile * 0.97, tile * 0.92
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _asphalt(along, across, side, seed, grain, fine):
     """Paint tarmac with patches, cracks, covers and markings."""
     tar = 0.34 * grain
@@ -110,7 +110,7 @@ def _asphalt(along, across, side, seed, grain, fine):
     return tar, tar, tar * 1.03
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _marking(along, across, side, seed):
     """Return how bright the paint on the road is, 0 where there is none."""
     crossing = floor(along / 46.0)
@@ -124,7 +124,7 @@ def _marking(along, across, side, seed):
     return 0.0
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def sky(azimuth, rise, cover, seed, glow):
     """
     Paint the sky.

@@ -8,12 +8,12 @@
 
 from math import floor, sin
 
-from numba import njit
 from stavpr_lab.demonstration.street.street import BRICK, HALL, OFFICE, PARK
 from stavpr_lab.demonstration.street.surfaces import hash01, noise, part
+from stavpr_ros.compilation import kernel
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def roof_height(lot, along):
     """Return how high a lot's building is at a distance along its front: gables and chimneys."""
     height = lot.height
@@ -28,7 +28,7 @@ def roof_height(lot, along):
     return height
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def wall(lot, front, along, height, far, lamps):
     """
     Paint a point of a building or hedge.
@@ -74,7 +74,7 @@ def wall(lot, front, along, height, far, lamps):
     return _upper_floors(lot, along, height, shade, lamps)
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _glass(x, y, seed, lamps):
     """Paint a pane: sky in it, a curtain, or a lamp behind it."""
     mood = hash01(3, 5, seed)
@@ -89,7 +89,7 @@ def _glass(x, y, seed, lamps):
     return dark * 0.88, dark * 0.98, dark * 1.12
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _upper_floors(lot, along, height, shade, lamps):
     """Paint the floors above the ground floor, and all of a hall."""
     seed = lot.seed
@@ -120,7 +120,7 @@ def _upper_floors(lot, along, height, shade, lamps):
     return _glass(x, y, seed + bay * 131 + story * 7177, lamps)
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _hall(lot, along, height, shade, bay):
     """Paint sheet metal, a gate and a painted name."""
     seed = lot.seed
@@ -135,7 +135,7 @@ def _hall(lot, along, height, shade, bay):
     return lot.red * rib, lot.green * rib, lot.blue * rib
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _house_bay(lot, along, height, x, y, bay, story, shade, lamps):
     """
     Paint a bay of a house: window, shutters, balcony.
@@ -172,7 +172,7 @@ def _house_bay(lot, along, height, x, y, bay, story, shade, lamps):
     return r, g, b
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def letters(along, height, seed):
     """Return whether a point of a sign lies on a stroke of its writing."""
     x = along / 0.55
@@ -183,7 +183,7 @@ def letters(along, height, seed):
     return hash01(letter * 3 + int(x * 3.75), int((height - 0.2) * 4.8), seed) < 0.62
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _ground_floor(lot, along, height, shade, lamps):
     """Paint shops (sign, awning, window) or a plinth with a door and windows."""
     seed = lot.seed
@@ -220,7 +220,7 @@ def _ground_floor(lot, along, height, shade, lamps):
     return r * groove, g * groove, b * groove
 
 
-@njit(cache=True, error_model='numpy')
+@kernel
 def _shop(along, height, top, x, seed, own, door, wall_color, sign_color, lamps):
     """
     Paint a shop: sign, awning, window.

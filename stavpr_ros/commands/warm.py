@@ -1,0 +1,48 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``stavpr warm``: fill the cache of compiled kernels, for installations that are read-only."""
+
+import sys
+
+from stavpr_ros.commands.program import make_parser, run_program
+
+EPILOG = """The folder is NUMBA_CACHE_DIR, or else that of the package or, if it cannot be
+written, ~/.cache/stavpr.
+
+exit codes: 0 done; 1 no folder can be written; 2 usage error; 130 interrupted
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command."""
+    text = 'Compile the kernels of all operations into the cache, where they are missing.'
+    parser = make_parser('warm', text, EPILOG)
+    given = sys.argv[1:] if arguments is None else arguments
+    return run_program('warm', lambda: _run(parser.parse_args(given)))
+
+
+def _run(_: object) -> None:
+    import numpy as np
+    from stavpr_ros.compilation import CACHE
+    from stavpr_ros.errors import OutputError
+    from stavpr_ros.mapping import build_map
+    from stavpr_ros.pipeline import PipelineSettings
+    from stavpr_ros.pipeline.start import start_operation
+    from stavpr_ros.sources.frame import Frame
+
+    if CACHE is None:
+        raise OutputError('no cache folder can be written: set NUMBA_CACHE_DIR to one that can be')
+    images = np.random.default_rng(0).integers(0, 256, (40, 96, 128, 3), np.uint8)
+    frames = [Frame(image, number, str(number)) for number, image in enumerate(images)]
+    for precision in ('float32', 'int8'):
+        for mode in ('robust', 'paper'):
+            settings = PipelineSettings(mode=mode, precision=precision, backend='cpu')
+            extractor = settings.extractor()
+            route = build_map(frames, extractor, progress=False)
+            start_operation('localization', settings, route, extractor)
+            start_operation('loop_closure', settings, None, extractor)
+    print(f'the kernels are in {CACHE}')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

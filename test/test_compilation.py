@@ -1,0 +1,48 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The cache folder of compiled kernels, and the announcement of their compilation."""
+
+from pathlib import Path
+
+import pytest
+from stavpr_ros import compilation
+from stavpr_ros.compilation import cache_folder, COMPILING
+
+
+@pytest.fixture
+def read_only(tmp_path, monkeypatch):
+    """Return a folder of kernels that cannot be written; others can be."""
+    folder, temporary = tmp_path / 'read_only', tmp_path / 'temporary'
+    for each in (folder, temporary):
+        each.mkdir()
+    (folder / 'kernel.nbi').write_text('index')
+    is_writable = compilation._is_writable
+    monkeypatch.setattr(compilation, '_is_writable', lambda f: f != folder and is_writable(f))
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(folder))
+    monkeypatch.setattr('tempfile.tempdir', str(temporary))
+    return folder
+
+
+def test_read_only_kernels_are_copied_to_a_temporary_folder(read_only, caplog):
+    folder = cache_folder()
+    assert folder.parent.name == 'temporary'
+    assert (folder / 'kernel.nbi').read_text() == 'index'
+    assert f'({read_only}): {folder} is used; set NUMBA_CACHE_DIR' in caplog.text
+    folder.chmod(0o777)  # others could write: what is in it is not unpickled
+    assert cache_folder() is None
+    assert 'they are compiled at each start' in caplog.text
+
+
+def test_package_without_home_keeps_its_kernels_itself(monkeypatch):
+    monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
+    monkeypatch.setenv('HOME', '/proc/nohome')
+    assert cache_folder() == Path(compilation.__file__).parent / '__pycache__' / 'kernels'
+
+
+def test_compilation_is_announced_once():
+    progress, texts = compilation._Progress(), []
+    progress.announce = texts.append
+    for _ in range(2):
+        progress.on_start(None)
+        progress.on_end(None)
+    assert texts == [COMPILING]

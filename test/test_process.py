@@ -1,0 +1,53 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Mistakes at the start of a node: its arguments, its transport, the log directory."""
+
+from types import SimpleNamespace
+
+import pytest
+from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.ros.parameters import transport_remedy
+from stavpr_ros.ros.process import require_ros_arguments
+from stavpr_ros.ros.rclpy_workarounds import rclpy_implementation, ros_arguments_checked
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'line'),
+    [
+        ('-p map_path:=x', '-p map_path:=x'),
+        ('map_path:=route.stavpr', '-p map_path:=route.stavpr'),
+        ('--map x', '-p map_path:=x'),
+        ('--min-probability=0.9 --ros-args -p a:=b', '-p min_probability:=0.9'),
+        ('--ros-args -p a:=b -- -r image:=/camera', '-r image:=/camera'),
+    ],
+)
+def test_arguments_that_nothing_reads_are_rejected_with_the_right_line(arguments, line):
+    with pytest.raises(SettingsError, match=rf'write --ros-args {line} \('):
+        require_ros_arguments(arguments.split(), BY_NAME)
+
+
+@pytest.mark.parametrize('arguments', ['', '--ros-args -p map_path:=x', 'image:=/camera'])
+def test_arguments_of_ros_are_accepted(arguments):
+    require_ros_arguments(arguments.split(), BY_NAME)
+
+
+def test_log_directory_that_cannot_be_written_is_named(monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', '/proc/log')
+    expected = pytest.raises(UnavailableError, match='/proc/log cannot be written: set ROS_LOG')
+    with expected, ros_arguments_checked():
+        raise rclpy_implementation.RCLError('failed to initialize logging: no folder')
+
+
+@pytest.mark.parametrize(
+    ('topic', 'published', 'remedy'),
+    [
+        ('/image', '/image/compressed', 'set image_transport to compressed'),
+        ('/image/compressed', '/image', 'set image_transport to raw'),
+        ('/image', '/other', ''),
+    ],
+)
+def test_images_of_the_other_transport_are_named(topic, published, remedy):
+    node = SimpleNamespace(count_publishers=lambda name: int(name == published))
+    expected = f'{published} is published: {remedy}' if remedy else ''
+    assert transport_remedy(node, topic) == expected
