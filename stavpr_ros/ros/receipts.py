@@ -23,7 +23,7 @@ class Receipts:
 
     :param node: for the subscription; the caller spins it.
 
-    ``status`` is that of the last result.
+    ``status`` is that of the last result; ``expects_closures``: one loop closure for each match.
     """
 
     def __init__(self, node: Node) -> None:
@@ -32,10 +32,11 @@ class Receipts:
         self._sent = self._received = 0
         self._last = time.monotonic()  # event
         self.status = PlaceMatch.NOT_READY
+        self._closed = node.resolve_topic_name('stavpr/loop_closure')
         self._matches = self._closures = 0
+        self.expects_closures = True
         node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RESULTS)
-        topic = 'stavpr/loop_closure'
-        node.create_subscription(LoopClosure, topic, self._on_closure, RESULTS)
+        node.create_subscription(LoopClosure, self._closed, self._on_closure, RESULTS)
 
     def sent(self, header: Header) -> None:
         """Count an image; to be called before it is published."""
@@ -49,7 +50,8 @@ class Receipts:
 
     def closures_follow(self) -> bool:
         """Return whether the node, if it publishes loop closures, keeps up with their edges."""
-        return not self._closures or self._matches - self._closures <= MOST_BEHIND
+        few = self._matches - self._closures <= MOST_BEHIND
+        return few or not self.expects_closures or not self._node.count_publishers(self._closed)
 
     def settled(self) -> bool:
         """Return whether no more results are expected."""

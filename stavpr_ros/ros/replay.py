@@ -273,7 +273,8 @@ class Replayer:
                 self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
             self.publisher.publish(message)
             if self._spin_until(self.receipts.complete, timeout):
-                self._spin_until(self.receipts.closures_follow, timeout)
+                follow = self.receipts.closures_follow
+                self.receipts.expects_closures &= self._spin_until(follow, timeout)
                 break
         else:
             raise NoResultError(
