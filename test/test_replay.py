@@ -17,9 +17,9 @@ from processes import DOMAIN, environment, TIMEOUT
 import pytest
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image
-from stavpr_msgs.msg import LoopClosure, PlaceMatch
+from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
 from stavpr_ros.ros import process
-from stavpr_ros.ros.receipts import MOST_BEHIND
+from stavpr_ros.ros.receipts import LATCHED, MOST_BEHIND
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_playback import spinning
@@ -143,6 +143,8 @@ def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path):
     with spinning('stavpr', DOMAIN) as node:
         match = node.create_publisher(PlaceMatch, '~/match', 10)
         closure = node.create_publisher(LoopClosure, '~/loop_closure', 10)
+        info = node.create_publisher(MapInfo, '~/map_info', LATCHED)
+        info.publish(MapInfo(operation='loop_closure'))
         node.create_subscription(Image, 'image', answer, 10)
         node.create_timer(0.05, close)
         assert replay(bag, '--lossless')[0] == 0

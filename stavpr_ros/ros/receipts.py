@@ -6,10 +6,11 @@ from collections import Counter
 import time
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from stavpr_msgs.msg import LoopClosure, PlaceMatch
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
 from std_msgs.msg import Header
 
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 MOST_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
@@ -32,11 +33,12 @@ class Receipts:
         self._sent = self._received = 0
         self._last = time.monotonic()  # event
         self.status = PlaceMatch.NOT_READY
-        self._closed = node.resolve_topic_name('stavpr/loop_closure')
         self._matches = self._closures = 0
-        self.expects_closures = True
+        self.expects_closures = False
         node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RESULTS)
-        node.create_subscription(LoopClosure, self._closed, self._on_closure, RESULTS)
+        topic = 'stavpr/loop_closure'
+        node.create_subscription(LoopClosure, topic, self._on_closure, RESULTS)
+        node.create_subscription(MapInfo, 'stavpr/map_info', self._on_map_info, LATCHED)
 
     def sent(self, header: Header) -> None:
         """Count an image; to be called before it is published."""
@@ -49,9 +51,8 @@ class Receipts:
         return self._received == self._sent
 
     def closures_follow(self) -> bool:
-        """Return whether the node, if it publishes loop closures, keeps up with their edges."""
-        few = self._matches - self._closures <= MOST_BEHIND
-        return few or not self.expects_closures or not self._node.count_publishers(self._closed)
+        """Return whether a node in operation loop_closure keeps up with its edges."""
+        return not self.expects_closures or self._matches - self._closures <= MOST_BEHIND
 
     def settled(self) -> bool:
         """Return whether no more results are expected."""
@@ -75,6 +76,9 @@ class Receipts:
             self.status = match.status
             self._last = time.monotonic()
         self._matches += match.status == PlaceMatch.MATCH
+
+    def _on_map_info(self, info: MapInfo) -> None:
+        self.expects_closures = info.operation == 'loop_closure'
 
     def _on_closure(self, _: LoopClosure) -> None:
         self._closures += 1
