@@ -28,8 +28,9 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map, save_map
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust import unit_norm
 from stavpr_ros.sources import open_source
-import torch
+from stavpr_ros.threads import thread_count
 
 RANK, PIECE = 256, 4096
 AT = 0.37  # where in the city the real places begin
@@ -52,41 +53,41 @@ class HalfFeatures(LocalFeatures):
     """Features in float16, read as float32: a city's fit into memory."""
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
-        strips, weights = self.strips[:, images].float(), self.weights[:, images]
+        strips, weights = self.strips[:, images].astype(np.float32), self.weights[:, images]
         return LocalFeatures(strips, weights, self.settings, self.cells)
 
 
-def simulated(real: LocalFeatures, n: int, seed: int) -> Iterator[torch.Tensor]:
+def simulated(real: LocalFeatures, n: int, seed: int) -> Iterator[np.ndarray]:
     """Yield the strips (W, m, d) of n simulated places, block by block."""
     rng = np.random.default_rng(seed)
     W, m, d = real.strips.shape
-    images = real.strips.transpose(0, 1).reshape(m, W * d).double()
-    mean = images.mean(dim=0)
+    images = real.strips.transpose(1, 0, 2).reshape(m, W * d).astype(np.float64)
+    mean = images.mean(axis=0)
     images = images - mean
     keep = float((images[1:] * images[:-1]).sum() / (images**2).sum())
-    _, scales, directions = torch.linalg.svd(images, full_matrices=False)
+    _, scales, directions = np.linalg.svd(images, full_matrices=False)
     rank = min(RANK, m - 1)
-    basis = (scales[:rank, None] * directions[:rank] / np.sqrt(m - 1)).float()
+    basis = (scales[:rank, None] * directions[:rank] / np.sqrt(m - 1)).astype(np.float32)
     state = rng.standard_normal((1, rank)).astype(np.float32)
     for low in range(0, n, PIECE):
         shape = min(PIECE, n - low), rank
         new = rng.standard_normal(shape, np.float32) * np.float32(np.sqrt(1 - keep**2))
         route = lfilter([1.0], [1.0, -keep], new, axis=0, zi=keep * state)[0].astype(np.float32)
         state = route[-1:]
-        strips = (torch.from_numpy(route) @ basis + mean.float()).view(-1, W, d).transpose(0, 1)
-        yield strips / strips.norm(dim=2, keepdim=True).clamp_(min=1e-9)
+        strips = (route @ basis + mean.astype(np.float32)).reshape(-1, W, d).transpose(1, 0, 2)
+        yield unit_norm(strips)
 
 
 def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
     """Return a city of n places, and the first of the real ones."""
     W, m, d = real.strips.shape
-    half, low = torch.empty((W, n, d), dtype=torch.float16), 0
+    half, low = np.empty((W, n, d), dtype=np.float16), 0
     for strips in simulated(real, n, seed):
         half[:, low : low + strips.shape[1]] = strips
         low += strips.shape[1]
     first = int(AT * (n - m))
     half[:, first : first + m] = real.strips
-    weights = torch.full((W, n), W**-0.5)
+    weights = np.full((W, n), W**-0.5, np.float32)
     return HalfFeatures(half, weights, real.settings, real.cells), first
 
 
@@ -148,7 +149,7 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
         'places': n,
         'images': len(query),
         'cpu': cpu_model(),
-        'threads': torch.get_num_threads(),
+        'threads': thread_count(),
         'commit': commit(),
         'load': os.getloadavg()[0],
         'exact': exact,

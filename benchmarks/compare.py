@@ -37,10 +37,9 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
     from stavpr_ros.features import FeatureSettings, LocalFeatures
     from stavpr_ros.mapping import descriptor_map
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-    import torch
 
     def features(strips: np.ndarray, weights: np.ndarray) -> LocalFeatures:
-        return LocalFeatures(torch.from_numpy(strips), torch.from_numpy(weights), settings)
+        return LocalFeatures(strips, weights, settings)
 
     settings = FeatureSettings('synthetic', None)
     place_map = descriptor_map(features(strips, weights))

@@ -8,10 +8,10 @@ import sys
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-import torch
+from stavpr_ros.memory import aligned_empty
+from stavpr_ros.recognition.robust import normalize
 
 SETTINGS = FeatureSettings('synthetic', None)
-BLOCK_BYTES = 2**28
 
 
 def data_folder() -> Path:
@@ -22,20 +22,17 @@ def data_folder() -> Path:
     return folder
 
 
-def make_features(n: int, d: int, W: int, device: str, seed: int) -> LocalFeatures:
+def make_features(n: int, d: int, W: int, seed: int) -> LocalFeatures:
     """
-    Draw unit-norm Gaussian local features on a device, in blocks.
+    Draw unit-norm Gaussian local features.
 
     :returns: strips (W, n, d) float32, all of equal weight.
     """
-    generator = torch.Generator(device).manual_seed(seed)
-    strips = torch.empty(W, n, d, device=device)
-    rows = strips.view(W * n, d)
-    for block in rows.split(max(1, BLOCK_BYTES // (4 * d))):
-        block.normal_(generator=generator)
-        block.div_(torch.linalg.vector_norm(block, dim=1, keepdim=True))
-    weights = torch.full((W, n), W**-0.5, device=device)
-    return LocalFeatures(strips, weights, SETTINGS)
+    strips, rng = aligned_empty((W, n, d)), np.random.default_rng(seed)
+    for strip in strips:
+        rng.standard_normal(out=strip, dtype=np.float32)
+        normalize(strip)
+    return LocalFeatures(strips, np.full((W, n), W**-0.5, np.float32), SETTINGS)
 
 
 def make_window(l: int, n: int, seed: int) -> np.ndarray:
@@ -46,6 +43,8 @@ def make_window(l: int, n: int, seed: int) -> np.ndarray:
 def free_bytes(device: str) -> int:
     """Return the free memory of a device."""
     if device == 'cuda':
+        import torch
+
         return int(torch.cuda.mem_get_info()[0])
     with open('/proc/meminfo', encoding='ascii') as lines:
         found = dict(line.split(':') for line in lines)

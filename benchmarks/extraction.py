@@ -5,6 +5,7 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import cycle
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,11 +15,12 @@ import numpy as np
 from run import Peer, Run
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.extractor import cut_strips, normalize
-from stavpr_ros.features.gradient import feature_maps_by_torch, GradientSettings
+from stavpr_ros.features.gradient import FLOOR, GradientSettings
 from stavpr_ros.mapping import small_gray
 from stavpr_ros.sources.encodings import decode_message
 from timing import timed
 import torch
+from torch.nn.functional import avg_pool2d, pad
 
 WIDTH, HEIGHT, BATCH = 640, 480, 16
 FULL_HD, FULL_HD_IMAGES = (1920, 1080), 8
@@ -37,7 +39,33 @@ def by_torch(images: list[np.ndarray]) -> Any:
     s = GradientSettings()
     square = partial(cv2.resize, dsize=(s.size, s.size), interpolation=cv2.INTER_AREA)
     gray = np.stack([square(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for image in images])
-    return normalize(cut_strips(feature_maps_by_torch(torch.from_numpy(gray), s), 7))
+    return normalize(cut_strips(feature_maps_by_torch(torch.from_numpy(gray), s).numpy(), 7))
+
+
+def feature_maps_by_torch(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
+    """
+    Compute the feature maps of square images with torch's operators, on their device.
+
+    :param gray: shape (n, size, size), uint8.
+    :returns: shape (n, orientations, cells, cells), float32.
+    """
+    padded = pad(gray[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
+    dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
+    dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
+    period = 2 * math.pi if settings.signed else math.pi
+    bins = settings.orientations
+    position = (torch.atan2(dy, dx) * (bins / period)).remainder_(bins)
+    centers = torch.arange(bins, dtype=torch.float32, device=gray.device)
+    offset = (position - centers[None, :, None, None]).abs_()
+    # linear between two bins
+    share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)
+    cell = settings.cell
+    share.mul_(torch.hypot(dx, dy))
+    # cells overlap by half; each is multiplied by the mean of 1 / norm of its four blocks
+    histograms = avg_pool2d(share, 2 * cell, stride=cell, padding=cell // 2)
+    energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
+    scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + FLOOR)
+    return histograms * avg_pool2d(scale, 2, stride=1)
 
 
 def raw_message(image: np.ndarray) -> Any:

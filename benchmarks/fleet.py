@@ -21,7 +21,6 @@ from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import unit_norm
 from stavpr_ros.sources import open_source
-import torch
 
 ROUTES = {
     'gardens_point/day_left': 'gardens_point/day_right',
@@ -38,10 +37,10 @@ def generated(traverses: list[LocalFeatures], count: int, seed: int = 0) -> Loca
     """Return the features of ``count`` generated places, see the module."""
     rng = np.random.default_rng(seed)
     W, _, d = traverses[0].strips.shape
-    strips, weights = torch.empty(W, count, d), torch.full((W, count), W**-0.5)
+    strips, weights = np.empty((W, count, d), np.float32), np.full((W, count), W**-0.5, np.float32)
     for low in range(0, count, ROUTE):
         high = min(low + ROUTE, count)
-        total = torch.zeros(W, high - low, d)
+        total = np.zeros((W, high - low, d), np.float32)
         for _ in range(2):
             source = traverses[rng.integers(len(traverses))].strips
             n = source.shape[1]

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from results import cpu_model, table, write_json
-import torch
+from stavpr_ros.threads import thread_count
 
 TINY = 300  # places
 CACHES = ('cold', 'warm')
@@ -148,7 +148,7 @@ def main() -> None:
         sizes = {path.name: path.stat().st_size / 1e6 for path in sorted(folder.iterdir())}
         pairs = product(CASES, CACHES)
         rows = [measure(folder / case.file, case, cache, arguments.runs) for case, cache in pairs]
-    print(f'{cpu_model()}, {torch.get_num_threads()} threads; {arguments.places:,} places')
+    print(f'{cpu_model()}, {thread_count()} threads; {arguments.places:,} places')
     print(', '.join(f'{name}: {size:.0f} MB' for name, size in sizes.items()))
     print('\n'.join(lines(rows)))
     if arguments.output:

@@ -27,7 +27,6 @@ import numpy as np
 if TYPE_CHECKING:
     from stavpr_ros.features.registry import Kind
     from stavpr_ros.pipeline import Pipeline
-    import torch
 
 TARGET = 1.1
 STRIPS = 7
@@ -81,15 +80,13 @@ class Synthetic:
     def __init__(self, settings: SyntheticSettings, device: str) -> None:
         self.settings = settings
 
-    def feature_maps(self, images: list[np.ndarray]) -> 'torch.Tensor':
+    def feature_maps(self, images: list[np.ndarray]) -> 'np.ndarray':
         """Return Gaussian feature maps, shape (n, d, 1, W), seeded by the image's first bytes."""
-        import torch
-
         generators = [
             np.random.default_rng(int.from_bytes(i.tobytes()[:8], 'little')) for i in images
         ]
         drawn = [g.standard_normal((self.settings.d, 1, STRIPS), np.float32) for g in generators]
-        return torch.from_numpy(np.stack(drawn))
+        return np.stack(drawn)
 
 
 def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int = 0) -> Memory:
@@ -132,7 +129,7 @@ def _save_map(path: Path, n: int, d: int) -> None:
     from stavpr_ros.features import FeatureSettings
     from stavpr_ros.mapping import descriptor_map, save_map
 
-    features = make_features(n, d, STRIPS, 'cpu', seed=0)
+    features = make_features(n, d, STRIPS, seed=0)
     features = replace(
         features, settings=FeatureSettings('synthetic', SyntheticSettings(d)), cells=(1, 1)
     )

@@ -24,7 +24,7 @@ from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
 from stavpr_ros.recognition import RecognizerSettings
-import torch
+from stavpr_ros.recognition.robust import normalize
 
 PAGE = ROOT / 'docs' / 'performance.md'
 BEGIN, END = '<!-- written by benchmarks/projection.py -->', '<!-- end of projection -->'
@@ -59,19 +59,19 @@ def projected(
     if projection == 'pca':
         place_map = with_principal_components(place_map, dimension)
         assert place_map.projection is not None
-        matrix = torch.from_numpy(place_map.projection.matrix)
+        matrix = place_map.projection.matrix
     else:
         rng = np.random.default_rng(0)
         shape = place_map.features.dimension, dimension
-        matrix = torch.from_numpy(rng.standard_normal(shape).astype(np.float32))
+        matrix = rng.standard_normal(shape).astype(np.float32)
         place_map = replace(place_map, features=_times(place_map.features, matrix))
     query = _times(query, matrix)
     return place_map, replace(query, settings=place_map.features.settings)
 
 
-def _times(features: Any, matrix: torch.Tensor) -> Any:
+def _times(features: Any, matrix: np.ndarray) -> Any:
     strips = features.strips @ matrix
-    strips /= strips.norm(dim=2, keepdim=True).clamp_(min=1e-12)
+    normalize(strips)
     return replace(features, strips=strips, cells=None)
 
 

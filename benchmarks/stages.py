@@ -30,7 +30,7 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings, MeanCentering, z_normalized
+from stavpr_ros.recognition.robust import FilterSettings, MeanCentering, normalize, z_normalized
 from stavpr_ros.recognition.window import SequenceBuffer
 from stavpr_ros.sources.frame import ImageRecord
 from timing import best_seconds, timed
@@ -68,13 +68,12 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
     buffer = SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k)
     for row in rows:
         normalized = z_normalized(row)
-        buffer.push(torch.from_numpy(normalized))
+        buffer.push(normalized)
     sizes = Sizes(n, 0, l=SEQUENCE.length)
     add('query_znorm', call=lambda: z_normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
-    newest = torch.from_numpy(normalized)
-    add('window_push', call=lambda: buffer.push(newest), works=[bounds.window_push(sizes)])
+    add('window_push', call=lambda: buffer.push(normalized), works=[bounds.window_push(sizes)])
 
-    window = buffer.rows().numpy()[:, :n]
+    window = buffer.rows()[:, :n]
     middle = (SEQUENCE.length - 1) // 2
     lag = SEQUENCE.length - 1 - middle
     place_filter = PlaceFilter(n, lag, FILTER)
@@ -124,7 +123,7 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
 
 def device_retrieval(run: Run, n: int, seed: int) -> None:
     """Measure LM-DTW, selection and path on a GPU: one launch, one copy back."""
-    from stavpr_ros.recognition.lm_dtw_window import CudaLmDtwWindow
+    from stavpr_ros.recognition.cuda_windows import CudaLmDtwWindow
 
     rows = make_window(SEQUENCE.length, n, seed)
     window = CudaLmDtwWindow(SEQUENCE, n)
@@ -177,20 +176,20 @@ def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
 
 def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: int) -> None:
     """Measure the stages that read features, and whole frames in both modes."""
-    places = make_features(n, d, STRIPS, run.device, seed)
-    queries = make_features(FRAMES, d, STRIPS, 'cpu', seed + 1)
+    places = make_features(n, d, STRIPS, seed)
+    queries = make_features(FRAMES, d, STRIPS, seed + 1)
     sizes, size = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), (n, d)
     centered = partial(MeanCentering(places).next_query, queries.strips[:, 0])
     run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
     for precision in precisions:
         peers = references(run, places, queries[:1], precision)
         matcher = make_matcher(places, SPATIAL, run.device, precision)
-        batch = queries.to(run.device)
-        call = partial(matcher.distances, batch.strips[:, 0].contiguous(), batch.weights[:, 0])
+        first = np.ascontiguousarray(queries.strips[:, 0])
+        call = partial(matcher.distances, first, queries.weights[:, 0])
         works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
         run.measure('image_distances', size, call, works, peers, precision)
         if n <= MATRIX_PLACES:
-            call = partial(matcher.distance_matrix, batch.strips, batch.weights)
+            call = partial(matcher.distance_matrix, queries.strips, queries.weights)
             works = [bounds.product(sizes, precision, FRAMES)]
             works += [bounds.spatial_alignment(sizes, FRAMES)]
             many = [product(run, places, queries)]
@@ -233,15 +232,15 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
-        block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, 'cpu', seed + low)
+        block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, seed + low)
         rounded.write(low, block.strips)
-    query = make_features(1, d, STRIPS, 'cpu', seed)
-    weights = torch.full((STRIPS, n), STRIPS**-0.5)
+    query = make_features(1, d, STRIPS, seed)
+    weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
     places = Int8Features(rounded, weights, query.settings)
     exact = CpuMatcher(places, SPATIAL, 'int8')
     probable = np.linspace(0, n - BLOCK, TOP).astype(np.int64)
     stage = FirstStage(exact, places, lambda: probable)
-    arguments = query.strips[:, 0].contiguous(), query.weights[:, 0]
+    arguments = np.ascontiguousarray(query.strips[:, 0]), query.weights[:, 0]
     sizes = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k)
     works = [bounds.product(sizes, 'int8'), bounds.spatial_alignment(sizes)]
     call = partial(exact.distances, *arguments)
@@ -262,12 +261,15 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
         return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVEN:,} places')
     extractor, d = FeatureExtractor(projection=PROJECTED), PROJECTED
     images = np.random.default_rng(seed).integers(0, 256, (DRIVEN, 48, 64, 3), np.uint8)
-    driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, 'cpu', seed)
-    strips = strips.strips.mul_(d**0.5 * driven.strips.std(dim=1, keepdim=True))
-    strips.add_(driven.strips.mean(dim=1, keepdim=True))
-    strips.div_(torch.linalg.vector_norm(strips, dim=2, keepdim=True))
+    driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, seed)
+    strips = strips.strips
+    strips *= d**0.5 * driven.strips.std(axis=1, keepdims=True)
+    strips += driven.strips.mean(axis=1, keepdims=True)
+    normalize(strips)
     strips[:, (n - DRIVEN) // 2 :][:, :DRIVEN] = driven.strips
-    features = LocalFeatures(strips, torch.full((STRIPS, n), STRIPS**-0.5), extractor.settings)
+    features = LocalFeatures(
+        strips, np.full((STRIPS, n), STRIPS**-0.5, np.float32), extractor.settings
+    )
     poses = np.zeros((n, 7))
     poses[:, 0], poses[:, 6] = np.arange(n), 1
     names = ('',) * n
@@ -299,10 +301,12 @@ def references(
     """Return the peers of one image's distances: torch's product, a search for the nearest."""
     found = [product(run, places, query)]
     if run.device == 'cpu':
-        images, image = (each.strips.transpose(0, 1).flatten(1) for each in (places, query))
+        images, image = (
+            each.strips.transpose(1, 0, 2).reshape(len(each), -1) for each in (places, query)
+        )
         search = faiss_peer if precision == 'float32' else usearch_peer
         try:
-            found.append(search(images.numpy(), image.numpy()))
+            found.append(search(images, image))
         except ImportError as error:
             name = str(error.name).split('.', maxsplit=1)[0]
             run.skip(name, 0, 0, f'not installed (requirements/{SEARCHES[name]}.txt)')
@@ -339,8 +343,11 @@ def product(run: Run, places: LocalFeatures, queries: LocalFeatures) -> Peer:
     The faster orientation of a skinny product depends on the machine. The memory of the result is
     allocated beforehand.
     """
-    strips = places.strips.flatten(0, 1)
-    rows = queries.strips.transpose(0, 1).flatten(0, 1).to(strips.device)
+    d = places.dimension
+    strips, rows = (
+        torch.from_numpy(np.ascontiguousarray(each.reshape(-1, d))).to(run.device)
+        for each in (places.strips, queries.strips.transpose(1, 0, 2))
+    )
     out = torch.empty(len(rows) * len(strips), device=strips.device)
     wide, tall = out.view(len(rows), -1), out.view(len(strips), -1)
     forms: dict[str, Call] = {

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The choice of the device for the features and of the backend for the matching."""
 
+import ctypes
+from functools import cache
 import importlib.util
 
 from stavpr_ros.checks import require_choice
@@ -17,10 +19,8 @@ def choose_device(requested: str) -> str:
     :raises SettingsError: no such device.
     :raises UnavailableError: ``cuda`` was requested and is not available.
     """
-    import torch
-
     require_choice('device', requested, DEVICES)
-    available = torch.cuda.is_available()
+    available = torch_has_cuda()
     if requested == 'cuda' and not available:
         raise UnavailableError(
             "device 'cuda': torch finds no CUDA device here; take 'cpu' or 'auto'"
@@ -46,9 +46,7 @@ def choose_backend(requested: str) -> str:
 
 def why_no_cuda() -> str:
     """Return the reason why the ``cuda`` backend is not available; empty when it is."""
-    import torch
-
-    if not torch.cuda.is_available():
+    if not torch_has_cuda():
         return 'torch finds no CUDA device here'
     if importlib.util.find_spec('numba_cuda') is None:
         return (
@@ -56,3 +54,15 @@ def why_no_cuda() -> str:
             'or numba-cuda[cu12] where the driver is one for CUDA 12'
         )
     return ''
+
+
+@cache
+def torch_has_cuda() -> bool:
+    """Return whether torch has a CUDA device; without a driver, torch is not imported."""
+    try:
+        ctypes.CDLL('libcuda.so.1')
+    except OSError:
+        return False
+    import torch
+
+    return bool(torch.cuda.is_available())

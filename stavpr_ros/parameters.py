@@ -150,8 +150,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'backend',
             'auto',
-            'Device of feature extraction and image distances; auto: CUDA if it is available. '
-            'Loop closure matches on the CPU, except with cuda.',
+            'Device of networks and of the image distances of localization; auto: CUDA if it is '
+            'available. Features gradient and loop closure are computed on the CPU.',
             choices=('auto', 'cpu', 'cuda'),
         ),
     ),

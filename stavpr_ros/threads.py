@@ -6,25 +6,30 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from functools import cache
 import os
+import sys
 import threading
 from typing import TypeVar
 
 Result = TypeVar('Result')
+_limits = [0]  # the last one set
 
 
 def wait_passively() -> None:
     """
-    Let threads that wait for each other sleep instead of spin; before torch or numba is imported.
+    Let threads that wait for each other sleep instead of spin; before NumPy is imported.
 
     Spinning is OpenMP's default. It saves 1.5 ms an image on an idle machine and costs 100 ms when
-    another process wants the same cores. A choice that the user has made (OMP_WAIT_POLICY) stays.
+    another process wants the same cores. NumPy's products get one thread each, which spins as well
+    otherwise: blocks of a map are multiplied side by side. A choice that the user has made
+    (OMP_WAIT_POLICY, OPENBLAS_NUM_THREADS) stays.
     """
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 
 def limit_threads(count: int) -> None:
     """
-    Limit torch, numba and OpenCV to so many threads.
+    Limit numba, OpenCV, and torch where it is loaded, to so many threads.
 
     OpenCV's limit is that of the process, the others' for the calling thread.
 
@@ -32,23 +37,40 @@ def limit_threads(count: int) -> None:
     """
     import cv2
     import numba
-    import torch
 
-    of_torch, of_opencv = _unlimited()
+    _limits[:] = [count]
     most = numba.config.NUMBA_NUM_THREADS
     # before torch: the start of numba's threads sets the number of OpenMP's, which is torch's
     numba.set_num_threads(min(count or most, most))
-    torch.set_num_threads(count or of_torch)
-    cv2.setNumThreads(count or of_opencv)
+    cv2.setNumThreads(count or _of_opencv())
+    if torch := sys.modules.get('torch'):
+        torch.set_num_threads(count or _of_torch())
+
+
+def thread_limit() -> int:
+    """Return the limit of threads, for libraries that are loaded later; 0 = none."""
+    return _limits[0]
+
+
+def thread_count() -> int:
+    """Return the number of threads that the calling thread may use."""
+    import numba
+
+    return int(numba.get_num_threads())
 
 
 @cache
-def _unlimited() -> tuple[int, int]:
-    """Return how many threads torch and OpenCV take before the first limit."""
+def _of_opencv() -> int:
+    """Return how many threads OpenCV takes before the first limit."""
     import cv2
-    import torch
 
-    return torch.get_num_threads(), cv2.getNumThreads()
+    return int(cv2.getNumThreads())
+
+
+@cache
+def _of_torch() -> int:
+    """Return how many threads torch takes before the first limit."""
+    return int(sys.modules['torch'].get_num_threads())
 
 
 def call_on_thread(function: Callable[[], Result], name: str) -> Future[Result]:

@@ -8,6 +8,8 @@ from pathlib import Path
 import subprocess
 import sys
 
+import cv2
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -102,6 +104,35 @@ def test_package_and_parameters_import_lightly():
         [sys.executable, '-c', code], capture_output=True, text=True, check=True
     ).stdout
     assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())
+
+
+def test_mapping_and_localization_with_gradient_load_no_torch(tmp_path):
+    """Nor what reads other inputs; a folder of images to a map, and the map to a match."""
+    rng = np.random.default_rng(0)
+    for i, image in enumerate(rng.integers(0, 256, (40, 48, 64, 3), np.uint8)):
+        cv2.imwrite(str(tmp_path / f'{i:02}.png'), image)
+    code = f"""
+import sys
+from stavpr_ros.commands.build_map import main
+from stavpr_ros.mapping import open_map
+from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.sources import open_source
+assert main(['--input', {str(tmp_path)!r}, '--output', {str(tmp_path / 'map')!r}]) == 0
+place_map = open_map({str(tmp_path / 'map')!r})
+extractor, recognizer = place_map.extractor(), PlaceRecognizer(place_map, RecognizerSettings())
+images = [frame.image for frame in open_source({str(tmp_path)!r})]
+for image in images:
+    match = recognizer.update(extractor.extract([image]))
+print('\\n', match.status.name, *sys.modules)
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    status, *loaded = done.stdout.splitlines()[-1].split()
+    assert status in ('MATCH', 'NO_MATCH')
+    assert not {'torch', 'rclpy', 'onnx', 'matplotlib', 'sklearn'} & set(loaded)
 
 
 def test_modules_import_each_other_without_cycles():

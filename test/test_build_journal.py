@@ -16,7 +16,6 @@ from stavpr_ros.mapping.builder import build_journal
 from stavpr_ros.mapping.journal import JournalReader
 from stavpr_ros.mapping.journal_map import journal_map
 from stavpr_ros.sources.frame import Frame
-import torch
 
 EXTRACTOR = FeatureExtractor()
 
@@ -46,7 +45,7 @@ def until(frames, count):
 def assert_equal(found, expected):
     assert (found.ids, list(found.thumbnails)) == (expected.ids, list(expected.thumbnails))
     for name in ('strips', 'weights'):
-        assert torch.equal(getattr(found.features, name), getattr(expected.features, name))
+        assert np.array_equal(getattr(found.features, name), getattr(expected.features, name))
     np.testing.assert_array_equal(found.stamps, expected.stamps)
     np.testing.assert_array_equal(found.poses, expected.poses)
 
@@ -98,8 +97,8 @@ def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
 
     class Extractor(SimpleNamespace):
         def extract(self, images):
-            strips = torch.full((7, len(images), d), d**-0.5)
-            weights = torch.full((7, len(images)), 7**-0.5)
+            strips = np.full((7, len(images), d), d**-0.5, np.float32)
+            weights = np.full((7, len(images)), 7**-0.5, np.float32)
             return LocalFeatures(strips, weights, EXTRACTOR.settings, (14, 2))
 
     extractor = Extractor(settings=EXTRACTOR.settings, projection=None)

@@ -6,6 +6,7 @@ import threading
 import time
 
 import cv2
+import numba
 import numpy as np
 from processes import SECOND, TIMEOUT
 import pytest
@@ -16,7 +17,6 @@ from robot import image_message
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import load_map
 from stavpr_ros.threads import limit_threads
-import torch
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
@@ -218,14 +218,14 @@ def test_save_path_that_cannot_be_written_is_rejected(make_node, tmp_path):
 
 
 def test_limit_of_threads_can_be_removed(make_node):
-    """The limit of OpenCV holds for the process, that of torch for the worker."""
+    """The limit of OpenCV holds for the process, that of numba for the worker."""
     limit_threads(0)
-    before = torch.get_num_threads(), cv2.getNumThreads()
+    before = numba.get_num_threads(), cv2.getNumThreads()
     node = make_node(threads=1)
     for threads, expected in ((1, (1, 1)), (0, before)):
         assert set_parameter(node, 'threads', threads).successful
         assert node.trigger_configure() == SUCCESS
-        counts = node.runtime.worker.run(lambda: (torch.get_num_threads(), cv2.getNumThreads()))
+        counts = node.runtime.worker.run(lambda: (numba.get_num_threads(), cv2.getNumThreads()))
         assert counts == expected
         assert node.trigger_cleanup() == SUCCESS
 

@@ -15,7 +15,6 @@ from stavpr_ros.features.descriptors import (
     read_descriptors,
     require_comparable,
 )
-import torch
 
 D = 24
 
@@ -52,7 +51,7 @@ def test_read_descriptors_of_each_kind_of_file(tmp_path, vectors, kind):
     path = save(tmp_path, kind, vectors)
     assert is_descriptors(path)
     features = read_descriptors(path, 'netvlad')
-    assert features.strips.dtype == torch.float32
+    assert features.strips.dtype == np.float32
     assert features.strips.shape == (1, 40, D)
     np.testing.assert_allclose(features.strips[0], unit(vectors), atol=1e-6)
     assert features.weights[0].tolist() == [float(i != 5) for i in range(40)]

@@ -15,7 +15,6 @@ from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.filter_paths import smooth
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART
-import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 PLACES, LENGTH = 240, 12
@@ -163,17 +162,17 @@ def test_standing_camera_changes_no_probability(recognizer, route):
 
 def test_equal_images_in_dark_stretch_of_map_move_on(route):
     """Without evidence, at the speed before: the camera may move there."""
-    dark = features_of(route).strips.numpy().copy()
+    dark = features_of(route).strips.copy()
     dark[:, 20:50] = 0
     window = FilterWindow(SequenceSettings(4), PLACES)
     seen = PlaceChanges(PLACES, APART)
-    seen.add(torch.from_numpy(dark))
+    seen.add(dark)
     window.change.learn(seen.changes)
     at, images = np.arange(PLACES), 30
     for i in range(images):
         z = np.where(np.abs(at - i) < 2, -4, 0).astype(np.float32)
         lit = i < 18
-        z = torch.from_numpy(z if lit else np.zeros_like(z))
+        z = z if lit else np.zeros_like(z)
         window.add(z, i, window.change.curve[1] * lit)
     assert window.filter.count == images
     mean = window.filter.places_of_states() @ at / window.filter.places_of_states().sum()
@@ -209,7 +208,7 @@ def test_places_are_counted_from_first_ever():
     rows[np.arange(9), np.arange(12, 21)] = -6
     whole, evicted = (FilterWindow(SequenceSettings(5), 30) for _ in range(2))
     for i, row in enumerate(rows):
-        z = torch.from_numpy(row)
+        z = row
         whole.add(z, i, 1.0)
         if i == 8:
             evicted.evict(4)

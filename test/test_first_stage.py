@@ -14,7 +14,7 @@ from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSetti
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.first_stage import CHUNK, FirstStage
 from stavpr_ros.recognition.matcher import PRECISIONS
-import torch
+from stavpr_ros.recognition.robust import unit_norm
 
 W, d = 7, 40
 SETTINGS = RecognizerSettings(mode='robust')
@@ -28,7 +28,7 @@ def random_features(n, seed=0, strips=W):
 def noisy(features, share=0.4, seed=1):
     """Return the same images, seen otherwise."""
     mixed = features.strips + share * random_features(len(features), seed).strips
-    return replace(features, strips=mixed / mixed.norm(dim=2, keepdim=True))
+    return replace(features, strips=unit_norm(mixed))
 
 
 def stage_of(features, probable=(), precision='float32', spatial=None):
@@ -64,7 +64,7 @@ def test_coarse_distances_equal_plain_loops_over_shifts(monkeypatch):
     queries = first_stage.int8.tiled(rows[:, None])
     features = stage._reduced.kernel_arguments()
     first_stage.int8.smallest_distances(features, queries, CHUNK, out, nearest)
-    x, y = query.strips[:, 0].double().numpy(), places.strips.double().numpy()
+    x, y = query.strips[:, 0].astype(np.float64), places.strips.astype(np.float64)
     for place in range(300):
         cosines = []
         for shift in range(-3, 4):
@@ -79,8 +79,8 @@ def test_row_is_exact_at_candidates_and_of_same_scale_elsewhere(few):
     features = random_features(5000)
     matcher, stage = stage_of(features, probable=[1280])
     query = noisy(features[3333:3334])
-    found = stage.distances(query.strips[:, 0], query.weights[:, 0]).numpy()
-    expected = matcher.distances(query.strips[:, 0], query.weights[:, 0]).numpy()
+    found = stage.distances(query.strips[:, 0], query.weights[:, 0])
+    expected = matcher.distances(query.strips[:, 0], query.weights[:, 0])
     exact = np.isclose(found, expected, atol=1e-6)
     assert exact[3328 : 3328 + CHUNK].all(), 'the nearest chunk'
     assert exact[1280 : 1280 + 128 + CHUNK].all(), 'what the filter finds probable'
@@ -96,8 +96,8 @@ def test_image_shifted_by_strips_is_among_candidates(few, shift):
     features = random_features(5000)
     _, stage = stage_of(features)
     query = noisy(features[3333:3334], 0.2)
-    strips = torch.roll(query.strips, shift, dims=0)
-    found = stage.distances(strips[:, 0], query.weights[:, 0]).numpy()
+    strips = np.roll(query.strips, shift, axis=0)
+    found = stage.distances(strips[:, 0], query.weights[:, 0])
     assert np.argmin(found) == 3333
 
 

@@ -26,7 +26,7 @@ from stavpr_ros.fleet.store import MapIndex, place_vectors, sample_places
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, Session
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-import torch
+from stavpr_ros.recognition.robust import unit_norm
 
 for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
     pytest.importorskip(package, reason='the extra fleet is not installed')
@@ -40,20 +40,17 @@ SOURCE = FeatureSettings('descriptors', settings_class('descriptors')(), 3)
 
 def walk(n, seed=0, d=24):
     """Unit-norm features of places that resemble their neighbors, (3, n, d)."""
-    generator = torch.Generator().manual_seed(seed)
-    noise = torch.randn(3, n + 2, d, generator=generator)
+    noise = np.random.default_rng(seed).standard_normal((3, n + 2, d), np.float32)
     strips = noise[:, 2:] + 0.7 * noise[:, 1:-1] + 0.4 * noise[:, :-2]
-    strips /= strips.norm(dim=2, keepdim=True)
-    return LocalFeatures(strips, torch.full((3, n), 3**-0.5), SOURCE)
+    strips = unit_norm(strips)
+    return LocalFeatures(strips, np.full((3, n), 3**-0.5, np.float32), SOURCE)
 
 
 def seen_again(features, noise=0.6, seed=1):
     """Return the places of features on another day."""
-    generator = torch.Generator().manual_seed(seed)
-    strips = features.strips + noise * torch.randn(
-        features.strips.shape, generator=generator
-    ) / np.sqrt(features.dimension)
-    return replace(features, strips=strips / strips.norm(dim=2, keepdim=True))
+    drawn = np.random.default_rng(seed).standard_normal(features.strips.shape, np.float32)
+    strips = features.strips + np.float32(noise / np.sqrt(features.dimension)) * drawn
+    return replace(features, strips=unit_norm(strips))
 
 
 @pytest.fixture(scope='module')
@@ -101,10 +98,12 @@ def test_fetch_returns_places_of_every_store(store, tmp_path, server):
     city = city_in(place_map, store, tmp_path, server)
     places = np.array([2, 3, 4, 20])
     fetched, same_as = city.store.fetch(places)
-    torch.testing.assert_close(
+    np.testing.assert_allclose(
         fetched.features.strips, place_map.features.strips[:, places], atol=1e-3, rtol=0
     )
-    torch.testing.assert_close(fetched.features.weights, place_map.features.weights[:, places])
+    np.testing.assert_allclose(
+        fetched.features.weights, place_map.features.weights[:, places], rtol=1e-5, atol=1e-5
+    )
     assert same_as.tolist() == [2, 3, 4, 5]
     assert fetched.ids == ('place 2', 'place 3', 'place 4', 'place 20')
     np.testing.assert_array_equal(fetched.poses, place_map.poses[places])
@@ -134,7 +133,7 @@ def test_sample_places_holds_runs_of_neighbors():
 def test_place_vectors_of_one_strip_and_of_seven():
     strips = walk(4).strips[:1]
     np.testing.assert_allclose(place_vectors(strips), strips[0], atol=1e-6)
-    seven = torch.cat([walk(4, seed).strips for seed in range(3)])[:7]
+    seven = np.concatenate([walk(4, seed).strips for seed in range(3)])[:7]
     vectors = place_vectors(seven)
     assert vectors.shape == (4, 72)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)

@@ -12,7 +12,6 @@ from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import encode_thumbnail, growing_map, GrowingMap, load_map, save_map
-import torch
 
 # 7 x 7 cells, one column a strip
 EXTRACTOR = FeatureExtractor('gradient', GradientSettings(28, cell=4, orientations=2))
@@ -26,8 +25,10 @@ def little_room(monkeypatch):
 
 
 def features(i, d=D, settings=EXTRACTOR.settings, count=1):
-    strips = torch.arange(W * count * d, dtype=torch.float32).reshape(W, count, d) + 1000 * i
-    return LocalFeatures(strips / 2**20, torch.full((W, count), i / 128), settings, (7, 1))
+    strips = np.arange(W * count * d, dtype=np.float32).reshape(W, count, d) + 1000 * i
+    return LocalFeatures(
+        strips / 2**20, np.full((W, count), i / 128, np.float32), settings, (7, 1)
+    )
 
 
 def where(i):
@@ -58,7 +59,7 @@ def assert_holds(made, numbers):
     assert tuple(made.ids) == tuple(f'place {i}' for i in numbers)
     assert tuple(made.features.strips.shape) == (W, len(numbers), D)
     for place, i in enumerate(numbers):
-        torch.testing.assert_close(
+        np.testing.assert_allclose(
             made.features.strips[:, place], features(i).strips[:, 0], rtol=0, atol=0
         )
         assert made.features.weights[:, place].tolist() == [i / 128] * W

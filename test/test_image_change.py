@@ -17,7 +17,6 @@ from stavpr_ros.recognition.map_change import (
     STRETCH,
 )
 from stavpr_ros.recognition.robust import FilterSettings
-import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SETTINGS = FilterSettings()
@@ -36,7 +35,7 @@ def plain_change(a, b):
 
 def learned(strips):
     change, seen = ImageChange(strips.shape[1], SETTINGS), PlaceChanges(strips.shape[1], APART)
-    seen.add(torch.from_numpy(strips))
+    seen.add(strips)
     change.learn(seen.changes)
     return change
 

@@ -21,18 +21,17 @@ from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.int8_features import rounded
 from stavpr_ros.recognition.matcher import make_matcher
-import torch
 
 TILE = int8.TILE
 
 
 def unit(strips):
-    return strips / strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
+    return strips / np.linalg.norm(strips, axis=-1, keepdims=True).clip(1e-12)
 
 
 def random_strips(W, n, d, seed=0):
     """Return unit-norm strips (W, n, d), the first of the first image zero."""
-    strips = unit(torch.randn((W, n, d), generator=torch.Generator().manual_seed(seed)))
+    strips = unit(np.random.default_rng(seed).standard_normal((W, n, d), np.float32))
     if n:
         strips[0, 0] = 0
     return strips
@@ -40,7 +39,7 @@ def random_strips(W, n, d, seed=0):
 
 def features_of(strips):
     W, n, _ = strips.shape
-    weights = torch.full((W, n), W**-0.5)
+    weights = np.full((W, n), W**-0.5, np.float32)
     return LocalFeatures(strips, weights, FeatureSettings('gradient', GradientSettings(), W))
 
 
@@ -59,7 +58,7 @@ def expected_distances(held, queries, x):
     whole, lengths = int8.rounded_queries(queries)
     n = held.shape[1]
     return oracle.whole_number_distances(
-        whole[x], held.rounded().numpy(), lengths[x], held.reciprocals[:, :n]
+        whole[x], held.rounded(), lengths[x], held.reciprocals[:, :n]
     )
 
 
@@ -93,10 +92,10 @@ def test_vectors_equal_single_strips_bit_for_bit(n, d):
 @pytest.mark.parametrize('d', [1, 2, 8, 224, 1000])
 def test_products_of_extreme_strips_neither_saturate_nor_overflow(d):
     """Strips with one value, all equal, two neighbors, in all signs: the largest products."""
-    one, two, even = torch.zeros(d), torch.zeros(d), torch.ones(d)
+    one, two, even = np.zeros(d, np.float32), np.zeros(d, np.float32), np.ones(d, np.float32)
     one[d // 2], two[: min(2, d)] = 1, 1
     kinds = [unit(sign * x) for x in (one, two, even) for sign in (1, -1)]
-    strips = torch.stack([torch.stack(kinds)] * 2)  # (2, 6, d)
+    strips = np.stack([np.stack(kinds)] * 2)  # (2, 6, d)
     for x in range(len(kinds)):
         found, held = kernel_distances(strips, strips, x)
         np.testing.assert_array_equal(found, expected_distances(held, strips, x))
@@ -109,23 +108,25 @@ def test_rounding_moves_distances_little(d):
     """A rounded value is off by half a step; strips are as long as 16 bits of a product allow."""
     reference, query = random_strips(1, 400, d), random_strips(1, 2, d, seed=1)
     found, held = kernel_distances(reference, query, 1)
-    whole = held.rounded().numpy()[0].astype(np.int64)
+    whole = held.rounded()[0].astype(np.int64)
     assert np.sqrt((whole**2).sum(axis=1)).max() <= int8.LONGEST
     assert np.abs(whole).max() <= 127
-    exact = 1 - reference[0].double() @ query[0, 1].double()
-    off = found[0, 0] - exact.numpy()
+    exact = 1 - reference[0].astype(np.float64) @ query[0, 1].astype(np.float64)
+    off = found[0, 0] - exact
     # both sides are off by a vector of length sqrt(d / 12) / N in a direction of its own
     N = int8.LONGEST - np.sqrt(d) / 2
     assert np.sqrt((off**2).mean()) < 1.5 * max(np.sqrt(2 / 12) / N, 0.29 / 63)
     assert held[:, 3:5].shape == (1, 2, d)
-    assert (held[:, 3:5] - reference[:, 3:5]).norm(dim=2).max() < 1.3 * np.sqrt(d / 12) / N
+    assert (
+        np.linalg.norm(held[:, 3:5] - reference[:, 3:5], axis=2).max() < 1.3 * np.sqrt(d / 12) / N
+    )
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
 def test_matcher_in_int8_equals_functions_of_its_strip_distances(strategy):
     reference, queries = features_of(random_strips(7, 300, 20)), random_strips(7, 3, 20, seed=1)
     spatial = SpatialSettings(strategy)
-    weights = torch.full((7, 3), 7**-0.5)
+    weights = np.full((7, 3), 7**-0.5, np.float32)
     matrix = CpuMatcher(reference, spatial, 'int8').distance_matrix(queries, weights)
     assert matrix.shape == (3, 300)
     for x in range(3):
@@ -202,10 +203,10 @@ def test_instruction_of_processor_fits_its_lanes():
 
 
 HASHED = """
-import hashlib, numpy as np, torch
+import hashlib, numpy as np
 from stavpr_ros.alignment.cpu import int8
 rng = np.random.default_rng(0)
-strips = torch.from_numpy(rng.standard_normal((3, 21, 37)).astype(np.float32))
+strips = rng.standard_normal((3, 21, 37)).astype(np.float32)
 held = int8.Int8Strips(3, 21, 37)
 held.write(0, strips)
 out = np.empty((7, 3, 21), np.float32)

@@ -22,7 +22,6 @@ from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.place_map import Place
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
-import torch
 
 BYTES = (0, 5, 9, 13, 20, 1500)  # of each part of a record
 
@@ -80,7 +79,7 @@ def assert_equal(path, place_map):
     found = load_map(path)
     assert found.settings == place_map.settings
     for name in ('strips', 'weights'):
-        assert torch.equal(getattr(found.features, name), getattr(place_map.features, name))
+        assert np.array_equal(getattr(found.features, name), getattr(place_map.features, name))
     np.testing.assert_array_equal(found.stamps, place_map.stamps)
     np.testing.assert_array_equal(found.poses, place_map.poses)
     assert (found.ids, found.thumbnails) == (place_map.ids, place_map.thumbnails)
@@ -285,7 +284,7 @@ def test_killed_recording_is_recovered_with_all_places(start, route, target):
     assert recover_maps(target, log) == str(target)
     assert '9 places of an earlier recording were recovered' in log.method_calls[0].args[0]
     assert stamps(target) == seconds(*range(1, 10))
-    assert torch.equal(load_map(target).features.strips, expected.features.strips)
+    assert np.array_equal(load_map(target).features.strips, expected.features.strips)
     assert journals(target) == []
 
 
@@ -392,7 +391,7 @@ def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch)
     n = len(held)
     assert n <= len(found) < 80
     assert found.stamps[-n:].tolist() == held.stamps.tolist()
-    assert torch.allclose(found.features.strips[:, -n:], held.features.strips, atol=1e-6)
+    assert np.allclose(found.features.strips[:, -n:], held.features.strips, atol=1e-6)
 
 
 def test_operation_changes_keep_the_journal_of_unsaved_places(start, route, target):

@@ -20,7 +20,7 @@ from stavpr_ros.recognition import PlaceRecognizer, prepared_map, RecognizerSett
 from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.prepared_map import METHOD, statistics_of_map
 from stavpr_ros.recognition.robust import MeanCentering
-import torch
+from stavpr_ros.threads import limit_threads
 
 SETTINGS = RecognizerSettings(mode='robust')
 
@@ -37,11 +37,11 @@ def place_map():
     small = example_map()
     rng = np.random.default_rng(5)
     walk = rng.normal(size=(2, 610, 32)).cumsum(1).astype(np.float32)
-    strips = torch.from_numpy(walk[:, 10:] - walk[:, :-10])
+    strips = walk[:, 10:] - walk[:, :-10]
     strips[1, 7] = 0
-    strips /= strips.norm(dim=2, keepdim=True).clamp(min=1e-9)
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True).clip(1e-9)
     features = LocalFeatures(
-        strips, torch.full((2, 600), 0.5), small.settings, small.features.cells
+        strips, np.full((2, 600), 0.5, np.float32), small.settings, small.features.cells
     )
     return dataclasses.replace(
         small, features=features, stamps=np.zeros(600, np.int64), ids=('',) * 600, poses=None,
@@ -79,21 +79,17 @@ def test_answers_with_statistics_are_those_without_bit_for_bit(
 
 
 def test_several_threads_learn_the_same_as_one(place_map):
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            found.append(statistics_of_map(place_map).parts())
-            assert torch.get_num_threads() == threads
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (2, 1):  # the fixture ends with all again
+        limit_threads(threads)
+        found.append(statistics_of_map(place_map).parts())
     for name, array in found[0].items():
         np.testing.assert_array_equal(array, found[1][name])
 
 
 def test_changes_are_those_of_neighbors_up_to_five_places_apart(place_map):
     found = statistics_of_map(place_map)
-    centered = MeanCentering(place_map.features).places(place_map.features).strips.numpy()
+    centered = MeanCentering(place_map.features).places(place_map.features).strips
     assert found.changes.shape == (APART, 600)
     for place, apart in ((8, 1), (256, 1), (258, 4), (599, 5), (3, 3)):
         similarity = np.einsum('jd,jd->j', centered[:, place], centered[:, place - apart])
@@ -118,7 +114,7 @@ def change_file(path, change=lambda section: None, **parts):
 
 def test_statistics_of_other_features_are_learned_again_and_logged(place_map, tmp_path):
     path = save(place_map, tmp_path / 'map')
-    other = place_map.features.strips.flip(1).numpy()
+    other = place_map.features.strips[:, ::-1]
     change_file(path, strips=other)
     opened = open_map(path)
     found, note = answers(opened, 'float32')

@@ -21,7 +21,6 @@ from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.first_stage import FirstStage
-import torch
 
 W, d, D = 3, 8, 20
 BACKBONE = OnnxSettings(model='', layer='map', vector='global', sha256='0' * 64)
@@ -31,11 +30,11 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 
 def unit(*shape, seed=0):
     drawn = np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
-    return torch.from_numpy(drawn / np.linalg.norm(drawn, axis=-1, keepdims=True))
+    return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
 
 def features_of(n, seed=0):
-    weights = torch.full((W, n), W**-0.5)
+    weights = np.full((W, n), W**-0.5, np.float32)
     return LocalFeatures(unit(W, n, d, seed=seed), weights, SETTINGS, None, unit(n, D, seed=seed))
 
 
@@ -55,12 +54,12 @@ def test_map_file_returns_vectors(place_map, tmp_path, storage):
     save_map(place_map, path, storage)
     expected = place_map.features.vectors
     if storage == 'float16':
-        expected = expected.half().float()
+        expected = expected.astype(np.float16).astype(np.float32)
     opened, loaded = open_map(path), load_map(path)
-    assert torch.equal(loaded.features.vectors, expected)
-    assert torch.equal(opened.features.vectors, expected)
+    assert np.array_equal(loaded.features.vectors, expected)
+    assert np.array_equal(opened.features.vectors, expected)
     some = np.array([3, 4, 40])
-    assert torch.equal(opened.features[some].vectors, expected[some])
+    assert np.array_equal(opened.features[some].vectors, expected[some])
     stored = map_reader.read(path)[1]['vectors/vectors']
     np.testing.assert_array_equal(stored.astype(np.float32), expected)
     save_map(opened, tmp_path / 'b.stavpr')
@@ -84,7 +83,7 @@ def test_map_file_without_vectors_has_no_section(place_map, tmp_path):
     ],
 )
 def test_map_file_with_invalid_vectors_is_rejected(place_map, tmp_path, vectors, named):
-    bad = replace(place_map.features, vectors=torch.from_numpy(vectors))
+    bad = replace(place_map.features, vectors=vectors)
     save_map(replace(place_map, features=bad), tmp_path / 'a')
     with pytest.raises(MapFileError, match=named):
         load_map(tmp_path / 'a')
@@ -100,14 +99,14 @@ def grown(features, limit=100):
 def test_growing_map_holds_vectors(tmp_path):
     features = features_of(300)
     growing = grown(features, 400)
-    assert torch.equal(growing.snapshot().features.vectors, features.vectors)
+    assert np.array_equal(growing.snapshot().features.vectors, features.vectors)
     growing.forget(100)
-    assert torch.equal(growing.features.vectors, features.vectors[100:])
+    assert np.array_equal(growing.features.vectors, features.vectors[100:])
     save_map(growing.snapshot(), tmp_path / 'a')
     continued = GrowingMap.from_map(open_map(tmp_path / 'a'), 400)
     continued.add(features[:1], 999)
-    expected = torch.cat([features.vectors[100:], features.vectors[:1]])
-    assert torch.equal(continued.features.vectors, expected)
+    expected = np.concatenate([features.vectors[100:], features.vectors[:1]])
+    assert np.array_equal(continued.features.vectors, expected)
 
 
 def test_growing_map_of_a_route_that_another_object_holds_has_vectors():
@@ -116,15 +115,15 @@ def test_growing_map_of_a_route_that_another_object_holds_has_vectors():
     growing = GrowingMap(SETTINGS, None, 10, held_features=lambda: bare)
     for i in range(5):
         growing.add(features[i : i + 1])
-    assert torch.equal(growing.snapshot().features.vectors, features.vectors)
+    assert np.array_equal(growing.snapshot().features.vectors, features.vectors)
 
 
 @pytest.mark.parametrize(
     ('vectors', 'named'),
     [
         (None, 'no vector: places of the map have one of 20'),
-        (torch.zeros(1, 5), 'a vector of 5 dimensions'),
-        (torch.full((1, D), torch.nan), 'not finite'),
+        (np.zeros((1, 5), np.float32), 'a vector of 5 dimensions'),
+        (np.full((1, D), np.nan, np.float32), 'not finite'),
     ],
 )
 def test_growing_map_rejects_another_vector(vectors, named):
@@ -140,26 +139,28 @@ def test_journal_returns_vectors(place_map, tmp_path):
     for i in range(len(place_map)):
         writer.append(JournalPlace(i, place_map.place(i), place_map.features[i : i + 1], b''))
     writer.close()
-    assert torch.equal(journal_map(writer.path).features.vectors, place_map.features.vectors)
+    assert np.array_equal(journal_map(writer.path).features.vectors, place_map.features.vectors)
     assert recover(writer.path).recorded == 50
     found = load_map(target).features
-    assert torch.equal(found.vectors, place_map.features.vectors)
-    assert torch.equal(found.strips, place_map.features.strips)
+    assert np.array_equal(found.vectors, place_map.features.vectors)
+    assert np.array_equal(found.strips, place_map.features.strips)
 
 
 def test_maps_made_of_maps_keep_vectors(place_map):
     vectors = place_map.features.vectors
-    assert torch.equal(with_principal_components(place_map, 4).features.vectors, vectors)
+    assert np.array_equal(with_principal_components(place_map, 4).features.vectors, vectors)
     both = merge_maps([place_map, place_map], ['a', 'b'])
-    assert torch.equal(both.features.vectors, torch.cat([vectors, vectors]))
-    assert torch.equal(select_places(both, np.array([1, 60])).features.vectors, vectors[[1, 10]])
+    assert np.array_equal(both.features.vectors, np.concatenate([vectors, vectors]))
+    assert np.array_equal(
+        select_places(both, np.array([1, 60])).features.vectors, vectors[[1, 10]]
+    )
 
 
 def noisy(features, share):
     """Return the same images with other vectors."""
     drawn = unit(len(features), D, seed=9)
     vectors = features.vectors + share * drawn
-    return replace(features, vectors=vectors / vectors.norm(dim=1, keepdim=True))
+    return replace(features, vectors=vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 @pytest.fixture
@@ -179,12 +180,12 @@ def test_first_stage_takes_candidates_by_vector_not_by_strips(few):
     image = replace(features_of(1, seed=5), vectors=features.vectors[816:817])
     matcher = CpuMatcher(features, SpatialSettings())
     strips, weights = image.strips[:, 0], image.weights[:, 0]
-    expected = matcher.distances(strips, weights).numpy()
-    whole = LocalFeatures(features.vectors[None], torch.ones(1, 1200), SETTINGS)
+    expected = matcher.distances(strips, weights)
+    whole = LocalFeatures(features.vectors[None], np.ones((1, 1200), np.float32), SETTINGS)
 
     def exact_in_chunk(held, *vector):
         stage = FirstStage(matcher, held, lambda: np.empty(0, np.int64))
-        found = stage.distances(strips, weights, *vector).numpy()
+        found = stage.distances(strips, weights, *vector)
         return np.isclose(found, expected, atol=1e-6)[800:832].all()
 
     assert exact_in_chunk(whole, image.vectors)

@@ -25,7 +25,6 @@ from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.matcher import make_matcher, PRECISIONS
 from stavpr_ros.threads import limit_threads
-import torch
 
 ADAPTIVE = SpatialSettings()
 
@@ -35,8 +34,8 @@ def random_features(W, n, d, seed=0):
     rng = np.random.default_rng(seed)
     strips = rng.standard_normal((W, n, d))
     strips[0, :1] = 0
-    weights = torch.from_numpy(rng.uniform(0.1, 1, (W, n))).float()
-    return replace(features_of(strips), weights=torch.nn.functional.normalize(weights, dim=0))
+    weights = rng.uniform(0.1, 1, (W, n)).astype(np.float32)
+    return replace(features_of(strips), weights=weights / np.linalg.norm(weights, axis=0))
 
 
 # ------------------------------------------------ distances
@@ -58,9 +57,7 @@ def test_fused_distances_equal_separate_functions(W, n, d, strategy, data):
     matrix = CpuMatcher(features, spatial).distance_matrix(queries.strips, queries.weights)
     assert matrix.shape == (3, n)
     for x in range(3):
-        separate = image_distances(
-            strip_distances(queries.strips[:, x], features.strips).numpy(), spatial
-        )
+        separate = image_distances(strip_distances(queries.strips[:, x], features.strips), spatial)
         np.testing.assert_array_equal(matrix[x], separate)
         row = CpuMatcher(features, spatial).distances(queries.strips[:, x], queries.weights[:, x])
         np.testing.assert_array_equal(row, separate)
@@ -78,7 +75,7 @@ def test_strategies_without_dtw_equal_separate_functions(W):
             row = CpuMatcher(features, SpatialSettings('sliding_window')).distances(
                 strips, weights
             )
-            d = strip_distances(strips, features.strips).numpy()
+            d = strip_distances(strips, features.strips)
             np.testing.assert_array_equal(
                 row, image_distances(d, SpatialSettings('sliding_window'))
             )
@@ -98,9 +95,9 @@ def test_kernels_of_one_and_two_threads_return_same_bits():
     for threads in (1, 2):
         limit_threads(threads)
         matrices = [
-            make_matcher(features, SpatialSettings(strategy), 'cpu', precision)
-            .distance_matrix(queries.strips, queries.weights)
-            .numpy()
+            make_matcher(features, SpatialSettings(strategy), 'cpu', precision).distance_matrix(
+                queries.strips, queries.weights
+            )
             for strategy in ('adaptive', 'vanilla', 'sliding_window')
             for precision in PRECISIONS
         ]
@@ -121,7 +118,7 @@ def test_lm_dtw_window_equals_plain_functions(n):
     buffer = query.buffer
     rows = np.random.default_rng(0).random((23, n), np.float32)
     for i, row in enumerate(rows):
-        buffer.push(torch.from_numpy(row))
+        buffer.push(row)
         if buffer.full:
             found = query.match(3)
             window = rows[i - 4 : i + 1]
@@ -139,7 +136,7 @@ def test_lm_dtw_window_equals_plain_functions(n):
 def test_lm_dtw_window_without_places_has_no_match():
     one = LmDtwWindow(SequenceSettings(5), 0)
     for _ in range(5):
-        one.buffer.push(torch.empty(0))
+        one.buffer.push(np.empty(0, np.float32))
     found = one.match(3)
     assert found.nearest is None
     assert found.path.shape == (0, 2)

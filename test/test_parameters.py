@@ -182,7 +182,7 @@ def test_backend_summary_names_device_of_each_stage(
     monkeypatch.setattr(f'{module}.why_no_cuda', lambda: why_not)
     settings = PipelineSettings(backend=backend)
     assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
-    extracting = f'backend {backend}{why}: extraction on {extraction}'
+    extracting = f'backend {backend}{why}: networks on {extraction}'
     assert settings.backend_summary('mapping') == extracting
     assert settings.backend_summary(operation) == (
         f'{extracting}, image distances on {matching} (float32), sequences on {matching}'

@@ -30,7 +30,6 @@ from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.window import SequenceBuffer
-import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 
@@ -91,7 +90,7 @@ def test_mapping_records_places(route):
     np.testing.assert_array_equal(places.poses[:4], [at(i) for i in range(4)])
     assert np.isnan(places.poses[4:]).all()
     features = FeatureExtractor().extract(route[:8])
-    torch.testing.assert_close(places.features.strips, features.strips, atol=1e-6, rtol=0)
+    np.testing.assert_allclose(places.features.strips, features.strips, atol=1e-6, rtol=0)
     thumbnail = places.thumbnail(3)
     assert thumbnail.shape == (48, 64, 3)
     small = cv2.resize(route[3], (64, 48), interpolation=cv2.INTER_AREA).astype(float)

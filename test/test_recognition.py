@@ -20,7 +20,6 @@ from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.window import SequenceBuffer
 from stavpr_ros.sources import open_source
-import torch
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 
@@ -98,7 +97,7 @@ def test_recognizer_on_map_shorter_than_window_matches(small_map, places):
 def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, mode):
     one, other = (recognizer(small_map, mode=mode) for _ in range(2))
     features = small_map.features
-    strips = features[:].strips.clone()
+    strips = features[:].strips.copy()
     strips[2, 0, 0] = value
     damaged = LocalFeatures(strips, features.weights, features.settings)
     for each in (one, other):
@@ -161,7 +160,7 @@ def test_sequence_buffer_holds_last_rows_in_order(copies):
     buffer = SequenceBuffer(3, 2, 4, copies=copies)
     assert len(buffer.memory) == 3 * copies
     for value in range(8):
-        buffer.push(torch.tensor([value, -value], dtype=torch.float32), 10 * value)
+        buffer.push(np.array([value, -value], dtype=np.float32), 10 * value)
         assert len(buffer) == min(value + 1, 3)
         assert buffer.stamps == tuple(10 * i for i in range(max(0, value - 2), value + 1))
         assert buffer.newest().tolist() == [value, -value]
@@ -171,20 +170,20 @@ def test_sequence_buffer_holds_last_rows_in_order(copies):
             assert buffer.at(columns).tolist() == expected
             rows = buffer.rows()
             assert rows[:, 0].tolist() == [value - 2, value - 1, value]
-            assert rows.is_contiguous()
-            assert torch.isinf(rows[:, 2:]).all()
+            assert rows.flags.c_contiguous
+            assert np.isinf(rows[:, 2:]).all()
     buffer.clear()
     assert (len(buffer), buffer.known, buffer.stamps) == (0, 0, ())
-    assert torch.isinf(buffer.rows()).all()
+    assert np.isinf(buffer.rows()).all()
 
 
 @pytest.mark.parametrize('copies', [1, 2])
 def test_sequence_buffer_that_grows_and_evicts_keeps_rows(copies):
     buffer = SequenceBuffer(2, 3, 4, copies=copies)
-    buffer.push(torch.tensor([1.0, 2.0]))
+    buffer.push(np.array([1.0, 2.0], np.float32))
     assert buffer.known == 2
     buffer.grow(5)
-    buffer.push(torch.tensor([3.0, 4.0, 5.0, 6.0]))
+    buffer.push(np.array([3.0, 4.0, 5.0, 6.0], np.float32))
     assert buffer.rows()[:, :5].tolist() == [[1, 2, np.inf, np.inf, np.inf], [3, 4, 5, 6, np.inf]]
     buffer.evict(1)
     assert (buffer.first, buffer.known, buffer.places) == (1, 3, 5)
@@ -197,11 +196,11 @@ def test_sequence_buffer_that_grows_and_evicts_keeps_rows(copies):
 @pytest.mark.parametrize('value', [np.nan, -np.inf])
 def test_sequence_buffer_with_invalid_row_is_unchanged(value):
     buffer = SequenceBuffer(2, 3, 4)
-    buffer.push(torch.tensor([1.0, np.inf, 2.0]), 5)
-    before = buffer.rows().clone()
+    buffer.push(np.array([1.0, np.inf, 2.0], np.float32), 5)
+    before = buffer.rows().copy()
     with pytest.raises(InputError, match='1 NaN or -inf among 3'):
-        buffer.push(torch.tensor([1.0, value, 2.0]), 6)
-    assert torch.equal(buffer.rows(), before)
+        buffer.push(np.array([1.0, value, 2.0], np.float32), 6)
+    assert np.array_equal(buffer.rows(), before)
     assert (len(buffer), buffer.stamps) == (1, (5,))
 
 

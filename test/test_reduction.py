@@ -37,7 +37,7 @@ def test_directions_are_those_of_largest_variance(count):
     whole = map_of(frames, FeatureExtractor(), thumbnails=False, progress=False)
     assert (7 * count < whole.dimension) == (count == 30)
     reduced = with_principal_components(whole, D)
-    x = whole.features.strips.double().numpy()
+    x = whole.features.strips.astype(np.float64)
     centered = (x - x.mean(axis=1, keepdims=True)).reshape(-1, x.shape[2])
     _, _, directions = np.linalg.svd(centered, full_matrices=False)
     matrix = reduced.projection.matrix

@@ -16,7 +16,6 @@ from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.relative_motion import agreement
-import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 N, LENGTH, CORNER = 90, 10, 45
@@ -184,7 +183,7 @@ def test_reset_forgets_the_way():
 def test_loop_closure_compares_the_way_with_its_route():
     """The second lap turns left where the first turned right; evicted places change nothing."""
     first, second = corridor()
-    both = features_of(torch.cat([first.strips, second.strips], 1).numpy())
+    both = features_of(np.concatenate([first.strips, second.strips], 1))
     results = []
     for turn in (-90, 90):
         closer = LoopCloser(settings_of(), 20, first.settings, limit=150)

@@ -26,7 +26,6 @@ from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.window import ColumnLayout
-import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 LENGTH, PLACES = 10, 90
@@ -70,7 +69,7 @@ def test_filter_of_sessions_equals_plain_loops():
     for image in range(12):
         z, weights = rng.standard_normal(n).astype(np.float32), rng.uniform(0.1, 1, 3)
         alpha = 0.0 if image == 5 else 0.4
-        one.update(layout.spread(torch.from_numpy(z)).numpy(), alpha, weights)
+        one.update(layout.spread(z), alpha, weights)
         plain.update(z, alpha, weights)
         found = one.places_of_states()
         np.testing.assert_allclose(

@@ -87,9 +87,9 @@ def test_mean_of_a_route_counts_a_standstill_once(limit):
     held._learn(0)
     kept = slice(len(places) - held.count, None)
     once = np.flatnonzero(np.diff(places[kept], prepend=-1)) + kept.start
-    expected = features.strips[:, once].mean(dim=1)
-    far = (features.strips[:, kept].mean(dim=1) - expected).abs().max()
-    assert (held.mean - expected).abs().max() < 0.05 * far
+    expected = features.strips[:, once].mean(axis=1)
+    far = abs(features.strips[:, kept].mean(axis=1) - expected).max()
+    assert abs(held.mean - expected).max() < 0.05 * far
 
 
 def test_change_weights_are_small_at_standstills_alone():

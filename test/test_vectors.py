@@ -17,29 +17,31 @@ from stavpr_ros.mapping import build_map, load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources.frame import Frame
-import torch
 
 
 def test_as_maps_of_tokens_by_hand():
     """A class token, a register, then patches row by row: patch 2 is below patch 0."""
-    tokens = torch.tensor([[[9.0, 9], [8, 8], [0, 10], [1, 11], [2, 12], [3, 13]]])
+    tokens = np.array([[[9.0, 9], [8, 8], [0, 10], [1, 11], [2, 12], [3, 13]]], np.float32)
     maps = as_maps(tokens, 1, 2, 'net')
     assert maps.tolist() == [[[[0, 1], [2, 3]], [[10, 11], [12, 13]]]]
 
 
 def test_as_maps_leaves_maps_and_vectors():
     for shape in ((2, 5, 3, 4), (2, 5)):
-        assert as_maps(torch.zeros(shape), 2, 1, 'net').shape == shape
-    assert as_maps(torch.zeros(2, 5, 1, 1), 2, 1, 'net').shape == (2, 5)
+        assert as_maps(np.zeros(shape, np.float32), 2, 1, 'net').shape == shape
+    assert as_maps(np.zeros((2, 5, 1, 1), np.float32), 2, 1, 'net').shape == (2, 5)
 
 
 @pytest.mark.parametrize(
     ('output', 'named'),
     [
-        (torch.zeros(2, 261, 8), r'261 tokens, 260 without the first 1.*prefix_tokens = 5 .*16'),
-        (torch.zeros(1, 8), r'\(1, 8\) for 2 images'),
-        (torch.zeros(2), r'\(2,\)'),
-        (torch.zeros(2, 0, 3, 3), r'\(2, 0, 3, 3\)'),
+        (
+            np.zeros((2, 261, 8), np.float32),
+            r'261 tokens, 260 without the first 1.*prefix_tokens = 5 .*16',
+        ),
+        (np.zeros((1, 8), np.float32), r'\(1, 8\) for 2 images'),
+        (np.zeros(2, np.float32), r'\(2,\)'),
+        (np.zeros((2, 0, 3, 3), np.float32), r'\(2, 0, 3, 3\)'),
         ({'x': 1}, 'type dict'),
     ],
 )
@@ -49,7 +51,7 @@ def test_as_maps_of_other_outputs_is_rejected(output, named):
 
 
 def test_one_of_several_outputs_by_number_and_key():
-    a, b = torch.zeros(1), torch.ones(1)
+    a, b = np.zeros(1, np.float32), np.ones(1, np.float32)
     assert one_of(a, '0', 'net') is a
     assert one_of((a, b), '1', 'net') is b
     assert one_of(OrderedDict(x_norm=a, tokens=b), 'tokens', 'net') is b
@@ -61,7 +63,7 @@ def test_one_of_several_outputs_by_number_and_key():
 def test_cut_strips_pooled_equals_plain_loops(pooling):
     """A map of 5 rows and 8 columns in three strips: columns 1-2, 3-4, 5-6."""
     maps = np.random.default_rng(0).standard_normal((2, 3, 5, 8)).astype(np.float32)
-    strips = cut_strips(torch.from_numpy(maps), 3, pooling)
+    strips = cut_strips(maps, 3, pooling)
     assert strips.shape == (3, 2, 3)
     for w in range(3):
         for n in range(2):
@@ -122,7 +124,7 @@ def test_extractor_of_tokens_equals_that_of_their_map(network, route):
     tokens = extractor(network, 'tokens', prefix_tokens=0).extract(route[:2])
     maps = extractor(network, 'map').extract(route[:2])
     assert tokens.strips.shape == (7, 2, 16 * 8)
-    torch.testing.assert_close(tokens.strips, maps.strips)
+    np.testing.assert_allclose(tokens.strips, maps.strips, rtol=1e-5, atol=1e-5)
     pooled = extractor(network, 'map', pooling='mean').extract(route[:2])
     assert pooled.strips.shape == (7, 2, 16)
 
@@ -160,7 +162,7 @@ def test_onnx_file_of_batch_one_is_run_image_by_image(network, tmp_path, route, 
         return run(session, names, feed)
 
     monkeypatch.setattr(InferenceSession, 'run', counted)
-    torch.testing.assert_close(made.extract(route[:3]).strips, expected)
+    np.testing.assert_allclose(made.extract(route[:3]).strips, expected, rtol=1e-5, atol=1e-5)
     assert batches == [1, 1, 1]
 
 
@@ -188,8 +190,8 @@ def vectors(n, d, seed=0):
     curve[0] = 0
     weights = (np.linalg.norm(curve, axis=1) > 0).astype(np.float32)
     return LocalFeatures(
-        torch.from_numpy(curve[None].astype(np.float32)),
-        torch.from_numpy(weights[None]),
+        (curve[None].astype(np.float32)),
+        weights[None],
         FeatureSettings('gradient', None, 1),
         (1, 1),
     )
@@ -212,9 +214,9 @@ def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision, erro
     matcher = make_matcher(features, spatial, 'cpu', precision)
     matrix = matcher.distance_matrix(queries.strips, queries.weights)
     expected = 1 - queries.strips[0] @ features.strips[0].T
-    torch.testing.assert_close(matrix, expected, rtol=0, atol=error)
+    np.testing.assert_allclose(matrix, expected, rtol=0, atol=error)
     row = matcher.distances(queries.strips[:, 1], queries.weights[:, 1])
-    assert torch.equal(row, matrix[1])
+    assert np.array_equal(row, matrix[1])
 
 
 def test_sliding_window_over_one_strip_is_rejected_with_the_map():
@@ -224,13 +226,15 @@ def test_sliding_window_over_one_strip_is_rejected_with_the_map():
 
 def test_extractor_of_vector_and_strips_equals_both_alone(network, route):
     both = extractor(network, 'map', vector='global').extract(route[:3])
-    torch.testing.assert_close(both.strips, extractor(network, 'map').extract(route[:3]).strips)
+    np.testing.assert_allclose(
+        both.strips, extractor(network, 'map').extract(route[:3]).strips, rtol=1e-5, atol=1e-5
+    )
     alone = extractor(network, 'global').extract(route[:3])
-    torch.testing.assert_close(both.vectors, alone.strips[0])
+    np.testing.assert_allclose(both.vectors, alone.strips[0], rtol=1e-5, atol=1e-5)
     assert alone.vectors is None
     assert both[1:].vectors.shape == (2, 32)
     joined = LocalFeatures.concatenate([both[:1], both[1:]])
-    assert torch.equal(joined.vectors, both.vectors)
+    assert np.array_equal(joined.vectors, both.vectors)
     bare = extractor(network, 'map').extract(route[:1])
     assert LocalFeatures.concatenate([both, bare]).vectors is None
 

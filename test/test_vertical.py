@@ -12,7 +12,6 @@ from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, cut_cells
 from stavpr_ros.recognition.matcher import make_matcher
-import torch
 
 SETTINGS = FeatureSettings('gradient', GradientSettings(), 5)
 
@@ -23,7 +22,7 @@ def random_features(n, H=4, channels=3, columns=2, W=5, seed=0):
     strips[1, 0].reshape(channels, H, columns)[:, 2] = 0  # one cell of one strip is empty
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
     return LocalFeatures(
-        torch.from_numpy(strips).float(), torch.ones(W, n), SETTINGS, (H, columns)
+        strips.astype(np.float32), np.ones((W, n), np.float32), SETTINGS, (H, columns)
     )
 
 
@@ -33,7 +32,7 @@ def test_cut_cells_are_those_of_feature_map():
     assert cells.shape == (20, 3, 6)
     for strip in range(5):
         for image in range(3):
-            cube = features.strips[strip, image].numpy().reshape(3, 4, 2)
+            cube = features.strips[strip, image].reshape(3, 4, 2)
             for row in range(4):
                 cell = cube[:, row].reshape(-1)
                 expected = cell / max(np.linalg.norm(cell), 1e-12)
@@ -49,9 +48,9 @@ def test_vertical_distances_equal_oracle(n, strategy, xi):
     reference, query = random_features(n), random_features(2, seed=1)
     spatial = SpatialSettings(strategy, 1.0, xi, vertical=True)
     matcher = CpuMatcher(reference, spatial)
-    found = matcher.distance_matrix(query.strips, query.weights).numpy()
-    x = cut_cells(query.strips, (4, 2)).double().numpy()
-    y = cut_cells(reference.strips, (4, 2)).double().numpy()
+    found = matcher.distance_matrix(query.strips, query.weights)
+    x = cut_cells(query.strips, (4, 2)).astype(np.float64)
+    y = cut_cells(reference.strips, (4, 2)).astype(np.float64)
     for image in sorted({0, n // 2, n - 1}):
         d = np.empty((5, 5))
         for i in range(5):

@@ -10,6 +10,7 @@ from map_examples import VERSION2
 import networks
 import numpy as np
 import pytest
+from scipy.spatial.distance import cosine
 from stavpr_lab.features.paper_networks import (
     DenseNet161,
     DenseNet161Places365,
@@ -72,11 +73,11 @@ def standardized(images: list[np.ndarray], size: int) -> torch.Tensor:
     return torch.from_numpy(values.transpose(0, 3, 1, 2))
 
 
-def assert_same(ours: torch.Tensor, oracle: torch.Tensor) -> None:
+def assert_same(ours: np.ndarray, oracle: torch.Tensor) -> None:
     """Compare to 10^-5 of the largest value, the accuracy of float32; neither is trivial."""
-    assert ours.dtype == torch.float32
+    assert ours.dtype == np.float32
     assert 0.05 < float((oracle > 0).double().mean()) < 0.95
-    assert float((ours - oracle).abs().max()) < 1e-5 * float(oracle.max())
+    assert abs(ours - oracle.numpy()).max() < 1e-5 * float(oracle.max())
 
 
 def smooth_images(*sizes: tuple[int, int]) -> list[np.ndarray]:
@@ -137,12 +138,12 @@ def test_network_with_many_images_runs_in_passes(small_vgg, monkeypatch):
     together = small_vgg.feature_maps(images)
     assert together.shape == (5, 512, 2, 2)
     for image, maps in zip(images, together, strict=True):
-        torch.testing.assert_close(small_vgg.feature_maps([image])[0], maps, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(small_vgg.feature_maps([image])[0], maps, rtol=1e-4, atol=1e-4)
 
 
 def test_network_half_on_cpu_changes_nothing(small_vgg):
     """A robot's CPU may query a map that a GPU made in half precision."""
-    assert small_vgg.feature_maps(smooth_images((32, 32))).dtype == torch.float32
+    assert small_vgg.feature_maps(smooth_images((32, 32))).dtype == np.float32
     assert small_vgg.settings == replace(small_vgg.settings, half=False)
 
 
@@ -155,9 +156,8 @@ def test_network_in_half_precision_on_gpu_is_close(kind, vgg_file, densenet_file
     half = backbone_class(kind)(
         settings_class(kind)(model=str(path), half=True), 'cuda'
     ).feature_maps(images)
-    assert half.dtype == torch.float16
-    cosines = torch.cosine_similarity(whole.flatten(1), half.float().cpu().flatten(1))
-    assert float(cosines.min()) > 0.9999
+    for one, other in zip(whole, half, strict=True):
+        assert 1 - cosine(one.ravel(), other.ravel()) > 0.9999
 
 
 @pytest.mark.parametrize(

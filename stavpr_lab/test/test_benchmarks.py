@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import oracle
 import pytest
+from scipy.spatial.distance import cosine
+from stavpr_ros.recognition.robust import norms_of, unit_norm
 import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
@@ -126,8 +128,8 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
 
 def test_table_of_synthetic_route_has_every_section(monkeypatch):
     """Sixty places and the same images with noise."""
-    places, noise = (data.make_features(60, 24, 7, 'cpu', seed) for seed in (0, 1))
-    strips = torch.nn.functional.normalize(places.strips + 0.3 * noise.strips, dim=2)
+    places, noise = (data.make_features(60, 24, 7, seed) for seed in (0, 1))
+    strips = unit_norm(places.strips + 0.3 * noise.strips)
     maps = [descriptor_map(replace(places, strips=each)) for each in (places.strips, strips)]
     monkeypatch.setattr(off_map, 'REMOVED', (20, 40))  # more than half of the map: no row
     monkeypatch.setattr(off_map, 'STEP', 20)
@@ -178,18 +180,20 @@ def test_process_of_matches_is_measured_beside_process_without():
 
 def test_simulated_places_have_mean_and_neighbors_of_real_ones():
     """Of places of which each resembles the one before, and all their mean."""
-    strips = data.make_features(60, 16, 7, 'cpu', 0).strips + 0.3
-    strips[:, 1:] += strips[:, :-1].clone()
-    unit = torch.nn.functional.normalize(strips, dim=2)
-    weights = torch.full((7, 60), 7**-0.5)
+    strips = data.make_features(60, 16, 7, 0).strips + 0.3
+    strips[:, 1:] += strips[:, :-1].copy()
+    unit = unit_norm(strips)
+    weights = np.full((7, 60), 7**-0.5, np.float32)
     real = LocalFeatures(unit, weights, FeatureSettings('synthetic', None))
-    strips = torch.cat(list(city.simulated(real, 5000, seed=0)), dim=1)
-    torch.testing.assert_close(strips.norm(dim=2), torch.ones(7, 5000))
-    mean, expected = strips.mean(dim=1), unit.mean(dim=1)
-    assert float(torch.cosine_similarity(mean.flatten(), expected.flatten(), dim=0)) > 0.99
-    change = 1 - (strips[:, 1:] * strips[:, :-1]).sum(dim=2).mean()
-    of_real = 1 - (unit[:, 1:] * unit[:, :-1]).sum(dim=2).mean()
+    strips = np.concatenate(list(city.simulated(real, 5000, seed=0)), axis=1)
+    np.testing.assert_allclose(
+        norms_of(strips), np.ones((7, 5000), np.float32), rtol=1e-5, atol=1e-5
+    )
+    mean, expected = strips.mean(axis=1), unit.mean(axis=1)
+    assert 1 - cosine(mean.ravel(), expected.ravel()) > 0.99
+    change = 1 - (strips[:, 1:] * strips[:, :-1]).sum(axis=2).mean()
+    of_real = 1 - (unit[:, 1:] * unit[:, :-1]).sum(axis=2).mean()
     assert 0.5 < float(change / of_real) < 2
     features, first = city.city(real, 500, seed=0)
-    torch.testing.assert_close(features[first : first + 60].strips, unit, atol=1e-3, rtol=0)
+    np.testing.assert_allclose(features[first : first + 60].strips, unit, atol=1e-3, rtol=0)
     assert len(features) == 500

@@ -185,7 +185,7 @@ def test_export_of_each_signature_equals_the_original(
         singles = [network(image[None]) for image in batch_of(images())]
     which = {'transformer': 'token', 'salad': 0}.get(name)
     expected = torch.cat([one if which is None else one[which] for one in singles])
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +207,7 @@ def test_export_of_maps_equals_the_inner_module(run, repository, tmp_path, name,
             expected, _ = network.backbone(batch_of(images()))
         else:
             expected = network(batch_of(images()))['patches'].mT.reshape(3, 8, 4, 4)
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-4)
     outputs = {value.name for value in onnx.load(path).graph.output}
     assert outputs == ({'map'} if '' in options else {'global', 'map'})
 

@@ -316,8 +316,8 @@ def _export(arguments: argparse.Namespace) -> None:
 
     place_map = load_map(arguments.map)
     arrays = {
-        'strips': place_map.features.strips.numpy(),
-        'weights': place_map.features.weights.numpy(),
+        'strips': place_map.features.strips,
+        'weights': place_map.features.weights,
         'stamps': place_map.stamps,
         'ids': np.array(place_map.ids),
         'poses': place_map.poses,

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
 
 # The constants of stavpr_msgs/PlaceMatch in the order of their values. recognition.Status has the
-# same names, but its package imports torch.
+# same names, but its package imports numba.
 STATUSES = (
     *('WARMING_UP', 'NO_MATCH', 'MATCH', 'INVALID_IMAGE'),
     *('NOT_READY', 'DROPPED', 'SKIPPED', 'MAPPED'),

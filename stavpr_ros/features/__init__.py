@@ -3,7 +3,7 @@
 """
 Images to local features: one kind a module, vertical strips, random projection.
 
-The names below are imported on first use: :mod:`stavpr_ros.features.registry` loads without torch.
+The names below are imported on first use: :mod:`stavpr_ros.features.registry` loads without NumPy.
 """
 
 from importlib import import_module

@@ -19,7 +19,6 @@ from stavpr_ros.features.extractor import FeatureSettings, LocalFeatures, normal
 from stavpr_ros.features.registry import DescriptorSettings
 from stavpr_ros.output_file import atomic_output, Force, NPY
 from stavpr_ros.regular_file import require_regular
-import torch
 
 _PATH = re.compile(r'(?P<file>.*\.(npy|npz|csv|mat))(:(?P<name>.+))?', re.IGNORECASE)
 _NUMERIC = ('double', 'single', *(f'{u}int{bits}' for u in ('', 'u') for bits in (8, 16, 32, 64)))
@@ -77,11 +76,11 @@ def read_descriptors(path: str, source: str = '') -> LocalFeatures:
     n, W = len(array), 1 if array.ndim == 2 else array.shape[1]
     if W > MOST_STRIPS:
         raise SourceError(f'descriptors {path}: W = {W} strips, at most {MOST_STRIPS}')
-    strips, weights = torch.empty((W, n, array.shape[-1])), torch.empty((W, n))
+    strips, weights = np.empty((W, n, array.shape[-1]), np.float32), np.empty((W, n), np.float32)
     for low in range(0, n, AT_ONCE):  # it may be in its file
         part = slice(low, low + AT_ONCE)
         rows = _float32(array[part].reshape(-1, W, array.shape[-1]), path, low)
-        strips[:, part], weights[:, part] = normalize(torch.from_numpy(rows).transpose(0, 1))
+        strips[:, part], weights[:, part] = normalize(rows.transpose(1, 0, 2))
     settings = FeatureSettings('descriptors', DescriptorSettings(source=source), W)
     return LocalFeatures(strips, weights, settings)
 
@@ -109,7 +108,7 @@ def write_descriptors(features: LocalFeatures, path: Path, force: Force = False)
     :param features: strips (W, n, d); written as (n, d) if W = 1, else (n, W, d), float32, each
         strip with its share of the norm of its image.
     """
-    strips = (features.strips * features.weights[:, :, None]).permute(1, 0, 2).cpu().numpy()
+    strips = (features.strips * features.weights[:, :, None]).transpose(1, 0, 2)
     array = np.ascontiguousarray(strips[:, 0] if strips.shape[1] == 1 else strips)
     with atomic_output(path, NPY, force) as file:
         np.save(file, array)

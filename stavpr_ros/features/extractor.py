@@ -19,7 +19,6 @@ from stavpr_ros.features.registry import (
     NetworkSettings,
     settings_class,
 )
-import torch
 
 STRIPS = 7  # of a feature map, as in the paper; a vector is one strip
 GEM_EXPONENT = 3
@@ -71,11 +70,11 @@ class LocalFeatures:
         (n, D), float32, for the first stage of large maps; None without.
     """
 
-    strips: torch.Tensor
-    weights: torch.Tensor
+    strips: np.ndarray
+    weights: np.ndarray
     settings: FeatureSettings
     cells: tuple[int, int] | None = None
-    vectors: torch.Tensor | None = None
+    vectors: np.ndarray | None = None
 
     def __len__(self) -> int:
         return self.strips.shape[1]
@@ -97,12 +96,6 @@ class LocalFeatures:
         vectors = None if self.vectors is None else self.vectors[images]
         return dataclasses.replace(self, strips=strips, weights=weights, vectors=vectors)
 
-    def to(self, device: str | torch.device) -> 'LocalFeatures':
-        """Return the features on a device."""
-        strips, weights = self.strips.to(device), self.weights.to(device)
-        vectors = None if self.vectors is None else self.vectors.to(device)
-        return dataclasses.replace(self, strips=strips, weights=weights, vectors=vectors)
-
     def require_same_settings(self, other: FeatureSettings, where: str) -> None:
         """
         Reject features with other settings.
@@ -120,11 +113,11 @@ class LocalFeatures:
         """Join the features of several batches of images; vectors if all have them."""
         vectors = [part.vectors for part in parts if part.vectors is not None]
         return LocalFeatures(
-            torch.cat([part.strips for part in parts], dim=1).contiguous(),
-            torch.cat([part.weights for part in parts], dim=1).contiguous(),
+            np.concatenate([part.strips for part in parts], axis=1),
+            np.concatenate([part.weights for part in parts], axis=1),
             parts[0].settings,
             parts[0].cells,
-            torch.cat(vectors) if len(vectors) == len(parts) else None,
+            np.concatenate(vectors) if len(vectors) == len(parts) else None,
         )
 
 
@@ -230,16 +223,16 @@ class FeatureExtractor:
         if self.projection is not None:
             strips, cells = self.projection.apply(strips), None
         if vectors is not None:
-            vectors = normalize(vectors.float()[None])[0][0]
+            vectors = normalize(np.asarray(vectors, np.float32)[None])[0][0]
         return LocalFeatures(*normalize(strips), self.settings, cells, vectors)
 
-    def _computed(self, images: Sequence[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def _computed(self, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray | None]:
         """Return maps, and vectors if the settings want them."""
         if getattr(self._backbone.settings, 'vector', ''):
             return self._backbone.maps_and_vectors(images)
         return self._backbone.feature_maps(images), None
 
-    def _cut(self, maps: torch.Tensor) -> tuple[torch.Tensor, tuple[int, int] | None]:
+    def _cut(self, maps: np.ndarray) -> tuple[np.ndarray, tuple[int, int] | None]:
         """Return strips (W, n, d), not normalized, and the cells of each."""
         W, pooling = self.settings.strips, getattr(self._backbone.settings, 'pooling', 'flatten')
         if maps.ndim == 2:
@@ -248,13 +241,13 @@ class FeatureExtractor:
                     f'features {self.settings.kind} are one vector of {maps.shape[1]} numbers an '
                     f'image: expected W = 1 strip and pooling flatten, not {W} and {pooling}'
                 )
-            return maps.float()[None], (1, 1)
+            return np.asarray(maps, np.float32)[None], (1, 1)
         cells = (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
         return cut_strips(maps, W, pooling), cells
 
 
-def _finite(values: torch.Tensor | None) -> bool:
-    return values is None or bool(torch.isfinite(values).all())
+def _finite(values: np.ndarray | None) -> bool:
+    return values is None or bool(np.isfinite(values).all())
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
@@ -272,7 +265,7 @@ def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:
     return cv2.resize(image, (size, size), interpolation=interpolation)
 
 
-def cut_strips(feature_maps: torch.Tensor, W: int, pooling: str = 'flatten') -> torch.Tensor:
+def cut_strips(feature_maps: np.ndarray, W: int, pooling: str = 'flatten') -> np.ndarray:
     """
     Cut feature maps into W vertical strips and flatten each (section 1 of the method), or pool it.
 
@@ -288,9 +281,7 @@ def cut_strips(feature_maps: torch.Tensor, W: int, pooling: str = 'flatten') -> 
     :raises InputError: fewer columns than strips, or not four axes.
     """
     if feature_maps.ndim != 4:
-        raise InputError(
-            f'feature maps have shape {tuple(feature_maps.shape)}: expected (n, C, H, Wf)'
-        )
+        raise InputError(f'feature maps have shape {feature_maps.shape}: expected (n, C, H, Wf)')
     n, channels, height, Wf = feature_maps.shape
     if not 1 <= W <= Wf:
         raise InputError(
@@ -298,17 +289,20 @@ def cut_strips(feature_maps: torch.Tensor, W: int, pooling: str = 'flatten') -> 
         )
     width = Wf // W
     left = (Wf % W) // 2
-    kept = feature_maps[..., left : left + W * width].float()
-    strips = kept.reshape(n, channels, height, W, width).permute(3, 0, 1, 2, 4)
+    kept = np.asarray(feature_maps[..., left : left + W * width], np.float32)
+    strips = kept.reshape(n, channels, height, W, width).transpose(3, 0, 1, 2, 4)
     if pooling == 'flatten':
         return strips.reshape(W, n, channels * height * width)
-    cells = strips.flatten(3)
-    if pooling == 'mean':
-        return cells.mean(3)
-    return cells.clamp(min=1e-6).pow(GEM_EXPONENT).mean(3).pow(1 / GEM_EXPONENT)
+    cells = strips.reshape(W, n, channels, height * width)
+    pooled: np.ndarray = (
+        cells.mean(3)
+        if pooling == 'mean'
+        else np.cbrt((np.maximum(cells, 1e-6) ** GEM_EXPONENT).mean(3))
+    )
+    return pooled
 
 
-def normalize(strips: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def normalize(strips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Split strips into directions and shares of the image's norm.
 
@@ -316,7 +310,7 @@ def normalize(strips: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     :returns: unit-norm strips (W, n, d), a zero strip stays zero (distance 1 to everything), and
         weights (W, n): norm of the strip / norm of all strips of its image, 0 for a black image.
     """
-    norms = torch.linalg.vector_norm(strips, dim=2)
-    whole = torch.linalg.vector_norm(norms, dim=0)
-    unit = strips / torch.where(norms > 0, norms, 1)[:, :, None]
-    return unit, norms / torch.where(whole > 0, whole, 1)
+    norms = np.linalg.norm(strips, axis=2)
+    whole = np.linalg.norm(norms, axis=0)
+    unit = strips / np.where(norms > 0, norms, np.float32(1))[:, :, None]
+    return unit, norms / np.where(whole > 0, whole, np.float32(1))

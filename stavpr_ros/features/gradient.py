@@ -7,8 +7,7 @@ Histograms of gradient orientation on a regular grid of overlapping cells, each 
 four 2 x 2 blocks around it (after Dalal and Triggs, "Histograms of Oriented Gradients for Human
 Detection", CVPR 2005; one channel an orientation, the mean over the four normalizations). The
 gradients are those of log(1 + 32 I), intensity I in 0..1: contrast ratios, which a change of light
-leaves as they are. On a CPU a compiled kernel computes them image by image, elsewhere torch for
-the whole batch.
+leaves as they are. A compiled kernel computes them image by image; there is none for GPUs.
 
 The kernel's arithmetic on pixels runs over rows in SIMD lanes: without look-up and scatter. A
 pixel's share in every orientation is computed, also where it is zero: that is a subtraction and a
@@ -19,16 +18,15 @@ grid; a cell is two by two of them. No ``fastmath``: the features are equal on e
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-import math
 
 import cv2
 import numpy as np
+from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import kernel
-from stavpr_ros.devices import choose_device
+from stavpr_ros.devices import DEVICES
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import GradientSettings
-import torch
-from torch.nn.functional import avg_pool2d, pad
+from stavpr_ros.threads import thread_count
 
 FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat
 F = np.float32
@@ -50,24 +48,22 @@ PER_THREAD = 8  # images at least: starting a thread costs as much as one or two
 
 
 class Gradient:
-    """Feature maps of ``orientations`` channels, ``cells`` x ``cells``."""
+    """Feature maps of ``orientations`` channels, ``cells`` x ``cells``; on the CPU in any case."""
 
     def __init__(self, settings: GradientSettings, device: str = 'cpu') -> None:
         self.settings = settings
-        self._device = torch.device(choose_device(device))
+        require_choice('device', device, DEVICES)
         self._shape = settings.orientations, settings.cells, settings.cells
 
-    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+    def feature_maps(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """
-        Compute the feature maps of a batch of images, on a CPU on as many threads as torch's.
+        Compute the feature maps of a batch of images, on several threads.
 
         :param images: RGB, each (h, w, 3) uint8, of any size.
         :returns: shape (n, orientations, cells, cells), float32, values >= 0.
         """
-        if self._device.type != 'cpu':
-            return self._by_torch(images)
         s = self.settings
-        maps = np.empty((len(images), *self._shape), np.float32)
+        maps: np.ndarray = np.empty((len(images), *self._shape), np.float32)
 
         def extract(i: int) -> None:
             gray = self._prepare(images[i])
@@ -75,16 +71,7 @@ class Gradient:
             _feature_maps(padded, s.cell, F(1.0 if s.signed else 0.5), F(FLOOR), maps[i])
 
         _on_threads(extract, len(images))
-        return torch.from_numpy(maps)
-
-    def _by_torch(self, images: Sequence[np.ndarray]) -> torch.Tensor:
-        gray = np.empty((len(images), self.settings.size, self.settings.size), np.uint8)
-
-        def prepare(i: int) -> None:
-            gray[i] = self._prepare(images[i])
-
-        _on_threads(prepare, len(images))
-        return feature_maps_by_torch(torch.from_numpy(gray).to(self._device), self.settings)
+        return maps
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -93,8 +80,8 @@ class Gradient:
 
 
 def _on_threads(work: Callable[[int], None], count: int) -> None:
-    """Call work(0) .. work(count - 1), which release the GIL, on as many threads as torch."""
-    threads = min(torch.get_num_threads(), count // PER_THREAD)
+    """Call work(0) .. work(count - 1), which release the GIL, on several threads."""
+    threads = min(thread_count(), count // PER_THREAD)
     if threads < 2:
         for i in range(count):
             work(i)
@@ -106,32 +93,6 @@ def _on_threads(work: Callable[[int], None], count: int) -> None:
 
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(part, range(threads)))  # the list re-raises errors of the threads
-
-
-def feature_maps_by_torch(gray: torch.Tensor, settings: GradientSettings) -> torch.Tensor:
-    """
-    Compute the feature maps of square images with torch's operators, on their device.
-
-    :param gray: shape (n, size, size), uint8.
-    :returns: shape (n, orientations, cells, cells), float32.
-    """
-    padded = pad(gray[:, None].float() / 255, (1, 1, 1, 1), mode='replicate')
-    dx = padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]
-    dy = padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
-    period = 2 * math.pi if settings.signed else math.pi
-    bins = settings.orientations
-    position = (torch.atan2(dy, dx) * (bins / period)).remainder_(bins)
-    centers = torch.arange(bins, dtype=torch.float32, device=gray.device)
-    offset = (position - centers[None, :, None, None]).abs_()
-    # linear between two bins
-    share = torch.clamp_(1 - torch.minimum(offset, bins - offset), min=0)
-    cell = settings.cell
-    share.mul_(torch.hypot(dx, dy))
-    # cells overlap by half; each is multiplied by the mean of 1 / norm of its four blocks
-    histograms = avg_pool2d(share, 2 * cell, stride=cell, padding=cell // 2)
-    energy = pad((histograms**2).sum(dim=1, keepdim=True), (1, 1, 1, 1), mode='replicate')
-    scale = torch.rsqrt(4 * avg_pool2d(energy, 2, stride=1) + FLOOR)
-    return histograms * avg_pool2d(scale, 2, stride=1)
 
 
 @kernel

@@ -21,7 +21,7 @@ from stavpr_ros.features.extractor import resize_square, TEST_SIDE
 from stavpr_ros.features.model_files import read_model
 from stavpr_ros.features.outputs import as_maps, as_vectors
 from stavpr_ros.features.registry import OnnxSettings
-import torch
+from stavpr_ros.threads import thread_limit
 
 FLOAT, FLOAT16 = 1, 10  # as ONNX numbers them
 BATCH = 'stavpr_batch'  # property of a file: '1' = the images of a batch influence each other
@@ -65,16 +65,16 @@ class Onnx:
         with file:
             content = file.read()
         self.settings = replace(settings, sha256=digest)
-        self._device = torch.device(choose_device(device))
+        self._device = choose_device(device)
         self._layers = [settings.layer, *([settings.vector] if settings.vector else [])]
         model = self._with_outputs(onnx, content)
         properties = {row.key: row.value for row in model.metadata_props}
         # whether images go through the network alone; None = not known yet
         self._one_by_one = True if properties.get(BATCH) == '1' else None
         offered = onnxruntime.get_available_providers()
-        gpu = [name for name in ON_GPU if name in offered][: self._device.type == 'cuda']
+        gpu = [name for name in ON_GPU if name in offered][: self._device == 'cuda']
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
+        options.intra_op_num_threads = thread_limit()  # 0 = as many as there are cores
         options.log_severity_level = 4  # errors are raised
         try:
             self._session = onnxruntime.InferenceSession(
@@ -84,7 +84,7 @@ class Onnx:
             raise UnavailableError(
                 f'{settings.model} cannot be run by onnxruntime: {error}'
             ) from error
-        if self._device.type == 'cuda':
+        if self._device == 'cuda':
             self._check_provider(device)
         self._input = self._session.get_inputs()[0]
         self._dtype = np.float16 if self._input.type == 'tensor(float16)' else np.float32
@@ -151,7 +151,7 @@ class Onnx:
             + (f'set size = {shape[2]}' if square else 'export it for square RGB images')
         )
 
-    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+    def feature_maps(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """
         Compute the feature maps of a batch of images.
 
@@ -162,7 +162,7 @@ class Onnx:
         """
         return self._maps(self._run(images)[0], len(images))
 
-    def maps_and_vectors(self, images: Sequence[np.ndarray]) -> tuple[torch.Tensor, torch.Tensor]:
+    def maps_and_vectors(self, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """
         Compute feature maps, see :meth:`feature_maps`, and the vectors (n, D) of layer ``vector``.
 
@@ -172,11 +172,12 @@ class Onnx:
         name = f'layer {self.settings.vector!r} of {self.settings.model}'
         return self._maps(maps, len(images)), as_vectors(vectors, len(images), name)
 
-    def _maps(self, output: torch.Tensor, images: int) -> torch.Tensor:
+    def _maps(self, output: np.ndarray, images: int) -> np.ndarray:
         name = f'layer {self.settings.layer!r} of {self.settings.model}'
-        return as_maps(output, images, self.settings.prefix_tokens, name)
+        maps: np.ndarray = as_maps(output, images, self.settings.prefix_tokens, name)
+        return maps
 
-    def _run(self, images: Sequence[np.ndarray]) -> list[torch.Tensor]:
+    def _run(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the outputs of the layers for images, in a batch if that changes nothing."""
         if len(images) == 1:
             return self._run_batch(images)
@@ -185,7 +186,7 @@ class Onnx:
         if not self._one_by_one:
             return self._run_batch(images)
         single = [self._run_batch([image]) for image in images]
-        return [torch.cat(outputs) for outputs in zip(*single, strict=True)]
+        return [np.concatenate(outputs) for outputs in zip(*single, strict=True)]
 
     def _runs_batches(self) -> bool:
         """Return whether two images in a batch have the outputs that each has alone."""
@@ -197,14 +198,14 @@ class Onnx:
         except SettingsError:  # a batch of one is written into the network
             return False
         for outputs, both in zip(zip(*single, strict=True), together, strict=True):
-            alone = torch.cat(outputs)
+            alone = np.concatenate(outputs)
             if alone.shape != both.shape:
                 return False
-            if float((alone - both).abs().max()) > TOLERANCE * float(alone.abs().max()):
+            if abs(alone - both).max() > TOLERANCE * abs(alone).max():
                 return False
         return True
 
-    def _run_batch(self, images: Sequence[np.ndarray]) -> list[torch.Tensor]:
+    def _run_batch(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
         batch = np.stack([self._prepare(image) for image in images]).astype(self._dtype)
         try:
             outputs = self._session.run(self._layers, {self._input.name: batch})
@@ -223,7 +224,7 @@ class Onnx:
                     f'layer {layer!r} of {self.settings.model} returns {output.shape} for '
                     f'{len(images)} images: expected as many rows; name another layer'
                 )
-        return [torch.from_numpy(o.astype(np.float32)).to(self._device) for o in outputs]
+        return [output.astype(np.float32, copy=False) for output in outputs]
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""

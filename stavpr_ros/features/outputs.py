@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 from stavpr_ros.errors import SettingsError
-import torch
 
 
 def one_of(output: Any, which: str, name: str) -> Any:
@@ -30,28 +29,27 @@ def one_of(output: Any, which: str, name: str) -> Any:
     return outputs[which]
 
 
-def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Tensor:
+def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:
     """
     Return what a network computes for a batch as feature maps or vectors.
 
     :param output: maps (n, C, H, Wf), vectors (n, D) or (n, D, 1, 1), or the tokens of a vision
-        transformer (n, T, C), of square images.
+        transformer (n, T, C), of square images; a NumPy array or a tensor.
     :param images: number n of images.
     :param prefix_tokens: leading tokens that are no patches.
     :param name: of the layer.
-    :returns: maps or vectors.
+    :returns: maps or vectors, likewise.
     :raises SettingsError: another shape or type; tokens that are no square.
     """
-    tensor = isinstance(output, torch.Tensor)
-    shape = tuple(output.shape) if tensor else ()
+    shape = tuple(getattr(output, 'shape', ()))
     if len(shape) not in (2, 3, 4) or shape[0] != images or 0 in shape:
-        returned = shape if tensor else f'type {type(output).__name__}'
+        returned = shape if shape else f'type {type(output).__name__}'
         raise SettingsError(
             f'{name} returns {returned} for {images} images: expected maps (n, C, H, W), tokens '
             '(n, T, C) or vectors (n, D); name another layer'
         )
     if shape[2:] == (1, 1):  # of a pooling over the whole map
-        return output.flatten(1)
+        return output[:, :, 0, 0]
     if len(shape) != 3:
         return output
     n, T, C = shape
@@ -63,10 +61,10 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> torch.Te
             f'expected those of a square; prefix_tokens = {T - largest**2} leaves {largest} x '
             f'{largest}'
         )
-    return output[:, prefix_tokens:].transpose(1, 2).reshape(n, C, side, side)
+    return output[:, prefix_tokens:].swapaxes(1, 2).reshape(n, C, side, side)
 
 
-def as_vectors(output: Any, images: int, name: str) -> torch.Tensor:
+def as_vectors(output: Any, images: int, name: str) -> Any:
     """
     Return what a network computes for a batch as vectors (n, D).
 

@@ -9,7 +9,6 @@ import hashlib
 import numpy as np
 from stavpr_ros.checks import require_at_least
 from stavpr_ros.errors import InputError
-import torch
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,7 @@ class Projection:
         digest = hashlib.sha256(np.ascontiguousarray(self.matrix).tobytes()).hexdigest()
         return f'{self.name}, sha256 {digest[:16]}'
 
-    def apply(self, strips: torch.Tensor) -> torch.Tensor:
+    def apply(self, strips: np.ndarray) -> np.ndarray:
         """
         Project local features.
 
@@ -59,4 +58,5 @@ class Projection:
                 f'local features have d = {strips.shape[-1]}, the projection takes '
                 f'{self.matrix.shape[0]}'
             )
-        return strips @ torch.from_numpy(self.matrix).to(strips.device)
+        projected: np.ndarray = strips @ self.matrix
+        return projected

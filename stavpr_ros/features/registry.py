@@ -3,7 +3,7 @@
 """
 The kinds of features: their settings, and the table of the kinds.
 
-Imports neither torch nor OpenCV, so that parameters and command-line options load quickly.
+Imports neither NumPy nor OpenCV, so that parameters and command-line options load quickly.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,6 @@ from stavpr_ros.errors import SettingsError
 
 if TYPE_CHECKING:
     import numpy as np
-    import torch
 
 MOST_PIXELS = 4096  # on a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
@@ -190,7 +189,7 @@ class Backbone(Protocol):
 
     settings: Any
 
-    def feature_maps(self, images: 'Sequence[np.ndarray]') -> 'torch.Tensor':
+    def feature_maps(self, images: 'Sequence[np.ndarray]') -> 'np.ndarray':
         """
         Compute feature maps (n, C, H, Wf), or vectors (n, D), float, of RGB images.
 
@@ -198,9 +197,7 @@ class Backbone(Protocol):
         """
         ...
 
-    def maps_and_vectors(
-        self, images: 'Sequence[np.ndarray]'
-    ) -> 'tuple[torch.Tensor, torch.Tensor]':
+    def maps_and_vectors(self, images: 'Sequence[np.ndarray]') -> 'tuple[np.ndarray, np.ndarray]':
         """Compute both; of kinds with a setting ``vector``, where it is given."""
         ...
 

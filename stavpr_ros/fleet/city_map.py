@@ -9,7 +9,6 @@ import numpy as np
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.fleet.store import PlaceStore, sample_places
 from stavpr_ros.mapping import Place, PlaceMap
-import torch
 
 
 class RemoteFeatures(LocalFeatures):
@@ -39,12 +38,12 @@ class RemoteFeatures(LocalFeatures):
         return self._store.index.sample.dimension
 
     @property
-    def strips(self) -> torch.Tensor:
+    def strips(self) -> np.ndarray:
         """Return the features of all places, (W, n, d)."""
         return self[:].strips
 
     @property
-    def weights(self) -> torch.Tensor:
+    def weights(self) -> np.ndarray:
         """Return the weights of all places, (W, n)."""
         return self[:].weights
 

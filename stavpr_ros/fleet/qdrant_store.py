@@ -30,7 +30,6 @@ from stavpr_ros.errors import (
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.fleet.store import MapIndex, place_vectors
 from stavpr_ros.mapping import load_map, PlaceMap, save_map, select_places, Session
-import torch
 
 INDEX_POINT = 2**40
 TIMEOUT = 5  # seconds that the server may take for a response
@@ -293,7 +292,7 @@ def _read_index(payload: dict[str, Any]) -> MapIndex:
 def _written_places(
     place_map: PlaceMap, selected: PlaceMap, places: np.ndarray
 ) -> Iterator[dict[str, Any]]:
-    strips = selected.features.strips.half().numpy()
+    strips = selected.features.strips.astype(np.float16)
     for i, place in enumerate(places.tolist()):
         pose, session = place_map.pose(place), place_map.session(place)
         yield {
@@ -321,8 +320,8 @@ def _read_places(payloads: list[dict[str, Any]], index: MapIndex) -> tuple[Place
     place_map = replace(
         sample,
         features=LocalFeatures(
-            torch.from_numpy(np.ascontiguousarray(strips)),
-            torch.from_numpy(np.ascontiguousarray(weights)),
+            np.ascontiguousarray(strips),
+            np.ascontiguousarray(weights),
             sample.settings,
             sample.features.cells,
         ),

@@ -29,6 +29,7 @@ from stavpr_ros.fleet.city_map import CityMap
 from stavpr_ros.fleet.neighborhoods import Votes
 from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
@@ -38,7 +39,6 @@ from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
 from stavpr_ros.recognition.sessions import SessionLayout
 from stavpr_ros.threads import call_on_thread
-import torch
 
 CHUNK = 32  # places that are fetched together
 CHUNKS = 128  # loaded: 4096 places
@@ -89,8 +89,8 @@ class _Image:
     :param z: normalized distances to the places in the loaded chunks, by slot.
     """
 
-    strips: torch.Tensor
-    weights: torch.Tensor
+    strips: np.ndarray
+    weights: np.ndarray
     change: float
     stamp: int
     mean: float
@@ -136,8 +136,8 @@ class FleetRecognizer(SequenceRecognizer):
         sample, places = index.sample.features, sample_places(index.places)
         self._sampled, W, d = len(sample), city.settings.strips, city.dimension
         # the sample, then the chunks: the matcher shares the memory
-        self._strips = torch.zeros(W, self._sampled + CHUNKS * CHUNK, d)
-        self._weights = torch.zeros(W, self._strips.shape[1])
+        self._strips = aligned_zeros((W, self._sampled + CHUNKS * CHUNK, d))
+        self._weights: np.ndarray = np.zeros(self._strips.shape[:2], np.float32)
         changes = PlaceChanges(self._sampled, APART)
         centered = self._centering.places(sample, changes.add)
         self._strips[:, : self._sampled] = centered.strips
@@ -186,10 +186,10 @@ class FleetRecognizer(SequenceRecognizer):
                 f'strips of {features.dimension} dimensions, the map has {self._city.dimension}'
             )
         strips = self._centering.next_query(features.strips[:, 0])
-        row = self._matcher.distances(strips, features.weights[:, 0]).numpy()
+        row = self._matcher.distances(strips, features.weights[:, 0])
         sampled, change = row[: self._sampled][self._learned.distinct(self._sampled)], 1.0
         if self._images:
-            change = change_between(strips.numpy(), self._images[-1].strips.numpy())
+            change = change_between(strips, self._images[-1].strips)
         self._centering.note_standstill(change < self._learned.standstill)
         mean, deviation = float(sampled.mean()), max(float(sampled.std()), MIN_DEVIATION)
         z = (row[self._sampled :] - np.float32(mean)) / np.float32(deviation)
@@ -295,10 +295,10 @@ class FleetRecognizer(SequenceRecognizer):
         centered = self._centering.places(lookup.fetched.features)
         images = list(self._images)
         distances = CpuMatcher(centered, self._settings.spatial).distance_matrix(
-            torch.stack([image.strips for image in images], dim=1),
-            torch.stack([image.weights for image in images], dim=1),
+            np.stack([image.strips for image in images], axis=1),
+            np.stack([image.weights for image in images], axis=1),
         )
-        changes = _changes_from_before(centered.strips.numpy())
+        changes = _changes_from_before(centered.strips)
         chunk_of = lookup.places // CHUNK
         free = np.lexsort((self._wanted, self._chunks >= 0)).tolist()
         for slot, chunk in zip(free, np.unique(chunk_of).tolist(), strict=False):
@@ -314,7 +314,7 @@ class FleetRecognizer(SequenceRecognizer):
             rows = slice(self._sampled + target.start, self._sampled + target.stop)
             self._strips[:, rows] = centered.strips[:, here]
             self._weights[:, rows] = centered.weights[:, here]
-            for image, row in zip(images, distances[:, here].numpy(), strict=True):
+            for image, row in zip(images, distances[:, here], strict=True):
                 image.z[target] = (row - np.float32(image.mean)) / np.float32(image.deviation)
         return True
 
@@ -340,8 +340,7 @@ class FleetRecognizer(SequenceRecognizer):
             self._push(image)
 
     def _push(self, image: _Image) -> None:
-        z = torch.from_numpy(image.z[self._order])
-        self._filter_window.add(z, image.stamp, image.change)
+        self._filter_window.add(image.z[self._order], image.stamp, image.change)
 
 
 def _firsts(places: np.ndarray, runs: np.ndarray) -> np.ndarray:

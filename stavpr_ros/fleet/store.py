@@ -15,8 +15,7 @@ import numpy as np
 from stavpr_ros.errors import FleetError
 from stavpr_ros.mapping import PlaceMap, select_places, Session
 from stavpr_ros.recognition.blocks import blocks
-from stavpr_ros.recognition.robust import evenly, MeanCentering, unit_norm
-import torch
+from stavpr_ros.recognition.robust import evenly, MeanCentering, normalize
 
 RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places
 GROUPS = 3  # of strips in a place's vector
@@ -112,7 +111,7 @@ def sample_places(n: int) -> np.ndarray:
     return np.unique(np.minimum(runs[:, None] + np.arange(RUN), n - 1))
 
 
-def place_vectors(strips: torch.Tensor) -> np.ndarray:
+def place_vectors(strips: np.ndarray) -> np.ndarray:
     """
     Return the vectors of places or images.
 
@@ -122,8 +121,8 @@ def place_vectors(strips: torch.Tensor) -> np.ndarray:
     W = len(strips)
     size = -(-W // GROUPS)
     firsts = np.unique(np.rint(np.linspace(0, W - size, GROUPS)).astype(int))
-    groups = [unit_norm(strips[first : first + size].float().mean(dim=0)) for first in firsts]
-    return unit_norm(torch.cat(groups, dim=1)).numpy()
+    groups = [normalize(strips[first : first + size].mean(axis=0)) for first in firsts]
+    return normalize(np.concatenate(groups, axis=1))
 
 
 def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:

@@ -3,7 +3,7 @@
 """
 The reference map: build, grow, save and load it; keyframes and trajectories.
 
-The names below are imported on first use: the submodule ``transforms`` loads without torch.
+The names below are imported on first use: the submodule ``transforms`` loads without numba.
 """
 
 from importlib import import_module

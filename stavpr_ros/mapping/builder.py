@@ -90,7 +90,7 @@ def build_map(
     places, encoded = zip(*found, strict=True)
     rows = np.array([np.full(7, np.nan) if each.pose is None else each.pose for each in places])
     return PlaceMap(
-        features=LocalFeatures.concatenate(features).to('cpu'),
+        features=LocalFeatures.concatenate(features),
         projection=extractor.projection,
         stamps=np.array([each.stamp for each in places], np.int64),
         ids=tuple(each.identifier for each in places),
@@ -125,8 +125,7 @@ def build_journal(
     options = keyframes, thumbnail_width if thumbnails else None
     try:
         with closing(_extracted(frames, extractor, poses, *options, progress, last)) as batches:
-            for batch, extracted in batches:
-                features = extracted.to('cpu')
+            for batch, features in batches:
                 if writer is None:
                     template = PlaceMap(
                         features[:1], extractor.projection, np.zeros(1, np.int64), ('',)

@@ -19,7 +19,6 @@ from stavpr_ros.mapping.place_map import (
     Session,
 )
 from stavpr_ros.mapping.trajectory import checked_pose
-import torch
 
 ROOM = 256  # initial capacity in places; doubled when it is full
 
@@ -110,14 +109,14 @@ class GrowingMap:
 
         Where another object holds the features, a copy.
         """
-        known = {name: torch.from_numpy(rows[: self._count]) for name, rows in self._rows.items()}
+        known = {name: rows[: self._count] for name, rows in self._rows.items()}
         vectors = known.get('vectors')
         if self._held_features is not None:
-            vectors = None if vectors is None else vectors.clone()
+            vectors = None if vectors is None else vectors.copy()
             return dataclasses.replace(self._held_features(), vectors=vectors)
         W = self.settings.strips
-        strips = known.get('strips', torch.empty(0, W, 0)).transpose(0, 1)
-        weights = known.get('weights', torch.empty(0, W)).transpose(0, 1)
+        strips = known.get('strips', np.empty((0, W, 0), np.float32)).transpose(1, 0, 2)
+        weights = known.get('weights', np.empty((0, W), np.float32)).T
         return LocalFeatures(strips, weights, self.settings, self._cells, vectors)
 
     @property
@@ -263,10 +262,7 @@ class GrowingMap:
 
 def _rows_of(features: LocalFeatures) -> dict[str, np.ndarray]:
     """Return the features of n images: strips (n, W, d), weights (n, W), vectors (n, D) if any."""
-    rows = {
-        'strips': features.strips.transpose(0, 1).cpu().numpy(),
-        'weights': features.weights.T.cpu().numpy(),
-    }
+    rows = {'strips': features.strips.transpose(1, 0, 2), 'weights': features.weights.T}
     if features.vectors is not None:
-        rows['vectors'] = features.vectors.cpu().numpy()
+        rows['vectors'] = features.vectors
     return rows

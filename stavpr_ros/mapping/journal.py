@@ -31,7 +31,6 @@ from stavpr_ros.mapping.map_file import load_map
 from stavpr_ros.mapping.place_map import Place, PlaceMap
 from stavpr_ros.mapping.stored_features import require_normalized
 from stavpr_ros.regular_file import open_regular
-import torch
 
 FORMAT, VERSION = 'stavpr-journal', 2
 SUFFIX = '.journal'
@@ -81,7 +80,7 @@ class JournalPlace(NamedTuple):
         stamp, identifier = self.place.stamp, self.place.identifier.encode()
         pose = np.nan if self.place.pose is None else self.place.pose
         arrays = self.features.strips, self.features.weights, self.features.vectors
-        strips, weights, vector = (0 if each is None else each.cpu().squeeze(1) for each in arrays)
+        strips, weights, vector = (0 if each is None else each.squeeze() for each in arrays)
         row = np.zeros((), _row(*sizes_of(self.features)))
         sizes = len(identifier), len(self.thumbnail)
         values = self.number, stamp, *sizes, pose, weights, strips, vector
@@ -105,9 +104,7 @@ class JournalPlace(NamedTuple):
             raise ValueError(f'its thumbnail has {len(thumbnail)} of {row["of_thumbnail"]} bytes')
         require_jpegs(np.frombuffer(thumbnail, np.uint8), np.array([len(thumbnail)]))
         require_weights(row['weights'])
-        strips, weights, vector = (
-            torch.from_numpy(row[name].copy()) for name in ('strips', 'weights', 'vector')
-        )
+        strips, weights, vector = (row[name].copy() for name in ('strips', 'weights', 'vector'))
         require_normalized(strips, 'strips', 0)
         require_normalized(vector[None], 'vectors', 0)
         features = LocalFeatures(

@@ -18,7 +18,6 @@ from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures, StoredThumbnails
 from stavpr_ros.output_file import explained, FileVersion, numbered, write_at
-import torch
 
 DAMAGED = '.damaged'  # suffix of journals that were not read to their end
 
@@ -78,7 +77,7 @@ def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
     poses = np.array([np.full(7, np.nan) if one.pose is None else one.pose for one in places])
     cells = template.features.cells
     return PlaceMap(
-        features=StoredFeatures(file, torch.cat(weights, dim=1), template.settings, cells),
+        features=StoredFeatures(file, np.concatenate(weights, axis=1), template.settings, cells),
         projection=template.projection,
         stamps=np.array([place.stamp for place in places], np.int64),
         ids=tuple(place.identifier for place in places),

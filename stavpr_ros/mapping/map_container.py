@@ -21,7 +21,7 @@ import weakref
 
 import numpy as np
 from stavpr_ros.errors import MapFileError
-import torch
+from stavpr_ros.memory import aligned_empty
 
 # Name of a type in safetensors files: its NumPy type; BF16 is only passed on.
 DTYPES = {
@@ -105,7 +105,7 @@ class MapFile:
         """Read a part whole, checked, into memory that begins with a cache line."""
         part = self.parts[name]
         self.verify(name)
-        content = torch.empty(part.size, dtype=torch.uint8).numpy()
+        content = aligned_empty((part.size,), np.uint8)
         self.fill(content, part.start)
         return content.view(DTYPES[part.dtype]).reshape(part.shape)
 

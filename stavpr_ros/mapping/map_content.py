@@ -18,7 +18,6 @@ from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
-import torch
 
 # parts that are read, and compared with their hashes, later
 LARGE = ('strips', 'thumbnails', 'vectors/vectors', 'statistics/codes')
@@ -79,7 +78,7 @@ def map_content(file: MapFile) -> PlaceMap:
         ends = _ends(arrays['id_ends'], len(arrays['ids']), 'id_ends')
         content = arrays['ids'].tobytes()
         ids = [content[a:b].decode() for a, b in zip([0, *ends], ends, strict=False)]
-    features = StoredFeatures(file, torch.from_numpy(weights), settings, cells)
+    features = StoredFeatures(file, weights, settings, cells)
     if STATISTICS in known:
         features.statistics = statistics_of(file, arrays)
         features.has_stale_statistics = features.statistics is None

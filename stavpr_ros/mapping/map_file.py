@@ -105,7 +105,7 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
         parts[ends] = _part(ends, np.cumsum(lengths, dtype=np.int64))
 
     arrays = {
-        'weights': features.weights.cpu().numpy(),
+        'weights': features.weights,
         'stamps': place_map.stamps,
         'poses': place_map.poses,
         'projection': projection.matrix if projection else None,
@@ -122,7 +122,7 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
             require_jpegs(np.frombuffer(b''.join(part), np.uint8), ends, first)
         add_texts('thumbnails', 'thumbnail_ends', place_map.thumbnails)
     if (vectors := features.vectors) is not None:
-        parts['vectors/vectors'] = _part('vectors/vectors', vectors.cpu().numpy(), dtype)
+        parts['vectors/vectors'] = _part('vectors/vectors', vectors, dtype)
     return parts
 
 
@@ -132,7 +132,7 @@ def _strips(features: LocalFeatures, dtype: np.dtype) -> Iterator[np.ndarray]:
         if isinstance(features, StoredFeatures):
             yield features.stored_strip(j).astype(dtype, copy=False)
         else:
-            yield features.strips[j].cpu().numpy().astype(dtype, copy=False)
+            yield features.strips[j].astype(dtype, copy=False)
 
 
 # --------------------------------------------------------------------------------------- reading

@@ -9,7 +9,6 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures, Projection
 from stavpr_ros.features.extractor import normalize
 from stavpr_ros.mapping.place_map import PlaceMap
-import torch
 
 BLOCK_PLACES = 1024  # at a time: those of an opened map stay in its file
 STRIPS_A_DIRECTION = 3  # of fewer, directions follow chance (docs/performance.md)
@@ -38,12 +37,12 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
             f'{STRIPS_A_DIRECTION} are needed for a direction: take at most '
             f'{W * n // STRIPS_A_DIRECTION}, or add places'
         )
-    basis = _directions(features, d)[:, -dimension:].float()
-    matrix, name = basis.numpy(), f'principal components {d} -> {dimension} of {n} places'
+    basis = _directions(features, d)[:, -dimension:].astype(np.float32)
+    matrix, name = basis, f'principal components {d} -> {dimension} of {n} places'
     if before := place_map.projection:
         matrix, name = before.matrix @ matrix, f'{before.name}, {name}'
     projection = Projection(np.ascontiguousarray(matrix), name)
-    strips = torch.empty((W, n, dimension))
+    strips: np.ndarray = np.empty((W, n, dimension), np.float32)
     for low in range(0, n, BLOCK_PLACES):
         strips[:, low : low + BLOCK_PLACES], _ = normalize(
             features[low : low + BLOCK_PLACES].strips @ basis
@@ -57,20 +56,22 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     )
 
 
-def _directions(features: LocalFeatures, d: int) -> torch.Tensor:
+def _directions(features: LocalFeatures, d: int) -> np.ndarray:
     """Return the principal directions, (d, m), float64, those of the largest variance last."""
     W, n = features.weights.shape
     if W * n < d:  # the products of fewer strips than dimensions
-        strips = features[:].strips.double()
-        centered = (strips - strips.mean(dim=1, keepdim=True)).flatten(0, 1)
-        _, vectors = torch.linalg.eigh(centered @ centered.T)
+        strips = features[:].strips.astype(np.float64)
+        centered = (strips - strips.mean(axis=1, keepdims=True)).reshape(W * n, d)
+        _, vectors = np.linalg.eigh(centered @ centered.T)
         directions = vectors.T @ centered
-        return (directions / directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)).T
-    total = torch.zeros((W, d), dtype=torch.float64)
-    squares = torch.zeros((d, d), dtype=torch.float64)
+        norms = np.linalg.norm(directions, axis=1, keepdims=True)
+        unit: np.ndarray = (directions / norms.clip(1e-9)).T
+        return unit
+    total, squares = np.zeros((W, d)), np.zeros((d, d))
     for low in range(0, n, BLOCK_PLACES):
         strips = features[low : low + BLOCK_PLACES].strips
-        total += strips.sum(dim=1)
-        squares += strips.flatten(0, 1).T @ strips.flatten(0, 1)
-    _, vectors = torch.linalg.eigh(squares - total.T @ total / max(n, 1))
-    return vectors
+        rows = strips.reshape(-1, d)
+        total += strips.sum(axis=1)
+        squares += rows.T @ rows
+    directions = np.linalg.eigh(squares - total.T @ total / max(n, 1))[1]
+    return directions

@@ -9,7 +9,7 @@ import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
-import torch
+from stavpr_ros.memory import aligned_empty
 
 LONGEST = 1.01  # norm of a strip; float16 rounds it
 CODES = f'{STATISTICS}/codes'
@@ -61,7 +61,7 @@ class StoredFeatures(LocalFeatures):
     def __init__(
         self,
         file: MapFile,
-        weights: torch.Tensor,
+        weights: np.ndarray,
         settings: FeatureSettings,
         cells: tuple[int, int] | None,
     ) -> None:
@@ -95,18 +95,14 @@ class StoredFeatures(LocalFeatures):
         return np.dtype(DTYPES[self._part.dtype]).name
 
     @property
-    def strips(self) -> torch.Tensor:
+    def strips(self) -> np.ndarray:
         """Return the features, read from the file; shape (W, n, d), float32."""
         return self._read(np.arange(len(self)))
 
     @property
-    def vectors(self) -> torch.Tensor | None:
+    def vectors(self) -> np.ndarray | None:
         """Return the vectors, read from the file; shape (n, D), float32."""
         return self._read_vectors(np.arange(len(self)))
-
-    def to(self, device: str | torch.device) -> LocalFeatures:
-        """Read the features to a device."""
-        return self[:].to(device)
 
     def stored_strip(self, j: int) -> np.ndarray:
         """Return the features of one strip in the type of the file, shape (n, d)."""
@@ -114,7 +110,7 @@ class StoredFeatures(LocalFeatures):
         strip: np.ndarray = np.empty((n, d), DTYPES[self._part.dtype])
         with errors_of(self.file.path):
             self.file.fill(strip, self._part.start + j * strip.nbytes)
-            require_normalized(torch.from_numpy(strip), f'strips, strip {j}', 0)
+            require_normalized(strip, f'strips, strip {j}', 0)
         return strip
 
     @property
@@ -129,24 +125,24 @@ class StoredFeatures(LocalFeatures):
         self.file.fill(codes, self.file.parts[CODES].start + (j * n + first) * d)
         return codes
 
-    def _read(self, places: np.ndarray) -> torch.Tensor:
+    def _read(self, places: np.ndarray) -> np.ndarray:
         """Return the features of places, shape (W, len(places), d), float32."""
         W, n, d = self._part.shape
-        out = torch.empty((W, len(places), d))
+        out = aligned_empty((W, len(places), d))
         for j in range(W):
             self._fill(out[j], self._part, j * n, places, f'strips, strip {j}')
         return out
 
-    def _read_vectors(self, places: np.ndarray) -> torch.Tensor | None:
+    def _read_vectors(self, places: np.ndarray) -> np.ndarray | None:
         """Return the vectors of places, shape (len(places), D), float32."""
         if self._vectors is None:
             return None
-        out = torch.empty((len(places), self._vectors.shape[1]))
+        out = aligned_empty((len(places), self._vectors.shape[1]))
         self._fill(out, self._vectors, 0, places, 'vectors/vectors')
         return out
 
     def _fill(
-        self, out: torch.Tensor, part: Part, first: int, places: np.ndarray, name: str
+        self, out: np.ndarray, part: Part, first: int, places: np.ndarray, name: str
     ) -> None:
         """Read the rows of places of a part; ``first`` is the row of place 0."""
         dtype = np.dtype(DTYPES[part.dtype])
@@ -156,14 +152,14 @@ class StoredFeatures(LocalFeatures):
             for run, at in starts:  # neighbors are read at once
                 rows = run[at : at + PLACES_AT_ONCE]
                 target, place = out[rows[0] : rows[-1] + 1], int(places[rows[0]])
-                block = target.numpy() if dtype == np.float32 else np.empty(target.shape, dtype)
+                block = target if dtype == np.float32 else np.empty(target.shape, dtype)
                 self.file.fill(block, part.start + (first + place) * block[0].nbytes)
                 if dtype != np.float32:
-                    target.copy_(torch.from_numpy(block))
+                    target[:] = block
                 require_normalized(target, name, place)
 
 
-def require_normalized(rows: torch.Tensor, name: str, place: int) -> None:
+def require_normalized(rows: np.ndarray, name: str, place: int) -> None:
     """
     Reject features that are not finite, or longer than 1.
 
@@ -172,8 +168,7 @@ def require_normalized(rows: torch.Tensor, name: str, place: int) -> None:
     :raises ValueError: names part and place.
     """
     for low in range(0, len(rows), PLACES_AT_ONCE):
-        # by NumPy: torch would wake its threads for each of thousands of short blocks
-        block = rows[low : low + PLACES_AT_ONCE].float().numpy()
+        block = rows[low : low + PLACES_AT_ONCE].astype(np.float32, copy=False)
         if not (np.einsum('ij,ij->i', block, block) <= LONGEST**2).all():  # NaN included
             raise ValueError(
                 f'part {name}, from place {place + low} on: features are not finite, or longer '

@@ -63,9 +63,7 @@ class SaveState:
         newest = places.place(places.first + len(places) - 1)
         if self.journal is None and self.recorded == self.saved:
             stamps, ids = np.array([newest.stamp]), (newest.identifier,)
-            template = PlaceMap(
-                features.to('cpu'), places.projection, stamps, ids, camera=places.camera
-            )
+            template = PlaceMap(features, places.projection, stamps, ids, camera=places.camera)
             self.journal = open_journal(self.base, template)
         if self.journal is not None:
             thumbnail = places.thumbnails[-1]

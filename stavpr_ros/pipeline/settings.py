@@ -20,7 +20,7 @@ from stavpr_ros.mapping.stores import is_address
 from stavpr_ros.parameters import BY_NAME, default
 from stavpr_ros.pipeline.maps_folder import maps_folder
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.loop_closer import choose_loop_backend, least_limit
+from stavpr_ros.recognition.loop_closer import least_limit
 from stavpr_ros.recognition.robust import options_of
 from stavpr_ros.recognition.verification import GeometricSettings
 
@@ -136,17 +136,17 @@ class PipelineSettings:
 
     def matching_backend(self, operation: str) -> str:
         """
-        Return the backend of the image distances, ``cpu`` or ``cuda``.
+        Return the backend of the image distances, ``cpu`` or ``cuda``; loop closure has the first.
 
         :raises UnavailableError: ``cuda`` is set and not available.
         """
-        choose = choose_loop_backend if operation == 'loop_closure' else choose_backend
-        return choose(self.backend)
+        backend = choose_backend(self.backend)
+        return 'cpu' if operation == 'loop_closure' else backend
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""
         why = f' ({why_no_cuda() or "CUDA is available"})' if self.backend == 'auto' else ''
-        stages = f'backend {self.backend}{why}: extraction on {choose_backend(self.backend)}'
+        stages = f'backend {self.backend}{why}: networks on {choose_backend(self.backend)}'
         if operation == 'mapping':
             return stages
         matching = self.matching_backend(operation)

@@ -137,7 +137,6 @@ def _loop_closer(
         extractor.settings,
         limit=settings.max_places,
         exclude_seconds=settings.exclude_seconds,
-        backend=settings.backend,
         precision=settings.precision,
     )
 

@@ -10,14 +10,14 @@ computed by one thread, several blocks at the same time.
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 
 import numba as nb
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.compilation import parallel_kernel
 from stavpr_ros.features import LocalFeatures
-import torch
+from stavpr_ros.memory import aligned_empty
+from stavpr_ros.threads import thread_count
 
 PIECE = 256  # places read or centered at a time
 
@@ -29,58 +29,41 @@ def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
 
 
 def converted_blocks(
-    features: LocalFeatures, convert: Callable[[LocalFeatures], torch.Tensor]
-) -> Iterator[tuple[slice, torch.Tensor]]:
-    """
-    Yield the converted blocks, in their order.
-
-    Meanwhile torch has one thread, on the calling thread too.
-    """
-    slices = _slices(features)
-    with one_thread() as threads:
-        if threads == 1 or len(slices) <= 1:
-            for places in slices:
-                yield places, convert(features[places])
-            return
-        pending: deque[tuple[slice, Future[torch.Tensor]]] = deque()
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            for places in slices:
-                future = pool.submit(lambda places: convert(features[places]), places)
-                pending.append((places, future))
-                if len(pending) > threads:
-                    first, future = pending.popleft()
-                    yield first, future.result()
-            for first, future in pending:
+    features: LocalFeatures, convert: Callable[[LocalFeatures], np.ndarray]
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield the converted blocks, in their order."""
+    slices, threads = _slices(features), thread_count()
+    if threads == 1 or len(slices) <= 1:
+        for places in slices:
+            yield places, convert(features[places])
+        return
+    pending: deque[tuple[slice, Future[np.ndarray]]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for places in slices:
+            future = pool.submit(lambda places: convert(features[places]), places)
+            pending.append((places, future))
+            if len(pending) > threads:
+                first, future = pending.popleft()
                 yield first, future.result()
+        for first, future in pending:
+            yield first, future.result()
 
 
 def converted(
     features: LocalFeatures,
-    convert: Callable[[torch.Tensor], torch.Tensor],
-    visit: Callable[[torch.Tensor], None] = lambda strips: None,
+    convert: Callable[[np.ndarray], np.ndarray],
+    visit: Callable[[np.ndarray], None] = lambda strips: None,
 ) -> LocalFeatures:
     """
     Return new features, converted block by block.
 
     :param visit: called with the strips of each converted block.
     """
-    shape = (*features.weights.shape, features.dimension)
-    strips = torch.empty(shape, device=features.weights.device)
+    strips = aligned_empty((*features.weights.shape, features.dimension))
     for places, block in converted_blocks(features, lambda block: convert(block.strips)):
         visit(block)
         strips[:, places] = block
     return LocalFeatures(strips, features.weights, features.settings, features.cells)
-
-
-@contextmanager
-def one_thread() -> Iterator[int]:
-    """Limit torch to one thread on the calling thread; yields the number before."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield before
-    finally:
-        torch.set_num_threads(before)
 
 
 def _slices(features: LocalFeatures) -> list[slice]:
@@ -105,23 +88,24 @@ class PlaceChanges:
     def __init__(self, n: int, apart: int) -> None:
         self.changes: np.ndarray = np.zeros((apart, n), np.float32)
         self._count = 0
-        self._latest: torch.Tensor | None = None
+        self._latest: np.ndarray | None = None
 
-    def add(self, strips: torch.Tensor) -> None:
-        """Add the next places, unit-norm strips (W, m, d), of any type."""
+    def add(self, strips: np.ndarray) -> None:
+        """Add the next places, unit-norm strips (W, m, d), float32."""
         m, n = strips.shape[1], self.changes.shape[1]
         if not n or not m:
             return
-        strips = strips.float().cpu()
-        block = strips if self._latest is None else torch.cat([self._latest, strips], dim=1)
+        block = np.ascontiguousarray(strips)
+        if self._latest is not None:
+            block = np.concatenate([self._latest, strips], axis=1)
         before = block.shape[1] - m
         out = np.empty(block.shape[1], np.float32)
         for apart in range(1, min(len(self.changes), block.shape[1] - 1) + 1):
-            _changes(block.contiguous().numpy(), apart, out)
+            _changes(block, apart, out)
             first = max(before, apart)
             self.changes[apart - 1, self._count + first - before : self._count + m] = out[first:]
         self._count += m
-        self._latest = block[:, -len(self.changes) :].clone()
+        self._latest = block[:, -len(self.changes) :].copy()
 
 
 @parallel_kernel

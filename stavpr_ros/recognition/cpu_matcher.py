@@ -11,14 +11,13 @@ from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import adaptive_weights, image_distances, WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.memory import aligned_empty, is_aligned
 from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.recognition.robust import normalize
 from stavpr_ros.recognition.route_strips import RouteStrips
-import torch
-
-CACHE_LINE = 64  # bytes; vectors across two of them are read at half the speed
 
 
-def cut_cells(strips: torch.Tensor, cells: tuple[int, int]) -> torch.Tensor:
+def cut_cells(strips: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
     """
     Cut strips into their cells, unit norm each; zero cells stay zero.
 
@@ -28,9 +27,8 @@ def cut_cells(strips: torch.Tensor, cells: tuple[int, int]) -> torch.Tensor:
     """
     W, n, d = strips.shape
     H, columns = cells
-    cut = strips.reshape(W, n, d // (H * columns), H, columns).permute(0, 3, 1, 2, 4)
-    cut = cut.reshape(W * H, n, d // H)
-    return cut / cut.norm(dim=2, keepdim=True).clamp_(min=1e-12)
+    cut = strips.reshape(W, n, d // (H * columns), H, columns).transpose(0, 3, 1, 2, 4)
+    return normalize(cut.reshape(W * H, n, d // H).copy())
 
 
 class CpuMatcher:
@@ -55,14 +53,14 @@ class CpuMatcher:
             raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
         self._prepare(W, spatial)
         self._cells = features.cells if spatial.vertical else None
-        self._weights = features.weights.cpu()
+        self._weights = features.weights
         self._places = self._weights.shape[1]
         if precision == 'int8' and isinstance(features, LocalFeatures):
             features = rounded(features, lambda block: block)
         if isinstance(features, Int8Features):
             self._map = features.strips.kernel_arguments()
             return
-        strips = features.strips.cpu()
+        strips = features.strips
         if spatial.vertical:
             if features.cells is None:
                 raise InputError(
@@ -71,10 +69,11 @@ class CpuMatcher:
                 )
             strips = cut_cells(strips, features.cells)
             self._cell_a = adaptive_weights(features.cells[0], spatial, np.dtype(np.float32))
-        strips = strips.float().contiguous()
-        if strips.data_ptr() % CACHE_LINE:
-            strips = strips.clone()
-        self._map = strips.numpy()
+        if not (strips.flags.c_contiguous and is_aligned(strips)):
+            aligned = aligned_empty(strips.shape)
+            aligned[:] = strips
+            strips = aligned
+        self._map = strips
 
     def _prepare(self, W: int, spatial: SpatialSettings) -> None:
         self._spatial = spatial
@@ -86,20 +85,21 @@ class CpuMatcher:
         """Return the number of places n."""
         return self._places
 
-    def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,)."""
-        return self.distance_matrix(strips[:, None], weights[:, None])[0]
+        row: np.ndarray = self.distance_matrix(strips[:, None], weights[:, None])[0]
+        return row
 
-    def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of Q images to every place, (Q, n)."""
-        out = np.empty((strips.shape[1], self.places), np.float32)
+        out: np.ndarray = np.empty((strips.shape[1], self.places), np.float32)
         if len(strips) == 1:  # one vector an image: its alignment is its cosine distance
             if isinstance(self._map, tuple):
                 int8.cosine_distances(self._map, int8.tiled(strips), out)
             else:
-                dot.cosine_distances(self._map[0], strips[0].contiguous().numpy(), out)
-            return torch.from_numpy(out)
-        strips = strips if self._cells is None else cut_cells(strips.cpu(), self._cells)
+                dot.cosine_distances(self._map[0], np.ascontiguousarray(strips[0]), out)
+            return out
+        strips = strips if self._cells is None else cut_cells(strips, self._cells)
         queries = int8.tiled(strips) if isinstance(self._map, tuple) else dot.tiled(strips)
         if self._cells is not None:
             dot.vertical_image_distances(
@@ -110,9 +110,9 @@ class CpuMatcher:
         else:
             for x in range(len(out)):
                 out[x] = self._without_dtw(queries, x, weights[:, x])
-        return torch.from_numpy(out)
+        return out
 
-    def distances_at(self, strips: torch.Tensor, firsts: np.ndarray, size: int) -> np.ndarray:
+    def distances_at(self, strips: np.ndarray, firsts: np.ndarray, size: int) -> np.ndarray:
         """
         Return the distances of one image to chunks of places, strategies with DTW only.
 
@@ -126,7 +126,7 @@ class CpuMatcher:
         )
         return out
 
-    def _without_dtw(self, queries: Any, x: int, weights: torch.Tensor) -> np.ndarray:
+    def _without_dtw(self, queries: Any, x: int, weights: np.ndarray) -> np.ndarray:
         """Return the distances of image x without DTW, (n,)."""
         W, n = self._weights.shape
         d = np.empty((-(-W // dot.TILE) * dot.TILE, W, n), np.float32)
@@ -136,8 +136,9 @@ class CpuMatcher:
             dot.strip_distances(self._map, queries[x], d)
         if self._spatial.strategy == 'sliding_window':
             return image_distances(d[:W], self._spatial)
-        similarity = 1 - torch.from_numpy(d).diagonal()[:, :W]  # (n, W)
-        return (1 - (similarity * self._weights.T) @ weights).numpy()
+        similarity = 1 - d.diagonal()[:, :W]  # (n, W)
+        row: np.ndarray = 1 - (similarity * self._weights.T) @ weights
+        return row
 
 
 class CpuRouteMatcher(CpuMatcher):
@@ -149,21 +150,15 @@ class CpuRouteMatcher(CpuMatcher):
     :raises SettingsError: xi > W.
     """
 
-    device = None  # a CUDA device where the route lies
-
     def __init__(self, W: int, spatial: SpatialSettings) -> None:
         self._prepare(W, spatial)
 
-    def to_oldest(self, strips: RouteStrips, newest: torch.Tensor, places: int) -> torch.Tensor:
+    def to_oldest(self, strips: RouteStrips, newest: np.ndarray, places: int) -> np.ndarray:
         """
         Return the distances of an image to the oldest places, (places,).
 
         :param strips: of the route; newest: of the image, (W, 1, d), float32.
         """
-        if isinstance(strips, Int8Strips):
-            self._map = strips.kernel_arguments()
-        else:
-            assert isinstance(strips, torch.Tensor)
-            self._map = strips.numpy()
+        self._map = strips.kernel_arguments() if isinstance(strips, Int8Strips) else strips
         self._places = places
-        return self.distance_matrix(newest, newest[:, :, 0])[0]
+        return self.distances(newest[:, 0], newest[:, 0, 0])

@@ -9,23 +9,14 @@ from stavpr_ros.recognition.filter_paths import (
     Belief,
     belief_of,
     NEGLIGIBLE,
+    NO_PLACES,
     TOP,
 )
 from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
-from stavpr_ros.recognition.route_strips import move_up
 import torch
 from torch.nn import functional
 
 MOST = 512  # most probable places that are copied to the host: more than are ever excluded
-
-
-def current_device() -> torch.device:
-    """
-    Return torch's current CUDA device.
-
-    :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
-    """
-    return runtime().torch_device
 
 
 def z_normalized_on_device(
@@ -63,7 +54,7 @@ class CudaPlaceFilter:
         places: int,
         lag: int,
         settings: FilterSettings | None = None,
-        gaps: np.ndarray | None = None,
+        gaps: np.ndarray = NO_PLACES,
     ) -> None:
         from stavpr_ros.alignment.cuda import place_filter
 
@@ -71,7 +62,7 @@ class CudaPlaceFilter:
         self._kernels, self._runtime = place_filter, runtime()
         self._device = device = self._runtime.torch_device
         self._shape, self._speeds = (len(s.levels), len(s.speeds)), np.array(s.speeds, np.float64)
-        self._gaps = torch.from_numpy(np.empty(0, np.int64) if gaps is None else gaps).to(device)
+        self._gaps = torch.from_numpy(gaps).to(device)
         self._reach, self._lag = int(np.ceil(self._speeds.max())) + 2, lag
         self._levels = torch.tensor(s.levels, dtype=torch.float32, device=device)
         self._level_changes = torch.from_numpy(s.level_changes()).to(device)
@@ -129,23 +120,6 @@ class CudaPlaceFilter:
         self._scale = torch.ones((), dtype=torch.float64, device=self._device)
         self.count, self._known, self._read_at = 0, 0, -1
 
-    def grow(self, places: int) -> None:
-        """Make room for more places."""
-        states, origins, sums, steps = self._states, self._origins, self._sums, self._steps
-        before = self._room
-        self._allocate(places)
-        self._states[:, :before], self._origins[..., :before] = states, origins
-        self._sums[:, : sums.shape[1]] = sums
-        self._steps.copy_(steps)
-        self._read_at = -1
-
-    def evict(self, count: int) -> None:
-        """Drop the oldest places; the others move up."""
-        for values in (self._states, self._sums, *self._origins):
-            move_up(values, count, values.shape[1])
-            values[:, -count:] = ALL_ENTERED if values.dtype == torch.uint8 else 0
-        self._sum_states()
-
     def _sum_states(self) -> None:
         self._on_map = self._sums[: self._shape[0]].sum(dim=1, dtype=torch.float64)
         self._read_at = -1
@@ -167,16 +141,13 @@ class CudaPlaceFilter:
         block = self._kernels.BLOCK
         self._runtime.launch(kernel, (-(-count // block), 1), block, *arguments)
 
-    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
-        """See :meth:`StateFilter.z_normalized`."""
-        return z_normalized_on_device(row, around, torch.from_numpy(counted).to(row.device))
-
     def update(
         self,
         z: torch.Tensor,
         weight: float,
         speed_weights: np.ndarray,
         speed_likelihoods: np.ndarray | float = 1.0,
+        not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """See :meth:`StateFilter.update`."""
         s, (K, V), v, n = self.settings, self._shape, self._views, len(z)
@@ -195,6 +166,9 @@ class CudaPlaceFilter:
         before = lost = self._on_map
         if n:
             self._z[:n] = z
+            if len(not_near):
+                raised = torch.from_numpy(not_near).to(self._device)
+                self._z[raised] = self._z[raised].clamp(min=0)
             self._z[self._gaps] = -torch.inf
             changes = s.speed_changes(speed_weights, speed_likelihoods)
             self._speed_factors.copy_(torch.from_numpy(changes))

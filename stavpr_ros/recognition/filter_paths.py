@@ -27,6 +27,7 @@ from stavpr_ros.compilation import kernel
 BLOCK = 128  # places whose states are neighbors in memory; a multiple of all LANES
 ENTERED = 9  # origin of a state that came from off the map
 ALL_ENTERED = ENTERED | ENTERED << 4  # two origins
+NO_PLACES: np.ndarray = np.empty(0, np.int64)
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
 CLOSE = 2  # places: the probability of a place is that of its neighbors within CLOSE, too

@@ -3,10 +3,9 @@
 """The window of mode robust: a place filter, read at the middle of the window."""
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -16,6 +15,7 @@ from stavpr_ros.recognition.filter_paths import (
     Belief,
     CLOSE,
     NEGLIGIBLE,
+    NO_PLACES,
     offset_probabilities,
     OFFSETS,
 )
@@ -24,7 +24,6 @@ from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
-import torch
 
 AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
 
@@ -58,30 +57,23 @@ class StateFilter(Protocol):
     def reset(self) -> None:
         """Forget where the camera was."""
 
-    def grow(self, places: int) -> None:
-        """Make room for more places."""
-
-    def evict(self, count: int) -> None:
-        """Drop the oldest places; the others move up."""
-
-    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
-        """See :func:`stavpr_ros.recognition.robust.z_normalized`; on the filter's device."""
-
     def update(
         self,
-        z: torch.Tensor,
+        z: Any,
         weight: float,
         speed_weights: np.ndarray,
         speed_likelihoods: np.ndarray | float = 1.0,
+        not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """
         Advance by an image.
 
-        :param z: z-normalized distances to the first m places, (m,), float32, on the filter's
-            device; +inf excludes a place.
+        :param z: z-normalized distances to the first m places, (m,), float32, an array or a tensor
+            on the filter's device; +inf excludes a place.
         :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
         :param speed_likelihoods: of each speed relative to that off the map, (V,).
+        :param not_near: places below m whose z counts as 0 at least.
         """
 
     def places_of_states(self) -> np.ndarray:
@@ -121,7 +113,6 @@ class FilterWindow(QueryWindow):
     :param normalizes, around: see :class:`stavpr_ros.recognition.window.QueryWindow`.
     :param to_oldest: states are followed back to the oldest image of the window, which
         :meth:`match_oldest` requires, instead of the middle one.
-    :param on_device: rows and filter are on torch's current CUDA device.
 
     ``change`` compares images, ``filter`` contains the states.
     """
@@ -137,24 +128,24 @@ class FilterWindow(QueryWindow):
         normalizes: bool = False,
         around: int = 0,
         to_oldest: bool = False,
-        on_device: bool = False,
     ) -> None:
         layout, settings = layout or ColumnLayout(), settings or FilterSettings()
         length, width = sequence.length, layout.width(places)
-        device = torch.device('cpu')
-        filter_class: Callable[..., StateFilter] = PlaceFilter
-        if on_device:
-            from stavpr_ros.recognition import cuda_filter
-
-            device, filter_class = cuda_filter.current_device(), cuda_filter.CudaPlaceFilter
-        buffer = SequenceBuffer(length, width, sequence.k, device=device, copies=1)
-        super().__init__(buffer, layout, normalizes, around)
+        super().__init__(self._buffer(sequence, width), layout, normalizes, around)
         self._middle = (length - 1) // 2
         lag = length - 1 - (0 if to_oldest else self._middle)
-        self.filter = filter_class(width, lag, settings, layout.gaps)
+        self.filter = self._state_filter(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings)
         self._speeds, self._levels = settings.speeds, settings.levels
         self._images: deque[WindowImage] = deque(maxlen=length)
+
+    def _buffer(self, sequence: SequenceSettings, width: int) -> SequenceBuffer:
+        return SequenceBuffer(sequence.length, width, sequence.k, copies=1)
+
+    def _state_filter(
+        self, width: int, lag: int, settings: FilterSettings, gaps: np.ndarray
+    ) -> StateFilter:
+        return PlaceFilter(width, lag, settings, gaps)
 
     @property
     def changes(self) -> tuple[float, ...]:
@@ -176,26 +167,28 @@ class FilterWindow(QueryWindow):
     def grow(self, places: int) -> None:
         """Make room for more places."""
         super().grow(places)
+        assert isinstance(self.filter, PlaceFilter)
         self.filter.grow(places)
         self.change.grow(places)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         super().evict(count)
+        assert isinstance(self.filter, PlaceFilter)
         self.filter.evict(count)
         self.change.evict(count)
 
-    def push(self, row: torch.Tensor, strips: torch.Tensor, stamp: int) -> None:
+    def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
         """See :meth:`QueryWindow.push`."""
         row = self._as_columns(row)
         self.buffer.push(row, stamp)
-        self._update(row, self.change.next_query(strips.cpu().numpy()))
+        self._update(row, self.change.next_query(strips))
 
-    def add(self, row: torch.Tensor, stamp: int, change: float) -> None:
+    def add(self, row: np.ndarray, stamp: int, change: float) -> None:
         """
         Add the newest image by its normalized distances, and drop the oldest.
 
-        :param row: to the places, (n,), float32, on the device of the filter.
+        :param row: to the places, (n,), float32.
         :param change: from the image before.
         """
         row = self.layout.spread(row)
@@ -205,10 +198,7 @@ class FilterWindow(QueryWindow):
     def _counted(self, n: int) -> np.ndarray:
         return self.change.distinct(n)
 
-    def _normalized(self, row: torch.Tensor, counted: np.ndarray) -> torch.Tensor:
-        return self.filter.z_normalized(row, self._around, counted)
-
-    def _update(self, z: torch.Tensor, change: float) -> None:
+    def _update(self, z: Any, change: float) -> None:
         """
         Advance the filter by an image.
 
@@ -226,18 +216,15 @@ class FilterWindow(QueryWindow):
             speeds = self.change.speed_weights(change)
             likelihoods = self.change.speed_likelihoods(change)
             moves = speeds[0] < AT_REST * speeds.max()
-            self.filter.update(self._of_moving(z) if moves else z, weight, speeds, likelihoods)
+            # places where the map's camera was at rest are not near to a moving one
+            at_rest = self.layout.columns_of(self.change.at_rest()) if moves else NO_PLACES
+            not_near = at_rest[at_rest < len(z)]
+            self.filter.update(z, weight, speeds, likelihoods, not_near)
         else:
             by_place = self.layout.gathered(self.filter.places_of_states()[: len(z)])
             if self.change.is_dark_stretch(by_place):
                 self.filter.update(z, 0.0, ones, ones)
         self._images.append(WindowImage(change, weight, self.filter.count - 1))
-
-    def _of_moving(self, z: torch.Tensor) -> torch.Tensor:
-        """Return z of a moving camera: places where the map's camera was at rest are not near."""
-        columns = self.layout.columns_of(self.change.at_rest())
-        far = torch.from_numpy(columns[columns < len(z)]).to(z.device)
-        return z.index_put((far,), z[far].clamp(min=0)) if len(far) else z
 
     def _match(self, nms_radius: int) -> WindowMatch:
         return self._match_image(self._middle, nms_radius)
@@ -340,13 +327,12 @@ class FilterWindow(QueryWindow):
 
     def _off_map(self, n: int, first: int) -> WindowMatch:
         """Return the place that is most probable now, with the probability 0."""
-        nothing = np.empty(0, np.int64)
-        place = self.filter.most_probable(nothing)[0] + first
+        place = self.filter.most_probable(NO_PLACES)[0] + first
         match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
         length = self.buffer.length
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
         return WindowMatch(
-            match, path, partial(self._sequences, n, first, nothing, np.empty(0)), 0.0
+            match, path, partial(self._sequences, n, first, NO_PLACES, np.empty(0)), 0.0
         )
 
     def _path(self, state: np.ndarray, position: int) -> np.ndarray:

@@ -22,8 +22,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.filter_paths import BLOCK
 from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, unit_norm
-import torch
+from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, normalize
 
 BYTES = 128  # of a place, at most
 LEARNED = 2048  # places that the components are learned from
@@ -50,14 +49,14 @@ class FirstStage:
     ) -> None:
         self._matcher, self._probable = matcher, probable
         W, n, d = features.strips.shape
-        learned = torch.as_tensor(features.strips[:, evenly(n, LEARNED)]).float()
-        _, vectors = torch.linalg.eigh(learned.transpose(1, 2) @ learned)
+        learned = features.strips[:, evenly(n, LEARNED)]
+        _, vectors = np.linalg.eigh(learned.transpose(0, 2, 1) @ learned)
         self._basis = vectors[..., -min(d, max(1, BYTES // W)) :]  # (W, d, p)
         self._reduced = Int8Strips(1, n, W * self._basis.shape[2])
         for low in range(0, n, PIECE):
-            strips = torch.as_tensor(features.strips[:, low : low + PIECE]).float()
-            reduced = unit_norm(strips @ self._basis).transpose(0, 1).flatten(1)  # (m, W p)
-            self._reduced.write(low, reduced[None].contiguous())
+            reduced = normalize(features.strips[:, low : low + PIECE] @ self._basis)
+            by_place = reduced.transpose(1, 0, 2).reshape(1, reduced.shape[1], -1)  # (1, m, W p)
+            self._reduced.write(low, np.ascontiguousarray(by_place))
         self._chunks = -(-n // CHUNK)
         self._sample = evenly(self._chunks, SAMPLED)
 
@@ -67,15 +66,16 @@ class FirstStage:
         return self._matcher.places
 
     def distances(
-        self, strips: torch.Tensor, weights: torch.Tensor, vector: torch.Tensor | None = None
-    ) -> torch.Tensor:
+        self, strips: np.ndarray, weights: np.ndarray, vector: np.ndarray | None = None
+    ) -> np.ndarray:
         """
         Return the distances of one image to every place, (n,); exact ones where they count.
 
         :param vector: of the image, (1, D), where those of the places are compared.
         """
         n = self.places
-        out, nearest = np.empty(n, np.float32), np.empty(self._chunks, np.float32)
+        out: np.ndarray = np.empty(n, np.float32)
+        nearest = np.empty(self._chunks, np.float32)
         query = int8.tiled(self._shifted(strips if vector is None else vector)[:, None])
         int8.smallest_distances(self._reduced.kernel_arguments(), query, CHUNK, out, nearest)
         coarse = self._of_sample(out)
@@ -89,14 +89,14 @@ class FirstStage:
         places = (chunks[:, None] * CHUNK + np.arange(CHUNK)).ravel()
         inside = places < n
         out[places[inside]] = exact.ravel()[inside]
-        return torch.from_numpy(out)
+        return out
 
     @property
     def dimension(self) -> int:
         """Return the number of bytes of a place."""
         return self._reduced.shape[2]
 
-    def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the exact distances of Q images to every place, (Q, n)."""
         return self._matcher.distance_matrix(strips, weights)
 
@@ -111,7 +111,7 @@ class FirstStage:
         probable = (self._probable() // CHUNK)[:, None] + np.arange(BLOCK // CHUNK + 1)
         return np.append(near, probable[probable < self._chunks])
 
-    def _shifted(self, strips: torch.Tensor) -> torch.Tensor:
+    def _shifted(self, strips: np.ndarray) -> np.ndarray:
         """
         Return an image, shifted by up to so many strips that one tile has, reduced as places are.
 
@@ -120,9 +120,9 @@ class FirstStage:
         """
         W, _, p = self._basis.shape
         most = min(W - 1, TILE // 2)
-        rows = torch.zeros((2 * most + 1, W, p))
+        rows = np.zeros((2 * most + 1, W, p), np.float32)
         for shift in range(-most, most + 1):
             places = slice(max(0, -shift), min(W, W - shift))  # strips of a place
             shifted = strips[places.start + shift : places.stop + shift, None]
             rows[shift + most, places] = (shifted @ self._basis[places])[:, 0]
-        return rows.flatten(1)
+        return rows.reshape(len(rows), -1)

@@ -5,10 +5,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.blocks import converted_blocks
-import torch
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Int8Features:
     """
 
     strips: Int8Strips
-    weights: torch.Tensor
+    weights: np.ndarray
     settings: FeatureSettings
     cells: tuple[int, int] | None = None
 
@@ -31,7 +31,7 @@ class Int8Features:
 def rounded(
     features: LocalFeatures,
     convert: Callable[[LocalFeatures], LocalFeatures],
-    visit: Callable[[torch.Tensor], None] = lambda strips: None,
+    visit: Callable[[np.ndarray], None] = lambda strips: None,
 ) -> Int8Features:
     """
     Return features, converted and rounded to int8 block by block.
@@ -40,7 +40,7 @@ def rounded(
     """
     W, n = features.weights.shape
     strips = Int8Strips(W, n, features.dimension)
-    for places, block in converted_blocks(features, lambda block: convert(block).strips.cpu()):
+    for places, block in converted_blocks(features, lambda block: convert(block).strips):
         visit(block)
-        strips.write(places.start, block.contiguous())
+        strips.write(places.start, np.ascontiguousarray(block))
     return Int8Features(strips, features.weights, features.settings, features.cells)

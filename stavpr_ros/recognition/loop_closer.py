@@ -4,11 +4,9 @@
 
 from collections import deque
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice
-from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
@@ -21,26 +19,12 @@ from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
-import torch
-
-if TYPE_CHECKING:
-    from stavpr_ros.recognition.cuda_matcher import CudaRouteMatcher
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
 AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
 # A route's mean follows its light late: until then all its images change little
 MODEL = FilterSettings(speed_weight=0)
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
-
-
-def choose_loop_backend(backend: str) -> str:
-    """
-    Return the backend of loop closure: ``cpu`` for ``auto``, which has not been timed on a GPU.
-
-    :raises UnavailableError: ``cuda``, and there is none.
-    :raises SettingsError: no such backend.
-    """
-    return 'cpu' if backend == 'auto' else choose_backend(backend)
 
 
 class LoopCloser(SequenceRecognizer):
@@ -63,12 +47,9 @@ class LoopCloser(SequenceRecognizer):
     :param limit: most places that are kept; None for all. It must leave room for more than the
         excluded images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
-    :param backend: see :func:`choose_loop_backend`. On ``cuda`` the route's features lie on the
-        device; without the place filter, sequences are matched on the CPU.
     :param precision: of the route's features once it is settled, ``float32`` or ``int8``; see
         :mod:`stavpr_ros.recognition.route_features`.
     :raises SettingsError: invalid settings.
-    :raises UnavailableError: no such backend here.
     """
 
     def __init__(
@@ -78,28 +59,18 @@ class LoopCloser(SequenceRecognizer):
         feature_settings: FeatureSettings,
         limit: int | None = None,
         exclude_seconds: float = 0.0,
-        backend: str = 'auto',
         precision: str = 'float32',
     ) -> None:
         _require_fitting(settings, exclude, limit, exclude_seconds)
         require_choice('precision', precision, PRECISIONS)
-        backend = choose_loop_backend(backend)
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
-        window = _route_window(settings, backend)
-        super().__init__(settings, feature_settings, window, self._track)
+        super().__init__(settings, feature_settings, _route_window(settings), self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
-        self._matcher: CpuRouteMatcher | CudaRouteMatcher
-        if backend == 'cpu':
-            self._matcher = CpuRouteMatcher(W, settings.spatial)
-        else:
-            from stavpr_ros.recognition import cuda_matcher
-
-            self._matcher = cuda_matcher.CudaRouteMatcher(W, settings.spatial)
+        self._matcher = CpuRouteMatcher(W, settings.spatial)
         options = settings.applied_options
-        device = self._matcher.device
         self._route = RouteFeatures(
-            feature_settings, options.mean_centering, options.whitening, limit, precision, device
+            feature_settings, options.mean_centering, options.whitening, limit, precision
         )
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
@@ -179,9 +150,8 @@ class LoopCloser(SequenceRecognizer):
         if route.append(features):
             window.grow(route.room)
         if isinstance(window, FilterWindow):
-            latest = route.latest.numpy()
-            window.change.learn_newest(latest, route.count)
-            window.change.recenter_query(latest[:, -2:][:, 0])
+            window.change.learn_newest(route.latest, route.count)
+            window.change.recenter_query(route.latest[:, -2:][:, 0])
         self._young.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
 
@@ -193,28 +163,19 @@ class LoopCloser(SequenceRecognizer):
             young.popleft()
         return len(young) if stamp else 0
 
-    def _distances(self) -> torch.Tensor:
+    def _distances(self) -> np.ndarray:
         """Return the distances of the newest image to its places; none if they are too few."""
         if self._places < LEAST_PLACES:
-            return torch.empty(0, device=self._matcher.device)
+            return np.empty(0, np.float32)
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
 
 
-def _route_window(settings: RecognizerSettings, backend: str) -> QueryWindow:
+def _route_window(settings: RecognizerSettings) -> QueryWindow:
     """Return an empty window for a route without places."""
     options, sequence = settings.applied_options, settings.sequence
     if not options.place_filter:
         return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
-    return FilterWindow(
-        sequence,
-        0,
-        MODEL,
-        None,
-        options.query_znorm,
-        AROUND,
-        to_oldest=True,
-        on_device=backend == 'cuda',
-    )
+    return FilterWindow(sequence, 0, MODEL, None, options.query_znorm, AROUND, to_oldest=True)
 
 
 def least_limit(exclude: int, length: int) -> int:

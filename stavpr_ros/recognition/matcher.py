@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matchers: distances of images to all places of a map, whose features are on one backend."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.checks import require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.recognition.int8_features import Int8Features
-import torch
 
 PRECISIONS = ('float32', 'int8')
 
@@ -25,22 +25,22 @@ class Matcher(Protocol):
     def places(self) -> int:
         """Return the number of places n."""
 
-    def distances(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    def distances(self, strips: np.ndarray, weights: np.ndarray) -> Any:
         """
         Return the distances of one image to every place.
 
         :param strips: its unit-norm local features, shape (W, d), float32.
         :param weights: norm of each strip over the norm of all, shape (W,), float32.
-        :returns: shape (n,), float32, on the matcher's device.
+        :returns: shape (n,), float32; a NumPy array, or a tensor on a CUDA device.
         """
 
-    def distance_matrix(self, strips: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """
         Return the distances of Q images to every place, as :meth:`distances` of each.
 
         :param strips: shape (W, Q, d), float32.
         :param weights: shape (W, Q), float32.
-        :returns: shape (Q, n), float32, on the matcher's device.
+        :returns: shape (Q, n), float32.
         """
 
 

@@ -49,7 +49,7 @@ def _centered(place_map, text, progress):  # type: ignore[no-untyped-def]
     bar = tqdm(total=len(place_map), desc=text, unit='place', disable=None if progress else True)
     with bar:
         for places, block in blocks(place_map.features):
-            strips = centering.places(block).strips.numpy()
+            strips = centering.places(block).strips
             yield from zip(range(places.start, places.stop), strips.swapaxes(0, 1), strict=True)
             bar.update(places.stop - places.start)
 

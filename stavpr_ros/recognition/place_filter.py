@@ -42,6 +42,7 @@ that makes their sum 1 is part of the next image's level changes.
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES
+from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.recognition.filter_kernels import advance, PLACES
 from stavpr_ros.recognition.filter_paths import (
     ALL_ENTERED,
@@ -52,11 +53,11 @@ from stavpr_ros.recognition.filter_paths import (
     find_largest,
     find_most_probable,
     NEGLIGIBLE,
+    NO_PLACES,
     TOP,
     trace_back,
 )
-from stavpr_ros.recognition.robust import FilterSettings, z_normalized
-import torch
+from stavpr_ros.recognition.robust import FilterSettings
 
 NO_PLACE = np.float32(-np.inf)  # z of a gap between sessions, where likelihoods are 1
 
@@ -78,10 +79,10 @@ class PlaceFilter:
         places: int,
         lag: int,
         settings: FilterSettings | None = None,
-        gaps: np.ndarray | None = None,
+        gaps: np.ndarray = NO_PLACES,
     ) -> None:
         self.settings = settings or FilterSettings()
-        self._gaps = np.empty(0, np.int64) if gaps is None else gaps
+        self._gaps = gaps
         self._speeds = np.array(self.settings.speeds, np.float64)
         self._levels = np.array(self.settings.levels, np.float32)
         self._level_changes = self.settings.level_changes()
@@ -94,7 +95,7 @@ class PlaceFilter:
         K, V = len(self._levels), len(self._speeds)
         self._room, blocks = room, max(1, -(-room // BLOCK))
         # not normalized: times scale, the states are probabilities
-        self._a: np.ndarray = torch.zeros((blocks, K, V, BLOCK)).numpy()
+        self._a: np.ndarray = aligned_zeros((blocks, K, V, BLOCK))
         self._by_place: np.ndarray = np.zeros(blocks * BLOCK, np.float32)  # sums of the states
         self._maxima: np.ndarray = np.zeros(blocks, np.float32)  # of these, by block
         shape = len(self._steps), blocks, K, (V + 1) // 2, BLOCK
@@ -133,19 +134,15 @@ class PlaceFilter:
         """Return the probability of each place, (room,), float32."""
         return self._by_place[: self._room] * np.float32(self._scale)
 
-    def z_normalized(self, row: torch.Tensor, around: int, counted: np.ndarray) -> torch.Tensor:
-        """See :meth:`StateFilter.z_normalized`."""
-        return torch.from_numpy(z_normalized(row.numpy(), around, counted))
-
     def update(
         self,
-        z: np.ndarray | torch.Tensor,
+        z: np.ndarray,
         weight: float,
         speed_weights: np.ndarray,
         speed_likelihoods: np.ndarray | float = 1.0,
+        not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """See :meth:`StateFilter.update`."""
-        z = np.asarray(z)
         s, n = self.settings, len(z)
         slot = self.count % len(self._steps)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
@@ -163,8 +160,9 @@ class PlaceFilter:
         off = self._off @ self._level_changes
         entering = (off * s.enter / (len(self._speeds) * real)).astype(np.float32)
         if n:
-            if len(self._gaps):
+            if len(self._gaps) or len(not_near):
                 z = z.copy()
+                z[not_near] = np.maximum(z[not_near], 0)
                 z[self._gaps] = NO_PLACE
             advance(
                 self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,

@@ -7,6 +7,7 @@ Learning takes several passes over the features; the statistics of a large map a
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
@@ -25,7 +26,6 @@ from stavpr_ros.recognition.robust import (
     SAMPLE,
     STRENGTH,
 )
-import torch
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
@@ -123,7 +123,7 @@ def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> 
     """Add the features, rounded for precision int8; see :func:`statistics_of_map`."""
     features = _AsStored(place_map.features, storage)
     centering = MeanCentering(features, statistics=statistics)
-    return replace(statistics, codes=rounded(features, centering.places).strips.rounded().numpy())
+    return replace(statistics, codes=rounded(features, centering.places).strips.rounded())
 
 
 def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:
@@ -149,9 +149,9 @@ def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics |
     whitening = centering.whitening
     return MapStatistics(
         METHOD,
-        centering.mean.numpy(),
-        whitening.directions.numpy(),
-        whitening.gains.numpy(),
+        centering.mean,
+        whitening.directions,
+        whitening.gains,
         changes.changes,
     )
 
@@ -167,17 +167,17 @@ class _AsStored(LocalFeatures):
         for name in ('weights', 'settings', 'cells'):
             object.__setattr__(self, name, getattr(features, name))
         object.__setattr__(self, 'whole', features)
-        object.__setattr__(self, 'dtype', getattr(torch, storage))
+        object.__setattr__(self, 'dtype', np.dtype(storage))
 
     whole: LocalFeatures
-    dtype: torch.dtype
+    dtype: np.dtype[Any]
 
     def __len__(self) -> int:
         return len(self.whole)
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
         block = self.whole[images]
-        return replace(block, strips=block.strips.cpu().to(self.dtype).float())
+        return replace(block, strips=block.strips.astype(self.dtype).astype(np.float32))
 
     @property
     def dimension(self) -> int:

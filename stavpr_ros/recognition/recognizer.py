@@ -19,7 +19,7 @@ from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.recognition.blocks import blocks
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.lm_dtw_window import CudaLmDtwWindow, LmDtwWindow
+from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
@@ -36,7 +36,6 @@ from stavpr_ros.recognition.robust import MeanCentering
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
-import torch
 
 if TYPE_CHECKING:
     from stavpr_ros.recognition.first_stage import FirstStage
@@ -148,7 +147,7 @@ class SequenceRecognizer(ABC):
         :returns: shape (n,), float32; lower is nearer.
         """
         window = self._window
-        return window.layout.gathered(window.buffer.newest().cpu().numpy())
+        return window.layout.gathered(window.buffer.newest())
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
@@ -209,8 +208,7 @@ class PlaceRecognizer(SequenceRecognizer):
 
     :param place_map: the reference map.
     :param settings: see :class:`RecognizerSettings`.
-    :param backend: ``cpu``, ``cuda``, or ``auto``. With ``cuda``, only mode paper and the place
-        filter run on the device as a whole; with other options, LM-DTW runs on the CPU.
+    :param backend: ``cpu``, ``cuda``, or ``auto``; ``cuda`` for mode paper and the place filter.
     :param precision: of the map's features in the matcher, ``float32`` or ``int8``; see
         :func:`stavpr_ros.recognition.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
@@ -272,9 +270,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
             assert isinstance(self._matcher, CpuMatcher)
             if (vectors := features.vectors) is not None:
-                whole = LocalFeatures(
-                    vectors[None], torch.ones(1, len(vectors)), features.settings
-                )
+                ones = np.ones((1, len(vectors)), np.float32)
+                whole = LocalFeatures(vectors[None], ones, features.settings)
                 centering = MeanCentering(whole, options.mean_centering, options.whitening)
                 prepared = centering.places(whole)
                 require_finite(prepared, 'the map')
@@ -333,7 +330,7 @@ class PlaceRecognizer(SequenceRecognizer):
         require_finite(features, 'the image')
         if self._centering is not None:
             features = self._centering.places(features)
-        return self._matcher.distance_matrix(features.strips, features.weights).cpu().numpy()
+        return self._matcher.distance_matrix(features.strips, features.weights)
 
     def _require_dimension(self, features: LocalFeatures) -> None:
         """Reject features of another network than the map's; the kernels trust their shape."""
@@ -373,14 +370,21 @@ class PlaceRecognizer(SequenceRecognizer):
 def _window_of(place_map: PlaceMap, settings: RecognizerSettings, backend: str) -> QueryWindow:
     """Return an empty window for a map."""
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
-    layout, on_device = layout_of(place_map, settings.nms_radius), backend == 'cuda'
-    if options.place_filter:
-        return FilterWindow(
-            sequence, n, None, layout, normalizes=options.query_znorm, on_device=on_device
-        )
-    if on_device and not options.any:
+    layout = layout_of(place_map, settings.nms_radius)
+    if backend == 'cuda':
+        from stavpr_ros.recognition.cuda_windows import CudaFilterWindow, CudaLmDtwWindow
+
+        if options.place_filter:
+            return CudaFilterWindow(sequence, n, None, layout, options.query_znorm)
+        if options.any:
+            raise SettingsError(
+                f"options {options} with backend 'cuda': without the place filter, it runs mode "
+                "paper only; take 'cpu'"
+            )
         return CudaLmDtwWindow(sequence, n, layout)
-    return LmDtwWindow(sequence, n, layout, normalizes=options.query_znorm)
+    if options.place_filter:
+        return FilterWindow(sequence, n, None, layout, options.query_znorm)
+    return LmDtwWindow(sequence, n, layout, options.query_znorm)
 
 
 def position_of(pose: np.ndarray | None) -> np.ndarray:

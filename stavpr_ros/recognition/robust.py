@@ -16,14 +16,7 @@ from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_statistics import MapStatistics
-from stavpr_ros.recognition.blocks import (
-    blocks,
-    converted,
-    converted_blocks,
-    one_thread,
-    PlaceChanges,
-)
-import torch
+from stavpr_ros.recognition.blocks import blocks, converted, converted_blocks, PlaceChanges
 
 MODES = ('paper', 'robust')
 MIN_PROBABILITY = 0.5  # above which mode robust matches a window
@@ -184,52 +177,45 @@ class Whitening:
     ``change`` holds g_i - 1, shape (W, 1, rank), float32.
     """
 
-    def __init__(self, directions: torch.Tensor, gains: torch.Tensor) -> None:
+    def __init__(self, directions: np.ndarray, gains: np.ndarray) -> None:
         self.directions, self.gains = directions, gains
         gains = gains[:, None]
-        self.change, self._inverse = (gains - 1).float(), (1 / gains - 1).float()
+        self.change = (gains - 1).astype(np.float32)
+        self._inverse = (1 / gains - 1).astype(np.float32)
 
     @staticmethod
-    def learned(strips: torch.Tensor) -> 'Whitening':
+    def learned(strips: np.ndarray) -> 'Whitening':
         """Learn from unit-norm features of places, (W, m, d), m > 0."""
-        with one_thread():  # so that the result does not depend on how many there are
-            found = [_principal_directions(strip) for strip in strips]  # one by one: less memory
+        found = [_principal_directions(strip) for strip in strips]  # one by one: less memory
         directions, gains = zip(*found, strict=True)
-        return Whitening(torch.stack(directions), torch.stack(gains))
+        return Whitening(np.stack(directions), np.stack(gains))
 
-    def __call__(self, strips: torch.Tensor) -> torch.Tensor:
+    def __call__(self, strips: np.ndarray) -> np.ndarray:
         """Return features (W, n, d) with the directions shrunk, of less than unit norm."""
         return self._scaled(strips, self.change)
 
-    def inverse(self, strips: torch.Tensor) -> torch.Tensor:
+    def inverse(self, strips: np.ndarray) -> np.ndarray:
         """Return the features that became these."""
         return self._scaled(strips, self._inverse)
 
-    def _scaled(self, strips: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
-        if strips.shape[1] == 1 and not strips.is_cuda:  # torch would wake its threads for it
-            strip, directions = strips.numpy(), self.directions.numpy()
-            parts = (strip @ directions.transpose(0, 2, 1)) * change.numpy()
-            return torch.from_numpy(strip + parts @ directions)
-        parts = torch.bmm(strips, self.directions.mT) * change
-        return torch.baddbmm(strips, parts, self.directions)
-
-    def to(self, device: torch.device) -> 'Whitening':
-        """Return this, moved to a device."""
-        for name in ('directions', 'change', '_inverse'):
-            setattr(self, name, getattr(self, name).to(device))
-        return self
+    def _scaled(self, strips: np.ndarray, change: np.ndarray) -> np.ndarray:
+        parts = strips @ self.directions.transpose(0, 2, 1)
+        parts *= change
+        scaled: np.ndarray = parts @ self.directions
+        scaled += strips
+        return scaled
 
 
-def _principal_directions(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _principal_directions(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return those of (m, d), at most ``RANK``, (rank, d), float32, and their gains (rank,)."""
-    samples = features.double()
+    samples = features.astype(np.float64)
     # of the places with each other: there are fewer of them than dimensions
-    values, vectors = torch.linalg.eigh(samples @ samples.T)
-    shares = values.clamp(min=0) / values.sum().clamp(min=1e-12)
-    gains = torch.rsqrt(1 + STRENGTH * shares / (shares**2).sum().clamp(min=1e-12))
+    values, vectors = np.linalg.eigh(samples @ samples.T)
+    shares = values.clip(0) / max(values.sum(), 1e-12)
+    gains = 1 / np.sqrt(1 + STRENGTH * shares / max((shares**2).sum(), 1e-12))
     directions = vectors[:, -RANK:].T @ samples
-    directions /= directions.norm(dim=1, keepdim=True).clamp_(min=1e-9)
-    return directions.float(), gains[-RANK:]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True).clip(1e-9)
+    return directions.astype(np.float32), gains[-RANK:]
 
 
 class MeanCentering:
@@ -254,39 +240,37 @@ class MeanCentering:
         self._centering = centering
         self.whitening: Whitening | None = None
         if statistics is not None:
-            self.mean = torch.from_numpy(statistics.mean)
-            found = torch.from_numpy(statistics.directions), torch.from_numpy(statistics.gains)
-            self.whitening = Whitening(*found)
+            self.mean = statistics.mean
+            self.whitening = Whitening(statistics.directions, statistics.gains)
         else:
             self._learn(features, whitening)
         self.reset()
 
     def _learn(self, features: LocalFeatures, whitening: bool) -> None:
-        total = torch.zeros((len(features.weights), features.dimension), dtype=torch.float64)
-        total = total.to(features.weights.device)
+        total = np.zeros((len(features.weights), features.dimension))
         changes = PlaceChanges(len(features), 1)
         for _, strips in converted_blocks(features, lambda block: block.strips):
             changes.add(strips)
-            total += strips.sum(dim=1)
+            total += strips.sum(axis=1, dtype=np.float64)
         weights = change_weights(changes.changes[0])
         for places, block in blocks(features) if weights.min(initial=1) < 1 else ():
-            less = torch.from_numpy(1 - weights[places]).to(total.device)
-            total -= (block.strips * less[:, None]).sum(dim=1)
-        self.mean = (total / max(weights.sum(), 1)).float() * self._centering  # (W, d)
+            total -= (block.strips * (1 - weights[places])[:, None]).sum(axis=1)
+        mean = total / max(weights.sum(), 1) * self._centering
+        self.mean = mean.astype(np.float32)  # (W, d)
         if whitening and len(features):
             centered = self.places(features[evenly_weighted(weights, SAMPLE)]).strips
-            self.whitening = Whitening.learned(centered.cpu()).to(centered.device)
+            self.whitening = Whitening.learned(centered)
 
     def reset(self) -> None:
         """Drop the images of the query."""
         # float64: in float32, the images of a long traverse would be rounded away
-        self._before = self._sum, self._count = self.mean.double() * PRIOR, PRIOR
+        self._before = self._sum, self._count = self.mean.astype(np.float64) * PRIOR, PRIOR
         self._standing = 0  # images
 
     def places(
         self,
         features: LocalFeatures,
-        visit: Callable[[torch.Tensor], None] = lambda strips: None,
+        visit: Callable[[np.ndarray], None] = lambda strips: None,
     ) -> LocalFeatures:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
@@ -295,36 +279,36 @@ class MeanCentering:
         """
         return converted(features, lambda strips: self._converted(strips, self.mean), visit)
 
-    def _converted(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
-        if strips.shape[1] == 1 and not strips.is_cuda:
+    def _converted(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        if strips.shape[1] == 1:
             return self._converted_image(strips[:, 0], mean)[:, None]
         centered = strips - mean[:, None]
-        centered *= strips.any(dim=2, keepdim=True)
+        centered[~strips.any(axis=2)] = 0
         normalize(centered)
         return centered if self.whitening is None else normalize(self.whitening(centered))
 
-    def _converted_image(self, strips: torch.Tensor, mean: torch.Tensor) -> torch.Tensor:
+    def _converted_image(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
         W, d = strips.shape
-        directions, change = torch.empty((W, 0, d)), torch.empty((W, 1, 0))
+        directions, change = np.empty((W, 0, d), np.float32), np.empty((W, 1, 0), np.float32)
         if self.whitening is not None:
             directions, change = self.whitening.directions, self.whitening.change
-        out = np.empty((W, d), np.float32)
+        out: np.ndarray = np.empty((W, d), np.float32)
         arguments = strips, mean, directions, change[:, 0]
-        _convert_image(*(each.contiguous().numpy() for each in arguments), out)
-        return torch.from_numpy(out)
+        _convert_image(*map(np.ascontiguousarray, arguments), out)
+        return out
 
-    def next_query(self, strips: torch.Tensor) -> torch.Tensor:
+    def next_query(self, strips: np.ndarray) -> np.ndarray:
         """
         Return the next image's features less the query's running mean, it included, whitened.
 
         :param strips: shape (W, d); the same is returned.
         """
-        strips = strips.to(self.mean.device)
         self._before = self._sum, self._count
         if self._centering:
             self._sum = self._sum + strips
             self._count += 1
-        return self._converted(strips[:, None], (self._sum / self._count).float())[:, 0]
+        mean = (self._sum / self._count).astype(np.float32)
+        return self._converted(strips[:, None], mean)[:, 0]
 
     def note_standstill(self, is_standing: bool) -> None:
         """
@@ -348,15 +332,21 @@ def evenly_weighted(weights: np.ndarray, count: int) -> np.ndarray:
     return np.unique(np.searchsorted(sums, evenly(int(sums[-1]), count) + 0.5))
 
 
-def unit_norm(strips: torch.Tensor) -> torch.Tensor:
+def unit_norm(strips: np.ndarray) -> np.ndarray:
     """Return features (..., d) with unit norm; zero ones stay zero."""
-    return normalize(strips.clone())
+    return normalize(strips.copy())
 
 
-def normalize(strips: torch.Tensor) -> torch.Tensor:
+def normalize(strips: np.ndarray) -> np.ndarray:
     """Give features (..., d) unit norm, in place, and return them; zero ones stay zero."""
-    strips /= strips.norm(dim=-1, keepdim=True).clamp_(min=1e-12)
+    strips /= norms_of(strips)[..., None].clip(1e-12)
     return strips
+
+
+def norms_of(strips: np.ndarray) -> np.ndarray:
+    """Return the norms of features (..., d), shape (...)."""
+    norms: np.ndarray = np.sqrt(np.einsum('...d,...d->...', strips, strips))
+    return norms
 
 
 def z_normalized(

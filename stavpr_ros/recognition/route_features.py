@@ -8,8 +8,6 @@ From then on they are rounded, and the mean is updated only when as many images 
 are places, so that a place is seldom rounded again.
 """
 
-from copy import copy
-
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -17,11 +15,11 @@ from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.robust import (
     change_weights,
     evenly_weighted,
+    norms_of,
     unit_norm,
     Whitening,
 )
 from stavpr_ros.recognition.route_strips import grown, move_up, rounded_strips, RouteStrips
-import torch
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
@@ -44,11 +42,9 @@ class RouteFeatures:
     :param whitening: whiten; learned again from time to time while the route is short.
     :param limit: most places there will be; None = no limit.
     :param precision: of the features once the route is settled, see the module.
-    :param device: a CUDA device where the features lie; None = on the CPU. Only the image's own
-        are copied to it, and a sample is copied back when whitening is learned.
 
-    ``latest`` are the features of the newest ``LATEST`` places, oldest first, (W, m, d), on the
-    CPU; ``mean`` the mean that is subtracted, (W, d), float32, zeros without centering.
+    ``latest`` are the features of the newest ``LATEST`` places, oldest first, (W, m, d); ``mean``
+    the mean that is subtracted, (W, d), float32, zeros without centering.
     """
 
     def __init__(
@@ -58,27 +54,23 @@ class RouteFeatures:
         whitening: bool,
         limit: int | None,
         precision: str = 'float32',
-        device: torch.device | None = None,
     ) -> None:
-        self.count = 0
-        self._precision, self._on_device = precision, device is not None
-        self._device = device or torch.device('cpu')
-        # centered, (W, room, d)
-        self.strips: RouteStrips = torch.empty((settings.strips, 0, 0), device=self._device)
+        self.count, self._precision = 0, precision
+        none = np.empty((settings.strips, 0), np.float32)
+        self.strips: RouteStrips = none[..., None]  # centered, (W, room, d)
         self._is_settled, self._since_mean = False, 0  # images since the mean was taken
-        self.latest = torch.empty((settings.strips, 0, 0))
+        self.latest = none[..., None]
         self._settings, self._centering, self._limit = settings, mean_centering, limit
         self._whitens = whitening
-        # of the features less the mean; on the CPU, and on the device
-        self._whitening: Whitening | None = None
-        self._there: Whitening | None = None
+        self._whitening: Whitening | None = None  # of the features less the mean
         self._cells: tuple[int, int] | None = None
-        self._weights = torch.empty((settings.strips, 0))
+        self._weights = none
         # (W, room): the norm of each feature before it was made unit norm; 0 for zero features
-        self._norms = torch.empty((settings.strips, 0), device=self._device)
+        self._norms = none
         # sum of the original features, and their mean weighted by `change_weights`, (W, d)
-        self._sum = self.mean = torch.empty((settings.strips, 0))
-        self._newest = np.empty((settings.strips, 0), np.float32)  # original
+        self._sum: np.ndarray = none
+        self.mean: np.ndarray = none
+        self._newest = none  # original
         self._changes = np.empty(0, np.float32)  # from place to place, (room,)
         self._next_mean = 1
 
@@ -88,8 +80,8 @@ class RouteFeatures:
         return self.strips.shape[1]
 
     @property
-    def newest(self) -> torch.Tensor:
-        """Centered features of the newest place, (W, 1, d), float32, on the CPU."""
+    def newest(self) -> np.ndarray:
+        """Centered features of the newest place, (W, 1, d), float32."""
         return self.latest[:, -1:]
 
     def original(self) -> LocalFeatures:
@@ -100,32 +92,33 @@ class RouteFeatures:
         """
         n = self.count
         if n and (self._centering or self._whitens):
-            strips, norms = self._centered(slice(n)).cpu(), self._norms[:, :n].cpu()
+            strips = self._centered(slice(n))
             for j in range(len(strips)):
-                strips[j] += self.mean[j] * (norms[j, :, None] > 0)
+                strips[j] += self.mean[j] * (self._norms[j, :n, None] > 0)
         else:
-            strips = self._float32(slice(n)).cpu().clone()
-        return LocalFeatures(strips, self._weights[:, :n].clone(), self._settings, self._cells)
+            strips = self.strips[:, :n].copy()
+        return LocalFeatures(strips, self._weights[:, :n].copy(), self._settings, self._cells)
 
     def append(self, features: LocalFeatures) -> bool:
         """Append the features of one image, strips (W, 1, d); return whether memory grew."""
-        strips = features.strips.cpu()
+        strips = features.strips
         grows = self.count == self.room
         if grows:
             self._grow(strips.shape[2])
             self._cells = features.cells
-        newest, norms = self._whitened(strips), strips[:, 0].any(dim=1).float()
+        newest = self._whitened(strips)
+        norms: np.ndarray = np.asarray(strips[:, 0].any(axis=1), np.float32)
         if self._centering or self._whitens:
             change = -self._whitened(self.mean[:, None])[:, 0]
             moved = [_moved(newest[j], norms[j : j + 1], change[j]) for j in range(len(strips))]
-            newest = torch.stack([unit for unit, _ in moved])
-            norms = torch.cat([length for _, length in moved])
-        newest = newest.contiguous()
+            newest = np.stack([unit for unit, _ in moved])
+            norms = np.concatenate([length for _, length in moved])
+        newest = np.ascontiguousarray(newest)
         self._write(self.count, newest)
         self._norms[:, self.count] = norms
-        self.latest = torch.cat([self.latest[:, 1 - LATEST :], newest], dim=1)
+        self.latest = np.concatenate([self.latest[:, 1 - LATEST :], newest], axis=1)
         self._weights[:, self.count] = features.weights[:, 0]
-        before, self._newest = self._newest, strips[:, 0].numpy()
+        before, self._newest = self._newest, strips[:, 0]
         self._changes[self.count] = change_between(self._newest, before) if self.count else 0
         self.count += 1
         if self._centering:
@@ -141,21 +134,21 @@ class RouteFeatures:
             self._learn(0)
             self._next_mean = int(self.count * GROWTH) + 1
         if settles:
-            self.strips = rounded_strips(self._floats, self.count, self._on_device)
+            self.strips = rounded_strips(self._floats, self.count)
             self._is_settled, self._since_mean = True, 0
         return grows
 
-    def _write(self, first: int, strips: torch.Tensor) -> None:
+    def _write(self, first: int, strips: np.ndarray) -> None:
         """Make strips (W, m, d) those of the places from ``first`` on."""
-        if isinstance(self.strips, torch.Tensor):
+        if isinstance(self.strips, np.ndarray):
             self.strips[:, first : first + strips.shape[1]] = strips
         else:
-            self.strips.write(first, strips.cpu())
+            self.strips.write(first, strips)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the mean is then that of the others until the next eviction."""
         kept = self.count - count
-        self._weights[:, :kept] = self._weights[:, count : self.count].clone()
+        self._weights[:, :kept] = self._weights[:, count : self.count].copy()
         self._sum -= self._total(np.ones(count))
         self._changes[:kept] = self._changes[count : self.count].copy()
         if (self._centering or self._whitens) and not self._is_settled:
@@ -163,29 +156,26 @@ class RouteFeatures:
             self._learn(count)
             self._next_mean = self.count + count + 1
             return
-        if isinstance(self.strips, torch.Tensor):
+        if isinstance(self.strips, np.ndarray):
             move_up(self.strips, count, self.count)
         else:
             self.strips.evict(count)
         move_up(self._norms, count, self.count)
         self.count = kept
 
-    def _whitened(self, strips: torch.Tensor) -> torch.Tensor:
+    def _whitened(self, strips: np.ndarray) -> np.ndarray:
         return self._whitening(strips) if self._whitening else strips
 
-    def _centered(self, places: slice | np.ndarray) -> torch.Tensor:
+    def _centered(self, places: slice | np.ndarray) -> np.ndarray:
         """Return features less the mean, not whitened, of their own norm, (W, m, d)."""
-        strips = self._float32(places) * self._norms[:, places, None]
-        return self._there.inverse(strips) if self._there else strips
+        strips = self.strips[:, places] * self._norms[:, places, None]
+        return self._whitening.inverse(strips) if self._whitening else strips
 
     @property
-    def _floats(self) -> torch.Tensor:
+    def _floats(self) -> np.ndarray:
         """Return the strips before they are rounded."""
-        assert isinstance(self.strips, torch.Tensor)
+        assert isinstance(self.strips, np.ndarray)
         return self.strips
-
-    def _float32(self, places: slice | np.ndarray) -> torch.Tensor:
-        return self.strips[:, places].float()
 
     def _grow(self, d: int) -> None:
         """Double the room; memory that is not used yet is not touched."""
@@ -193,39 +183,38 @@ class RouteFeatures:
         room = max(ROOM, 2 * self.room)
         room = room if self._limit is None else min(room, self._limit)
         if not n:
-            shape = W, 0, d
-            self._sum, self.mean = torch.zeros((W, d), dtype=torch.float64), torch.zeros((W, d))
-            self.strips, self.latest = self._floats.new_empty(shape), torch.empty(shape)
-        if isinstance(self.strips, torch.Tensor):
+            self._sum, self.mean = np.zeros((W, d)), np.zeros((W, d), np.float32)
+            self.strips = self.latest = np.empty((W, 0, d), np.float32)
+        if isinstance(self.strips, np.ndarray):
             self.strips = grown(self.strips, room)
         else:
             self.strips.grow(room)
         self._norms, self._weights = grown(self._norms, room), grown(self._weights, room)
         self._changes = np.append(self._changes, np.zeros(room - n, np.float32))
 
-    def _total(self, weights: np.ndarray) -> torch.Tensor:
+    def _total(self, weights: np.ndarray) -> np.ndarray:
         """Return the weighted sum of the original features of the oldest places, (W, d)."""
-        total = torch.zeros_like(self._sum)
+        total: np.ndarray = np.zeros_like(self._sum)
         if not self._centering:
             return total
         for low in range(0, len(weights), PIECE):
             piece = slice(low, min(low + PIECE, len(weights)))
             if not weights[piece].any():
                 continue
-            of_place = torch.from_numpy(weights[piece]).float().to(self._device)
+            of_place = weights[piece].astype(np.float32)
             norms, alive = self._norms[:, piece] * of_place, self._norms[:, piece] > 0
-            sums = [own @ strips for own, strips in zip(norms, self._float32(piece), strict=True)]
-            of_piece = torch.stack(sums)
-            if self._there:
-                of_piece = self._there.inverse(of_piece[:, None])[:, 0]
-            total += of_piece.cpu() + (alive * of_place).sum(dim=1, keepdim=True).cpu() * self.mean
+            of_piece = norms[:, None] @ self.strips[:, piece]
+            if self._whitening:
+                of_piece = self._whitening.inverse(of_piece)
+            total += of_piece[:, 0] + (alive * of_place).sum(axis=1, keepdims=True) * self.mean
         return total
 
-    def _weighted_mean(self, first: int, weights: np.ndarray) -> torch.Tensor:
+    def _weighted_mean(self, first: int, weights: np.ndarray) -> np.ndarray:
         """Return the mean of the places from ``first`` on, of these weights."""
         less = np.append(np.zeros(first), 1 - weights)
         total = self._sum - self._total(less) if less.any() else self._sum
-        return (total / weights.sum()).float()
+        mean: np.ndarray = (total / weights.sum()).astype(np.float32)
+        return mean
 
     def _learn(self, first: int) -> None:
         """Take the mean and, until the route is settled, whitening; ``first`` becomes place 0."""
@@ -235,37 +224,35 @@ class RouteFeatures:
         self.mean, self._since_mean = mean, 0
         if self._whitens and self.count <= SETTLED and not self._is_settled:
             sample = evenly_weighted(weights, SAMPLE)
-            whitening = Whitening.learned(unit_norm(self._centered(sample)).cpu())
-            there = copy(whitening).to(self._device)
+            whitening = Whitening.learned(unit_norm(self._centered(sample)))
             for low in range(0, self.count, AT_ONCE):
                 places = slice(low, min(low + AT_ONCE, self.count))
-                strips, norms = there(self._centered(places)), self._norms[:, places]
-                norms.copy_(strips.norm(dim=2).clamp_(min=1e-12) * (norms > 0))
+                strips, norms = whitening(self._centered(places)), self._norms[:, places]
+                norms[:] = norms_of(strips).clip(1e-12) * (norms > 0)
                 self._floats[:, places] = unit_norm(strips)
-            self._whitening, self._there = whitening, there
+            self._whitening = whitening
         last = slice(max(0, self.count - LATEST), self.count)
-        self.latest = self._float32(last).cpu().clone()
+        self.latest = self.strips[:, last].copy()
 
-    def _shift(self, first: int, change: torch.Tensor) -> None:
+    def _shift(self, first: int, change: np.ndarray) -> None:
         """
         Add to features, and make them unit norm again; zero features stay zero.
 
         :param first: place from which on; it becomes place 0, the last one the last of ``count``.
         :param change: shape (W, d).
         """
-        change = change.to(self._device)
         for low in range(0, self.count, PIECE):
             piece = slice(low, min(low + PIECE, self.count))
             source = slice(piece.start + first, piece.stop + first)
-            strips, norms = self._float32(source), self._norms[:, source]
+            strips, norms = self.strips[:, source], self._norms[:, source]
             moved = [_moved(*each) for each in zip(strips, norms, change, strict=True)]
-            self._write(low, torch.stack([unit for unit, _ in moved]))
-            self._norms[:, piece] = torch.stack([lengths for _, lengths in moved])
+            self._write(low, np.stack([unit for unit, _ in moved]))
+            self._norms[:, piece] = np.stack([lengths for _, lengths in moved])
 
 
 def _moved(
-    strips: torch.Tensor, norms: torch.Tensor, change: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+    strips: np.ndarray, norms: np.ndarray, change: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Add to features (m, d) of norms (m,), and make them unit norm; zero features stay zero.
 
@@ -275,6 +262,6 @@ def _moved(
     moved = strips * norms[:, None]
     moved += change
     moved *= alive
-    length = moved.norm(dim=1, keepdim=True).clamp_(min=1e-12)
+    length = norms_of(moved)[:, None].clip(1e-12)
     moved /= length
     return moved, (length * alive)[:, 0]

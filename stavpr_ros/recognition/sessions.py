@@ -16,7 +16,6 @@ from stavpr_ros.recognition.filter_paths import Belief
 from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout
-import torch
 
 
 class SessionLayout(ColumnLayout):
@@ -52,10 +51,10 @@ class SessionLayout(ColumnLayout):
         """See :meth:`ColumnLayout.width`."""
         return self._width
 
-    def spread(self, row: torch.Tensor) -> torch.Tensor:
+    def spread(self, row: np.ndarray) -> np.ndarray:
         """See :meth:`ColumnLayout.spread`."""
-        out = torch.full((self._width,), torch.inf, dtype=row.dtype, device=row.device)
-        out[torch.from_numpy(self.columns).to(row.device)] = row
+        out: np.ndarray = np.full(self._width, np.inf, row.dtype)
+        out[self.columns] = row
         return out
 
     def gathered(self, values: np.ndarray) -> np.ndarray:

@@ -12,14 +12,15 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 import sys
+from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
-from stavpr_ros.recognition.filter_paths import Belief
+from stavpr_ros.memory import aligned_empty
+from stavpr_ros.recognition.filter_paths import Belief, NO_PLACES
 from stavpr_ros.recognition.match import WindowMatch
 from stavpr_ros.recognition.robust import z_normalized
-import torch
 
 
 class ColumnLayout:
@@ -32,13 +33,13 @@ class ColumnLayout:
 
     firsts: np.ndarray = np.zeros(1, np.int64)
     runs: Sequence[slice] = (slice(None),)
-    gaps: np.ndarray = np.empty(0, np.int64)
+    gaps: np.ndarray = NO_PLACES
 
     def width(self, places: int) -> int:
         """Return the number of columns of so many places."""
         return places
 
-    def spread(self, row: torch.Tensor) -> torch.Tensor:
+    def spread(self, row: np.ndarray) -> np.ndarray:
         """Return distances to places (n,) as those to columns, +inf in gaps."""
         return row
 
@@ -99,7 +100,6 @@ class SequenceBuffer:
     :param k: places that one start of LM-DTW covers.
     :param row_width: words from row to row for n places and k; the padding that a kernel needs
         behind the places is +inf.
-    :param device: of the memory.
     :param copies: times that each row is written, l rows apart. 2 = the latest l rows are always
         one slice of the memory, oldest row first, as LM-DTW takes them; 1 = half the memory.
     """
@@ -110,7 +110,6 @@ class SequenceBuffer:
         places: int,
         k: int,
         row_width: Callable[[int, int], int] = padded_width,
-        device: torch.device | str = 'cpu',
         copies: int = 2,
     ) -> None:
         self.length, self.k, self._copies = int(length), k, copies
@@ -119,15 +118,20 @@ class SequenceBuffer:
         self.known = 0  # places with an entry in any row of the window; all others are +inf
         self._count = 0
         self._stamps: deque[int] = deque(maxlen=self.length)
-        self._allocate(places, torch.device(device))
+        self._allocate(places)
 
-    def _allocate(self, places: int, device: torch.device) -> None:
+    def _allocate(self, places: int) -> None:
         self.places = places
-        self.memory = torch.full(
-            (self._copies * self.length, self._row_width(places, self.k)), torch.inf, device=device
-        )
-        copies = self.memory.view(self._copies, self.length, -1)
+        shape = self._copies * self.length, self._row_width(places, self.k)
+        self.memory: Any = self._filled(shape)
+        copies = self.memory.reshape(self._copies, self.length, -1)
         self._slots = [copies[:, slot, :places] for slot in range(self.length)]
+
+    def _filled(self, shape: tuple[int, int]) -> Any:
+        """Return memory filled with +inf."""
+        memory = aligned_empty(shape)
+        memory[:] = np.inf
+        return memory
 
     def __len__(self) -> int:
         return min(self._count, self.length)
@@ -147,62 +151,64 @@ class SequenceBuffer:
         """Row of ``memory`` where the window begins."""
         return self._count % self.length
 
-    def push(self, row: torch.Tensor, stamp: int = 0) -> None:
+    def push(self, row: np.ndarray, stamp: int = 0) -> None:
         """
         Add the distances of the newest image and drop the oldest.
 
-        :param row: shape (m,), float32, of the first m <= n places; the others become +inf. On the
-            buffer's device.
+        :param row: shape (m,), float32, of the first m <= n places; the others become +inf.
         :param stamp: of the image, ns; 0 = unknown.
-        :raises InputError: NaN or -inf in the row; the buffer is unchanged. Not checked on a CUDA
-            device, which the call would have to wait for.
+        :raises InputError: NaN or -inf in the row; the buffer is unchanged.
         """
+        if not row.sum() > -np.inf:
+            no_nan(row, 'image distances')
+        self._add(row, stamp)
+
+    def _add(self, row: Any, stamp: int) -> None:
         slot, m = self._slots[self._count % self.length], len(row)
-        if row.is_cuda:
-            slot[:, :m], slot[:, m:] = row, torch.inf
-        else:  # by NumPy: torch wakes a thread for a row of 32,768 places
-            values, entries = row.numpy(), slot.numpy()
-            if not values.sum() > -np.inf:
-                no_nan(values, 'image distances')
-            entries[:, :m], entries[:, m:] = values, np.inf
+        slot[:, :m], slot[:, m:] = row, np.inf
         self.known = max(self.known, m)
         self._stamps.append(stamp)
         self._count += 1
 
-    def rows(self) -> torch.Tensor:
+    def rows(self) -> np.ndarray:
         """Return the window, (l, n + padding), float32; padding is +inf. A view of two copies."""
         if self._copies == 1:
-            return self.memory.roll(-self.oldest, dims=0)
-        return self.memory[self.oldest : self.oldest + self.length]
+            return np.roll(self.memory, -self.oldest, axis=0)
+        rows: np.ndarray = self.memory[self.oldest : self.oldest + self.length]
+        return rows
 
-    def newest(self) -> torch.Tensor:
-        """Return the row of the newest image, (n,), a view."""
-        return self._slots[self.oldest - 1][0]
+    def newest(self) -> np.ndarray:
+        """Return the row of the newest image, (n,)."""
+        row: np.ndarray = self._slots[self.oldest - 1][0]
+        return row
 
     def at(self, columns: np.ndarray) -> np.ndarray:
         """Return entries of the window, oldest row first, by their columns, (l, m) each."""
-        rows = (self.oldest + np.arange(self.length)[:, None]) % self.length
-        if not self.memory.is_cuda:  # torch takes longer to index a few entries
-            return self.memory.numpy()[rows, columns]
-        return self.memory[torch.from_numpy(rows), torch.from_numpy(columns)].cpu().numpy()
+        entries: np.ndarray = self.memory[self._ring(), columns]
+        return entries
+
+    def _ring(self) -> np.ndarray:
+        """Return the rows of one copy of the window, oldest first, (l, 1)."""
+        rows: np.ndarray = (self.oldest + np.arange(self.length)[:, None]) % self.length
+        return rows
 
     def clear(self) -> None:
         """Empty the window."""
-        self.memory.fill_(torch.inf)
+        self.memory[:] = np.inf
         self._stamps.clear()
         self.known = self._count = 0
 
     def grow(self, places: int) -> None:
         """Make room for more places; in the rows of the window they are +inf."""
         rows, before = self.memory, self.places
-        self._allocate(places, rows.device)
+        self._allocate(places)
         self.memory[:, :before] = rows[:, :before]
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up, and new ones have room behind them."""
         kept = self.places - count
-        self.memory[:, :kept] = self.memory[:, count : self.places].clone()
-        self.memory[:, kept : self.places] = torch.inf
+        self.memory[:, :kept] = self.memory[:, count : self.places].copy()
+        self.memory[:, kept : self.places] = np.inf
         self.known = max(0, self.known - count)
         self.first += count
 
@@ -237,31 +243,28 @@ class QueryWindow(ABC):
         """Whether the newest image equals the one before, up to noise; False without a filter."""
         return False
 
-    def push(self, row: torch.Tensor, strips: torch.Tensor, stamp: int) -> None:
+    def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
         """
         Add the newest image, and drop the oldest.
 
-        :param row: its distances to the places, (n,), float32, on the device of the matcher.
+        :param row: its distances to the places, (n,), float32, as the matcher returns them.
         :param strips: its features, centered, (W, d).
         :param stamp: ns; 0 = unknown.
         """
         self.buffer.push(self._as_columns(row), stamp)
 
-    def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
+    def _as_columns(self, row: Any) -> Any:
         """Return distances to the places, normalized, as a row of the buffer."""
-        row = row.to(self.buffer.memory.device)
         if self._normalizes:
             counted = self._counted(len(row))
-            parts = [self._normalized(row[run], counted[run]) for run in self.layout.runs]
-            row = parts[0] if len(parts) == 1 else torch.cat(parts)
+            row = np.concatenate(
+                [z_normalized(row[run], self._around, counted[run]) for run in self.layout.runs]
+            )
         return self.layout.spread(row)
 
     def _counted(self, n: int) -> np.ndarray:
         """Return which of n places count for mean and deviation of a row, (n,), bool."""
         return np.ones(n, bool)
-
-    def _normalized(self, row: torch.Tensor, counted: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(z_normalized(row.numpy(), self._around, counted))
 
     def match(self, nms_radius: int) -> WindowMatch:
         """

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Mapping
 import gc
+import sys
 import threading
 import traceback
 from typing import Any
@@ -202,9 +203,8 @@ class PlaceRecognitionNode(ManagedNode):
         gc.unfreeze()
         # runtime and worker refer to each other: without it, the map would stay in memory
         gc.collect()
-        import torch
-
-        torch.cuda.empty_cache()
+        if torch := sys.modules.get('torch'):
+            torch.cuda.empty_cache()
 
     # parameters, map and operation
 

@@ -5,7 +5,6 @@
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-import torch
 
 
 def route_strips(seed, places, dimension=24):
@@ -19,7 +18,9 @@ def features_of(strips, noise=0.0, seed=0):
     strips = strips + noise * np.random.default_rng(seed).standard_normal(strips.shape)
     strips = strips / np.maximum(np.linalg.norm(strips, axis=2, keepdims=True), 1e-12)
     settings = FeatureSettings('gradient', None, len(strips))
-    return LocalFeatures(torch.from_numpy(strips).float(), torch.ones(strips.shape[:2]), settings)
+    return LocalFeatures(
+        strips.astype(np.float32), np.ones(strips.shape[:2], np.float32), settings
+    )
 
 
 def map_of(features, poses=None, **parts):

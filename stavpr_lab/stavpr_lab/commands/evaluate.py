@@ -233,7 +233,6 @@ def _evaluate(
     query, ground_truth = sequences.query.features, sequences.drive.truth
     common: dict[str, Any] = {
         'shown': () if arguments.window is None else (arguments.window,),
-        'backend': arguments.backend,
         'precision': arguments.precision,
         'progress': True,
         'odometry': sequences.odometry,
@@ -242,6 +241,7 @@ def _evaluate(
         exclude, late = arguments.exclude_places, arguments.late_closures
         return evaluate_loop_closures(query, ground_truth, settings, exclude, late=late, **common)
     unknown = sequences.unknown.features if sequences.unknown else None
+    common['backend'] = arguments.backend
     return evaluate_on_map(sequences.reference, query, ground_truth, settings, unknown, **common)
 
 

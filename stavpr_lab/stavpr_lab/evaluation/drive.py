@@ -118,7 +118,7 @@ class DriveChanges:
             position = int(np.argmin(np.abs(images - at)))  # at high speed, the nearest one
             images = np.insert(images, position, np.full(count, images[position]))
         if self.reverse:
-            images = images[::-1].copy()  # torch indexes with no negative strides
+            images = images[::-1]
         if self.drop:
             images = images[np.random.default_rng(self.seed).random(len(images)) >= self.drop]
         if not len(images):

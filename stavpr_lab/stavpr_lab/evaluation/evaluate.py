@@ -290,7 +290,6 @@ def evaluate_loop_closures(
     progress: bool = False,
     odometry: np.ndarray | None = None,
     late: bool = False,
-    backend: str = 'cpu',
     precision: str = 'float32',
 ) -> Evaluation:
     """
@@ -299,14 +298,12 @@ def evaluate_loop_closures(
     :param ground_truth: of the same images: the earlier images that are correct.
     :param exclude_places: the latest images that are not part of the map.
     :param late: late matches count for the images that had none.
-    :param backend, precision: see :class:`stavpr_ros.recognition.loop_closer.LoopCloser`.
+    :param precision: see :class:`stavpr_ros.recognition.loop_closer.LoopCloser`.
 
     The others are as in :func:`evaluate_on_map`.
     """
     centered_images(len(query), settings.sequence.length)
-    closer = LoopCloser(
-        settings, exclude_places, query.settings, backend=backend, precision=precision
-    )
+    closer = LoopCloser(settings, exclude_places, query.settings, precision=precision)
     label = 'closing loops' if progress else ''
     results = recognize_traverse(closer, query, len(query), settings, shown, label, odometry, late)
     return evaluate_traverse(results, ground_truth, settings.sequence.length)

@@ -15,7 +15,7 @@ import math
 
 import cv2
 import numpy as np
-import torch
+from scipy.spatial.distance import cdist
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ def differences(queries: np.ndarray, places: np.ndarray) -> np.ndarray:
     :param places: shape (n, pixels), float32.
     :returns: D, shape (N, n), float32.
     """
-    sums = torch.cdist(torch.from_numpy(queries), torch.from_numpy(places), p=1.0)
-    return sums.numpy() / queries.shape[1]
+    sums = cdist(queries, places, 'cityblock')
+    return (sums / queries.shape[1]).astype(np.float32)
 
 
 def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:

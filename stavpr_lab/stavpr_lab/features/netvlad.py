@@ -94,7 +94,7 @@ class NetVlad:
         standard: dict[str, Any] = {'scale': found.scale, 'mean': found.mean, 'std': found.std}
         self._batch = BatchMaker(settings.size, settings.resize, self._device, **standard)
 
-    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+    def feature_maps(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """
         Compute the vectors of a batch of images.
 
@@ -103,7 +103,7 @@ class NetVlad:
         """
         with torch.inference_mode():
             parts = [images[i : i + PER_PASS] for i in range(0, len(images), PER_PASS)]
-            return torch.cat([self._vectors(self._batch(part)) for part in parts])
+            return torch.cat([self._vectors(self._batch(part)) for part in parts]).cpu().numpy()
 
     def _vectors(self, batch: torch.Tensor) -> torch.Tensor:
         columns = normalize(self._conv5_3(batch).flatten(2), dim=1)  # (n, D, P)

@@ -84,19 +84,19 @@ class PublishedNetwork:
         """Rename the parameters of a file with old names."""
         return parameters
 
-    def feature_maps(self, images: Sequence[np.ndarray]) -> torch.Tensor:
+    def feature_maps(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """
         Compute the feature maps of a batch of images.
 
         :param images: RGB, each (h, w, 3) uint8, of any size; resized without keeping the aspect.
-        :returns: maps (n, C, H, Wf), or vectors (n, D), >= 0, float32, or float16 with ``half`` on
-            a GPU.
+        :returns: maps (n, C, H, Wf), or vectors (n, D), >= 0, float32.
         :raises UnavailableError: the device has too little memory.
         """
         try:
             with torch.inference_mode():
                 parts = [images[i : i + PER_PASS] for i in range(0, len(images), PER_PASS)]
-                return torch.cat([self._layer(self._batch(part)) for part in parts])
+                maps = torch.cat([self._layer(self._batch(part)) for part in parts])
+                return maps.float().cpu().numpy()
         except torch.cuda.OutOfMemoryError as error:
             raise UnavailableError(
                 f'device {self._device} has too little memory for '

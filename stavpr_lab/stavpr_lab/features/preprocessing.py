@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import IMAGENET_MEAN, IMAGENET_STD
+from stavpr_ros.threads import thread_limit
 import torch
 
 
@@ -33,6 +34,8 @@ class BatchMaker:
     ) -> None:
         self._size, self._resize = size, resize
         self._device, self._dtype = device, dtype
+        if limit := thread_limit():
+            torch.set_num_threads(limit)
         deviation = torch.tensor(std, dtype=torch.float64)
         factor, shift = scale / deviation, -torch.tensor(mean, dtype=torch.float64) / deviation
         self._factor = factor.float().view(3, 1, 1).to(device)

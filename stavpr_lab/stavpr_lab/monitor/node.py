@@ -40,7 +40,7 @@ STATUSES = (
     *('warming up', 'no match', 'match', 'invalid image'),
     *('not ready', 'dropped', 'skipped', 'mapped'),
 )
-"""By the constants of PlaceMatch; recognition.Status has them too, but imports torch."""
+"""By the constants of PlaceMatch; recognition.Status has them too, but imports numba."""
 WITH_ROW = {PlaceMatch.WARMING_UP, PlaceMatch.NO_MATCH, PlaceMatch.MATCH}
 LEVELS = ('ok', 'warn', 'error', 'stale')
 

@@ -24,7 +24,7 @@ from numba.extending import intrinsic
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES, load, load_splat, splat, store, Vector
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
-import torch
+from stavpr_ros.memory import aligned_zeros
 
 TILE = 7  # query strips whose sums stay in registers
 QUAD = 4  # dimensions of a lane
@@ -237,19 +237,17 @@ class Int8Strips:
     def __init__(self, W: int, places: int, d: int) -> None:
         groups, quads = -(-places // LANES), -(-d // QUAD)
         self.shape = W, places, d
-        # of torch's memory, which starts with a cache line
-        memory = torch.zeros((W, groups, quads, LANES, QUAD), dtype=torch.int8)
-        self.values: np.ndarray = memory.numpy()
+        self.values = aligned_zeros((W, groups, quads, LANES, QUAD), np.int8)
         self.reciprocals: np.ndarray = np.zeros((W, groups * LANES), np.float32)
 
     def __len__(self) -> int:
         return self.shape[0]
 
-    def write(self, first: int, strips: torch.Tensor) -> None:
+    def write(self, first: int, strips: np.ndarray) -> None:
         """Round strips (W, m, d), float32, and keep them as the places from ``first`` on."""
         d = self.shape[2]
         _round_places(
-            strips.numpy(), _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
+            strips, _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
         )
 
     def copy(self, j: int, first: int, codes: np.ndarray) -> None:
@@ -267,41 +265,39 @@ class Int8Strips:
                 f'most {LONGEST:.0f}'
             )
 
-    def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> torch.Tensor:
+    def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> np.ndarray:
         """Return strips of places, [:, places], float32, of unit norm again."""
         places = np.arange(self.shape[1])[index[1]]
         rounded = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
         strips = rounded.reshape(len(places), len(self), -1)[:, :, : self.shape[2]]
-        return torch.from_numpy(
-            strips.transpose(1, 0, 2) * self.reciprocals[:, places, None]
-        ).contiguous()
+        return np.ascontiguousarray(strips.transpose(1, 0, 2) * self.reciprocals[:, places, None])
 
-    def rounded(self) -> torch.Tensor:
+    def rounded(self) -> np.ndarray:
         """Return a copy of the whole numbers, (W, n, d), int8."""
         W, n, d = self.shape
         strips = self.values.transpose(0, 1, 3, 2, 4).reshape(W, self.values.shape[1] * LANES, -1)
-        return torch.from_numpy(strips[:, :n, :d]).contiguous()
+        return np.ascontiguousarray(strips[:, :n, :d])
 
     def kernel_arguments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the features as the kernels take them."""
         return self.values.view(np.int32)[..., 0], self.reciprocals
 
 
-def rounded_queries(queries: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+def rounded_queries(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Round the strips of Q images.
 
-    :param queries: shape (W, Q, d), float32, on any device.
+    :param queries: shape (W, Q, d), float32.
     :returns: int8, (Q, W, d); 1 / length of each rounded strip, (Q, W), float32.
     """
     W, Q, d = queries.shape
     rounded, reciprocals = np.empty((Q, W, d), np.int8), np.empty((Q, W), np.float32)
-    strips = queries.transpose(0, 1).contiguous().cpu().numpy()
+    strips = np.ascontiguousarray(queries.transpose(1, 0, 2))
     _round_queries(strips, _longest(d), np.float32(QUERY_PEAK), rounded, reciprocals)
     return rounded, reciprocals
 
 
-def tiled(queries: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def tiled(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Round the strips of Q images and lay them out as the kernels take them.
 

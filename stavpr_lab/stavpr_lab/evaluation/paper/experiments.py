@@ -228,7 +228,9 @@ class DatasetExperiment:
         def maps(source: FrameSource) -> list[torch.Tensor]:
             images = [frame.image for frame in source]
             return [
-                torch.cat([network.feature_maps([image]).cpu() for image in images])
+                torch.from_numpy(
+                    np.concatenate([network.feature_maps([image]) for image in images])
+                )
                 for network in networks
             ]
 

@@ -1,0 +1,30 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays whose memory begins with a cache line: vectors across two are read at half the speed."""
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+CACHE_LINE = 64  # bytes
+
+
+def aligned_empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
+    """Return an array whose content is undefined."""
+    return _aligned(np.empty, shape, dtype)
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
+    """Return an array of zeros; pages that are not written take no memory."""
+    return _aligned(np.zeros, shape, dtype)
+
+
+def is_aligned(array: np.ndarray) -> bool:
+    """Return whether an array's memory begins with a cache line."""
+    return array.ctypes.data % CACHE_LINE == 0
+
+
+def _aligned(allocate, shape, dtype):  # type: ignore[no-untyped-def]
+    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    block = allocate(size + CACHE_LINE, np.uint8)
+    first = -block.ctypes.data % CACHE_LINE
+    return block[first : first + size].view(dtype).reshape(shape)
