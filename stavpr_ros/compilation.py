@@ -15,7 +15,7 @@ from numba.core import event
 from tqdm import tqdm
 
 COMPILING = 'compiling kernels, once, about 30 s'
-KERNELS = 215  # that `stavpr warm` compiles, for the progress bar
+KERNELS = 104  # that `stavpr warm` compiles, for the progress bar
 
 # Of numba's threading layers, the default's fallback aborts the process when two threads meet in
 # it.

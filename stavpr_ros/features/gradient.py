@@ -205,8 +205,10 @@ def _chunks_to_cells(chunks: np.ndarray, factor: F, maps: np.ndarray, energy: np
                 maps[b, i, j] = mean
                 total += mean * mean
             energy[i + 1, j + 1] = total
-    energy[0], energy[-1] = energy[1], energy[-2]
-    energy[:, 0], energy[:, -1] = energy[:, 1], energy[:, -2]
+    for j in range(cells + 2):
+        energy[0, j], energy[cells + 1, j] = energy[1, j], energy[cells, j]
+    for i in range(cells + 2):
+        energy[i, 0], energy[i, cells + 1] = energy[i, 1], energy[i, cells]
 
 
 @kernel

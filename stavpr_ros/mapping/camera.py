@@ -7,7 +7,6 @@ import math
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping.trajectory import checked_pose
 
@@ -98,6 +97,8 @@ def mount_of(text: str) -> tuple[float, ...] | None:
     """
     if not text.strip():
         return None
+    from scipy.spatial.transform import Rotation
+
     try:
         numbers = [float(word) for word in text.replace(',', ' ').split()]
     except ValueError:

@@ -6,7 +6,6 @@ from bisect import bisect_left
 from threading import Lock
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError
 from stavpr_ros.units import SECOND
 
@@ -51,6 +50,8 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
 
 def rotation(a: np.ndarray, b: np.ndarray) -> float:
     """Return the angle between two poses, each of shape (7,), in degrees, 0 to 180."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_quat(a[3:]).inv() * Rotation.from_quat(b[3:])
     return float(np.degrees(turn.magnitude()))
 
@@ -62,6 +63,8 @@ def interpolate(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
     :param a: shape (7,), the quaternion of norm 1; so is b's.
     :param part: 0 (a) to 1 (b).
     """
+    from scipy.spatial.transform import Rotation
+
     start, end = Rotation.from_quat(a[3:]), Rotation.from_quat(b[3:])
     turned = start * (start.inv() * end) ** part  # scipy's Slerp is three times as slow for two
     return np.concatenate([(1 - part) * a[:3] + part * b[:3], turned.as_quat()])

@@ -3,11 +3,12 @@
 """Rigid transforms as homogeneous matrices, many at once."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 
 def matrices(poses: np.ndarray) -> np.ndarray:
     """Return x y z and quaternion x y z w, shape (..., 7), as transforms (..., 4, 4)."""
+    from scipy.spatial.transform import Rotation
+
     poses = np.asarray(poses, np.float64)
     result = np.zeros((*poses.shape[:-1], 4, 4))
     turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).as_matrix()
@@ -19,6 +20,8 @@ def matrices(poses: np.ndarray) -> np.ndarray:
 
 def to_poses(transforms: np.ndarray) -> np.ndarray:
     """Return matrices (..., 4, 4) as poses (..., 7)."""
+    from scipy.spatial.transform import Rotation
+
     turns = Rotation.from_matrix(transforms[..., :3, :3].reshape(-1, 3, 3)).as_quat()
     shape = transforms.shape[:-2]
     return np.concatenate([transforms[..., :3, 3], turns.reshape(*shape, 4)], axis=-1)

@@ -65,11 +65,11 @@ def _likelihoods(z, first, count, weight, mu, likely):
     """Write the likelihood of each level and place, (K, BLOCK); 0 from ``count`` on."""
     K = len(mu)
     flat = likely.reshape(-1)
+    for x in range(BLOCK):
+        flat[x] = z[first + x] if x < count else F(0)
     if weight == 0:
         likely[:] = 1
     else:
-        likely[0, :count] = z[first : first + count]
-        likely[0, count:] = 0
         factor = splat(weight)
         for x in range(0, BLOCK, LANES):
             distance = load(flat, x)
@@ -79,7 +79,9 @@ def _likelihoods(z, first, count, weight, mu, likely):
                 likelihood = exp(factor * off)
                 gap = distance < splat(F(NEAR_INFINITY))
                 store(flat, k * BLOCK + x, select(gap, splat(F(1)), likelihood))
-    likely[:, count:] = 0
+    for k in range(K):
+        for x in range(count, BLOCK):
+            likely[k, x] = 0
 
 
 @kernel
@@ -178,8 +180,12 @@ def _lost(row, step, spread):
     """Return the loss of a row, which ends with the map, over the end of the map."""
     end = len(row)
     slow = step - 1 if step > 0 else 0
-    total = (F(1) - F(2) * spread) * row[end - step :].sum()
-    return total + spread * (row[end - step - 1 :].sum() + row[end - slow :].sum())
+    by_step = by_more = by_less = F(0)
+    for x in range(end - step - 1, end):
+        by_more += row[x]
+        by_step += row[x] if x >= end - step else F(0)
+        by_less += row[x] if x >= end - slow else F(0)
+    return (F(1) - F(2) * spread) * by_step + spread * (by_more + by_less)
 
 
 @kernel
@@ -240,16 +246,16 @@ def advance(
             count, at = min(BLOCK, n - first), first // BLOCK
             whole = (count + LANES - 1) // LANES * LANES
             _likelihoods(z, first, count, weight, mu, likely)
-            if block:
-                before = (at - 1) * size + BLOCK - reach
-                _mix(states, before, BLOCK, reach, levels, speeds, b, mixed, 0, width, sums)
-            else:
+            for own in range(2):  # the columns before the block, and its own
+                source, pitch, from_, mixed_at, columns = states, BLOCK, at * size, reach, whole
+                if not own:
+                    from_, mixed_at, columns = (at - 1) * size + BLOCK - reach, 0, reach
+                    if not block:
+                        source, pitch, from_ = flat_halos, reach, part * K * V * reach
+                sums[:] = 0
                 _mix(
-                    flat_halos, part * K * V * reach, reach, reach, levels, speeds, b, mixed, 0,
-                    width, sums,
-                )  # fmt: skip
-            sums[:] = 0
-            _mix(states, at * size, BLOCK, whole, levels, speeds, b, mixed, reach, width, sums)
+                    source, from_, pitch, columns, levels, speeds, b, mixed, mixed_at, width, sums
+                )
             places[:] = 0
             for k in range(K):
                 totals[at, k, 0], totals[at, k, 1] = _sum_of_lanes(sums, k * LANES), 0
@@ -270,5 +276,8 @@ def advance(
                     )  # fmt: skip
                 store(lanes, 0, total)
                 totals[at, k, 2] = _sum_of_lanes(lanes, 0)
-            by_place[first : first + count] = places[:count]
-            maxima[at] = places[:count].max()
+            largest = F(0)
+            for x in range(count):
+                by_place[first + x] = places[x]
+                largest = max(largest, places[x])
+            maxima[at] = largest

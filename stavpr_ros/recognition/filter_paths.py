@@ -168,8 +168,10 @@ def backtrack_states(a, least, tops, origins, steps, newest, count, states, prob
                 states[at, 1], states[at, 4], states[at, 0], origins[slot], steps[slot]
             )
             if place >= 0:
-                states[left], probabilities[left] = states[at], probabilities[at]
+                for column in range(1, 4):
+                    states[left, column] = states[at, column]
                 states[left, 0], states[left, 4] = place, speed
+                probabilities[left] = probabilities[at]
                 row = ((earlier + place // BLOCK) * a.shape[1] + states[at, 1]) * halves
                 prefetch(flat, (row + speed // 2) * BLOCK + place % BLOCK)
                 left += 1
@@ -258,9 +260,10 @@ def _window_likelihoods(
             inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
             likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
         step = path[i] - path[i - 1] if i else 0
-        moves[i] = np.where(np.arange(step - 2, step + 3) >= 0, STEPS, 0)
-        if i and images[i] == images[i - 1]:
-            moves[i] = 0, 0, 1, 0, 0
+        same = i > 0 and images[i] == images[i - 1]
+        for d in range(-2, 3):
+            moved = STEPS[d + 2] if step + d >= 0 else 0
+            moves[i, d + 2] = (1 if d == 0 else 0) if same else moved
 
 
 @kernel
@@ -282,20 +285,27 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> No
                 for d in range(max(-2, s - S + 1), min(2, s) + 1):
                     masses[i, s] += masses[i - 1, s - d] * moves[i, d + 2]
             masses[i, s] *= likelihoods[i, s]
-        total = masses[i].sum()
-        if total > 0:
-            masses[i] /= total
-        else:
-            masses[i] = 1 / S
+        _normalize(masses[i])
     later, weighed = np.ones(S), np.empty(S)
     for i in range(l - 2, -1, -1):
-        weighed[:] = later * likelihoods[i + 1]
+        for s in range(S):
+            weighed[s] = later[s] * likelihoods[i + 1, s]
         for s in range(S):
             later[s] = 0
             for d in range(max(-2, -s), min(2, S - 1 - s) + 1):
                 later[s] += moves[i + 1, d + 2] * weighed[s + d]
-        total = later.sum()
-        later[:] = later / total if total > 0 else np.ones(S)
-        combined = masses[i] * later
-        if combined.sum() > 0:
-            masses[i] = combined / combined.sum()
+        _normalize(later)
+        total = 0.0
+        for s in range(S):
+            total += masses[i, s] * later[s]
+        if total > 0:
+            for s in range(S):
+                masses[i, s] *= later[s] / total
+
+
+@kernel
+def _normalize(masses: np.ndarray) -> None:
+    """Make a row's sum 1; that of a row of zeros, evenly."""
+    total = masses.sum()
+    for s in range(len(masses)):
+        masses[s] = masses[s] / total if total > 0 else 1 / len(masses)

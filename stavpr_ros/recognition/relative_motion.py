@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc
 from stavpr_ros.recognition.match import Match
 
 ALONG = 0.5  # deviation of a matched place along the track, places
@@ -141,6 +140,8 @@ def agreement(
     turn = np.vdot(mine, theirs)
     rest = np.abs(theirs - mine * (turn / abs(turn) if turn else 1))
     total += TURNS * np.mean(rest**2 / _variance(ALONG * spacing, error * driven))
+    from scipy.special import chdtrc
+
     return float(chdtrc(TURNS + 1, total))
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
@@ -364,6 +363,8 @@ def z_normalized(
     _z_normalize(row, np.ones(len(row), bool) if counted is None else counted, z)
     if not around:
         return z
+    from scipy.ndimage import uniform_filter1d
+
     clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
     return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
 
@@ -400,7 +401,8 @@ def _convert_image(
     for j in range(len(strips)):
         x, y = strips[j], out[j]
         alive = np.float32(x.any())
-        y[:] = alive * (x - mean[j])
+        for t in range(len(y)):
+            y[t] = alive * (x[t] - mean[j, t])
         parts = np.empty(directions.shape[1], np.float32)
         for i in range(len(parts)):
             direction, part = directions[j, i], np.float32(0)
@@ -414,7 +416,9 @@ def _convert_image(
         squares = np.float32(0)
         for t in range(len(y)):
             squares += y[t] * y[t]
-        y /= max(np.sqrt(squares), np.float32(1e-12))
+        norm = max(np.sqrt(squares), np.float32(1e-12))
+        for t in range(len(y)):
+            y[t] /= norm
 
 
 @reassociating_kernel

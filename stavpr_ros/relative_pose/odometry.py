@@ -5,7 +5,6 @@
 import math
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from stavpr_ros.mapping.trajectory import interpolate
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose.edge import Edge, Source
@@ -33,6 +32,8 @@ def align(pair: MatchedPair) -> Edge:
     if np.isnan(pair.query_pose).any():
         return Edge(Source.NONE, 'no odometry at the middle image of the window')
     track, driven = _lengths(pair.poses), _lengths(pair.query_poses)
+    from scipy.interpolate import CubicSpline
+
     known, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
     apart = known[np.diff(track[known], prepend=-1) > LEAST_STEP]  # not where the robot stood
     if min(len(images), len(apart)) < LEAST_IMAGES or not pair.spacing > 0:

@@ -10,7 +10,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 from stavpr_msgs.msg import (
     AlignedPair,
@@ -274,6 +273,8 @@ def matched_pose_message(
     first = places.first if isinstance(places, GrowingMap) else 0
     around = range(max(first, newest - 2), min(first + len(places), newest + 3))
     near = np.array([near for near in (places.place(i).pose for i in around) if near is not None])
+    from scipy.spatial.transform import Rotation
+
     turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
     variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
     message = PoseWithCovarianceStamped()

@@ -7,7 +7,6 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 from rclpy.node import Node
-from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline import NodeSettings
@@ -89,12 +88,16 @@ def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     :param place: pose of the robot in the map, x y z and quaternion x y z w, shape (7,).
     :param odometry: pose of the robot in the odometry's frame, shape (7,).
     """
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_quat(place[3:]) * Rotation.from_quat(odometry[3:]).inv()
     return np.concatenate([place[:3] - turn.apply(odometry[:3]), turn.as_quat()])
 
 
 def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:
     """Return a pose for navigation in the plane: x, y and yaw, with their covariance alone."""
+    from scipy.spatial.transform import Rotation
+
     result = PoseWithCovarianceStamped(header=message.header)
     pose, o = result.pose.pose, message.pose.pose.orientation
     pose.position.x, pose.position.y = message.pose.pose.position.x, message.pose.pose.position.y

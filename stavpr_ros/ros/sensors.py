@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The subscriptions to odometry and to camera_info, and the camera's place on the robot."""
 
+import importlib
 import time
 from typing import Any
 
@@ -31,6 +32,7 @@ class OdometryInput:
     """
 
     def __init__(self, node: Node, timeout: float) -> None:
+        importlib.import_module('scipy.spatial.transform')  # loads slowly: not at the first pose
         self.trajectory = Trajectory(timeout)
         self._node, self._timeout = node, timeout
         self._arrived: float | None = None
