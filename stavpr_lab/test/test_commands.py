@@ -248,6 +248,7 @@ def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatc
         (replay, ['no/such.bag'], 1, 'no/such.bag does not exist'),
         (replay, [], 2, 'BAG'),
         (replay, ['.', '--rate', '0'], 2, '0: expected a number above 0'),
+        (replay, ['.', '--rate', 'inf'], 2, 'inf: expected a number above 0'),
         (replay, ['.', '--rate', '2', '--lossless'], 2, 'not allowed with'),
         (replay, ['{folder}/bag', '--ros-args', '-r', 'image:=im%age'], 2, 'im%age'),
         (replay, ['{folder}/bag', '--ros-args', '-r'], 2, 'remap'),
