@@ -235,19 +235,18 @@ def random_window(seed, l, n, levels=None, banned=0.0):
     return D
 
 
-@pytest.mark.parametrize('columns', [None, 3])  # staged at once, in pieces
 @pytest.mark.parametrize(
-    ('l', 'n', 'beta', 'levels', 'banned', 'apart', 'block'),
+    ('l', 'n', 'beta', 'levels', 'banned', 'apart', 'block', 'columns'),
     [
-        (5, 22, 2.0, None, 0.0, 3, 8),  # several blocks, the last one not full
-        (3, 16, 2.0, 4, 0.1, 2, 4),  # whole blocks, ties; near starts in an earlier block
-        (4, 21, 2.0, 2, 0.3, 7, 4),
-        (3, 24, 2.0, 0, 0.0, 4, 4),  # all starts are equal: the lowest one of all blocks
-        (3, 9, 2.0, None, 1.0, 2, 4),  # no path
-        (3, 5, 3.1, 5, 0.0, 8, 8),  # fewer places than a block has threads, and k > n
-        (2, 9, 1.2, None, 0.0, 8, 2),  # the shortest window, k = 3
-        (3, 1, 2.0, None, 0.0, 3, 1),  # one place
-        (7, 13, 1.3, 4, 0.1, 12, 8),  # odd k, not a multiple of l
+        (5, 22, 2.0, None, 0.0, 3, 8, None),  # several blocks, the last one not full
+        (5, 22, 2.0, None, 0.0, 3, 8, 3),  # its columns staged in pieces
+        (3, 16, 2.0, 4, 0.1, 2, 4, 3),  # whole blocks, ties; near starts in an earlier block
+        (3, 24, 2.0, 0, 0.0, 4, 4, None),  # all starts are equal: the lowest one of all blocks
+        (3, 9, 2.0, None, 1.0, 2, 4, 3),  # no path
+        (3, 5, 3.1, 5, 0.0, 8, 8, None),  # fewer places than a block has threads, and k > n
+        (2, 9, 1.2, None, 0.0, 8, 2, 3),  # the shortest window, k = 3
+        (3, 1, 2.0, None, 0.0, 3, 1, None),  # one place
+        (7, 13, 1.3, 4, 0.1, 12, 8, 3),  # odd k, not a multiple of l
     ],
 )
 def test_sequences_equal_oracle(runtime, l, n, beta, levels, banned, apart, block, columns):

@@ -156,7 +156,7 @@ CASES = {
         (OK, 'result: no match (blind)', BLIND),
         (OK, '1 of 2 images matched', {'recent_statuses': {'match': 1, 'no match': 1, 'x': 9}}),
         (OK, '0 of 0 images matched in the last 10 s', NEW),
-        (OK, 'warming up: 7 of 20 images', {'window': 7}),
+        (OK, 'warming up: 19 of 20 images', {'window': 19}),
         (WARN, 'no match is possible: no threshold', {'missing': 'no threshold'}),
         (OK, 'waiting for the map', LOADING | {'missing': 'a map is being loaded'}),
         (WARN, 'no match is possible', {'map_state': 'loading', 'missing': 'no threshold'}),

@@ -300,6 +300,7 @@ HAND_MADE = [
     ({'stamps': None}, None, 'part stamps is missing'),
     ({'weights': np.full((2, 24), -1, np.float32)}, None, 'weights is not between 0 and 1'),
     ({'weights': np.full((2, 24), np.nan, np.float32)}, None, 'weights is not between 0 and 1'),
+    ({'weights': np.full((2, 24), 1.5, np.float32)}, None, 'weights is not between 0 and 1'),
     ({'strips': np.full((2, 24, 32), np.nan, np.float32)}, None, 'strip 0, from place 0 on'),
     ({'strips': np.full((2, 24, 32), 1, np.float16)}, None, 'longer than 1'),
     ({'strips': np.zeros((2, 24, 33), np.float32)}, None, 'strips of 33 dimensions'),

@@ -153,6 +153,12 @@ def test_match_message_has_the_fields_of_its_status(places, match, fields):
     same(message, status=match.status, reason=match.reason, path=message.path, **fields)
 
 
+@pytest.mark.parametrize(('length', 'position'), [(4, 1), (5, 2)])
+def test_position_of_a_match_is_the_middle_of_its_window(length, position):
+    """Of two middle images the earlier one."""
+    assert accepted(window_stamps=WINDOW[:length]).position == position
+
+
 def test_match_message_has_the_probability_of_each_place_of_the_path(places):
     ratios = np.array([0.5, 1, 1, 1.2, 2])
     match = accepted(probability=0.8, path_ratios=ratios)

@@ -140,7 +140,7 @@ def mapped(robot):
     return {match.header.stamp.sec * SECOND for match in places}
 
 
-@pytest.mark.parametrize('kills', [3, pytest.param(20, marks=pytest.mark.long)])
+@pytest.mark.parametrize('kills', [2, pytest.param(20, marks=pytest.mark.long)])
 def test_node_killed_at_a_random_moment_loses_no_published_place(
     recording, robot, route, tmp_path, kills
 ):

@@ -48,10 +48,6 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-NO_ROSDEP_KEY = {
-    *('evo', 'faiss', 'gtsam', 'llvmlite', 'onnx', 'onnxruntime', 'qdrant_client', 'qdrant_edge'),
-    *('h5py', 'ray', 'rosbags', 'torch'),
-}
 ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
 ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 
@@ -117,14 +113,9 @@ def test_every_imported_ros_package_is_dependency(package):
 
 
 @each_package
-def test_every_other_import_has_rosdep_key_or_explanation(package):
-    needed = {name for name in imports_of(package) if not ROS.fullmatch(name)}
-    needed -= PACKAGES.keys()
-    assert needed - set(ROSDEP_KEYS) - NO_ROSDEP_KEY == set()
-    keys = {ROSDEP_KEYS[name] for name in needed & set(ROSDEP_KEYS)}
+def test_every_import_with_a_rosdep_key_is_dependency(package):
+    keys = {ROSDEP_KEYS[name] for name in imports_of(package) & set(ROSDEP_KEYS)}
     assert keys - declared(package, 'exec_depend') == set()
-    text = (PACKAGES[package] / 'package.xml').read_text(encoding='utf-8')
-    assert [name for name in NO_ROSDEP_KEY & needed if f'      {name} ' not in text] == []
 
 
 def test_dependencies_between_packages_are_declared():

@@ -25,7 +25,7 @@ from pipelines import (
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import save_map
+from stavpr_ros.mapping import save_map, Session
 from stavpr_ros.pipeline import OPERATIONS, Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
@@ -187,6 +187,16 @@ def test_matched_pair_without_alignment_copies_nothing_of_the_window(
     monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
     pair = pipeline.matched_pair(match, relative_pose)
     assert (pair.place, pair.distances.size, len(pair.thumbnails)) == (match.place_index, 0, 8)
+
+
+def test_matched_pair_has_thumbnails_of_one_session(small_map, route, tmp_path):
+    path, sessions = tmp_path / 'map.stavpr', (Session('a'), Session('b'))
+    index = np.repeat(np.array([0, 1], np.int32), [3, 57])
+    save_map(replace(small_map, sessions=sessions, session_index=index), path)
+    pipeline = localizing(str(path))
+    match = process(pipeline, route[2 : 2 + LENGTH], poses=True)[-1]
+    assert match.place_index == 4
+    assert min(pipeline.matched_pair(match, 'pnp').thumbnails) == 3
 
 
 @pytest.mark.parametrize('has_poses', [True, False])

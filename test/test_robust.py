@@ -150,8 +150,15 @@ def test_robust_recognizer_after_reset_is_as_new(small_map):
     assert repr(recognize_all(one, small_map.features[20:30])) == first
 
 
-@pytest.mark.parametrize('without', ['', 'mean_centering', 'query_znorm', 'place_filter'])
-@pytest.mark.parametrize('strategy', ['adaptive', 'none'])
+@pytest.mark.parametrize(
+    ('without', 'strategy'),
+    [
+        ('', 'none'),
+        ('mean_centering', 'adaptive'),
+        ('query_znorm', 'none'),
+        ('place_filter', 'adaptive'),
+    ],
+)
 def test_recognizer_without_one_option_finds_places(small_map, without, strategy):
     robust_options = ROBUST.without(without) if without else ROBUST
     settings = RecognizerSettings(

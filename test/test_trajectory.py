@@ -93,6 +93,7 @@ def test_trajectory_keeps_at_most_capacity():
         ([0, math.inf, 0, 0, 0, 0, 1], 'finite'),
         ([0, 0, 0, 0, 0, 0, math.nan], 'finite'),
         (np.zeros(7), 'quaternion of norm 0'),
+        ([0, 0, 0, 0, 0, 0, 1e7], 'quaternion of norm'),
     ],
 )
 def test_trajectory_with_invalid_pose_changes_nothing(pose, words):

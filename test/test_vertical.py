@@ -39,9 +39,9 @@ def test_cut_cells_are_those_of_feature_map():
                 np.testing.assert_allclose(cells[strip * 4 + row, image], expected, atol=1e-6)
 
 
-@pytest.mark.parametrize('n', [1, 15, 65])
 @pytest.mark.parametrize(
-    ('strategy', 'xi'), [('adaptive', None), ('adaptive', 2), ('vanilla', None)]
+    ('n', 'strategy', 'xi'),
+    [(1, 'adaptive', None), (15, 'vanilla', None), (65, 'adaptive', 2)],
 )
 def test_vertical_distances_equal_oracle(n, strategy, xi):
     """The inner alignment has its own central cell and no band."""

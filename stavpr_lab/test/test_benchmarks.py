@@ -10,11 +10,9 @@ import sys
 
 import cv2
 import numpy as np
-import oracle
 import pytest
 from scipy.spatial.distance import cosine
 from stavpr_ros.recognition.robust import norms_of, unit_norm
-import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
@@ -29,8 +27,6 @@ import off_map_page
 import peaks
 import report
 import results
-from run import Run
-import stages
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -66,25 +62,7 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     assert cv2.imread(str(path.with_suffix('.png'))).shape[1] > 1000
 
 
-def test_command_on_missing_device_is_rejected(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(torch.cuda, 'is_available', lambda: False)
-    assert matching.main(['--device', 'cuda', '--output', str(tmp_path)]) == 2
-    assert 'torch finds no CUDA device here' in capsys.readouterr().err
-
-
 # ------------------------------------------------ peers on an equal footing
-
-
-def test_librosa_peer_scales_sample_and_rejects_other_sums(monkeypatch):
-    monkeypatch.setattr(stages, 'timed', lambda call: lambda: call() and 2.0)
-
-    def dtw(C, backtrack):
-        return np.array(oracle.accumulate(C, 1, np.float64).S)
-
-    window = data.make_window(5, 600, 0)
-    assert stages.librosa_peer(window, dtw).job() == 2.0 * 600 / 500
-    with pytest.raises(AssertionError, match='start 0'):
-        stages.librosa_peer(window, lambda C, backtrack: dtw(C + 1, backtrack))
 
 
 # ------------------------------------------------ comparison, accuracy
@@ -166,13 +144,6 @@ def test_first_right_match_counts_images_since_start():
     matches += [match(Status.MATCH, 5), match(Status.NO_MATCH, 2), match(Status.MATCH, 3)]
     assert off_map.first_right(matches, truth, 4) == 6  # windows of 4: image 3 is the middle
     assert off_map.first_right(matches[:5], truth, 4) is None
-
-
-def test_process_of_matches_is_measured_beside_process_without():
-    run = Run('cpu', PEAKS)
-    stages.process_stages(run, 2 * stages.DRIVEN, 'int8', 0)
-    (row,) = run.rows
-    assert (row.stage, [peer['name'] for peer in row.peers]) == ('process', ['without matches'])
 
 
 # ------------------------------------------------ the city

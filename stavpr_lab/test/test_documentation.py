@@ -229,12 +229,3 @@ def test_speed_in_readme_is_that_of_its_run():
         expected = [1e3 * float32['median_s'], 1e3 * int8['median_s']]
         assert times == pytest.approx(expected, abs=0.051)
         assert float(line.split('|')[3]) == pytest.approx(1 / reading, rel=0.02)
-
-
-@pytest.mark.parametrize('page', [page for page in PAGES if page.stem != 'slam_measured'])
-def test_tables_of_accuracy_name_their_results(page):
-    """A table with numbers of three digits below 1 is generated, marked or compared above."""
-    checked = '<!-- tables.json: ', '<!-- written by benchmarks/', 'Commit ', '| `robust` |'
-    for before, table in re.findall(r'((?:^(?!\|).*\n)*)((?:^\|.*\n)+)', page.read_text(), re.M):
-        if re.search(r'\| *(1\.000|0?\.\d{3}) *\|', table):
-            assert any(mark in before + table for mark in (*checked, '| mode `robust` |')), table

@@ -213,19 +213,6 @@ def test_environment_has_no_other_ros(checkout, monkeypatch):
     }
 
 
-def test_wheels_are_relocated_to_the_local_python(checkout):
-    built_on = '/opt/python/cp312-cp312'
-    file = checkout / '.venv' / 'share' / 'fake' / 'fakeConfig.cmake'
-    file.parent.mkdir(parents=True)
-    file.write_text(
-        f'"{built_on}/include/python3.12;{built_on}/lib/python3.12/site-packages/numpy/x"'
-    )
-    setup_venv.relocate_wheels()
-    include = setup_venv.sysconfig.get_paths()['include']
-    packages = checkout / '.venv' / 'lib' / f'python{setup_venv.PYTHON_VERSION}' / 'site-packages'
-    assert file.read_text() == f'"{include};{packages}/numpy/x"'
-
-
 def test_failed_command_shows_the_end_of_its_log(checkout):
     with pytest.raises(setup_venv.SetupError, match=r'pip failed with status 1.*\n  \| no wheel'):
         setup_venv.run_logged('pip', 'title', [sys.executable, '-c', 'exit("no wheel")'])

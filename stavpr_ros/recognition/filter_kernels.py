@@ -197,6 +197,16 @@ def _sum_of_lanes(values, at):
 
 
 @kernel
+def _copy_sums(places, count, by_place, first):
+    """Write the sums of a block's places; return the largest."""
+    largest = F(0)
+    for x in range(count):
+        by_place[first + x] = places[x]
+        largest = max(largest, places[x])
+    return largest
+
+
+@kernel
 def _scratch(size):
     """Return zeros, (size,), that begin with a cache line."""
     memory = np.zeros(size + LINE, np.float32)
@@ -276,8 +286,4 @@ def advance(
                     )  # fmt: skip
                 store(lanes, 0, total)
                 totals[at, k, 2] = _sum_of_lanes(lanes, 0)
-            largest = F(0)
-            for x in range(count):
-                by_place[first + x] = places[x]
-                largest = max(largest, places[x])
-            maxima[at] = largest
+            maxima[at] = _copy_sums(places, count, by_place, first)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import align_maps, Closure, optimize, PoseGraph
+from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.consistency import largest_consistent
 from stavpr_slam.pose_graph.files import save_graph
 from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
@@ -261,6 +262,15 @@ def test_update_closure_of_unknown_stamp_is_counted(drive):
     graph.update()
     assert graph.counts['unknown stamp'] == 1
     assert graph.pending == 1
+
+
+def test_add_closure_before_its_odometry_keeps_the_newest_only(drive, monkeypatch):
+    monkeypatch.setattr(graph_module, 'MAX_PENDING', 3)
+    graph = PoseGraph()
+    graph.add_odometry(SECOND, odometry_of(drive[0])[0])
+    for each in drive[1][:5]:
+        graph.add_closure(each)
+    assert graph.pending == 3
 
 
 def test_optimize_images_between_keyframes_have_their_odometry():

@@ -249,9 +249,12 @@ def test_pose_graph_without_its_process_reports_and_begins_anew(peer, running):
 def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
     truth = circle()
 
-    def publish(**fields) -> None:
+    def drive() -> None:
         peer.drive(truth)
         peer.wait_until(lambda: peer.values.get('nodes') == str(2 * LAP))
+
+    def publish(**fields) -> None:
+        peer.delay(2 * LAP * SECOND, odometry_of(truth)[-1])
         for query in range(LAP, 2 * LAP):
             message = closure_message(truth, query)
             for name, value in fields.items():
@@ -262,6 +265,7 @@ def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
     peer.until_diagnosed(DiagnosticStatus.WARN, '100 of 100 closures are invalid: ')
     assert 'set camera_transform' in peer.text
     assert peer.call(peer.reset, Trigger.Request()).success
+    drive()
     publish(place_stamp=time_message(SECOND // 2))
     peer.until_diagnosed(DiagnosticStatus.WARN, '100 of 100 closures are of stamps without')
     assert peer.call(peer.reset, Trigger.Request()).success
@@ -272,6 +276,7 @@ def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
         publish(source=source)
         peer.until_diagnosed(DiagnosticStatus.WARN, f'100 of 100 closures {remedy}')
         assert peer.call(peer.reset, Trigger.Request()).success
+    drive()
     publish()
     peer.wait_until(lambda: peer.count('accepted_closures') > 0.9 * LAP)
     peer.until_diagnosed(DiagnosticStatus.OK, 'closures accepted')

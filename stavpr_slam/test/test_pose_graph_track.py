@@ -7,7 +7,7 @@ import pytest
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings, OdometryNoise, PoseGraph
 from stavpr_slam.pose_graph.files import save_graph
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.pose_graph.track import MOST
+from stavpr_slam.pose_graph.track import MOST, OdometryTrack
 from stavpr_slam.pose_graph.transforms import planar_poses
 from test_pose_graph import circle, closure, error, LAP, odometry_of, SECOND
 
@@ -62,6 +62,24 @@ def test_saved_trajectory_has_the_odometry_between_keyframes(solved, tmp_path):
     assert np.linalg.norm(found - np.array(exact)[:, :2], axis=1).max() < 0.1
     assert error(found, truth) < 1
     assert [len(each) for each in graph.chain.trajectory(graph.solved)] == 3 * [len(rows)]
+
+
+def test_track_behind_its_last_kept_pose_is_up_to_the_newest():
+    track = OdometryTrack(2.0, 1.0)
+    first, second, newest = planar_poses(np.array([[0, 0, 0], [2, 0, 0], [2.1, 0, 0.0]]))
+    track.add(SECOND, first, True)
+    track.add(2 * SECOND, second, True)
+    track.add(4 * SECOND, newest, False)
+    assert len(track.kept[0]) == 2
+    assert track.at(3 * SECOND)[0] == pytest.approx(2.05)
+
+
+def test_add_odometry_of_an_equal_stamp_is_ignored():
+    chain = KeyframeChain(ChainSettings(), OdometryNoise())
+    here, there = planar_poses(np.array([[0, 0, 0], [1.9, 0, 0.0]]))
+    assert chain.add(SECOND, here)
+    assert not chain.add(SECOND, there)
+    assert len(chain) == 1
 
 
 @pytest.mark.parametrize(('jitter', 'most'), [(0.0, 5), (0.05, MOST + 2)])
