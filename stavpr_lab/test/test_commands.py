@@ -101,7 +101,7 @@ def test_command_help_names_the_command_as_called(run, monkeypatch):
         monkeypatch.setattr('sys.argv', [program])
         text = run(build_map, '--help').out
         assert text.startswith(f'usage: {name} --input FOLDER|VIDEO|BAG|ARRAY')
-        assert text.partition('examples:')[2].count(f'\n  {name} ') == 6
+        assert text.partition('examples:')[2].count(f'\n  {name} ') == 7
         assert '--onnx-layer' not in text.partition('examples:')[0]
     assert '--onnx-layer LAYER' in run(build_map, '--help-features').out
 
@@ -225,19 +225,13 @@ def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, 
     assert (tmp_path / 'map.stavpr').exists() is (code == 0)
 
 
-@pytest.mark.parametrize(
-    ('where', 'words'),
-    [
-        ('mapping.save_map', 'nothing was written'),
-        ('recognition.threshold.suggest_threshold', 'is written'),
-    ],
-)
-def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatch, where, words):
+@pytest.mark.parametrize('where', ['mapping.save_map', 'recognition.threshold.suggest_threshold'])
+def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatch, where):
     monkeypatch.setattr(f'stavpr_ros.{where}', interrupt)
     result = run(build_map, '--input', traverse, '--output', tmp_path / 'map')
     assert result.code == 130
-    assert words in result.err
-    assert (tmp_path / 'map').exists() is (words == 'is written')
+    assert 'nothing was written' in result.err
+    assert not (tmp_path / 'map').exists()
 
 
 def test_build_map_with_damaged_image_fails_or_skips(run, tmp_path):

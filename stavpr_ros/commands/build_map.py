@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 import json
 from pathlib import Path
@@ -287,29 +288,27 @@ def _known_poses(place_map: 'PlaceMap') -> str:
     return f', {known} of them with a pose' if known else ''
 
 
-def _report(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
+def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float | None':
+    """Return the threshold of mode paper for a map, None = unknown; print the reason."""
     from stavpr_ros.errors import InputError
     from stavpr_ros.recognition.threshold import suggest_threshold
 
-    output, kind = arguments.output, place_map.settings.kind
     if len(place_map) > MOST_SUGGESTED:
-        print(f'{output}: {len(place_map)} places')
-        return  # the suggestion for mode paper would take the whole map into memory
-    megabytes = Path(output).stat().st_size / 1e6
-    strips = place_map.features.strips
-    shape = f'{strips.shape[0]} strips of {strips.shape[2]} dimensions'
-    print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+        return None  # it would take the whole map into memory
+    model = getattr(arguments, f'{place_map.settings.kind}_model', None) or ''
     try:
-        threshold = suggest_threshold(
-            place_map,
-            progress=True,
-            model=getattr(arguments, f'{kind}_model', None) or '',
-        )
+        return suggest_threshold(place_map, progress=True, model=model)
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
-        return
-    value = f'{threshold:.3f}'
-    print(f'suggested threshold for mode paper: {value} (-p mode:=paper -p threshold:={value})')
+        return None
+
+
+def _report(place_map: 'PlaceMap', output: str) -> None:
+    megabytes = Path(output).stat().st_size / 1e6
+    shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
+    print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+    if place_map.threshold is not None:
+        print(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
 
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
@@ -347,12 +346,13 @@ def main(args: list[str] | None = None) -> int:
         else:
             state = 'nothing was written; the same command continues the work'
             place_map, journal = _build(arguments)
+        place_map = replace(place_map, threshold=_suggested(place_map, arguments))
         statistics = statistics_of_map(place_map)
         save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
         if journal is not None:
             journal.unlink()
-        state = f'{arguments.output} is written, without a suggested threshold'
-        _report(place_map, arguments)
+        state = f'{arguments.output} is written'
+        _report(place_map, arguments.output)
         return None
 
     return run_program('build_map', work, lambda: f'interrupted, {state}')
