@@ -24,7 +24,7 @@ TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfil
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy off-map \
+.PHONY: help setup build demo animation evaluate test test-long lint docs bench bench-quick accuracy off-map \
 	shell clean distclean development
 
 help: ## list the targets (the default)
@@ -53,6 +53,9 @@ demo: build ## run the node on the synthetic street, or on your images (MAP= QUE
 	@$(RUN) $(LAB)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") \
 		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
+
+animation: demo ## write the animation of the README, docs/demo.webp
+	@$(RUN) python -m stavpr_lab.demonstration.animation demo_output docs/demo.webp
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## report the matches of QUERY= on MAP=; metrics with TRUTH= (ARGS=)

@@ -29,6 +29,7 @@ setup(
         'numba>=0.59',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
+        'pillow>=10.2',
         'scikit-learn>=1.4',
         'scipy>=1.11',
         'stavpr_ros',
