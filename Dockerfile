@@ -23,7 +23,8 @@ COPY requirements/robot.txt src/stavpr_ros/requirements/
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-pip python3-venv \
     && rosdep update --rosdistro "$ROS_DISTRO" \
-    && rosdep install --from-paths src/stavpr_ros src/stavpr_ros/stavpr_{msgs,slam} --ignore-src -y \
+    && ln -s stavpr_ros/stavpr_{msgs,slam} src/ \
+    && rosdep install --from-paths src --ignore-src -y \
     && rm -rf /var/lib/apt/lists/*
 
 # What apt has no package for: a virtual environment that sees the system's packages.
@@ -39,7 +40,7 @@ USER 1000:1000
 FROM development AS runtime
 COPY --chown=1000:1000 . src/stavpr_ros
 RUN . "/opt/ros/$ROS_DISTRO/setup.bash" \
-    && python3 -m colcon build --base-paths src/stavpr_ros src/stavpr_ros/stavpr_{msgs,slam} \
+    && python3 -m colcon build \
     && . install/setup.bash && stavpr warm
 ENTRYPOINT ["/bin/bash", "-c", ". /ros_ws/install/setup.bash && exec \"$@\"", "--"]
 CMD ["ros2", "run", "stavpr_ros", "node"]

@@ -24,7 +24,7 @@ TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfil
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo evaluate test test-long lint docs bench bench-quick accuracy off-map \
+.PHONY: help setup build demo animation evaluate test test-long lint docs bench bench-quick accuracy off-map \
 	shell clean distclean development
 
 help: ## list the targets (the default)
@@ -34,7 +34,7 @@ help: ## list the targets (the default)
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
 	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, hdf5, faiss, fleet, ray, cuda, slam, evaluation, bench, dev, docs'
-	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your folders of images, bags or saved maps'
+	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your images, videos, bags or saved maps'
 	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
 	@echo '  SLAM=world                 demo: three laps, odometry corrected by a pose graph'
@@ -53,6 +53,9 @@ demo: build ## run the node on the synthetic street, or on your images (MAP= QUE
 	@$(RUN) $(LAB)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") \
 		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
+
+animation: demo ## write the animation of the README, docs/demo.webp
+	@$(RUN) python -m stavpr_lab.demonstration.animation demo_output docs/demo.webp
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## report the matches of QUERY= on MAP=; metrics with TRUTH= (ARGS=)

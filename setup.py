@@ -15,6 +15,7 @@ Debian's packages provide under other names.
 
 from configparser import ConfigParser
 from glob import glob
+import os
 from pathlib import Path
 import sys
 
@@ -24,11 +25,18 @@ NAME = 'stavpr_ros'
 SIBLINGS = ('stavpr_slam', 'stavpr_lab')
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
 
-# Commands of other packages print there where they are.
-EXECUTABLES = ('node', 'build_map', 'map', 'replay', 'record', 'warm')
-MOVED = (
+# Commands of other packages run here as well, if these are installed.
+EXECUTABLES = (
+    'node', 'build_map', 'map', 'replay', 'record', 'warm',
     'weights', 'monitor', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph', 'bridge'
 )  # fmt: skip
+BY_COLCON = not {'--build-base', '--build-directory'}.isdisjoint(sys.argv)
+MESSAGES = 'share/ament_index/resource_index/packages/stavpr_msgs'
+NO_MESSAGES = """
+stavpr_ros needs stavpr_msgs, a package in its folder, where colcon does not search. In the folder
+of the workspace, make links beside it, then build again:
+  ln -s stavpr_ros/stavpr_{msgs,slam,lab} src/
+"""
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']
 TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
@@ -49,6 +57,10 @@ def files_in(folder: str) -> list[str]:
     """List the files of a folder, relative to this one."""
     return sorted(path for path in glob(f'{folder}/*') if Path(path).is_file())
 
+
+prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+if BY_COLCON and not any(Path(prefix, MESSAGES).is_file() for prefix in prefixes):
+    sys.exit(NO_MESSAGES)
 
 packages = find_packages(include=[NAME, f'{NAME}.*'])
 entry_points = {'console_scripts': [f'stavpr = {NAME}.commands.stavpr:main']}
@@ -75,7 +87,7 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', files_in('config')),
         (f'share/{NAME}/launch', files_in('launch')),
-        (f'lib/{NAME}', [f'scripts/{name}' for name in EXECUTABLES + MOVED]),
+        (f'lib/{NAME}', [f'scripts/{name}' for name in EXECUTABLES]),
     ],
     python_requires='>=3.11',
     install_requires=[

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sphinx configuration, used by ``make docs`` and by rosdoc2."""
 
+from importlib.util import find_spec
 from pathlib import Path
 import sys
 
@@ -24,5 +25,6 @@ autodoc_default_options = {'members': True, 'show-inheritance': True, 'member-or
 autodoc_typehints = 'description'
 autodoc_typehints_description_target = 'documented'
 autodoc_mock_imports = ['onnx', 'onnxruntime', 'sklearn', 'jinja2']
-html_theme = 'alabaster'
-html_theme_options = {'page_width': '1100px', 'sidebar_width': '240px'}
+# Debian has no current furo: rosdoc2 builds with the theme of Sphinx.
+html_theme = 'furo' if find_spec('furo') else 'alabaster'
+html_title = 'stavpr_ros'

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Replay a bag, or a folder of images, into the node.
+Replay a bag, a video or a folder of images into the node.
 
 ros2 launch stavpr_ros replay.launch.py bag:=drive.bag map_path:=route.stavpr
 ros2 launch stavpr_ros replay.launch.py bag:=drive.bag operation:=mapping keyframe_distance:=0.5
@@ -19,7 +19,7 @@ OPTIONS = {
     'keyframe_distance or keyframe_angle is given, else none',
     'also': 'further topics of the bag, separated by spaces, published under their names',
     'rate': 'factor on the recorded pace; empty: 1',
-    'fps': 'images per second at which a folder was recorded; empty: 10',
+    'fps': 'images per second: of a folder, as recorded; taken of a video; empty: 10, 5',
     'start_offset': 'recorded seconds to leave out at the beginning; empty: 0',
     'duration': 'recorded seconds to replay; empty: all',
 }
@@ -65,7 +65,7 @@ def _replay(context: LaunchContext) -> list[Node]:
 def generate_launch_description() -> LaunchDescription:
     """Describe the node and the replay; with use_sim_time, the replay publishes /clock."""
     own = [
-        DeclareLaunchArgument('bag', description='ROS 1 or ROS 2 bag, or folder of images'),
+        DeclareLaunchArgument('bag', description='ROS 1 or ROS 2 bag, video, or folder of images'),
         *(
             DeclareLaunchArgument(name, default_value='', description=description)
             for name, description in OPTIONS.items()

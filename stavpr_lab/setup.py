@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
 
-from glob import glob
-
 from setuptools import find_packages, setup
 
 NAME = 'stavpr_lab'
+EXECUTABLES = ('demo', 'evaluate', 'experiments', 'export_model', 'monitor', 'weights')
 
 setup(
     name=NAME,
@@ -21,7 +20,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'lib/{NAME}', sorted(glob('scripts/*'))),
+        (f'lib/{NAME}', [f'scripts/{name}' for name in EXECUTABLES]),
     ],
     python_requires='>=3.11',
     install_requires=[
@@ -30,6 +29,7 @@ setup(
         'numba>=0.59',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
+        'pillow>=10.2',
         'scikit-learn>=1.4',
         'scipy>=1.11',
         'stavpr_ros',

@@ -222,8 +222,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'threshold',
             -1.0,
-            'Mode paper: a window is matched when its distance is below this; negative = not set, '
-            'the node waits for a value. Mode robust rejects it, see min_probability.',
+            'Mode paper: a window is matched when its distance is below this; negative = the '
+            "map's, as suggested by build_map. Mode robust rejects it, see min_probability.",
             'distance',
             'live',
             bounds=(-1.0, 1e6),

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
 
-from glob import glob
-
 from setuptools import find_packages, setup
 
 NAME = 'stavpr_slam'
@@ -21,7 +19,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'lib/{NAME}', sorted(glob('scripts/*'))),
+        (f'lib/{NAME}', ['scripts/bridge', 'scripts/pose_graph']),
     ],
     python_requires='>=3.11',
     install_requires=[

@@ -93,6 +93,16 @@ def test_saved_map_is_a_safetensors_file_and_one_made_by_that_library_loads(
     assert_same(load_map(tmp_path / 'theirs'), example)
 
 
+def test_threshold_is_a_section_that_older_readers_ignore(example, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    save_map(dataclasses.replace(example, threshold=0.25), path)
+    assert load_map(path).threshold == 0.25
+    manifest, _ = parts_of(path.read_bytes())
+    assert manifest['sections']['threshold'] == {'version': 1, 'required': False, 'data': 0.25}
+    with pytest.raises(InputError, match=r'threshold = 0\.0: expected a distance above 0'):
+        dataclasses.replace(example, threshold=0.0)
+
+
 def test_reader_written_from_the_documentation_finds_the_same(example, saved):
     from map_reader import read
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node over ROS: images in, matches out; parameters that change meanwhile."""
 
+from dataclasses import replace
+
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from robot import image_message, LENGTH, SECOND
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.mapping import save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.ros import output
 from stavpr_ros.ros.messages import nanoseconds
@@ -73,6 +76,18 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
         best, second = listed.candidates[:2]
         assert (best.place_index, best.distance) == (match.sequence_middle, match.distance)
         assert second.place_index == match.second_best_index
+
+
+@pytest.mark.parametrize(('given', 'applied'), [({}, 0.3), ({'threshold': 0.1}, 0.1)])
+def test_node_takes_the_threshold_of_the_map_unless_it_is_set(
+    robot, start, small_map, route, tmp_path, given, applied
+):
+    save_map(replace(small_map, threshold=0.3), tmp_path / 'route.stavpr')
+    start(map_path=str(tmp_path / 'route.stavpr'), mode='paper', **given)
+    for image in route[20 : 20 + LENGTH]:
+        message = robot.show(image_message(image), SECOND)
+    assert message.status == PlaceMatch.MATCH
+    assert message.threshold == pytest.approx(applied)
 
 
 def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):

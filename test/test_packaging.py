@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import zipfile
 
 from interface_packages import INTERFACES
+from processes import executable
 import pytest
 import setuptools
 import stavpr_ros
@@ -151,10 +152,40 @@ def sources(tmp_path_factory) -> Path:
     return root
 
 
-def run_setup(folder: Path, *arguments: str) -> None:
+def run_setup(folder: Path, *arguments: str, prefix: str | None = None) -> None:
     command = [sys.executable, '-W', 'ignore', 'setup.py', '--quiet', *arguments]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    environment = os.environ if prefix is None else os.environ | {'AMENT_PREFIX_PATH': prefix}
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def colcon_arguments(folder: Path) -> list[str]:
+    """Return the arguments that colcon passes to setup.py."""
+    build = ['build', '--build-base', str(folder / 'build'), 'install', '--prefix', str(folder)]
+    return [*build, '--record', str(folder / 'log'), '--single-version-externally-managed']
+
+
+def test_build_by_colcon_without_messages_names_the_links(sources, tmp_path):
+    with pytest.raises(AssertionError, match=r'ln -s stavpr_ros/stavpr_{msgs,slam,lab} src/'):
+        run_setup(sources, *colcon_arguments(tmp_path), prefix='/opt/ros/jazzy')
+    assert not list(tmp_path.iterdir())
+
+
+def test_build_by_colcon_with_messages_passes(sources, tmp_path):
+    packages = tmp_path / 'underlay/share/ament_index/resource_index/packages'
+    packages.mkdir(parents=True)
+    (packages / 'stavpr_msgs').touch()
+    run_setup(sources, *colcon_arguments(tmp_path), prefix=f'/opt/ros:{tmp_path}/underlay')
+    assert next(tmp_path.glob('**/lib/stavpr_ros/node')).is_file()
+
+
+def test_build_by_bloom_passes_without_messages(sources, tmp_path):
+    """Debian's build of a package has its build dependencies alone."""
+    run_setup(sources, 'build', prefix='/opt/ros/jazzy')
+    run_setup(sources, 'install', '--root', str(tmp_path), prefix='/opt/ros/jazzy')
+    assert next(tmp_path.glob('**/lib/stavpr_ros/node')).is_file()
 
 
 @pytest.fixture(scope='module')
@@ -194,21 +225,33 @@ def test_install_keeps_names_of_ros2_run(installed, package):
     scripts = next(installed[package].glob(f'**/lib/{package}'))
     own = {name for name, owner in stavpr.PACKAGES.items() if owner == package}
     if package == 'stavpr_ros':
-        own = set(COMMANDS)
-        for name, owner in stavpr.PACKAGES.items():
-            done = subprocess.run(
-                [sys.executable, scripts / name, '-x'], capture_output=True, text=True, check=False
-            )
-            assert done.returncode == 1
-            assert f'ros2 run {owner} {name} -x' in done.stderr
-    others = set(stavpr.PACKAGES) if package == 'stavpr_ros' else set()
-    assert {path.name for path in scripts.iterdir()} == own | others
+        own = {*COMMANDS, *stavpr.PACKAGES}
+    assert {path.name for path in scripts.iterdir()} == own
     for name in own:
-        text = (scripts / name).read_text(encoding='utf-8')
         assert os.access(scripts / name, os.X_OK)
-        assert text.startswith('#!/usr/bin/env python3\n')
-        assert f'from {package}.commands.{name} import main\n' in text
-        assert (PACKAGES[package] / package / 'commands' / f'{name}.py').is_file()
+        assert (scripts / name).read_text(encoding='utf-8').startswith('#!/usr/bin/env python3\n')
+        owner = stavpr.PACKAGES.get(name, 'stavpr_ros')
+        assert (PACKAGES[owner] / owner / 'commands' / f'{name}.py').is_file()
+
+
+@each_package
+def test_executable_without_environment_names_remedy(installed, package):
+    scripts = next(installed[package].glob(f'**/lib/{package}'))
+    for script in scripts.iterdir():
+        command = [sys.executable, '-I', '-S', script]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert done.stderr.startswith(f"{script.name}: No module named 'stavpr_ros'. Source the")
+        assert 'Traceback' not in done.stderr
+
+
+def test_executables_run_commands_of_other_packages():
+    scripts = Path(executable('node')).parent
+    done = subprocess.run(
+        [scripts / 'evaluate', '--help'], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.startswith('usage: ')
+    assert '--query' in done.stdout
 
 
 @each_package
@@ -235,7 +278,7 @@ def test_install_contains_every_file_of_package(installed, package):
 
 def test_wheel_has_all_python_packages_and_entry_points(sources, installed, tmp_path):
     """``pip install .`` gives ``stavpr evaluate``, without an order of builds as colcon has."""
-    run_setup(sources, 'bdist_wheel', '--dist-dir', str(tmp_path))
+    run_setup(sources, 'bdist_wheel', '--dist-dir', str(tmp_path), prefix='/opt/ros/jazzy')
     (wheel,) = tmp_path.glob('*.whl')
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())

@@ -80,6 +80,19 @@ def test_missing_map_or_threshold_is_the_reason(map_file, route):
     assert statuses(process(pipeline, route[:1])) == [Status.WARMING_UP]
 
 
+def test_paper_takes_the_threshold_of_the_map_unless_it_is_set(small_map, route, tmp_path):
+    save_map(replace(small_map, threshold=0.2), tmp_path / 'route.stavpr')
+    pipeline = localizing(str(tmp_path / 'route.stavpr'), mode='paper')
+    assert (pipeline.threshold, pipeline.missing) == (0.2, '')
+    match = process(pipeline, route[20:30])[-1]
+    assert (match.status, match.threshold) == (Status.MATCH, 0.2)
+    for threshold in (0.3, None):
+        pipeline.change(replace(pipeline.settings, threshold=threshold))
+        (match,) = process(pipeline, route[30:31])
+        assert (match.status, match.threshold) == (Status.MATCH, threshold or 0.2)
+    assert localizing(str(tmp_path / 'route.stavpr')).threshold == 1 - MIN_PROBABILITY
+
+
 def test_mapping_records_places(route):
     pipeline = Pipeline(settings_of(thumbnail_width=64), 'mapping')
     assert (pipeline.map_state, pipeline.missing, len(pipeline.places)) == ('growing', '', 0)

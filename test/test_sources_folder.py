@@ -69,7 +69,7 @@ def test_open_source_of_no_source_fails(tmp_path):
     with pytest.raises(SourceError, match='No such file or directory; check its name'):
         FolderSource(tmp_path / 'missing')
     fill(tmp_path, ['1.png'])
-    with pytest.raises(SourceError, match='is no folder and no bag'):
+    with pytest.raises(SourceError, match='is no folder, video or bag'):
         open_source(tmp_path / '1.png')
     with pytest.raises(SourceError, match='leave the topic out'):
         open_source(tmp_path, '/image')
@@ -98,3 +98,13 @@ def test_folder_with_names_not_utf8_is_read(tmp_path):
     (tmp_path / os.fsdecode(b'caf\xe9.png')).write_bytes(b'')
     with pytest.raises(ImageError, match=r'caf\ufffd\.png: 0 bytes'):
         list(open_source(tmp_path))
+
+
+def test_folder_without_images_yields_those_of_sub_folders(tmp_path):
+    for name in ('10', '9/b', '.hidden', '9'):
+        (tmp_path / name).mkdir(parents=True, exist_ok=True)
+    fill(tmp_path, ['10/1.png', '9/b/1.png', '.hidden/1.png', '9/2.png', '9/a.png'])
+    expected = ['9/2.png', '9/a.png', '9/b/1.png', '10/1.png']
+    assert [frame.identifier for frame in FolderSource(tmp_path)] == expected
+    fill(tmp_path, ['own.png'])
+    assert [frame.identifier for frame in FolderSource(tmp_path)] == ['own.png']

@@ -100,8 +100,8 @@ def test_command_help_names_the_command_as_called(run, monkeypatch):
     ):
         monkeypatch.setattr('sys.argv', [program])
         text = run(build_map, '--help').out
-        assert text.startswith(f'usage: {name} --input FOLDER|BAG|ARRAY')
-        assert text.partition('examples:')[2].count(f'\n  {name} ') == 6
+        assert text.startswith(f'usage: {name} --input FOLDER|VIDEO|BAG|ARRAY')
+        assert text.partition('examples:')[2].count(f'\n  {name} ') == 7
         assert '--onnx-layer' not in text.partition('examples:')[0]
     assert '--onnx-layer LAYER' in run(build_map, '--help-features').out
 
@@ -211,6 +211,8 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
         (['--keyframe-interval', '1'], 2, 'have no stamps'),
         (['--keyframe-change', '-1'], 2, 'change = -1'),
         (['--odometry', '/odom'], 2, 'is no bag'),
+        (['--fps', '5'], 2, 'no input is a video'),
+        (['--fps', 'fast'], 2, '--fps'),
         (['--odometry', '/odom', '--poses', 'x.csv'], 2, 'give one'),
         (['--no-thumbnails', '--thumbnail-width', '9'], 2, 'give one'),
         (['--thumbnail-width', '0'], 2, 'width = 0'),
@@ -223,19 +225,27 @@ def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, 
     assert (tmp_path / 'map.stavpr').exists() is (code == 0)
 
 
-@pytest.mark.parametrize(
-    ('where', 'words'),
-    [
-        ('mapping.save_map', 'nothing was written'),
-        ('recognition.threshold.suggest_threshold', 'is written'),
-    ],
-)
-def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatch, where, words):
+@pytest.mark.parametrize('where', ['mapping.save_map', 'recognition.threshold.suggest_threshold'])
+def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatch, where):
     monkeypatch.setattr(f'stavpr_ros.{where}', interrupt)
     result = run(build_map, '--input', traverse, '--output', tmp_path / 'map')
     assert result.code == 130
-    assert words in result.err
-    assert (tmp_path / 'map').exists() is (words == 'is written')
+    assert 'nothing was written' in result.err
+    assert not (tmp_path / 'map').exists()
+
+
+def test_build_map_of_video_takes_images_at_the_rate(run, tmp_path):
+    images = route_images(24)
+    codec, size = cv2.VideoWriter_fourcc(*'MJPG'), images[0].shape[1::-1]
+    writer = cv2.VideoWriter(str(tmp_path / 'phone.avi'), codec, 8, size)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    arguments = ['--input', tmp_path / 'phone.avi', '--fps', '4', '--keyframe-interval', '0.6']
+    result = run(build_map, *arguments, '--output', tmp_path / 'map.stavpr')
+    assert '4 of 12 images became places' in result.out
+    stamps = load_map(tmp_path / 'map.stavpr').stamps
+    np.testing.assert_allclose(stamps / SECOND, [1, 1.75, 2.5, 3.25], atol=0.002)
 
 
 @pytest.mark.parametrize(
@@ -336,7 +346,7 @@ def test_demo_on_bag_and_folder_reports_matches(run, traverse, tmp_path):
     options = ['--query', query, '--topic', '/front', '--output', output]
     result = run(demo, '--map', traverse, *options)
     assert result.code == 2
-    assert 'neither recording is a bag' in result.err
+    assert 'no recording is a bag' in result.err
     result = run_process('demo', '--map', tmp_path / 'bag', *options)
     assert result.returncode == 0, result.stdout + result.stderr
     assert '24.png' in result.stdout

@@ -8,6 +8,7 @@ from pathlib import Path
 import re
 import shlex
 import sys
+import textwrap
 
 from evaluation_commands import write_images
 from fixtures import route_images
@@ -20,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / 'benchmarks' / 'results'
 PAGES = [
     *(ROOT / name for name in ('README.md', 'CONTRIBUTING.md', 'benchmarks/README.md')),
-    *sorted((ROOT / 'docs').glob('*.md')),
+    *sorted((ROOT / 'docs').rglob('[!_]*.md')),
 ]
 NAMES = {row.name for row in PARAMETERS}
 WALKS = ('gardens_point', 'walk_night')
@@ -78,6 +79,15 @@ def test_readme_python_example_runs(run):
     assert len(lines) == 40
     assert lines[0].startswith('0 WARMING_UP -1 nan')
     assert [line.split()[1] for line in lines[30:]] == ['MATCH'] * 10
+
+
+@pytest.mark.parametrize('page', ['recognition', 'mapping', 'sources'])
+def test_examples_of_the_api_pages_run(run, page):
+    text = (ROOT / f'docs/api/{page}.rst').read_text()
+    (example,) = re.findall(r'code-block:: python\n\n((?:   .*\n|\n)+)', text)
+    lines = run(exec, textwrap.dedent(example), {}).splitlines()
+    assert lines
+    assert all('039.png' in line for line in lines[-1:]) is (page != 'mapping')
 
 
 def test_build_map_and_evaluate_examples_run(run, workspace):

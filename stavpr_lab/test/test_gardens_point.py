@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scores import best_f1
 from stavpr_lab.demonstration.live import run_live
+from stavpr_lab.demonstration.recordings import Recording
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.evaluation.records import evaluate_records
@@ -58,7 +59,7 @@ def test_node_on_gardens_point_equals_library(
 
     model = {'model_path': settings.model} if settings else {}
     parameters = {'map_path': map_path, 'mode': mode} | limit | model
-    records, _ = run_live(parameters, str(bags / 'day_right'), len(query), tmp_path)
+    records, _ = run_live(parameters, Recording(str(bags / 'day_right')), len(query), tmp_path)
     truth = np.arange(len(query))
     live = evaluate_records(records, 20, threshold, truth, TOLERANCE).matches
 

@@ -3,10 +3,14 @@
 """Plots: written, of a sensible size, with the colors of their contents, also for empty input."""
 
 from dataclasses import replace
+import json
 
 import cv2
+from evaluation_commands import write_images
 import numpy as np
+from PIL import Image
 import pytest
+from stavpr_lab.demonstration.animation import write_animation
 from stavpr_lab.demonstration.plots import demo_sheet
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, ImageMatches, Ranking
@@ -18,6 +22,7 @@ from stavpr_lab.evaluation.plots import (
     reduced_matrix,
 )
 from stavpr_lab.evaluation.records import TraverseEvaluation
+from stavpr_ros.mapping import save_map
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
 
 QUERIES, PLACES, THRESHOLD = 40, 30, 0.5
@@ -142,3 +147,20 @@ def test_match_image_puts_query_and_place_side_by_side(accepted, color):
     assert tuple(sheet[-1, 0]) == color
     assert sheet[48:].std() > 5  # the text
     assert np.all(query == 50)
+
+
+def test_animation_has_every_fifth_image_beside_its_place(tmp_path, small_map, route):
+    save_map(small_map, tmp_path / 'map.stavpr')
+    write_images(tmp_path / 'second_traverse', route[:12])
+    missed = {'status': 'NO_MATCH', 'newest_index': -1, 'probability': 0.25}
+    found = {'status': 'MATCH', 'newest_index': 10, 'probability': 0.75}
+    lines = [json.dumps(missed)] * 10 + [json.dumps(found)] * 2
+    (tmp_path / 'matches.jsonl').write_text('\n'.join(lines))
+    write_animation(tmp_path, tmp_path / 'demo.webp')
+    with Image.open(tmp_path / 'demo.webp') as animation:
+        assert animation.n_frames == 3
+        bars = []
+        for i in range(3):
+            animation.seek(i)
+            bars.append(np.asarray(animation.convert('RGB'))[-5, 2])
+    np.testing.assert_allclose(bars, [NO_MATCH, NO_MATCH, RIGHT], atol=25)

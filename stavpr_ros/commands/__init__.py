@@ -22,14 +22,14 @@ class Command:
 
 COMMANDS = {
     'build_map': Command(
-        'stavpr_ros.commands.build_map', 'build a reference map from a folder of images or a bag'
+        'stavpr_ros.commands.build_map', 'build a reference map from images, a video or a bag'
     ),
     'map': Command(
         'stavpr_ros.commands.map', 'show, check, convert, export, merge and recover maps'
     ),
     'node': Command('stavpr_ros.commands.node', 'run the place-recognition node', True),
     'replay': Command(
-        'stavpr_ros.commands.replay', 'publish a bag or a folder of images to the node', True
+        'stavpr_ros.commands.replay', 'publish a bag, a video or images to the node', True
     ),
     'record': Command(
         'stavpr_ros.commands.record', 'write matches or loop closures to a JSON Lines file', True

@@ -1,9 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros build_map``: make a reference map from a folder of images or a bag."""
+"""``ros2 run stavpr_ros build_map``: make a reference map from images, a video or a bag."""
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 import json
 from pathlib import Path
@@ -17,7 +18,7 @@ from stavpr_ros.commands.jobs import (
     other_arguments,
     run_jobs,
 )
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import add_fps, make_parser, run_program
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.output_file import MAP, require_replaceable
 
@@ -27,9 +28,10 @@ if TYPE_CHECKING:
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.frame import Frame
+    from stavpr_ros.sources.video import VideoSource
 
 RULES = {  # fields of KeyframeSettings
-    'interval': ('S', 'seconds since the last place; for bags'),
+    'interval': ('S', 'seconds since the last place; for videos and bags'),
     'distance': ('M', 'meters from the last place; needs --odometry or --poses'),
     'angle': ('DEG', 'degrees from the last place; needs --odometry or --poses'),
     'change': ('C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
@@ -39,6 +41,7 @@ MOST_SUGGESTED = 20_000  # places of a map that a threshold of mode paper is sug
 EPILOG = """
 examples:
   build_map --input drive/ --output route.stavpr
+  build_map --input phone.mp4 --output route.stavpr
   build_map --input drive.bag --topic /camera/image_raw --output route.stavpr
   build_map --input drive.bag --output route.stavpr --odometry /odom \\
       --keyframe-distance 1 --keyframe-angle 15
@@ -65,9 +68,9 @@ def _parser() -> argparse.ArgumentParser:
         '--input',
         required=True,
         nargs='+',
-        metavar='FOLDER|BAG|ARRAY',
-        help='images, a ROS 1 or ROS 2 bag, or descriptors: .npy .npz .csv .mat, or FILE:NAME; '
-        'several: a map of each',
+        metavar='FOLDER|VIDEO|BAG|ARRAY',
+        help='images, a video, a ROS 1 or ROS 2 bag, or descriptors: .npy .npz .csv .mat, or '
+        'FILE:NAME; several: a map of each',
     )
     parser.add_argument(
         '--output',
@@ -77,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--force', action='store_true', help='replace an existing map')
     parser.add_argument('--topic', help='image topic of the bag, if it has several')
+    add_fps(parser)
     parser.add_argument(
         '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
     )
@@ -125,7 +129,7 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
 class _Images:
     """Every N-th image of a source; counts those that were read."""
 
-    def __init__(self, source: 'FolderSource | BagSource', every: int) -> None:
+    def __init__(self, source: 'FolderSource | VideoSource | BagSource', every: int) -> None:
         self._source, self._every = source, every
         self.read = 0
 
@@ -142,10 +146,12 @@ def _check(arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other, before anything is read."""
     from stavpr_ros.checks import require_at_least
     from stavpr_ros.sources.bag_file import is_bag
+    from stavpr_ros.sources.video import is_video, require_video
 
     moving = arguments.keyframe_distance or arguments.keyframe_angle
     bag = is_bag(Path(arguments.input))
     require_at_least('--every', arguments.every, 1)
+    require_video(arguments.fps, [arguments.input])
     if arguments.poses and arguments.skip_bad_images:
         raise SettingsError(
             '--poses and --skip-bad-images: a skipped image would shift the poses; give one'
@@ -156,11 +162,11 @@ def _check(arguments: argparse.Namespace) -> None:
         raise SettingsError('--keyframe-distance and --keyframe-angle need --odometry or --poses')
     if arguments.odometry and not bag:
         raise SettingsError(
-            f'--odometry: {arguments.input} is no bag; give --poses with a folder of images'
+            f'--odometry: {arguments.input} is no bag; give --poses with images and videos'
         )
-    if arguments.keyframe_interval and not bag:
+    if arguments.keyframe_interval and not (bag or is_video(arguments.input)):
         raise SettingsError(
-            f'--keyframe-interval: {arguments.input} is no bag, its images have no stamps'
+            f'--keyframe-interval: {arguments.input} is no bag or video, its images have no stamps'
         )
     if arguments.thumbnail_width is not None and arguments.no_thumbnails:
         raise SettingsError('--thumbnail-width and --no-thumbnails: give one')
@@ -172,13 +178,14 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.bag import read_odometry
     from stavpr_ros.sources.pose_file import read_poses
+    from stavpr_ros.sources.video import is_video
 
     if arguments.odometry:
         return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
     if not arguments.poses:
         return None
     poses, oriented = read_poses(Path(arguments.poses))
-    if len(poses) != images:
+    if len(poses) != images and not is_video(arguments.input):  # whose number is an estimate
         raise SourceError(
             f'poses {arguments.poses} has {len(poses)} lines for {images} images: give one each'
         )
@@ -216,7 +223,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     learned = isinstance(projection, str)
     plain = argparse.Namespace(**vars(arguments) | ({'projection': None} if learned else {}))
     extractor = make_extractor(plain)
-    source = open_source(arguments.input, arguments.topic, bad_image)
+    source = open_source(arguments.input, arguments.topic, bad_image, arguments.fps)
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
     journal = build_journal(
@@ -254,7 +261,7 @@ def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
     require_replaceable(arguments.output, MAP, arguments.force)
     require_descriptors_alone(arguments, arguments.input)
     keyframes = (f'keyframe_{rule}' for rule in RULES)
-    for name in ('topic', 'odometry', 'thumbnail_width', 'skip_bad_images', *keyframes):
+    for name in ('topic', 'fps', 'odometry', 'thumbnail_width', 'skip_bad_images', *keyframes):
         if getattr(arguments, name):
             raise SettingsError(
                 f'--{name.replace("_", "-")}: {arguments.input} holds descriptors, not images; '
@@ -281,29 +288,27 @@ def _known_poses(place_map: 'PlaceMap') -> str:
     return f', {known} of them with a pose' if known else ''
 
 
-def _report(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
+def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float | None':
+    """Return the threshold of mode paper for a map, None = unknown; print the reason."""
     from stavpr_ros.errors import InputError
     from stavpr_ros.recognition.threshold import suggest_threshold
 
-    output, kind = arguments.output, place_map.settings.kind
     if len(place_map) > MOST_SUGGESTED:
-        print(f'{output}: {len(place_map)} places')
-        return  # the suggestion for mode paper would take the whole map into memory
-    megabytes = Path(output).stat().st_size / 1e6
-    strips = place_map.features.strips
-    shape = f'{strips.shape[0]} strips of {strips.shape[2]} dimensions'
-    print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+        return None  # it would take the whole map into memory
+    model = getattr(arguments, f'{place_map.settings.kind}_model', None) or ''
     try:
-        threshold = suggest_threshold(
-            place_map,
-            progress=True,
-            model=getattr(arguments, f'{kind}_model', None) or '',
-        )
+        return suggest_threshold(place_map, progress=True, model=model)
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
-        return
-    value = f'{threshold:.3f}'
-    print(f'suggested threshold for mode paper: {value} (-p mode:=paper -p threshold:={value})')
+        return None
+
+
+def _report(place_map: 'PlaceMap', output: str) -> None:
+    megabytes = Path(output).stat().st_size / 1e6
+    shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
+    print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+    if place_map.threshold is not None:
+        print(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
 
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
@@ -341,12 +346,13 @@ def main(args: list[str] | None = None) -> int:
         else:
             state = 'nothing was written; the same command continues the work'
             place_map, journal = _build(arguments)
+        place_map = replace(place_map, threshold=_suggested(place_map, arguments))
         statistics = statistics_of_map(place_map)
         save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
         if journal is not None:
             journal.unlink()
-        state = f'{arguments.output} is written, without a suggested threshold'
-        _report(place_map, arguments)
+        state = f'{arguments.output} is written'
+        _report(place_map, arguments.output)
         return None
 
     return run_program('build_map', work, lambda: f'interrupted, {state}')

@@ -198,6 +198,9 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         'statistics': 'none'
         if features.statistics is None
         else f'kept for a fast start{", with codes for int8" if features.has_codes else ""}',
+        'threshold': 'none'
+        if place_map.threshold is None
+        else f'{place_map.threshold:.3f}, mode paper',
         'stamps': f'{_time(int(known.min()))} to {_time(int(known.max()))}'
         if len(known)
         else 'unknown',

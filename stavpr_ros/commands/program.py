@@ -5,6 +5,7 @@
 import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import difflib
+import math
 from pathlib import Path
 import shutil
 import sys
@@ -90,6 +91,20 @@ def add_parameter(group: Any, name: str, text: str, **changes: Any) -> None:
     else:
         own = {'type': type(row.default), 'default': row.default, 'choices': row.choices or None}
     group.add_argument(f'--{name.replace("_", "-")}', help=text, **own | changes)
+
+
+def positive(text: str) -> float:
+    """Return the number that an option names, above 0 and finite."""
+    value = float(text)
+    if not (value > 0 and math.isfinite(value)):
+        raise argparse.ArgumentTypeError(f'{text}: expected a number above 0')
+    return value
+
+
+def add_fps(group: Any) -> None:
+    """Add the option ``--fps`` of videos."""
+    text = 'images per second that are taken of a video (5); the same for map and query'
+    group.add_argument('--fps', type=positive, metavar='HZ', help=text)
 
 
 def run_program(

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``replay``: publish the images of a bag or folder, at a pace or each after the last result."""
+"""``replay``: publish images of a bag, video or folder, at a pace or after the last result."""
 
 import argparse
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -10,7 +10,7 @@ import sys
 import time
 
 import rclpy
-from stavpr_ros.commands.program import DONE, FAILED, make_parser, run_program
+from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run_program
 from stavpr_ros.errors import ImageError, SourceError, StavprError, UnavailableError
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import (
@@ -25,8 +25,10 @@ from stavpr_ros.sources.bag import BagSource, ODOMETRY
 from stavpr_ros.sources.bag_messages import list_topics, read_messages
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
+from stavpr_ros.sources.video import VideoSource
 from tqdm import tqdm
 
+Source = FolderSource | VideoSource | BagSource
 NO_SUBSCRIBER, NO_RESULT = 3, 4  # exit codes, besides those of every command
 FOLDER_FPS = 10.0
 CLOCK_RATE = 40.0  # that of `ros2 bag play`
@@ -44,13 +46,15 @@ examples:
         the bag's odometry on the topic odom, two more topics, and /clock for use_sim_time
   ros2 run stavpr_ros replay photos --fps 5 --ros-args -r image:=/camera/image
         a folder of images, 5 per second, on another topic
+  ros2 run stavpr_ros replay phone.mp4 --lossless
+        a video, 5 images of each second
 
 On a terminal, space pauses and resumes, s or the right arrow publishes the next image. The
 services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger) do the same.
 
 exit codes:
   0    all images were published; the last line names how many of them the node received
-  1    the bag or folder cannot be read, or none of its images
+  1    the input cannot be read, or none of its images
   2    wrong usage
   3    no subscriber within --wait seconds
   4    no result for an image (--lossless), or no acknowledgment
@@ -86,7 +90,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
     def notify(text: str) -> None:
         tqdm.write(f'replay: {text}', file=sys.stderr)
 
-    source = open_source(options.bag, options.topic, skip)
+    source = open_source(options.bag, options.topic, skip, options.fps)
     others = _others(options, source, notify)
     whole = options.duration == math.inf and not (options.start_offset or options.loop)
     # no bar without a terminal
@@ -118,15 +122,13 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
 
 
 def _others(
-    options: argparse.Namespace, source: FolderSource | BagSource, notify: Callable[[str], None]
+    options: argparse.Namespace, source: Source, notify: Callable[[str], None]
 ) -> dict[RecordedTopic, str]:
     """Return the topics to publish beside the images, and the names to publish them on."""
     if options.odometry is None and options.also is None:
         return {}
-    if isinstance(source, FolderSource):
-        raise SourceError(
-            f'{source.path} is a folder of images: --odometry and --also require a bag'
-        )
+    if not isinstance(source, BagSource):
+        raise SourceError(f'{source.path} is no bag, which --odometry and --also require')
     topics = list_topics(source.path)
 
     def find(name: str, of_type: str = '') -> RecordedTopic:
@@ -162,7 +164,7 @@ def _others(
 def _replay(
     replayer: Replayer,
     options: argparse.Namespace,
-    source: FolderSource | BagSource,
+    source: Source,
     count: Callable[[], object],
 ) -> str:
     """Publish the records; return a summary."""
@@ -193,12 +195,12 @@ def _replay(
 
 
 def _records(
-    options: argparse.Namespace, source: FolderSource | BagSource, topics: Collection[str]
+    options: argparse.Namespace, source: Source, topics: Collection[str]
 ) -> Iterator[ImageRecord | MessageRecord]:
     """Yield the images, and the messages of other topics, in the order of recording."""
     span = options.start_offset, options.duration
     if isinstance(source, FolderSource):
-        return source.records(options.fps, *span)
+        return source.records(options.fps or FOLDER_FPS, *span)
     images = source.records(*span)
     if not topics:
         return images
@@ -212,7 +214,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         'bag',
         metavar='BAG',
-        help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, or a folder of images',
+        help='a ROS 2 bag (folder, .db3 or .mcap file), a ROS 1 .bag, a video, or a folder of '
+        'images',
     )
     parser.add_argument('--topic', help='image topic in the bag; needed if it has several')
     parser.add_argument(
@@ -231,7 +234,7 @@ def _parser() -> argparse.ArgumentParser:
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument(
         '--rate',
-        type=_positive,
+        type=positive,
         metavar='R',
         help='factor on the recorded pace (1)',
     )
@@ -240,10 +243,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         '--fps',
-        type=_positive,
-        default=FOLDER_FPS,
+        type=positive,
         metavar='HZ',
-        help='images per second at which a folder was recorded (%(default)g)',
+        help=f'images per second: of a folder, as recorded ({FOLDER_FPS:g}); taken of a video (5)',
     )
     parser.add_argument('--loop', action='store_true', help='start again at the end')
     parser.add_argument(
@@ -255,7 +257,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         '--duration',
-        type=_positive,
+        type=positive,
         default=math.inf,
         metavar='S',
         help='end after so many recorded seconds',
@@ -263,7 +265,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--clock',
         nargs='?',
-        type=_positive,
+        type=positive,
         const=CLOCK_RATE,
         metavar='HZ',
         help=f'publish the recorded time on /clock for use_sim_time ({CLOCK_RATE:g} Hz)',
@@ -271,26 +273,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--start-paused', action='store_true', help='start paused')
     parser.add_argument(
         '--timeout',
-        type=_positive,
+        type=positive,
         default=20.0,
         metavar='S',
         help='seconds without a result until an image is sent again; 3 tries (%(default)g)',
     )
     parser.add_argument(
-        '--wait', type=_positive, metavar='S', help='seconds to wait for a subscriber'
+        '--wait', type=positive, metavar='S', help='seconds to wait for a subscriber'
     )
     return parser
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f'{text}: expected a number above 0')
-    return value
-
-
 def _not_negative(text: str) -> float:
-    return 0.0 if float(text) == 0 else _positive(text)
+    return 0.0 if float(text) == 0 else positive(text)
 
 
 if __name__ == '__main__':

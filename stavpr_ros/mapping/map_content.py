@@ -13,7 +13,7 @@ from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
-from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, record
+from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, number, record
 from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
@@ -93,8 +93,14 @@ def map_content(file: MapFile) -> PlaceMap:
         session_index=arrays.get('session'),
         camera=_camera(sections['intrinsics']['data']) if 'intrinsics' in known else None,
         same_as=arrays.get('same_places/same_as'),
+        threshold=_threshold(sections['threshold']['data']) if 'threshold' in known else None,
         map_id=file.map_id,
     )
+
+
+def _threshold(data: Any) -> float:
+    number(data, 'section threshold')
+    return float(data)
 
 
 def _camera(data: Any) -> Camera:

@@ -61,6 +61,8 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
         data['intrinsics'] = asdict(place_map.camera)
     if place_map.same_as is not None:
         data['same_places'] = None
+    if place_map.threshold is not None:
+        data['threshold'] = place_map.threshold
     if place_map.features.vectors is not None:
         data['vectors'] = None
     if statistics is not None:  # the writer knows the hash of the features

@@ -74,6 +74,8 @@ class PlaceMap:
     :param camera: of its images; None = unknown.
     :param same_as: of each place, itself, or the place of an earlier session that shows the same,
         shape (n,), int32; None = unknown: see :func:`stavpr_ros.recognition.same_places`.
+    :param threshold: distance below which mode paper matches where its own is not set, above 0; as
+        :func:`stavpr_ros.recognition.threshold.suggest_threshold` returns it; None = unknown.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
         read from a file.
     """
@@ -89,6 +91,7 @@ class PlaceMap:
     session_index: np.ndarray | None = None
     camera: Camera | None = None
     same_as: np.ndarray | None = None
+    threshold: float | None = None
     map_id: str = ''
 
     def __post_init__(self) -> None:
@@ -115,6 +118,8 @@ class PlaceMap:
         _require_texts(self.ids)
         _require_sessions(self.sessions, self.session_index, n)
         _require_same_as(self.same_as, n)
+        if self.threshold is not None and not 0 < self.threshold < math.inf:
+            raise InputError(f'threshold = {self.threshold}: expected a distance above 0')
         require_projection(self.projection, self.settings)
 
     def __len__(self) -> int:

@@ -52,6 +52,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
         place_map,
         features=LocalFeatures(strips, features.weights, settings, vectors=features.vectors),
         projection=projection,
+        threshold=None,
         map_id='',
     )
 

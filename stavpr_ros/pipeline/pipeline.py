@@ -33,8 +33,8 @@ NO_MAP = (
     "no map: call the service load_map, or set parameter 'map_path' before the node is configured"
 )
 NO_THRESHOLD = (
-    "parameter 'threshold' is not set, which mode paper requires: set the value that build_map "
-    "printed for the map, 'ros2 param set /stavpr threshold VALUE'"
+    "parameter 'threshold' is not set, which mode paper requires where the map suggests none: "
+    "'ros2 param set /stavpr threshold VALUE', or build the map again"
 )
 NOT_A_KEYFRAME = 'not a keyframe'
 
@@ -47,8 +47,7 @@ class Pipeline:
     :param open_journal: of recorded places; None = they are in memory only.
     :raises StavprError: invalid settings, or a missing model.
 
-    ``operation``, ``settings`` and ``threshold`` (None = not set) are those in force;
-    :meth:`change` sets them.
+    ``operation`` and ``settings`` are those in force; :meth:`change` sets them.
     """
 
     def __init__(
@@ -63,7 +62,6 @@ class Pipeline:
         self._extractor: FeatureExtractor | None = None
         self._operation: Operation | None = None
         self.operation = operation
-        self.threshold = settings.applied_threshold
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._last: Match | None = None
@@ -108,6 +106,14 @@ class Pipeline:
         if self.operation == 'localization':
             return 'loaded' if self._map is not None else 'none'
         return 'full' if self._is_full else 'growing'
+
+    @property
+    def threshold(self) -> float | None:
+        """Return the distance below which a window is matched: as set, or the map's; or None."""
+        applied = self.settings.applied_threshold
+        if applied is None and self.operation == 'localization' and self._map is not None:
+            return self._map.threshold
+        return applied
 
     @property
     def window_fill(self) -> int:
@@ -157,15 +163,15 @@ class Pipeline:
         """
         settings, name = settings or self.settings, operation or self.operation
         settings.require_operation(name)
-        threshold, before = settings.applied_threshold, self.threshold
+        before = self.threshold
         if loaded is not None or name != self.operation:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
-        elif (recognizer := self._recognizer) is not None and threshold is not None:
-            if before is None:
-                self.reset()  # images since then are not in the window
+        elif (recognizer := self._recognizer) is not None:
             recognizer.set_limits(settings.threshold, settings.min_probability)
-        self.settings, self.threshold = settings, threshold
+        self.settings = settings
+        if before is None and self.threshold is not None:
+            self.reset()  # images since then are not in the window
         self._keyframes.settings = settings.keyframes
         if settings.geometric != (self._check and self._check.settings):
             self._check = GeometricCheck(settings.geometric) if settings.geometric else None

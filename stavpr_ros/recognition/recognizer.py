@@ -228,6 +228,7 @@ class PlaceRecognizer(SequenceRecognizer):
         require_type('settings', settings, RecognizerSettings, given)
         backend = choose_backend(backend)
         features, options = place_map.features, settings.applied_options
+        self._suggested = place_map.threshold
         poses = place_map.poses if place_map.has_poses else None
         super().__init__(
             settings,
@@ -257,6 +258,14 @@ class PlaceRecognizer(SequenceRecognizer):
                     "stage is of backend 'cpu'; take that, or 0"
                 )
             self._keep_time_budget(prepared.features, features)
+
+    def set_limits(self, threshold: float | None, min_probability: float) -> None:
+        """
+        Change the limits; without a threshold, mode paper takes that of the map.
+
+        :raises SettingsError: out of range.
+        """
+        super().set_limits(self._suggested if threshold is None else threshold, min_probability)
 
     def _keep_time_budget(
         self, prepared: LocalFeatures | Int8Features, features: LocalFeatures

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Folders, bags and messages to images."""
+"""Folders, videos, bags and messages to images."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,44 +12,49 @@ from stavpr_ros.errors import ImageError, SourceError
 if TYPE_CHECKING:
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.folder import FolderSource
+    from stavpr_ros.sources.video import VideoSource
 
 
 def open_source(
     path: str | Path,
     topic: str | None = None,
     on_error: Callable[[ImageError], None] | None = None,
-) -> 'FolderSource | BagSource':
+    fps: float | None = None,
+) -> 'FolderSource | VideoSource | BagSource':
     """
-    Open a folder of images or a bag, whichever it is.
+    Open a folder of images, a video or a bag, whichever it is.
 
-    :param path: a folder of images; a ROS 2 bag (its folder, or its .db3 or .mcap file); a ROS 1
-        .bag file.
-    :param topic: the bag's image topic; may be left out if there is only one. Not for folders of
-        images.
+    :param path: a folder of images; a video (.mp4, .mov ...); a ROS 2 bag (its folder, or its .db3
+        or .mcap file); a ROS 1 .bag file.
+    :param topic: the bag's image topic; may be left out if there is only one. Of bags only.
     :param on_error: called with the error of an image that cannot be decoded, which is then
         skipped; without it the error is raised.
+    :param fps: images per second that are taken of a video, 5 if not given; all images of the
+        others are.
+    :raises SettingsError: ``fps`` is not above 0.
     :raises SourceError: it cannot be read, or the topic is ambiguous.
     """
     # imported on use: rosbags and OpenCV load slowly
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.bag_file import is_bag, reading
     from stavpr_ros.sources.folder import FolderSource
+    from stavpr_ros.sources.video import FPS, is_video, VideoSource
 
-    require_type('path', path, (str, Path), 'the path of a folder of images or of a bag')
+    require_type('path', path, (str, Path), 'the path of a folder of images, a video or a bag')
     path = Path(path)
     with reading(path):
         exists = path.exists()
     if not exists:
-        raise SourceError(f'{path} does not exist: expected a folder of images or a bag')
+        raise SourceError(f'{path} does not exist: expected a folder of images, a video or a bag')
     if is_bag(path):
         return BagSource(path, topic, on_error)
+    if topic is not None:
+        raise SourceError(f'topic {topic!r} was given, but {path} is no bag: leave the topic out')
+    if is_video(path):
+        return VideoSource(path, on_error, FPS if fps is None else fps)
     if not path.is_dir():
         raise SourceError(
-            f'{path} is no folder and no bag: expected images, a ROS 2 bag (folder, .db3, .mcap) '
-            'or a ROS 1 .bag'
-        )
-    if topic is not None:
-        raise SourceError(
-            f'topic {topic!r} was given, but {path} is a folder of images: leave the topic out'
+            f'{path} is no folder, video or bag: expected images, a video (.mp4, .mov ...), a '
+            'ROS 2 bag (folder, .db3, .mcap) or a ROS 1 .bag'
         )
     return FolderSource(path, on_error)

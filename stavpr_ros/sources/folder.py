@@ -31,13 +31,15 @@ def text_of(path: str | Path) -> str:
 
 class FolderSource:
     """
-    The images of one folder in natural order; sub-folders and hidden files are left out.
+    The images of a folder in natural order, or of its sub-folders if it has none itself.
 
-    Iterating yields :class:`Frame` with the file's name as identifier and an unknown stamp.
+    Sub-folders, at any depth, are in natural order too, one after the other. Hidden files and
+    folders are left out. Iterating yields :class:`Frame` with an unknown stamp and, as identifier,
+    the file's name, in a sub-folder its path from the folder.
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
-    :raises SourceError: there is no such folder, or no image in it.
+    :raises SourceError: there is no such folder, or no image in it and its sub-folders.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class FolderSource:
         self.on_error = on_error
         try:
             files = [file for file in self.path.iterdir() if _is_image(file)]
+            files = files or _images_below(self.path)
         except OSError as error:
             raise SourceError(
                 f'{self.path} cannot be listed: {error.strerror}; check its name and permissions'
@@ -54,10 +57,10 @@ class FolderSource:
         if not files:
             expected = ' '.join(sorted(SUFFIXES))
             raise SourceError(
-                f'{self.path} has no images: expected files ending in {expected}, not in '
+                f'{self.path} has no images: expected files ending in {expected}, there or in '
                 'sub-folders'
             )
-        self.files: list[Path] = sorted(files, key=lambda file: natural_key(file.name))
+        self.files: list[Path] = sorted(files, key=self._order)
 
     def __len__(self) -> int:
         """Return the number of image files, readable or not."""
@@ -88,16 +91,32 @@ class FolderSource:
         for i, frame in self._numbered(max(first, 0), last):
             yield ImageRecord.of_image(frame.image, round((i + 1) * SECOND / frames_per_second))
 
+    def _order(self, file: Path) -> list[tuple[list[str | int], str]]:
+        return [natural_key(part) for part in file.relative_to(self.path).parts]
+
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):
             try:
-                frame = Frame(_read(file), 0, text_of(file.name))
+                frame = Frame(_read(file), 0, text_of(file.relative_to(self.path)))
             except ImageError as error:
                 if self.on_error is None:
                     raise
                 self.on_error(error)
                 continue
             yield i, frame
+
+
+def _images_below(folder: Path) -> list[Path]:
+    """List the images in sub-folders; symbolic links to folders are not followed."""
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    found = []
+    for name, folders, files in os.walk(folder, onerror=fail):
+        folders[:] = [each for each in folders if not each.startswith('.')]
+        found += [file for file in (Path(name, each) for each in files) if _is_image(file)]
+    return found
 
 
 def _is_image(file: Path) -> bool:

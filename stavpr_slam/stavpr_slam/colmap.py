@@ -18,6 +18,7 @@ from stavpr_ros.sources import open_source
 NEIGHBORS = 5  # places before a place that it is paired with
 BESIDE = 1  # places beside a recognized place that its query is paired with as well
 QUALITY = 95  # of JPEG
+ALL = 1000.0  # images per second of a video: all of them
 
 
 def export(
@@ -93,7 +94,7 @@ def _images(
         own = np.arange(len(place_map)) if index is None else np.flatnonzero(index == number)
         ids = {place_map.ids[place]: place for place in own.tolist()}
         stamps = {int(place_map.stamps[place]): place for place in own.tolist()}
-        for frame in open_source(path, topic):
+        for frame in open_source(path, topic, fps=ALL):
             known = stamps.get(frame.stamp) if frame.stamp else ids.get(frame.identifier)
             if known is not None:
                 yield known, frame.image

@@ -9,7 +9,7 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.program import add_parameter, make_parser, run_program
+from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
 from stavpr_ros.parameters import BY_NAME, default
 
@@ -27,7 +27,7 @@ Without options: renders two traverses of a synthetic street (the second at dusk
 the other lane, at a varying speed, with a detour that is not in the map), writes two bags, builds
 the map from the first, starts the node, replays the second bag into it over ROS, records the
 matches in a third process, and reports and plots the result. With --map and --query: the same with
-your own folders of images or bags.
+your own folders of images, videos or bags.
 
 With --loop: one traverse that passes places again is replayed into the node in operation
 loop_closure, which compares it with its own past; 'synthetic' is the synthetic street, twice.
@@ -40,6 +40,7 @@ EPILOG = """
 examples:
   demo
   demo --map monday/ --query tuesday/ --truth identity --tolerance 3
+  demo --map monday.mp4 --query tuesday.mp4 --fps 3
   demo --map monday.bag --query tuesday.bag --topic /camera/image_raw --min-probability 0.8
   demo --loop synthetic
   demo --loop round/ --truth closures.png --exclude-places 100
@@ -56,12 +57,13 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     output = 'output folder, where the files of an earlier demo are removed (%(default)s)'
     add('--output', default='demo_output', metavar='FOLDER', help=output)
-    add('--map', metavar='FOLDER|BAG', help='first traverse: the map is built from it')
-    add('--query', metavar='FOLDER|BAG', help='second traverse: it is replayed')
+    add('--map', metavar='FOLDER|VIDEO|BAG', help='first traverse: the map is built from it')
+    add('--query', metavar='FOLDER|VIDEO|BAG', help='second traverse: it is replayed')
     loop = f'a traverse that passes places again ({SYNTHETIC})'
-    add('--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|BAG|synthetic', help=loop)
+    add('--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|VIDEO|BAG|synthetic', help=loop)
     add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
     add('--topic', help='image topic of the bags, if they have several')
+    add_fps(parser)
     truth = (
         'identity: image i of the query shows place i of the map; with --loop a FILE: pairs of '
         'images (.csv), or a square array (.npy) or black and white image of loop closures'
@@ -202,7 +204,7 @@ def _remove_earlier(folder: Path) -> None:
 
 
 def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair':
-    from stavpr_lab.demonstration.recordings import own_pair, synthetic_pair
+    from stavpr_lab.demonstration.recordings import own_pair, own_recordings, synthetic_pair
 
     if not arguments.map:
         _print('1. Two traverses of a synthetic street')
@@ -210,7 +212,9 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
     _print(f'1. Your traverses: {arguments.map} is the map, {arguments.query} the query')
     identity = arguments.truth == 'identity'
     length = arguments.sequence_length
-    return own_pair(arguments.map, arguments.query, arguments.topic, identity, length)
+    paths = [arguments.map, arguments.query]
+    reference, query = own_recordings(paths, arguments.topic, arguments.fps)
+    return own_pair(reference, query, identity, length)
 
 
 def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, object]:
@@ -261,7 +265,7 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
         'sequence_length': length,
         'keyframe_change': 0.0,  # every image is evaluated
     }
-    records, _ = run_live(parameters, pair.query.path, len(query), folder, pair.query.topic)
+    records, _ = run_live(parameters, pair.query, len(query), folder)
     result = evaluate_records(records, length, threshold, pair.true_places, arguments.tolerance)
     plot = folder / 'demo.png'
     draw_result(result, query, place_map, threshold, pair.title, plot)
@@ -269,7 +273,7 @@ def _localization(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) -> 'LoopTraverse':
-    from stavpr_lab.demonstration.recordings import own_loop, synthetic_loop
+    from stavpr_lab.demonstration.recordings import own_loop, own_recordings, synthetic_loop
 
     tolerance = arguments.tolerance
     if arguments.loop == SYNTHETIC:
@@ -277,7 +281,8 @@ def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) ->
                'a detour')  # fmt: skip
         return synthetic_loop(folder, exclude, tolerance)
     _print(f'1. Your traverse: {arguments.loop}')
-    return own_loop(arguments.loop, arguments.topic, arguments.truth, exclude, tolerance)
+    (recording,) = own_recordings([arguments.loop], arguments.topic, arguments.fps)
+    return own_loop(recording, arguments.truth, exclude, tolerance)
 
 
 def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
@@ -312,9 +317,7 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
         'exclude_places': exclude,
         'geometric_check': arguments.geometric_check or GEOMETRIC_CHECK,
     }
-    matches, closures = run_live(
-        parameters, recording.path, len(place_map), folder, recording.topic
-    )
+    matches, closures = run_live(parameters, recording, len(place_map), folder)
     result = read_result(matches, closures, traverse.ground_truth, exclude)
     _report('3', result.summary(), draw_loops(result, place_map, traverse.title, folder))
 
@@ -367,7 +370,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
         result.append(fetch_graph(['graph.g2o', 'optimized.tum'], len(closures), domain))
 
     run_live(
-        parameters, str(bag), len(drive), folder, TOPIC, others,
+        parameters, recording, len(drive), folder, others,
         ['--odometry', '--also', slam.CAMERA_INFO, '--timeout', '120'], fetch,
     )  # fmt: skip
     values, edges = result[0]

@@ -9,7 +9,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
-from stavpr_ros.commands.program import add_parameter, make_parser, run_program
+from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
 from stavpr_ros.parameters import default
@@ -32,8 +32,9 @@ precision, recall@k, recall at 100 % precision, calibration; for sequences and s
 """
 
 EPILOG = """
-traverses: images, a bag, a saved map, or an array of descriptors that any program computed, .npy
-.npz .csv .mat, or FILE:NAME for one of several: (n, D), one vector an image, or (n, W, D)
+traverses: images, a video, a bag, a saved map, or an array of descriptors that any program
+computed, .npy .npz .csv .mat, or FILE:NAME for one of several: (n, D), one vector an image, or
+(n, W, D)
 
 ground truth (--truth), none by default:
   identity     image i of the query shows place i of the map; --tolerance is 3 then
@@ -70,14 +71,16 @@ def _parser() -> argparse.ArgumentParser:
     from stavpr_ros.commands.feature_options import add_feature_options
 
     parser = make_parser('evaluate', DESCRIPTION, EPILOG)
-    add = parser.add_argument_group('sequences').add_argument
-    add('--map', metavar='FOLDER|BAG|MAP|ARRAY', help='first traverse, see below')
+    sequences = parser.add_argument_group('sequences')
+    add = sequences.add_argument
+    add('--map', metavar='FOLDER|VIDEO|BAG|MAP|ARRAY', help='first traverse, see below')
     query = 'second traverse: the same; several: each is evaluated'
-    add('--query', nargs='+', metavar='FOLDER|BAG|MAP|ARRAY', help=query)
+    add('--query', nargs='+', metavar='FOLDER|VIDEO|BAG|MAP|ARRAY', help=query)
     add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
     add('--topic', help='image topic of the bags, if they have several')
+    add_fps(sequences)
     unknown = 'a traverse of places that are not in the map, for the rate of false alarms'
-    add('--unknown', metavar='FOLDER|BAG|MAP|ARRAY', help=unknown)
+    add('--unknown', metavar='FOLDER|VIDEO|BAG|MAP|ARRAY', help=unknown)
     add('--loop-closure', action='store_true', help="the map is the query's own past: no --map")
     exclude = f'the latest N images are not part of that map ({EXCLUDE_PLACES})'
     add('--exclude-places', type=int, metavar='N', help=exclude)
@@ -251,7 +254,7 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
 
     poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
     names = [
-        *('map', 'query', 'dataset', 'topic', 'unknown', 'loop_closure', 'exclude_places'),
+        *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
         *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of the command ``evaluate``: folders, bags, saved maps, data sets, ground truth."""
+"""The inputs of the command ``evaluate``: images, saved maps, data sets, ground truth."""
 
 import argparse
 from dataclasses import dataclass, field, replace
@@ -24,6 +24,7 @@ from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_file import is_bag
 from stavpr_ros.sources.folder import text_of
 from stavpr_ros.sources.pose_file import read_poses
+from stavpr_ros.sources.video import require_video
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance
 DEFAULTS = {'features': 'gradient', 'seed': 0}
@@ -64,8 +65,9 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
     if arguments.dataset is not None:
         sequences = _of_dataset(arguments, loader)
     else:
-        # saved maps first: they decide the features of the others
         paths = {'map': arguments.map, 'query': arguments.query, 'unknown': arguments.unknown}
+        require_video(arguments.fps, paths.values())
+        # saved maps first: they decide the features of the others
         opened = {
             name: loader.load(name, path)
             for name, path in sorted(paths.items(), key=_decides_features)
@@ -95,7 +97,7 @@ class _Loader:
         self.times: dict[str, float] = {}
 
     def load(self, name: str, path: str) -> PlaceMap:
-        """Open a folder, a bag, a saved map or descriptors."""
+        """Open a folder, a video, a bag, a saved map or descriptors."""
         if is_saved_map(path) or is_descriptors(path):
             crop = 'crop_map' if name == 'map' else 'crop_query'
             unusable = (crop, 'mirror') if name == 'query' else (crop,)
@@ -108,7 +110,8 @@ class _Loader:
             return self._read(path) if is_descriptors(path) else self._load_map(path)
         if Path(path).suffix == '.stavpr':
             return load_map(path)  # raises the reason why it is none
-        source = open_source(path, self._arguments.topic if is_bag(Path(path)) else None)
+        topic = self._arguments.topic if is_bag(Path(path)) else None
+        source = open_source(path, topic, fps=self._arguments.fps)
         return self.extract(name, source)
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:

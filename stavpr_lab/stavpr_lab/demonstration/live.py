@@ -16,6 +16,7 @@ import time
 from typing import Any
 
 from ament_index_python.packages import get_package_prefix, PackageNotFoundError
+from stavpr_lab.demonstration.recordings import Recording
 from stavpr_ros.errors import StavprError, UnavailableError
 
 START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile
@@ -52,10 +53,9 @@ def private_domain() -> dict[str, str]:
 
 def run_live(
     node_parameters: dict[str, Any],
-    query: str,
+    query: Recording,
     images: int,
     folder: Path,
-    topic: str | None = None,
     others: Mapping[str, list[str]] | None = None,
     replay_options: Sequence[str] = (),
     at_end: Callable[[Records, dict[str, str]], None] = lambda closures, environment: None,
@@ -64,11 +64,10 @@ def run_live(
     Replay a query losslessly into a node and return its records.
 
     :param node_parameters: of the node, name to value.
-    :param query: the bag or folder of images to replay.
+    :param query: the recording to replay.
     :param images: number of its images.
     :param folder: for the logs, ``matches.jsonl``, and in operation loop_closure
         ``loop_closures.jsonl``.
-    :param topic: image topic of the bag; None = its only one.
     :param others: commands of further processes by their names.
     :param replay_options: further options of the command ``replay``.
     :param at_end: called with the loop closures and the environment, while everything still runs.
@@ -78,9 +77,9 @@ def run_live(
     environment = private_domain()
     parameters = [f'{name}:={value}' for name, value in node_parameters.items()]
     node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
-    replay = [executable('replay'), query, '--lossless', '--wait', '120']
-    replay += [] if topic is None else ['--topic', topic]
-    replay += replay_options
+    replay = [executable('replay'), query.path, '--lossless', '--wait', '120', *replay_options]
+    replay += [] if query.topic is None else ['--topic', query.topic]
+    replay += [] if query.fps is None else ['--fps', str(query.fps)]
     record = [executable('record'), '--output']
     matches, closures = folder / 'matches.jsonl', folder / 'loop_closures.jsonl'
     recorders = {'record': [*record, str(matches)]}

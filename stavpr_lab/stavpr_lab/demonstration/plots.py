@@ -67,7 +67,7 @@ def _pair(
     match = f'place {place}' if place >= 0 else 'no match'
     found = f'{match}, distance {distance:.3f}' if np.isfinite(distance) else 'no window'
     right = place_map.thumbnail(place) if place >= 0 else None
-    return MatchPair(left, right, f'image {image}: {found}', outcome)
+    return MatchPair(left, right, f'query image {image}: {found}', outcome)
 
 
 def demo_sheet(
@@ -84,7 +84,8 @@ def demo_sheet(
     :param distances: every query to every place, shape (N, n).
     """
     above, below = 0.5 + 1.52 * max(1, -(-len(pairs) // 3)), 4.2
-    with plots.titled_page(path, 11, above + below, title, result.summary()) as figure:
+    summary = f'{result.summary()}\nPairs: query image on the left, matched place on the right'
+    with plots.titled_page(path, 11, above + below, title, summary) as figure:
         rows: Any = figure.subfigures(2, 1, height_ratios=(above, below))
         top, bottom = rows
         left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.18))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recordings of a demonstration: a synthetic street, written as bags, or the user's own."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -27,6 +27,7 @@ from stavpr_ros.sources.bag_file import is_bag, METADATA
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.sources.video import is_video, require_video, VideoSource
 from tqdm import tqdm
 
 TOPIC = '/camera/image_raw'
@@ -36,17 +37,19 @@ OnError = Callable[[ImageError], None]
 @dataclass(frozen=True)
 class Recording:
     """
-    A traverse in a folder of images or in a bag.
+    A traverse in a folder of images, a video or a bag.
 
-    :param topic: image topic; None = the only one of the bag, or a folder.
+    :param topic: image topic of a bag; None = the only one, or no bag.
+    :param fps: images per second that are taken of a video; None = the default, or no video.
     """
 
     path: str
     topic: str | None = None
+    fps: float | None = None
 
-    def open(self, on_error: OnError | None = None) -> FolderSource | BagSource:
+    def open(self, on_error: OnError | None = None) -> FolderSource | VideoSource | BagSource:
         """Open its images; see :func:`stavpr_ros.sources.open_source`."""
-        return open_source(self.path, self.topic, on_error)
+        return open_source(self.path, self.topic, on_error, self.fps)
 
     def save_feature_settings(self, extractor: FeatureExtractor, path: Path) -> None:
         """Write a map of one image, which sets the features of a node that closes loops."""
@@ -123,8 +126,26 @@ def synthetic_loop(folder: Path, exclude: int, tolerance: int) -> LoopTraverse:
     return LoopTraverse(Recording(str(bag), TOPIC), N, truth, 'A synthetic street, twice')
 
 
+def own_recordings(paths: Sequence[str], topic: str | None, fps: float | None) -> list[Recording]:
+    """
+    Name the user's traverses, each with the options that are for its kind.
+
+    :param topic: image topic of the bags, if they have several.
+    :param fps: images per second that are taken of the videos.
+    :raises SettingsError: an option is for none of them.
+    """
+    require_video(fps, paths)
+    bags = [is_bag(Path(path)) for path in paths]
+    if topic is not None and not any(bags):
+        raise SettingsError(f'--topic {topic}: no recording is a bag; leave it out')
+    return [
+        Recording(path, topic if bag else None, fps if is_video(path) else None)
+        for path, bag in zip(paths, bags, strict=True)
+    ]
+
+
 def own_pair(
-    reference: str, query: str, topic: str | None, identity: bool, sequence_length: int
+    reference: Recording, query: Recording, identity: bool, sequence_length: int
 ) -> TraversePair:
     """
     Open the user's traverses.
@@ -132,22 +153,19 @@ def own_pair(
     :param identity: image i of the query shows place i.
     :raises StavprError: they cannot be read, or do not fit the options.
     """
-    first, second = (
-        Recording(path, topic if is_bag(Path(path)) else None) for path in (reference, query)
-    )
-    places, images = len(first.open()), len(second.open())
-    if topic is not None and not (first.topic or second.topic):
-        raise SettingsError(f'--topic {topic}: neither recording is a bag; leave it out')
+    places, images = len(reference.open()), len(query.open())
     if images < sequence_length:
-        raise SettingsError(f'{query} has {images} images: the window needs {sequence_length}')
+        raise SettingsError(
+            f'{query.path} has {images} images: the window needs {sequence_length}'
+        )
     if identity and images > places:
         raise SettingsError(f'--truth identity: {images} query images on a map of {places} places')
-    title = f'{Path(query).name} recognized on the map of {Path(reference).name}'
-    return TraversePair(first, second, np.arange(images) if identity else None, title)
+    title = f'{Path(query.path).name} recognized on the map of {Path(reference.path).name}'
+    return TraversePair(reference, query, np.arange(images) if identity else None, title)
 
 
 def own_loop(
-    path: str, topic: str | None, ground_truth: str | None, exclude: int, tolerance: int
+    recording: Recording, ground_truth: str | None, exclude: int, tolerance: int
 ) -> LoopTraverse:
     """
     Open the user's traverse.
@@ -157,11 +175,12 @@ def own_loop(
     :param tolerance: of the ground truth, images.
     :raises StavprError: it cannot be read.
     """
-    recording = Recording(path, topic)
     N, truth = len(recording.open()), None
     if ground_truth is not None:
         truth = GroundTruth.from_file(ground_truth, N, N, tolerance).loop_closures(exclude - 1)
-    return LoopTraverse(recording, N, truth, f'{Path(path).resolve().name}: loop closures')
+    return LoopTraverse(
+        recording, N, truth, f'{Path(recording.path).resolve().name}: loop closures'
+    )
 
 
 def remove_earlier_bag(bag: Path) -> None:

@@ -38,9 +38,9 @@ def main(args: list[str] | None = None) -> int:
 
 def _run(args: list[str] | None) -> int:
     from stavpr_ros.ros.process import run_node
-    from stavpr_slam.ros.graph_node import PoseGraphNode
+    from stavpr_slam.ros.graph_node import PARAMETERS, PoseGraphNode
 
-    return run_node(PoseGraphNode, args)
+    return run_node(PoseGraphNode, args, PARAMETERS)
 
 
 if __name__ == '__main__':

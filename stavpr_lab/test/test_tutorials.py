@@ -1,0 +1,61 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The tutorials: their blocks ``sh`` and ``python`` run, one after the other, as written."""
+
+from pathlib import Path
+import re
+import subprocess
+
+import cv2
+from fixtures import route_images
+from processes import environment
+import pytest
+
+TUTORIALS = sorted((Path(__file__).resolve().parents[2] / 'docs/tutorials').glob('*.md'))
+LINES, SECONDS = 120, 300
+
+
+def write_phone_video(path, images):
+    codec, size = cv2.VideoWriter_fourcc(*'mp4v'), images[0].shape[1::-1]
+    writer = cv2.VideoWriter(str(path), codec, 5, size)
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Return a folder with the files that the tutorials begin with."""
+    images = route_images(100)
+    write_phone_video(tmp_path / 'monday.mp4', images)
+    write_phone_video(tmp_path / 'tuesday.mp4', [image // 4 * 3 for image in images])
+    return tmp_path
+
+
+def test_there_are_tutorials_of_one_page():
+    assert {page.stem for page in TUTORIALS} >= {'first_map', 'first_robot', 'tune', 'debug'}
+    assert [page for page in TUTORIALS if len(page.read_text().splitlines()) > LINES] == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('page', TUTORIALS, ids=lambda page: page.stem)
+def test_blocks_of_tutorial_run(page, folder, request):
+    blocks = re.findall(r'^```(sh|python)\n(.*?)^```$', page.read_text(), re.M | re.S)
+    assert blocks
+    if page.stem == 'public_data':
+        (folder / 'VPR-Bench/datasets').mkdir(parents=True)
+        data = request.getfixturevalue('data_folder') / 'corridor'
+        (folder / 'VPR-Bench/datasets/corridor').symlink_to(data)
+    shell = '\n'.join(
+        code if kind == 'sh' else f'python3 - <<"PY"\n{code}PY' for kind, code in blocks
+    )
+    done = subprocess.run(
+        ['bash', '-e', '-c', shell],
+        cwd=folder,
+        env=environment(),
+        timeout=SECONDS,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
