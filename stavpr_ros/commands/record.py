@@ -126,7 +126,7 @@ def _write_messages(
     def write(message: Any) -> None:
         nonlocal written
         line = json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n'
-        size = file.tell()
+        size = os.fstat(file.fileno()).st_size
         try:
             file.write(line.encode())
             file.flush() if file.committed else file.commit()
