@@ -101,14 +101,16 @@ class Round:
             self.counts['exit codes'] += 1
 
     def save(self) -> None:
-        """Save the map; it then contains all that is acknowledged."""
+        """Save the map under a new name: it then contains all that this node has acknowledged."""
         before = set(self.due)
-        if self.robot.call(SaveMap, 'save_map', path=str(self.target), overwrite=True).success:
+        name = f'saved-{time.time_ns()}.stavpr'
+        if self.robot.call(SaveMap, 'save_map', path=name).success:
             self.in_files |= before
 
     def copy_over(self) -> None:
-        """Copy another map over that of the node: the places in it are gone by this."""
-        self.target.write_bytes(self.other)
+        """Copy another map over one of the folder: the places in it are gone by this."""
+        files = sorted(self.maps.glob('*.stavpr')) or [self.target]
+        self.rng.choice(files).write_bytes(self.other)
         self.forgive(lambda stamp: stamp in self.in_files)
 
     def remove_folder(self) -> None:
