@@ -4,7 +4,10 @@
 #       ros2 run stavpr_ros node --ros-args -p map_path:=/data/route.stavpr -r image:=/camera/image_raw
 # Two stages: `development` has all dependencies (the devcontainer uses it), `runtime` the build.
 
-FROM ros:jazzy-ros-base AS development
+# For builds that can be repeated, --build-arg BASE=ros@sha256:DIGEST; the digest is printed by
+# `docker buildx imagetools inspect ros:jazzy-ros-base`.
+ARG BASE=ros:jazzy-ros-base
+FROM ${BASE} AS development
 
 # A package index with CPU builds of torch makes the image several GB smaller.
 ARG TORCH_INDEX=""
@@ -30,7 +33,7 @@ RUN apt-get update \
 # What apt has no package for: a virtual environment that sees the system's packages.
 RUN python3 -m venv --system-site-packages /opt/venv \
     && /opt/venv/bin/pip install --no-cache-dir ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} \
-        'torch>=2.2' \
+        'torch==2.13.0' \
     && /opt/venv/bin/pip install --no-cache-dir -r src/stavpr_ros/requirements/robot.txt \
     && chown -R 1000:1000 /ros_ws
 ENV PATH=/opt/venv/bin:$PATH

@@ -12,6 +12,7 @@ MAP ?=
 QUERY ?=
 LOOP ?=
 TRUTH ?=
+HOURS ?= 1
 ARGS ?=
 export MAP QUERY LOOP SLAM TRUTH
 
@@ -24,7 +25,7 @@ TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfil
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo animation evaluate test test-long lint docs bench bench-quick accuracy off-map \
+.PHONY: help setup build demo animation evaluate test test-long crash-test lint docs bench bench-quick accuracy off-map \
 	shell clean distclean development
 
 help: ## list the targets (the default)
@@ -67,6 +68,9 @@ test: lint docs ## lint, build the documentation, and run the tests but the long
 
 test-long: development ## run the tests that take minutes each (ARGS=)
 	@$(TEST) -m long $(ARGS)
+
+crash-test: development ## kill, stop and disturb a recording node for HOURS=; nothing may be lost
+	@$(RUN) bash -c 'PYTHONPATH="test/shared:$$PYTHONPATH" python test/crash_run.py $(HOURS)'
 
 lint: development ## check style and types with ruff and mypy
 	@$(RUN) ruff check .

@@ -98,7 +98,7 @@ setup(
         'pillow>=10.2',
         'rosbags>=0.10',
         'scipy>=1.11',
-        'torch>=2.2',
+        'torch>=2.10',
         'tqdm>=4.66',
         *(EVALUATION if WHEEL else []),
     ],

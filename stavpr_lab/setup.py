@@ -33,7 +33,7 @@ setup(
         'scikit-learn>=1.4',
         'scipy>=1.11',
         'stavpr_ros',
-        'torch>=2.2',
+        'torch>=2.10',
         'tqdm>=4.66',
     ],
     extras_require={

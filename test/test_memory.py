@@ -73,11 +73,13 @@ def test_opened_map_whose_file_changes_is_an_error(path, small_map):
     opened = open_map(path)
     verify_map(opened)
     features = small_map.features.strips.tobytes()
+    before = path.stat()
     path.write_bytes(path.read_bytes().replace(features[:64], bytes(64)))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # decay of the disk has no date
     with pytest.raises(MapFileError, match='of part strips, do not match their hash'):
         verify_map(opened)
     os.truncate(path, 1000)
-    with pytest.raises(MapFileError, match=r'is truncated: byte \d+ is missing'):
+    with pytest.raises(MapFileError, match='has been overwritten since it was opened'):
         _ = opened.features.strips
 
 

@@ -11,6 +11,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
+from rclpy.qos import QoSProfile
 from robot import image_message, LENGTH, SECOND
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
@@ -103,6 +104,23 @@ def test_services_and_parameters_name_files_in_the_maps_folder_only(
     assert values[0].string_value == str(folder / 'late.stavpr')
     robot.set(save_path=str(folder / 'late.stavpr'))
     robot.set(save_path='')
+
+
+def test_requests_of_many_clients_wait_and_all_get_a_response(robot, start):
+    """200 at once, while the first one takes long."""
+    node, end = start(), threading.Event()
+    client = robot.node.create_client(Trigger, '/stavpr/reset', qos_profile=QoSProfile(depth=1000))
+    try:
+        robot.does(Trigger, 'reset')
+        robot.until(client.service_is_ready, 'the service')
+        robot.until(client.call_async(Trigger.Request()).done, 'the first response')
+        node.runtime.worker.call(end.wait)
+        responses = [client.call_async(Trigger.Request()) for _ in range(200)]
+        end.set()
+        robot.until(lambda: all(each.done() for each in responses), 'all responses')
+    finally:
+        end.set()
+        robot.node.destroy_client(client)
 
 
 def test_services_without_a_map_return_the_reason(robot, start, route, map_file, tmp_path):

@@ -143,6 +143,22 @@ def test_license_file_is_there(folder):
     assert (ROOT / folder / 'CHANGELOG.rst').is_file()
 
 
+def test_dependencies_are_recent_or_pinned():
+    """Before torch 2.10 a file of weights could run code; a tag of an action can be moved."""
+    routes = [
+        *(folder / 'setup.py' for folder in PACKAGES.values()),
+        *ROOT.glob('requirements/*.txt'),
+        ROOT / 'Dockerfile',
+    ]
+    text = ''.join(path.read_text() for path in (*routes, *ROOT.glob('.github/workflows/*.yml')))
+    versions = re.findall(r'\btorch[>=]=(\d+)\.(\d+)', text)
+    assert len(versions) == 6
+    assert min((int(major), int(minor)) for major, minor in versions) >= (2, 10)
+    actions = re.findall(r'uses: \S+@(\S+)', text)
+    assert actions
+    assert all(re.fullmatch('[0-9a-f]{40}', commit) for commit in actions)
+
+
 @pytest.fixture(scope='module')
 def sources(tmp_path_factory) -> Path:
     """Copy the repository as far as the packages are made of it."""

@@ -4,6 +4,7 @@
 
 import json
 import os
+import resource
 
 from processes import Process
 import pytest
@@ -63,3 +64,23 @@ def test_record_replaces_an_old_recording_at_the_first_message(record, robot, pu
     process.wait()
     assert [json.loads(line)['place_index'] for line in path.open()] == [0, 1, 2]
     assert sorted(os.listdir(tmp_path)) == ['log', 'old.jsonl']
+
+
+def test_record_on_a_full_disk_ends_with_whole_lines(record, robot, publisher, tmp_path):
+    """The limit of the size of a file has the effect of a full disk."""
+    path = tmp_path / 'old.jsonl'
+    process = record('--force')
+    recording(robot, process)
+    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    def ended():
+        publisher.publish(PlaceMatch(reason='x' * 200))
+        return process.popen.poll() is not None
+
+    robot.until(ended, 'the end')
+    lines = path.read_text().splitlines(keepends=True)
+    assert len(lines) > 3
+    assert all(json.loads(line)['reason'] == 'x' * 200 for line in lines)
+    assert f'it has {len(lines)} matches, all of them whole: free space' in process.output()
+    assert 'untouched' not in process.output()
+    assert process.wait() == 1

@@ -13,6 +13,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.errors import OutputError
 from stavpr_ros.output_file import atomic_output, AtomicFile, RECORDING
 from stavpr_ros.units import SECOND
 
@@ -105,7 +106,11 @@ def _parser() -> argparse.ArgumentParser:
 def _write_messages(
     arguments: argparse.Namespace, file: AtomicFile, ros_arguments: list[str]
 ) -> int:
-    """Write messages until a signal; return their number."""
+    """
+    Write messages until a signal; return their number.
+
+    :raises OutputError: a message cannot be written; those before it stay.
+    """
     import rclpy
     from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -121,8 +126,18 @@ def _write_messages(
     def write(message: Any) -> None:
         nonlocal written
         line = json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n'
-        file.write(line.encode())
-        file.flush() if file.committed else file.commit()
+        size = os.fstat(file.fileno()).st_size
+        try:
+            file.write(line.encode())
+            file.flush() if file.committed else file.commit()
+        except OSError as error:
+            os.ftruncate(file.fileno(), size)
+            content = f'it has {written} {arguments.kind}, all of them whole'
+            raise OutputError(
+                f'{arguments.output} cannot be written ({error.strerror}); '
+                f'{content if file.committed else "what was there is untouched"}: free space, and '
+                'record again'
+            ) from error
         written += 1
 
     try:

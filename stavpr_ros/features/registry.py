@@ -271,8 +271,9 @@ def settings_from_json(kind: str, text: str, model: str = '') -> Any:
         if missing := [name for name in required if name not in values]:
             raise TypeError(f'{" and ".join(missing)} missing')
         return cls(**values)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise SettingsError(
-            f'settings {text!r} of features {kind} are invalid ({error}): expected a JSON object '
-            f'with {", ".join(names)} (parameter feature_settings; model also as model_path)'
+            f'settings {text[:200]!r} of features {kind} are invalid ({error}): expected a JSON '
+            f'object with {", ".join(names)} (parameter feature_settings; model also as '
+            'model_path)'
         ) from error

@@ -67,29 +67,43 @@ class MapFile:
     An open map file; it may be replaced or deleted meanwhile. Thread-safe.
 
     :param file: closed with this object.
-    :param size: bytes of the file when it was opened.
+
+    ``size`` is the number of bytes of the file when it was opened.
     """
 
     def __init__(self, file: io.FileIO, path: Path) -> None:
         self.path, self._file = path, file
-        self.size = os.fstat(file.fileno()).st_size
+        opened = os.fstat(file.fileno())
+        self.size, self._written = opened.st_size, opened.st_mtime_ns
         self.map_id = ''
         self.manifest: dict[str, Any] = {}
         self.parts: dict[str, Part] = {}
         weakref.finalize(self, file.close)
 
+    @property
+    def problem(self) -> str:
+        """Return why nothing can be read any more, '' = the file is the one that was opened."""
+        now = os.fstat(self._file.fileno())
+        if (now.st_size, now.st_mtime_ns) == (self.size, self._written):
+            return ''
+        return (
+            f'map {self.path} has been overwritten since it was opened: load it again (to replace '
+            'a map in use, write another file and rename it, as `mv` does)'
+        )
+
     def fill(self, array: np.ndarray, start: int) -> None:
         """
         Read bytes from a position on into a contiguous array.
 
-        :raises MapFileError: the file has become shorter.
+        :raises MapFileError: the file is too short, or has been overwritten by another one.
         """
         view = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b'')
-        while len(view):
-            count = os.preadv(self._file.fileno(), [view], start)
-            if not count:
-                raise self.damaged(f'is truncated: byte {start} is missing')
+        while len(view) and (count := os.preadv(self._file.fileno(), [view], start)):
             view, start = view[count:], start + count
+        if self.problem:  # after reading, so that nothing later can have been read
+            raise MapFileError(self.problem)
+        if len(view):
+            raise self.damaged(f'is truncated: byte {start} is missing')
 
     def bytes_at(self, start: int, count: int) -> bytes:
         """Read bytes; they must be within the file, checked before memory is taken."""

@@ -188,6 +188,8 @@ def _thumbnails(file: MapFile, ends: np.ndarray | None) -> Sequence[bytes]:
         return ()
     part = file.parts['thumbnails']
     _ends(ends, part.size, 'thumbnail_ends')
+    if not part.size:
+        return ()
     first = 0
     while first < len(ends):
         start = int(ends[first - 1]) if first else 0

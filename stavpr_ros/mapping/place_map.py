@@ -183,7 +183,7 @@ class PlaceMap:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None."""
         try:
             return decode_thumbnail(self.thumbnails[place]) if len(self.thumbnails) else None
-        except MapFileError:  # the file has become shorter since it was opened
+        except MapFileError:  # the file has been overwritten since it was opened
             return None
 
 

@@ -18,6 +18,7 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
+from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.geometric_check import GeometricCheck
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
@@ -138,9 +139,12 @@ class Pipeline:
 
     @property
     def problem(self) -> str:
-        """Return why places of the map cannot be reached; empty while they can."""
-        recognizer = self._recognizer
-        return recognizer.problem if recognizer else ''
+        """Return why places, or the file, of the map cannot be reached; empty while they can."""
+        place_map, recognizer = self._map, self._recognizer
+        problem = recognizer.problem if recognizer else ''
+        if place_map is not None and isinstance(place_map.features, StoredFeatures):
+            problem = problem or place_map.features.file.problem
+        return problem
 
     def change(
         self,

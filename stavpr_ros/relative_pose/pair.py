@@ -102,5 +102,5 @@ def matched_pair(
 def _thumbnail(places: PlaceMap | GrowingMap, position: int) -> bytes:
     try:
         return places.thumbnails[position]
-    except MapFileError:  # the file has become shorter since it was opened
+    except MapFileError:  # the file has been overwritten since it was opened
         return b''

@@ -48,18 +48,24 @@ class MapLoader:
         self._verifying = threading.Thread()  # the latest one
         self.path = self.problem = ''
 
-    def load(self, path: str, lock: AbstractContextManager[object] | None = None) -> None:
+    def load(
+        self,
+        path: str,
+        lock: AbstractContextManager[object] | None = None,
+        verify: bool = False,
+    ) -> None:
         """
-        Load a map and use it; its hashes are compared later, on a thread.
+        Load a map and use it.
 
         :param lock: acquired to put the map into use, not to read its file.
+        :param verify: compare its hashes first; otherwise a thread does so while it is in use.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long.
         """
         with self._lock:
             self.path, self.problem = path, ''
             self._on_change()
             try:
-                loaded = self._read_in_time(path)
+                loaded = self._read_in_time(path, verify)
                 with lock or nullcontext():
                     self._use(loaded)
             except Exception as error:
@@ -74,7 +80,7 @@ class MapLoader:
             f'{places.settings.strips} strips of {places.dimension} dimensions'
         )
         # reads all of the file, for seconds: the map is in use meanwhile
-        if not places.partial:
+        if not (places.partial or verify):
             self._verifying = threading.Thread(
                 target=self._verify, args=(path, places), daemon=True
             )
@@ -86,9 +92,16 @@ class MapLoader:
         if self._verifying.is_alive():
             self._verifying.join(END_POLL)
 
-    def _read_in_time(self, path: str) -> LoadedMap:
+    def _read_in_time(self, path: str, verify: bool) -> LoadedMap:
         """Read a map on a thread that is abandoned when it takes too long, or the node ends."""
-        reading = call_on_thread(lambda: self._read(path), 'reading')
+
+        def read() -> LoadedMap:
+            loaded = self._read(path)
+            if verify:
+                verify_map(loaded.places)
+            return loaded
+
+        reading = call_on_thread(read, 'reading')
         end = time.monotonic() + LOAD_TIMEOUT
         while not wait([reading], END_POLL).done:
             if self._node.ending.is_set():

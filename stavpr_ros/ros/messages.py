@@ -378,5 +378,7 @@ def map_info_message(
             message.dimension = places.dimension
         message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)
         message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
-        message.has_thumbnails = any(places.thumbnails)
+        thumbnails = places.thumbnails  # those of a map stay in its file, which is not read here
+        is_map = isinstance(places, PlaceMap)
+        message.has_thumbnails = bool(len(thumbnails)) if is_map else any(thumbnails)
     return message

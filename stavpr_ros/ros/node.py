@@ -225,14 +225,15 @@ class PlaceRecognitionNode(ManagedNode):
         except SettingsError as error:
             return self._rejected(error)
 
-    def load_map(self, path: str) -> None:
+    def load_map(self, path: str, verify: bool = False) -> None:
         """
         Load a map and use it.
 
+        :param verify: compare its hashes before it is used, not later.
         :raises StavprError: the node is not configured, or the map is invalid; the old one stays
             in use.
         """
-        self.runtime.load(path, self._lock)
+        self.runtime.load(path, self._lock, verify)
 
     def set_operation(self, operation: str) -> None:
         """

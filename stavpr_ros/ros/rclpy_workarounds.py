@@ -17,6 +17,8 @@ import traceback
 from typing import Any
 import warnings
 
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import Executor, ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -155,6 +157,31 @@ def repeat_responses(service: Service) -> None:
     service.send_response = send_repeatedly
 
 
+def respond_to_unreadable_parameters(service: Service) -> None:
+    """
+    Make the parameter services respond to values that rclpy cannot read, such as an unknown type.
+
+    No upstream issue was found: the error leaves the callback, and the client waits forever.
+    """
+    upstream = service.callback
+    if service.srv_type not in (SetParameters, SetParametersAtomically):
+        return
+
+    def callback(request: Any, response: Any) -> Any:
+        try:
+            return upstream(request, response)
+        except Exception as error:
+            reason = f'not set, nor any parameter after it ({type(error).__name__}: {error})'
+            result = SetParametersResult(successful=False, reason=reason)
+        if service.srv_type is SetParametersAtomically:
+            response.result = result
+        else:  # those before it are set
+            response.results += [result] * (len(request.parameters) - len(response.results))
+        return response
+
+    service.callback = callback
+
+
 class ManagedNode(LifecycleNodeMixin, Node):
     """
     Lifecycle node that rejects invalid transitions instead of ending the process.
@@ -179,6 +206,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         service.callback = self._change_or_reject
         for service in self.services:
             repeat_responses(service)
+            respond_to_unreadable_parameters(service)
 
     @property
     def state(self) -> str:

@@ -236,15 +236,17 @@ class Runtime:
                 self.problem = str(error)
                 self._node.get_logger().error(self.problem)
 
-    def load(self, path: str, lock: AbstractContextManager[Any] | None = None) -> None:
+    def load(
+        self, path: str, lock: AbstractContextManager[Any] | None = None, verify: bool = False
+    ) -> None:
         """
         Load a map and use it; meanwhile the old one stays in use.
 
-        :param lock: acquired to put the map into use, not to read its file.
+        :param lock, verify: those of :meth:`stavpr_ros.ros.map_loading.MapLoader.load`.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
             old map stays in use.
         """
-        self._maps.load(path, lock)
+        self._maps.load(path, lock, verify)
         self.worker.call(self._publish_route)
         if stages := self.pipeline.stages:
             self._node.get_logger().info(stages)

@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.maps_folder import inside
@@ -18,6 +19,9 @@ from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+# waiting requests of each service: of the default depth of 10, those of 50 clients were dropped
+REQUESTS = QoSProfile(depth=1000)
 
 
 class Services:
@@ -34,7 +38,7 @@ class Services:
         self,
         node: Node,
         runtime: Callable[[], Runtime],
-        load_map: Callable[[str], None],
+        load_map: Callable[[str, bool], None],
         set_operation: Callable[[str], None],
     ) -> None:
         self._logger = node.get_logger()
@@ -49,7 +53,9 @@ class Services:
             (SetOperation, 'set_operation', self._set_operation, others),
         ):
             callback = self._callback(name, serve)
-            service = node.create_service(kind, f'~/{name}', callback, callback_group=group)
+            service = node.create_service(
+                kind, f'~/{name}', callback, qos_profile=REQUESTS, callback_group=group
+            )
             repeat_responses(service)
 
     def _callback(
@@ -92,7 +98,7 @@ class Services:
         if not request.path:
             raise StavprError("path = '' is no file: set the name of a map in the maps folder")
         path = inside(runtime.settings.maps_path, request.path)
-        self._load(path)
+        self._load(path, request.verify)
         response.map = runtime.map_info()
         return f'{response.map.places} places from {path}'
 

@@ -109,7 +109,7 @@ def _pairs(place_map: PlaceMap, closures: str) -> set[tuple[int, int]]:
     matched = [] if same_as is None else [(i, int(j)) for i, j in enumerate(same_as) if i != j]
     if closures:
         place_of = {int(stamp): i for i, stamp in enumerate(place_map.stamps) if stamp}
-        stamped = [[place_of.get(stamp, -1) for stamp in pair] for pair in _closures(closures)]
+        stamped = [[place_of.get(stamp, -1) for stamp in pair] for pair in read_closures(closures)]
         matched += [(max(pair), min(pair)) for pair in stamped if min(pair) >= 0]
     for query, place in matched:
         for beside in range(max(0, place - BESIDE), min(n, place + BESIDE + 1)):
@@ -118,12 +118,16 @@ def _pairs(place_map: PlaceMap, closures: str) -> set[tuple[int, int]]:
     return pairs
 
 
-def _closures(path: str) -> list[tuple[int, int]]:
-    """Return the stamps of query and place of recorded loop closures, ns."""
+def read_closures(path: str) -> list[tuple[int, int]]:
+    """
+    Return the stamps of query and place of recorded loop closures, ns.
+
+    :raises InputError: the file cannot be read, or is of something else.
+    """
     try:
         rows = [json.loads(line) for line in Path(path).read_text().splitlines()]
         return [(int(row['query_stamp']), int(row['place_stamp'])) for row in rows]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(
             f'{path}: {type(error).__name__}: {error}; expected a file of record --loop-closures'
         ) from error

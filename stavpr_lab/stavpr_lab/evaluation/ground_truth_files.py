@@ -4,7 +4,6 @@
 
 from pathlib import Path
 import re
-import zipfile
 
 import cv2
 import numpy as np
@@ -143,7 +142,7 @@ def _load(path: Path) -> np.ndarray:
             names = loaded.files
             if len(names) == 1 or NAME in names:
                 return loaded[names[0] if len(names) == 1 else NAME]
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except Exception as error:  # damage raises errors of any type, of NumPy, zipfile and tokenize
         if 'pickle' in str(error):
             raise SourceError(
                 f'ground truth {path} contains Python objects, which are stored as a pickle, and '

@@ -1,0 +1,77 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The SROS 2 policy allows each program what it publishes, subscribes to, serves and requests."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from bags import SECOND, write_odometry
+import numpy as np
+from processes import Process
+import pytest
+from stavpr_ros.sources.frame import ImageRecord
+
+POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
+KINDS = {
+    'publish': 'publisher', 'subscribe': 'subscriber', 'reply': 'service', 'request': 'client'
+}  # fmt: skip
+
+
+def allowed(node: str) -> dict[str, set[str]]:
+    """Return the names in the profile of a node, by right."""
+    names: dict[str, set[str]] = {right: set() for right in KINDS}
+    for profile in ElementTree.parse(POLICY).iter('profile'):
+        if profile.get('node') == node:
+            for group in profile:
+                (right,) = group.attrib
+                names[right] |= {each.text.replace('~', f'/{node}') for each in group}
+    return names
+
+
+@pytest.mark.parametrize(
+    ('node', 'command', 'last'),
+    [
+        (
+            'stavpr_record',
+            ('record', '--output', 'FOLDER/x.jsonl'),
+            ('subscribe', '/stavpr/match'),
+        ),
+        ('stavpr_replay', ('replay', 'FOLDER/bag'), ('reply', '/stavpr_replay/pause')),
+        ('stavpr_monitor', ('monitor', '--port', '0'), ('request', '/stavpr/reset')),
+        ('pose_graph', ('pose_graph',), ('subscribe', '/stavpr/loop_closure')),
+        (
+            'robot_localization_bridge',
+            ('bridge', 'robot_localization'),
+            ('publish', '/diagnostics'),
+        ),
+    ],
+)
+def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last):
+    if node == 'pose_graph':
+        pytest.importorskip('gtsam')
+    stamps = [(i + 1) * SECOND for i in range(3)]
+    image = np.zeros((8, 8, 3), np.uint8)
+    images = [ImageRecord.of_image(image, stamp) for stamp in stamps]
+    write_odometry(tmp_path / 'bag', stamps, images=images)
+    arguments = [word.replace('FOLDER', str(tmp_path)) for word in command]
+    process = Process(tmp_path / 'log', *arguments)
+
+    def used(right: str) -> set[str]:
+        if (node, '/') not in robot.node.get_node_names_and_namespaces():
+            return set()
+        names = getattr(robot.node, f'get_{KINDS[right]}_names_and_types_by_node')(node, '/')
+        return {name for name, _ in names}
+
+    try:
+        robot.until(lambda: last[1] in used(last[0]), f'{last[1]} of {node}')
+        for right, names in allowed(node).items():
+            assert used(right) <= names, right
+        assert allowed(node)['publish'] - used('publish') <= {
+            '/camera_info',
+            '/clock',
+            '/odom',
+            '/tf',
+            '/tf_static',
+        }
+    finally:
+        process.end()
