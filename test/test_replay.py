@@ -20,7 +20,8 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
 from stavpr_ros.commands.replay import main
 from stavpr_ros.ros import process
-from stavpr_ros.ros.receipts import LATCHED, MOST_BEHIND
+from stavpr_ros.ros.qos import LATCHED
+from stavpr_ros.ros.receipts import MOST_BEHIND
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_playback import spinning

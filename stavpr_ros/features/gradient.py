@@ -81,7 +81,8 @@ class Gradient:
 
 def _on_threads(work: Callable[[int], None], count: int) -> None:
     """Call work(0) .. work(count - 1), which release the GIL, on several threads."""
-    threads = min(thread_count(), count // PER_THREAD)
+    threads = count // PER_THREAD
+    threads = threads if threads < 2 else min(threads, thread_count())
     if threads < 2:
         for i in range(count):
             work(i)

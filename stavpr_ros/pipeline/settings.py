@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 import os
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,7 @@ class PipelineSettings:
             settings_from_json(self.features, self.feature_settings, self.model_path)
         self.recognition()
 
-    @property
+    @cached_property
     def applied_threshold(self) -> float | None:
         """Return the distance below which a window is matched, None = not set."""
         return self.recognition().applied_threshold

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import replace
 import math
 import time
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.checks import require_type
@@ -162,9 +162,12 @@ class SequenceRecognizer(ABC):
         columns = self._window.layout.columns_of(places - buffer.first)
         return buffer.at(columns[None])[buffer.length - len(buffer) :]
 
-    def _require_one_image(self, features: LocalFeatures, where: str) -> None:
-        expected = 'the LocalFeatures of one image, as of place_map.extractor().extract([image])'
-        require_type('features', features, LocalFeatures, expected)
+    def _require_one_image(self, features: Any, where: str) -> None:
+        if not isinstance(features, LocalFeatures):
+            expected = (
+                'the LocalFeatures of one image, as of place_map.extractor().extract([image])'
+            )
+            require_type('features', features, LocalFeatures, expected)
         features.require_same_settings(self._feature_settings, where)
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images: expected those of one')

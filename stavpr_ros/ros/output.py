@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
+from rclpy.qos import qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch
 from stavpr_ros.mapping import GrowingMap, PlaceMap
@@ -25,11 +25,11 @@ from stavpr_ros.ros.messages import (
     NO_FRAMES,
     PoseFrames,
 )
+from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
 from std_msgs.msg import Float32, Header, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 

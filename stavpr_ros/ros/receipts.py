@@ -6,11 +6,11 @@ from collections import Counter
 import time
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
+from stavpr_ros.ros.qos import LATCHED
 from std_msgs.msg import Header
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 MOST_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost

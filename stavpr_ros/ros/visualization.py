@@ -21,7 +21,8 @@ from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.messages import image_message, pose_message
-from stavpr_ros.ros.output import is_requested, LATCHED
+from stavpr_ros.ros.output import is_requested
+from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray

@@ -20,13 +20,14 @@ import numpy as np
 from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import SetOperation
 from stavpr_ros.errors import StavprError
+from stavpr_ros.ros.qos import LATCHED
 from std_srvs.srv import Trigger
 
 KEPT = 3000  # samples: four minutes
@@ -35,7 +36,6 @@ POLL_SECONDS = 0.5  # for the state of the node, and whether images are needed
 ROUTE_POINTS = 1000  # of the map's route, at most
 COLUMN_BYTES = 8  # of ``~/distances``: a distance and its place, float32
 TIMEOUT = 30.0  # seconds for a command: configuring loads the map
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STATUSES = (
     *('warming up', 'no match', 'match', 'invalid image'),
     *('not ready', 'dropped', 'skipped', 'mapped'),

@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
@@ -32,6 +32,7 @@ from stavpr_ros.ros.messages import (
     transform_message,
 )
 from stavpr_ros.ros.navigation import tf_message
+from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings
 from stavpr_slam.pose_graph.solver import load_gtsam
@@ -44,7 +45,6 @@ from visualization_msgs.msg import MarkerArray
 
 ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 PERIOD = 1.0  # seconds between two diagnostics
 UNUSABLE = {  # counts of closures without a measurement, by the source of the relative pose
     RelativePose.REFUTED: 'refuted closures',
