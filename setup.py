@@ -105,7 +105,7 @@ setup(
     extras_require={
         'cuda': ['numba-cuda>=0.30'],
         'dev': [*TEST, *LINT],
-        'docs': ['myst-parser>=2.0', 'sphinx>=7.2'],
+        'docs': ['furo>=2024.8', 'myst-parser>=2.0', 'sphinx>=7.2'],
         'evaluation': EVALUATION,
         'faiss': ['faiss-cpu>=1.8'],
         'fleet': ['faiss-cpu>=1.8', 'qdrant-client>=1.15', 'qdrant-edge-py>=0.5'],
