@@ -126,6 +126,7 @@ def test_from_file_reads_a_place_a_line(tmp_path):
     ('text', 'message'),
     [
         ('query,place\n0,1\n0,one\n', "line 3: '0,one' has no whole number in column 2"),
+        ('0,1e19\n', "line 1: '0,1e19' has no whole number in column 2"),
         ('0,1,2\n', '3 columns'),
         ('query,place\n', 'no line of numbers'),
         ('0,-1\n', 'accepts no pair'),

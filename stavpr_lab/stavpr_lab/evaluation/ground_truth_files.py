@@ -18,6 +18,7 @@ PLACE_WORDS = ('place', 'ref', 'map', 'database', 'historical')
 BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and white
 
 Pairs = tuple[np.ndarray, np.ndarray]
+LARGEST = 2**53  # whole numbers below it are exact as floating-point numbers
 
 
 def read_pairs(path: Path, N: int, n: int) -> Pairs:
@@ -119,7 +120,7 @@ def _from_text(path: Path, N: int) -> Pairs:
 def _whole(cells: list[str], column: int, number: int, path: Path) -> int:
     try:
         value = float(cells[column])
-        if value.is_integer():
+        if value.is_integer() and abs(value) < LARGEST:
             return int(value)
     except (ValueError, IndexError):
         pass
