@@ -132,7 +132,7 @@ print('\\n', match.status.name, *sys.modules)
     assert done.returncode == 0, done.stderr
     status, *loaded = done.stdout.splitlines()[-1].split()
     assert status in ('MATCH', 'NO_MATCH')
-    assert not {'torch', 'rclpy', 'onnx', 'matplotlib', 'sklearn'} & set(loaded)
+    assert not {'torch', 'rosbags', 'rclpy', 'onnx', 'matplotlib', 'sklearn'} & set(loaded)
 
 
 def test_modules_import_each_other_without_cycles():

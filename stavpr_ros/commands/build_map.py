@@ -145,7 +145,7 @@ class _Images:
 def _check(arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other, before anything is read."""
     from stavpr_ros.checks import require_at_least
-    from stavpr_ros.sources.bag_file import is_bag
+    from stavpr_ros.sources.bag_path import is_bag
     from stavpr_ros.sources.video import is_video, require_video
 
     moving = arguments.keyframe_distance or arguments.keyframe_angle

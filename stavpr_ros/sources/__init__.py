@@ -35,8 +35,7 @@ def open_source(
     :raises SourceError: it cannot be read, or the topic is ambiguous.
     """
     # imported on use: rosbags and OpenCV load slowly
-    from stavpr_ros.sources.bag import BagSource
-    from stavpr_ros.sources.bag_file import is_bag, reading
+    from stavpr_ros.sources.bag_path import is_bag, reading
     from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.video import FPS, is_video, VideoSource
 
@@ -47,6 +46,8 @@ def open_source(
     if not exists:
         raise SourceError(f'{path} does not exist: expected a folder of images, a video or a bag')
     if is_bag(path):
+        from stavpr_ros.sources.bag import BagSource
+
         return BagSource(path, topic, on_error)
     if topic is not None:
         raise SourceError(f'topic {topic!r} was given, but {path} is no bag: leave the topic out')

@@ -9,7 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
-from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag, reading
+from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag
+from stavpr_ros.sources.bag_path import reading
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.units import SECOND

@@ -16,12 +16,11 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
-from stavpr_ros.errors import SourceError, StavprError
+from stavpr_ros.errors import SourceError
 from stavpr_ros.regular_file import require_regular
+from stavpr_ros.sources.bag_path import METADATA, reading, storage_files
 from stavpr_ros.units import SECOND
 
-METADATA = 'metadata.yaml'
-STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
 LOG_SUFFIXES = ('-wal', '-journal')
 """Files of SQLite beside a database with writes that are not in the database yet."""
 
@@ -59,18 +58,6 @@ class OpenBag:
             yield from self.reader.messages(connections, first if start else None, last)
 
 
-def is_bag(path: Path) -> bool:
-    """
-    Return whether a path is a bag and no folder of images, by names only.
-
-    :raises SourceError: the folder cannot be listed.
-    """
-    with reading(path):
-        if path.is_dir():
-            return (path / METADATA).exists() or bool(_storage_files(path))
-        return path.suffix in STORAGE_SUFFIXES or path.suffix == '.bag'
-
-
 def message_type(connection: Connection) -> str:
     """Return the full name of the type; in bags from before 2019 ``msg`` is missing."""
     package, _, name = connection.msgtype.rpartition('/')
@@ -101,29 +88,6 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
             reader.close()
 
 
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn errors of rosbags on a damaged file, of any type, into one that names the file."""
-    try:
-        yield
-    except StavprError:
-        raise
-    except OSError as error:
-        raise SourceError(
-            f'{path} cannot be read: {error}; check its name and permissions'
-        ) from error
-    except Exception as error:
-        raise SourceError(
-            f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or '
-            f'a ROS 1 .bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag '
-            'reindex`'
-        ) from error
-
-
-def _storage_files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix in STORAGE_SUFFIXES)
-
-
 def _stage(path: Path, scratch: Path) -> Path:
     """
     Link (copy where needed) a bag into a scratch folder, and return the path to open there.
@@ -144,7 +108,7 @@ def _stage(path: Path, scratch: Path) -> Path:
 
 def _only_storage_file(folder: Path) -> Path:
     """Return the only file of a bag whose recording ended before its metadata was written."""
-    files = _storage_files(folder)
+    files = storage_files(folder)
     if len(files) != 1:
         names = ', '.join(file.name for file in files) or 'none'
         raise SourceError(

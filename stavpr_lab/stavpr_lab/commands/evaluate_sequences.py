@@ -21,7 +21,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.bag_file import is_bag
+from stavpr_ros.sources.bag_path import is_bag
 from stavpr_ros.sources.folder import text_of
 from stavpr_ros.sources.pose_file import read_poses
 from stavpr_ros.sources.video import require_video

@@ -23,7 +23,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource
-from stavpr_ros.sources.bag_file import is_bag, METADATA
+from stavpr_ros.sources.bag_path import is_bag, METADATA
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord

@@ -1,0 +1,48 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a path is a bag, without rosbags, which loads slowly."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from stavpr_ros.errors import SourceError, StavprError
+
+METADATA = 'metadata.yaml'
+STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
+
+
+def is_bag(path: Path) -> bool:
+    """
+    Return whether a path is a bag and no folder of images, by names only.
+
+    :raises SourceError: the folder cannot be listed.
+    """
+    with reading(path):
+        if path.is_dir():
+            return (path / METADATA).exists() or bool(storage_files(path))
+        return path.suffix in STORAGE_SUFFIXES or path.suffix == '.bag'
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn errors of rosbags on a damaged file, of any type, into one that names the file."""
+    try:
+        yield
+    except StavprError:
+        raise
+    except OSError as error:
+        raise SourceError(
+            f'{path} cannot be read: {error}; check its name and permissions'
+        ) from error
+    except Exception as error:
+        raise SourceError(
+            f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or '
+            f'a ROS 1 .bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag '
+            'reindex`'
+        ) from error
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """Return the files of a folder that bags store messages in."""
+    return sorted(file for file in folder.iterdir() if file.suffix in STORAGE_SUFFIXES)
