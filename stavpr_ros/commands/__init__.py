@@ -25,7 +25,7 @@ COMMANDS = {
         'stavpr_ros.commands.build_map', 'build a reference map from images, a video or a bag'
     ),
     'map': Command(
-        'stavpr_ros.commands.map', 'show, check, convert, export, merge and recover maps'
+        'stavpr_ros.commands.map', 'show, check, compact, export, merge and recover maps'
     ),
     'node': Command('stavpr_ros.commands.node', 'run the place-recognition node', True),
     'replay': Command(

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros map``: show, check, convert, compact, export, merge, recover maps."""
+"""``ros2 run stavpr_ros map``: show, check, compact, export, merge and recover maps."""
 
 import argparse
 from collections.abc import Callable
@@ -26,7 +26,6 @@ EPILOG = """
 examples:
   map info route.stavpr --plot route.png
   map verify *.stavpr
-  map convert old.stavpr new.stavpr --storage float16
   map compact route.stavpr small.stavpr --drop-duplicates
   map export route.stavpr arrays.npz
   map colmap route.stavpr hloc --images drive.bag
@@ -40,9 +39,7 @@ exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usag
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser(
-        'map', 'Show, check, convert, compact, export, merge and recover maps.', EPILOG
-    )
+    parser = make_parser('map', 'Show, check, compact, export, merge and recover maps.', EPILOG)
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
     def add(
@@ -73,9 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     action = add('verify', _verify, 'Compare all of a map with its hashes, and check every value.')
     action.add_argument('maps', nargs='+', metavar='MAP')
-    text = 'Write a map in the present format.'
-    add_storage(add('convert', _convert, text, 'map', 'output', force=force), '', halves)
-    text = 'Write a map in less memory.'
+    text = 'Write a map in the present format, in less memory.'
     action = add('compact', _compact, text, 'map', 'output', force=force)
     text = 'of the features; float16 is half of float32 (%(default)s)'
     add_storage(action, 'float16', text)
@@ -248,10 +243,6 @@ def _verified(path: str) -> 'PlaceMap':
     place_map = open_map(path)
     verify_map(place_map)
     return place_map
-
-
-def _convert(arguments: argparse.Namespace) -> None:
-    _write(_verified(arguments.map), arguments)
 
 
 def _compact(arguments: argparse.Namespace) -> None:
