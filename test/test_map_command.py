@@ -154,16 +154,6 @@ def test_damaged_map_is_not_compacted(folder, drive, capsys):
     assert not (folder / 'new').exists()
 
 
-def test_map_export_is_read_by_numpy(folder, drive):
-    assert main(['export', 'day.stavpr', 'arrays.npz']) == 0
-    with np.load('arrays.npz', allow_pickle=False) as arrays:
-        np.testing.assert_array_equal(arrays['strips'], drive.features.strips)
-        assert arrays['ids'].tolist() == list(drive.ids)
-        assert sorted(arrays) == [
-            'ids', 'poses', 'session_ids', 'settings', 'stamps', 'strips', 'weights',
-        ]  # fmt: skip
-
-
 def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive, capsys):
     assert main(['merge', 'both.stavpr', 'day.stavpr', 'night.stavpr', 'day.stavpr']) == 0
     both = load_map('both.stavpr')

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros map``: show, check, compact, export, merge and recover maps."""
+"""``ros2 run stavpr_ros map``: show, check, compact, merge and recover maps."""
 
 import argparse
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from stavpr_ros import plugins
 from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError
-from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_replaceable
+from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import SECOND
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ examples:
   map info route.stavpr --plot route.png
   map verify *.stavpr
   map compact route.stavpr small.stavpr --drop-duplicates
-  map export route.stavpr arrays.npz
   map colmap route.stavpr hloc --images drive.bag
   map merge both.stavpr day.stavpr night.stavpr
   map sessions both.stavpr day.stavpr --keep day
@@ -39,7 +38,7 @@ exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usag
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('map', 'Show, check, compact, export, merge and recover maps.', EPILOG)
+    parser = make_parser('map', 'Show, check, compact, merge and recover maps.', EPILOG)
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
     def add(
@@ -96,7 +95,6 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='also the codes of precision int8, for its fastest start; of 1,000 places or more',
     )
-    add('export', _export, 'Write the arrays of a map for NumPy.', 'map', 'output', force=force)
     text = 'Write images, pairs and poses of a map to a folder for COLMAP and hloc.'
     action = add('colmap', _colmap, text, 'map', 'folder')
     action.add_argument(
@@ -304,28 +302,6 @@ def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
 
 
-def _export(arguments: argparse.Namespace) -> None:
-    import numpy as np
-    from stavpr_ros.mapping import load_map
-
-    place_map = load_map(arguments.map)
-    arrays = {
-        'strips': place_map.features.strips,
-        'weights': place_map.features.weights,
-        'stamps': place_map.stamps,
-        'ids': np.array(place_map.ids),
-        'poses': place_map.poses,
-        'session_index': place_map.session_index,
-        'session_ids': np.array([session.id for session in place_map.sessions]),
-        'projection': place_map.projection.matrix if place_map.projection else None,
-        'settings': np.array(place_map.settings.to_json()),
-    }
-    found = {name: array for name, array in arrays.items() if array is not None}
-    with atomic_output(arguments.output, ARRAYS, arguments.force) as file:
-        np.savez(file, **found)  # type: ignore[arg-type]
-    print(f'{arguments.output}: {len(place_map)} places; numpy.load reads it')
-
-
 def _colmap(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import load_map
 
@@ -353,8 +329,7 @@ def _check_output(arguments: argparse.Namespace) -> None:
         require_replaceable(arguments.plot, PNG, arguments.force)
     if 'output' not in arguments or arguments.action == 'recover':
         return
-    kind = ARRAYS if arguments.action == 'export' else MAP
-    require_replaceable(arguments.output, kind, arguments.force)
+    require_replaceable(arguments.output, MAP, arguments.force)
     output = Path(arguments.output)
     inputs = [arguments.map] if 'map' in arguments else arguments.maps
     if output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs):
