@@ -10,9 +10,8 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros import plugins
-from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError
+from stavpr_ros.errors import MapFileError, SettingsError, SourceError, UnavailableError
 from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import SECOND
 
@@ -140,7 +139,13 @@ def _parser() -> argparse.ArgumentParser:
         help='faiss:FILE, qdrant:FOLDER, or qdrant://HOST:PORT/COLLECTION',
     )
     text = 'Make a map of the journal of an interrupted recording.'
-    map_recover.add_arguments(add('recover', _recover, text))
+    action = add('recover', _recover, text)
+    action.add_argument('journal', metavar='JOURNAL', help='such as route.stavpr.journal')
+    action.add_argument(
+        '--output',
+        metavar='MAP',
+        help='the file to write; without it that of the recording, or a numbered name beside it',
+    )
     return parser
 
 
@@ -311,7 +316,16 @@ def _colmap(arguments: argparse.Namespace) -> None:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    return map_recover.recover_map(arguments.journal, arguments.output)
+    from stavpr_ros.mapping.journal import SUFFIX
+    from stavpr_ros.mapping.journal_map import recover
+
+    journal = arguments.journal
+    if arguments.output is None and not journal.endswith(SUFFIX):
+        raise SourceError(f'{journal} does not end with {SUFFIX}: name the map, --output')
+    found = recover(journal, arguments.output)
+    print(f'{found.path}: {found.places} places, {found.recorded} of them from {journal}')
+    print(*found.problems, sep='\n', end='\n' if found.problems else '')
+    return int(bool(found.problems))
 
 
 def _upload(arguments: argparse.Namespace) -> None:
