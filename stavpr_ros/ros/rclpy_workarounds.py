@@ -128,11 +128,9 @@ def repeat_responses(service: Service) -> None:
     Make a service repeat a response until its client is matched.
 
     Waits for ros2/rmw_fastrtps#418: a request may arrive before the middleware has discovered the
-    client's reader, at the start or on a busy machine. rmw_fastrtps then drops the response after
-    0.1 s, and the client waits forever; a transition requested by a life-cycle manager is made but
-    counts as failed. A longer ``max_blocking_time`` in the profile (ros2/rmw_fastrtps#704) is no
-    substitute: rclpy keeps the interpreter lock meanwhile (measured: no other thread ran for the
-    whole second of the setting).
+    client's reader. rmw_fastrtps then drops the response after 0.1 s, and the client waits
+    forever. A longer ``max_blocking_time`` in the profile (ros2/rmw_fastrtps#704) is no
+    substitute: rclpy keeps the interpreter lock meanwhile.
     """
     send = service.send_response
 
