@@ -16,7 +16,7 @@ import time
 from data import data_folder
 import numpy as np
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.fleet import CityMap, FleetRecognizer, MemoryStore, open_city_map, upload
+from stavpr_ros.fleet import FleetRecognizer, open_city_map, upload
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.robust import unit_norm
@@ -104,7 +104,7 @@ def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--places', type=int, nargs='+', default=[20_000])
-    parser.add_argument('--homes', nargs='+', default=['memory', 'faiss', 'qdrant'])
+    parser.add_argument('--homes', nargs='+', default=['faiss', 'qdrant'])
     arguments = parser.parse_args()
     extractor = FeatureExtractor()
     opened = {
@@ -124,12 +124,9 @@ def main() -> None:
             for home in arguments.homes:
                 with tempfile.TemporaryDirectory() as folder:
                     began = time.perf_counter()
-                    if home == 'memory':
-                        place_map = CityMap.of(MemoryStore(whole))
-                    else:
-                        address = f'{home}:{Path(folder, home)}'
-                        upload(whole, address)
-                        place_map = open_city_map(address)
+                    address = f'{home}:{Path(folder, home)}'
+                    upload(whole, address)
+                    place_map = open_city_map(address)
                     spent = time.perf_counter() - began
                     found = run(FleetRecognizer(place_map, SETTINGS, timeout=60), *given)
                 print(f'| {driven} | {count:,} | {home} | {found} | {spent:.1f} |', flush=True)

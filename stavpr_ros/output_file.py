@@ -34,7 +34,6 @@ RECORDING = FileKind('recording of matches', lambda head: head.startswith(b'{"st
 JSON = FileKind('JSON file', lambda head: head.lstrip()[:1] in (b'{', b'['))
 PNG = FileKind('PNG image', lambda head: head.startswith(b'\x89PNG'))
 NPY = FileKind('NumPy array', lambda head: head.startswith(b'\x93NUMPY'))
-ARRAYS = FileKind('file of NumPy arrays', lambda head: head.startswith(b'PK\x03\x04'))
 ANY = FileKind('file', lambda head: True)
 ONNX = FileKind('ONNX file', lambda head: head[:1] == b'\x08')  # its first field: the version
 HTML = FileKind('HTML page', lambda head: head.lstrip().lower().startswith(b'<!doctype html'))

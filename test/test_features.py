@@ -8,12 +8,9 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 
 
-@pytest.mark.parametrize(
-    ('kind', 'words'), [('teleport', 'take one of gradient'), ('torchscript', 'to an ONNX file')]
-)
-def test_extractor_of_unknown_kind_is_rejected(kind, words):
-    with pytest.raises(SettingsError, match=f"'{kind}'.*{words}"):
-        FeatureExtractor(kind)
+def test_extractor_of_unknown_kind_is_rejected():
+    with pytest.raises(SettingsError, match=r"'teleport'.*take one of gradient"):
+        FeatureExtractor('teleport')
 
 
 @pytest.mark.parametrize('bad', [{'cell': 1}, {'cell': 15}, {'size': 16}, {'orientations': 1}])

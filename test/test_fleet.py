@@ -19,11 +19,11 @@ from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import FleetError, InputError, OutputTakenError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.fleet import CityMap, FleetRecognizer, MemoryStore, open_city_map, upload
+from stavpr_ros.fleet import CityMap, FleetRecognizer, open_city_map, upload
 from stavpr_ros.fleet.neighborhoods import Votes
 from stavpr_ros.fleet.qdrant_store import EdgePoints
-from stavpr_ros.fleet.store import MapIndex, place_vectors, sample_places
-from stavpr_ros.mapping import descriptor_map, open_map, save_map, Session
+from stavpr_ros.fleet.store import map_vectors, MapIndex, place_vectors, sample_places
+from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.robust import unit_norm
@@ -71,6 +71,23 @@ def server():
     server = QdrantServer()
     yield server
     server.close()
+
+
+class MemoryStore:
+    """A map in memory, with an exact search."""
+
+    def __init__(self, place_map):
+        self.place_map, self.index = place_map, MapIndex.of(place_map)
+        self.vectors = map_vectors(place_map, self.index)
+
+    def nearest(self, vectors, count):
+        return np.argsort(-(vectors @ self.vectors.T), axis=1, kind='stable')[:, :count]
+
+    def fetch(self, places):
+        same_as = self.place_map.same_as
+        return select_places(self.place_map, places), places if same_as is None else same_as[
+            places
+        ]
 
 
 def city_in(place_map, store, tmp_path, server):

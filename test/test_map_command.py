@@ -125,43 +125,33 @@ def test_map_verify_names_the_damaged_ones(folder, capsys):
     assert 'missing does not exist' in shown.err
 
 
-def test_map_convert_writes_the_storage_of_its_option(folder):
-    assert main(['convert', 'day.stavpr', 'same']) == 0
+def test_map_compact_writes_the_storage_of_its_option(folder):
+    assert main(['compact', 'day.stavpr', 'same', '--storage', 'float32']) == 0
     assert open_map('same').map_id == open_map('day.stavpr').map_id
-    assert main(['convert', 'day.stavpr', 'half', '--storage', 'float16']) == 0
+    assert main(['compact', 'day.stavpr', 'half']) == 0
     assert open_map('half').features.storage == 'float16'
 
 
 def test_map_replaces_nothing_unasked(folder, capsys):
     before = (folder / 'night.stavpr').read_bytes()
-    assert main(['convert', 'day.stavpr', 'night.stavpr']) == 1
+    assert main(['compact', 'day.stavpr', 'night.stavpr']) == 1
     assert 'night.stavpr exists already' in capsys.readouterr().err
     assert main(['merge', 'day.stavpr', 'day.stavpr', 'night.stavpr', '--force']) == 2
     assert 'is also an input' in capsys.readouterr().err
     assert (folder / 'night.stavpr').read_bytes() == before
-    assert main(['convert', 'day.stavpr', 'night.stavpr', '--force']) == 0
-    assert main(['convert', 'missing', 'new']) == 1
+    assert main(['compact', 'day.stavpr', 'night.stavpr', '--force']) == 0
+    assert main(['compact', 'missing', 'new']) == 1
     assert not (folder / 'new').exists()
 
 
-def test_damaged_map_is_not_converted(folder, drive, capsys):
+def test_damaged_map_is_not_compacted(folder, drive, capsys):
     content = (folder / 'day.stavpr').read_bytes()
     first = drive.features.strips.tobytes()[:64]
     (folder / 'day.stavpr').write_bytes(content.replace(first, first[:-1] + b'\0'))
-    for action in (['convert', 'day.stavpr', 'new'], ['merge', 'new', 'day.stavpr']):
+    for action in (['compact', 'day.stavpr', 'new'], ['merge', 'new', 'day.stavpr']):
         assert main(action) == 1
         assert 'do not match their hash' in capsys.readouterr().err
     assert not (folder / 'new').exists()
-
-
-def test_map_export_is_read_by_numpy(folder, drive):
-    assert main(['export', 'day.stavpr', 'arrays.npz']) == 0
-    with np.load('arrays.npz', allow_pickle=False) as arrays:
-        np.testing.assert_array_equal(arrays['strips'], drive.features.strips)
-        assert arrays['ids'].tolist() == list(drive.ids)
-        assert sorted(arrays) == [
-            'ids', 'poses', 'session_ids', 'settings', 'stamps', 'strips', 'weights',
-        ]  # fmt: skip
 
 
 def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive, capsys):

@@ -187,7 +187,7 @@ def test_reader_written_from_the_documentation_finds_the_statistics(place_map, t
 def test_commands_write_statistics(place_map, tmp_path, capsys):
     old = tmp_path / 'old'
     save_map(place_map, old)
-    for action, *files in (('compact', old), ('convert', old), ('merge', old, old)):
+    for action, *files in (('compact', old), ('merge', old, old)):
         output = tmp_path / action
         paths = (files[0], output) if action != 'merge' else (output, *files)
         options = ['--different-routes'] if action == 'merge' else []

@@ -121,9 +121,3 @@ def test_several_queries_reject_options_of_one(capfd):
     with pytest.raises(SystemExit):
         evaluate.main(['--map', 'a', '--query', 'b', 'c', '--window', '3'])
     assert '--window goes with one --query' in capfd.readouterr().err
-
-
-def test_evaluation_of_images_refers_to_map_for_principal_components(tmp_path, route, capsys):
-    source = str(write_images(tmp_path / 'images', route[:30]))
-    assert evaluate.main(['--map', source, '--query', source, '--projection', 'pca:4']) != 0
-    assert 'build one by build_map' in capsys.readouterr().err

@@ -24,9 +24,7 @@ COMMANDS = {
     'build_map': Command(
         'stavpr_ros.commands.build_map', 'build a reference map from images, a video or a bag'
     ),
-    'map': Command(
-        'stavpr_ros.commands.map', 'show, check, convert, export, merge and recover maps'
-    ),
+    'map': Command('stavpr_ros.commands.map', 'show, check, compact, merge and recover maps'),
     'node': Command('stavpr_ros.commands.node', 'run the place-recognition node', True),
     'replay': Command(
         'stavpr_ros.commands.replay', 'publish a bag, a video or images to the node', True

@@ -198,12 +198,11 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
 
 def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     """Return the map, and the journal that it is in."""
-    from stavpr_ros.commands.feature_options import make_extractor, principal_dimension
+    from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.mapping import KeyframeSettings
     from stavpr_ros.mapping.builder import build_journal
     from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
-    from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.sources import open_source
 
     skipped = []
@@ -219,10 +218,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
 
     _check(arguments)
     keyframes = KeyframeSettings(*(getattr(arguments, f'keyframe_{rule}') for rule in RULES))
-    projection = arguments.projection
-    learned = isinstance(projection, str)
-    plain = argparse.Namespace(**vars(arguments) | ({'projection': None} if learned else {}))
-    extractor = make_extractor(plain)
+    extractor = make_extractor(arguments)
     source = open_source(arguments.input, arguments.topic, bad_image, arguments.fps)
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
@@ -237,8 +233,6 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         thumbnail_width=width,
     )
     place_map = journal_map(journal)
-    if learned:
-        place_map = with_principal_components(place_map, principal_dimension(projection))
     if arguments.odometry and not place_map.has_poses:
         raise SourceError(
             f'--odometry {arguments.odometry}: no image has a pose; are the stamps of both from '
@@ -321,9 +315,9 @@ def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
     jobs = []
     for name, one in zip(job_names(arguments.input), arguments.input, strict=True):
         output = Path(f'{folder / name}.stavpr')
-        options = ('--input', one, '--output', str(output), *others)
-        command = 'stavpr_ros.commands.build_map'
-        jobs.append(Job(name, command, options, is_new=not output.exists()))
+        new = () if output.exists() else ('--force',)
+        options = ('--input', one, '--output', str(output), *others, *new)
+        jobs.append(Job(name, 'stavpr_ros.commands.build_map', options))
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
 

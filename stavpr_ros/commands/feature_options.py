@@ -28,19 +28,6 @@ def _numbers(text: str) -> tuple[float, ...]:
 CONVERTERS = {bool: _boolean, tuple: _numbers}
 
 
-def _projection(text: str) -> int | str:
-    """Return the dimensions of a random projection, or ``pca:D`` as it is."""
-    kind, _, dimensions = text.rpartition(':')
-    if kind not in ('', 'pca') or not dimensions.isdecimal():
-        raise argparse.ArgumentTypeError(f'{text!r} is unknown: expected D or pca:D')
-    return text if kind else int(dimensions)
-
-
-def principal_dimension(projection: str) -> int:
-    """Return D of ``pca:D``."""
-    return int(projection.removeprefix('pca:'))
-
-
 def add_feature_options(parser: argparse.ArgumentParser) -> None:
     """
     Add ``--features``, the general options and ``--KIND-NAME`` for each setting of a kind.
@@ -52,9 +39,8 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     add('--features', choices=kinds(), default=default('features'), help=kind_help)
     strips = 'vertical strips of an image (7; 1 if the features are one vector)'
     add('--strips', type=int, metavar='W', help=strips)
-    projection = 'each strip to D dimensions by a random projection; build_map: pca:D, by the '
-    projection += 'principal components of the map (none)'
-    add('--projection', type=_projection, metavar='[pca:]D', help=projection)
+    projection = 'each strip to D dimensions by a random projection (none)'
+    add('--projection', type=int, metavar='D', help=projection)
     add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
     add('--device', default='auto', choices=DEVICES, help='where features are computed')
     listed = argparse.ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
@@ -83,12 +69,6 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
     :raises SettingsError: an option is missing, out of range or of another kind.
     """
     from stavpr_ros.features import FeatureExtractor
-
-    if isinstance(arguments.projection, str):
-        raise SettingsError(
-            f'--projection {arguments.projection} is learned from a whole map: build one by '
-            'build_map, or `stavpr map compact --pca`, and give that'
-        )
 
     return FeatureExtractor(
         arguments.features,

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros map``: show, check, convert, compact, export, merge, recover maps."""
+"""``ros2 run stavpr_ros map``: show, check, compact, merge and recover maps."""
 
 import argparse
 from collections.abc import Callable
@@ -10,10 +10,9 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros import plugins
-from stavpr_ros.commands import map_recover
 from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import MapFileError, SettingsError, UnavailableError
-from stavpr_ros.output_file import ARRAYS, atomic_output, MAP, PNG, require_replaceable
+from stavpr_ros.errors import MapFileError, SettingsError, SourceError, UnavailableError
+from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import SECOND
 
 if TYPE_CHECKING:
@@ -26,9 +25,7 @@ EPILOG = """
 examples:
   map info route.stavpr --plot route.png
   map verify *.stavpr
-  map convert old.stavpr new.stavpr --storage float16
   map compact route.stavpr small.stavpr --drop-duplicates
-  map export route.stavpr arrays.npz
   map colmap route.stavpr hloc --images drive.bag
   map merge both.stavpr day.stavpr night.stavpr
   map sessions both.stavpr day.stavpr --keep day
@@ -40,9 +37,7 @@ exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usag
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser(
-        'map', 'Show, check, convert, compact, export, merge and recover maps.', EPILOG
-    )
+    parser = make_parser('map', 'Show, check, compact, merge and recover maps.', EPILOG)
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
     def add(
@@ -73,9 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     action = add('verify', _verify, 'Compare all of a map with its hashes, and check every value.')
     action.add_argument('maps', nargs='+', metavar='MAP')
-    text = 'Write a map in the present format.'
-    add_storage(add('convert', _convert, text, 'map', 'output', force=force), '', halves)
-    text = 'Write a map in less memory.'
+    text = 'Write a map in the present format, in less memory.'
     action = add('compact', _compact, text, 'map', 'output', force=force)
     text = 'of the features; float16 is half of float32 (%(default)s)'
     add_storage(action, 'float16', text)
@@ -101,7 +94,6 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='also the codes of precision int8, for its fastest start; of 1,000 places or more',
     )
-    add('export', _export, 'Write the arrays of a map for NumPy.', 'map', 'output', force=force)
     text = 'Write images, pairs and poses of a map to a folder for COLMAP and hloc.'
     action = add('colmap', _colmap, text, 'map', 'folder')
     action.add_argument(
@@ -147,7 +139,13 @@ def _parser() -> argparse.ArgumentParser:
         help='faiss:FILE, qdrant:FOLDER, or qdrant://HOST:PORT/COLLECTION',
     )
     text = 'Make a map of the journal of an interrupted recording.'
-    map_recover.add_arguments(add('recover', _recover, text))
+    action = add('recover', _recover, text)
+    action.add_argument('journal', metavar='JOURNAL', help='such as route.stavpr.journal')
+    action.add_argument(
+        '--output',
+        metavar='MAP',
+        help='the file to write; without it that of the recording, or a numbered name beside it',
+    )
     return parser
 
 
@@ -250,10 +248,6 @@ def _verified(path: str) -> 'PlaceMap':
     return place_map
 
 
-def _convert(arguments: argparse.Namespace) -> None:
-    _write(_verified(arguments.map), arguments)
-
-
 def _compact(arguments: argparse.Namespace) -> None:
     from dataclasses import replace
 
@@ -313,28 +307,6 @@ def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
 
 
-def _export(arguments: argparse.Namespace) -> None:
-    import numpy as np
-    from stavpr_ros.mapping import load_map
-
-    place_map = load_map(arguments.map)
-    arrays = {
-        'strips': place_map.features.strips,
-        'weights': place_map.features.weights,
-        'stamps': place_map.stamps,
-        'ids': np.array(place_map.ids),
-        'poses': place_map.poses,
-        'session_index': place_map.session_index,
-        'session_ids': np.array([session.id for session in place_map.sessions]),
-        'projection': place_map.projection.matrix if place_map.projection else None,
-        'settings': np.array(place_map.settings.to_json()),
-    }
-    found = {name: array for name, array in arrays.items() if array is not None}
-    with atomic_output(arguments.output, ARRAYS, arguments.force) as file:
-        np.savez(file, **found)  # type: ignore[arg-type]
-    print(f'{arguments.output}: {len(place_map)} places; numpy.load reads it')
-
-
 def _colmap(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import load_map
 
@@ -344,7 +316,16 @@ def _colmap(arguments: argparse.Namespace) -> None:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    return map_recover.recover_map(arguments.journal, arguments.output)
+    from stavpr_ros.mapping.journal import SUFFIX
+    from stavpr_ros.mapping.journal_map import recover
+
+    journal = arguments.journal
+    if arguments.output is None and not journal.endswith(SUFFIX):
+        raise SourceError(f'{journal} does not end with {SUFFIX}: name the map, --output')
+    found = recover(journal, arguments.output)
+    print(f'{found.path}: {found.places} places, {found.recorded} of them from {journal}')
+    print(*found.problems, sep='\n', end='\n' if found.problems else '')
+    return int(bool(found.problems))
 
 
 def _upload(arguments: argparse.Namespace) -> None:
@@ -362,8 +343,7 @@ def _check_output(arguments: argparse.Namespace) -> None:
         require_replaceable(arguments.plot, PNG, arguments.force)
     if 'output' not in arguments or arguments.action == 'recover':
         return
-    kind = ARRAYS if arguments.action == 'export' else MAP
-    require_replaceable(arguments.output, kind, arguments.force)
+    require_replaceable(arguments.output, MAP, arguments.force)
     output = Path(arguments.output)
     inputs = [arguments.map] if 'map' in arguments else arguments.maps
     if output.exists() and any(Path(path).exists() and output.samefile(path) for path in inputs):

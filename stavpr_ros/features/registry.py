@@ -228,11 +228,6 @@ def settings_class(kind: str) -> Any:
 
 
 def _kind(name: str) -> Kind:
-    if name == 'torchscript':
-        raise SettingsError(
-            "features 'torchscript' were removed: export the network to an ONNX file "
-            '(docs/features.md) and take features onnx; build a map with it again'
-        )
     found = KINDS.get(name) or _all().get(name)
     if found is None:
         remedy = f'take one of {", ".join(kinds())}'

@@ -10,13 +10,12 @@ import this package. docs/fleet.md explains it.
 from stavpr_ros.fleet.addresses import open_city_map, upload
 from stavpr_ros.fleet.city_map import CityMap
 from stavpr_ros.fleet.recognizer import FleetMap, FleetRecognizer
-from stavpr_ros.fleet.store import MemoryStore, PlaceStore
+from stavpr_ros.fleet.store import PlaceStore
 
 __all__ = [
     'CityMap',
     'FleetMap',
     'FleetRecognizer',
-    'MemoryStore',
     'PlaceStore',
     'open_city_map',
     'upload',

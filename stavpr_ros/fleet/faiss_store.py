@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import FleetError, OutputTakenError, UnavailableError
-from stavpr_ros.fleet.store import LocalStore, map_vectors, MapIndex
-from stavpr_ros.mapping import open_map, PlaceMap, save_map
+from stavpr_ros.fleet.store import map_vectors, MapIndex
+from stavpr_ros.mapping import open_map, PlaceMap, save_map, select_places
 
 EXACT = 4096  # places up to which all vectors are compared
 REDUCED = 128  # dimensions that larger maps' vectors are reduced to
@@ -35,7 +35,7 @@ def _index_path(path: str | Path, map_id: str) -> Path:
     return Path(f'{path}.{map_id}.faiss')
 
 
-class FaissStore(LocalStore):
+class FaissStore:
     """
     A map file whose places are searched by FAISS.
 
@@ -45,7 +45,8 @@ class FaissStore(LocalStore):
 
     def __init__(self, path: str | Path) -> None:
         faiss = _faiss()
-        super().__init__(open_map(path))
+        self._map = open_map(path)
+        self.index = MapIndex.of(self._map)
         file = _index_path(path, self._map.map_id)
         try:
             self._index = faiss.read_index(str(file), faiss.IO_FLAG_MMAP)
@@ -61,6 +62,11 @@ class FaissStore(LocalStore):
     def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
         """See :class:`stavpr_ros.fleet.store.PlaceStore`."""
         return np.asarray(self._index.search(vectors, count)[1])
+
+    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
+        """See :class:`stavpr_ros.fleet.store.PlaceStore`."""
+        same_as = self._map.same_as
+        return select_places(self._map, places), places if same_as is None else same_as[places]
 
 
 def upload_to_faiss(place_map: PlaceMap, path: str, force: bool = False) -> None:

@@ -1,20 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Recognition on a city's map: exact, over the neighborhoods where the camera may be.
-
-Every few images, the vectors of the latest ones are looked up, and the neighborhoods that they
-agree on are fetched, in chunks of neighboring places that are kept while there is room. Mode
-robust runs over the loaded chunks as over a map of so many sessions, with three differences:
-
-* The mean, the whitening and the z-normalization come from a sample of the whole map.
-* The filter's probabilities of starting on and entering the map are multiplied by the share m / n
-  of the loaded places, so that each place has the probability that it has in the whole map: the
-  loaded places are the most similar of n.
-* When chunks are replaced, the filter runs over the latest images again, over the new places.
-
-While the map cannot be reached, the loaded chunks are used.
-"""
+"""Recognition on a city's map, over the neighborhoods of the camera: see docs/fleet.md."""
 
 from collections import deque
 from concurrent.futures import Future, wait

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The protocol of stores, the index that a robot downloads, and the store in memory.
+The protocol of stores, and the index that a robot downloads.
 
 The vector of a place is made of its centered and whitened strips: the means of three groups of
 neighboring strips, joined, unit norm.
@@ -132,32 +132,3 @@ def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:
     for places, block in blocks(place_map.features):
         vectors[places] = place_vectors(centering.places(block).strips)
     return vectors
-
-
-class LocalStore:
-    """A map on this machine; the base of stores that differ in the search for vectors."""
-
-    def __init__(self, place_map: PlaceMap) -> None:
-        self._map = place_map
-        self.index = MapIndex.of(place_map)
-
-    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
-        """See :class:`PlaceStore`."""
-        same_as = self._map.same_as
-        return select_places(self._map, places), places if same_as is None else same_as[places]
-
-
-class MemoryStore(LocalStore):
-    """A map in memory, with an exact search."""
-
-    def __init__(self, place_map: PlaceMap) -> None:
-        super().__init__(place_map)
-        self._vectors = map_vectors(place_map, self.index)
-
-    def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
-        """See :class:`PlaceStore`."""
-        similarity = vectors @ self._vectors.T
-        count = min(count, similarity.shape[1])
-        found = np.argpartition(-similarity, count - 1, axis=1)[:, :count]
-        order = np.argsort(-np.take_along_axis(similarity, found, axis=1), axis=1, kind='stable')
-        return np.take_along_axis(found, order, axis=1)

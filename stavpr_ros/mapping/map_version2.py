@@ -34,11 +34,6 @@ def read_header(file: MapFile) -> None:
     :raises ValueError: anything else that is wrong with it.
     """
     head = file.bytes_at(0, min(8, file.size))
-    if head.startswith(b'PK'):
-        raise MapFileError(
-            f'{file.path} is a ZIP archive, as maps of format version 1 were: build the map again '
-            'with build_map'
-        )
     length = int.from_bytes(head, 'little')
     if file.size < 8 or not 2 <= length <= min(MOST_HEADER, file.size - 8):
         raise file.foreign(f'its header would have {length} of {file.size} bytes')

@@ -29,11 +29,11 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     d, W, n = place_map.dimension, place_map.settings.strips, len(place_map)
     if not 1 <= dimension < d:
         raise SettingsError(
-            f'projection pca:{dimension}: the features have {d} dimensions, take 1 to {d - 1}'
+            f'{dimension} principal components of features of {d} dimensions: take 1 to {d - 1}'
         )
     if dimension * STRIPS_A_DIRECTION > W * n:
         raise SettingsError(
-            f'projection pca:{dimension}: the map has {W * n} strips ({n} places), '
+            f'{dimension} principal components of {W * n} strips ({n} places): '
             f'{STRIPS_A_DIRECTION} are needed for a direction: take at most '
             f'{W * n // STRIPS_A_DIRECTION}, or add places'
         )

@@ -196,13 +196,11 @@ class StampWatch:
         """
         Take the next stamp; return the step and the number of images missing before it.
 
-        The step is the seconds of a gap, minus those of a jump back, 0 = neither. A jump back is
-        an earlier stamp, as when a bag starts again. A reordered image does not move the newest
-        stamp back: otherwise the image after it would seem to come after a gap.
+        The step is the seconds of a gap, minus those of a jump back, 0 = neither. A reordered
+        image does not move the newest stamp back: the next image comes after no gap.
 
-        Missing images are estimated at a camera of steady rate: 0 while the rate is unknown or
-        unsteady, and after a pause. Jitter of a tenth of the period and the loss of half of the
-        images do no harm; a change of the rate is detected after ``INTERVALS`` images.
+        Missing images are estimated at a camera of steady rate, with jitter up to a tenth of the
+        period and the loss of half of the images: 0 while the rate is unknown, and after a pause.
 
         :param stamp: nanoseconds; 0 = unknown, ignored.
         """

@@ -219,10 +219,8 @@ class AdaptiveSubscription:
     A subscription that is reliable when every publisher offers it, and best effort otherwise.
 
     A reliable one receives nothing of best-effort publishers, and a best-effort one loses large
-    images of reliable publishers. The publishers are followed as they come and go: a second
-    subscription is made first, and the old one is destroyed when the new one is matched. Without
-    a publisher the last choice stays, at first reliable: then no image of a reliable publisher is
-    lost before it is discovered. The parameter qos_overrides...reliability takes precedence.
+    images of reliable publishers. The old subscription is destroyed when the new one is matched.
+    Without a publisher the last choice stays, at first reliable: see docs/node_guide.md.
 
     :param depth: of the queue of the middleware.
     :param callback: called with each image once, in the order of arrival.

@@ -256,11 +256,9 @@ def matched_pose_message(
     """
     Return the pose of the place of the newest image; None without a match or a known pose.
 
-    The covariance is diagonal: the variance of each coordinate over the poses of the two places
-    before and after it, since a match may be off by a place, and at least (0.1 m)^2 and (0.1
-    rad)^2. Rotations are rotation vectors about the axes of the map. Place recognition does not
-    observe a lateral offset of the camera from the mapped route; the covariance does not include
-    it.
+    The covariance is diagonal: the variance over the poses of the two places before and after it,
+    rotation vectors about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2. It does not
+    include a lateral offset of the camera from the route.
 
     :param frame: of the poses of the map.
     """

@@ -9,6 +9,7 @@ import numpy as np
 from rclpy.node import Node
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.recognition import Match
 from stavpr_ros.ros.messages import matched_pose_message, transform_message
@@ -88,10 +89,7 @@ def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:
     :param place: pose of the robot in the map, x y z and quaternion x y z w, shape (7,).
     :param odometry: pose of the robot in the odometry's frame, shape (7,).
     """
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_quat(place[3:]) * Rotation.from_quat(odometry[3:]).inv()
-    return np.concatenate([place[:3] - turn.apply(odometry[:3]), turn.as_quat()])
+    return to_poses(matrices(place) @ inverse(matrices(odometry)))
 
 
 def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:

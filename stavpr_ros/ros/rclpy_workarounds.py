@@ -81,11 +81,9 @@ class PromptExecutor(Executor):
 
     Waits for ros2/rclpy#1547 (merged for later distributions): ``MultiThreadedExecutor`` submits a
     callback again and again until a thread has begun it, and does not wait for events meanwhile.
-    Measured on two cores, images of 230 KB at the pace of their results, 2 ms of work: at most 55
-    and 71 ms per result and 0.6 to 1.0 s of processor time with ``MultiThreadedExecutor``, 12 and
-    13 ms and 0.4 s here, 9 ms and 0.3 s with a single thread. With the node itself 100 to 900 ms
-    were observed. The node needs threads all the same, or a service that loads a map stops the
-    images.
+    Measured on two cores with images of 230 KB: at most 55 and 71 ms per result with
+    ``MultiThreadedExecutor``, 12 and 13 ms here. A single thread would be as fast, but a service
+    that loads a map would stop the images.
 
     Waits also for ros2/rclpy#1590 (issue #1355): an entity that another thread destroys while
     the executor collects its entities raises ``InvalidHandle`` out of ``spin_once``.
@@ -132,11 +130,9 @@ def repeat_responses(service: Service) -> None:
     Make a service repeat a response until its client is matched.
 
     Waits for ros2/rmw_fastrtps#418: a request may arrive before the middleware has discovered the
-    client's reader, at the start or on a busy machine. rmw_fastrtps then drops the response after
-    0.1 s, and the client waits forever; a transition requested by a life-cycle manager is made but
-    counts as failed. A longer ``max_blocking_time`` in the profile (ros2/rmw_fastrtps#704) is no
-    substitute: rclpy keeps the interpreter lock meanwhile (measured: no other thread ran for the
-    whole second of the setting).
+    client's reader. rmw_fastrtps then drops the response after 0.1 s, and the client waits
+    forever. A longer ``max_blocking_time`` in the profile (ros2/rmw_fastrtps#704) is no
+    substitute: rclpy keeps the interpreter lock meanwhile.
     """
     send = service.send_response
 

@@ -268,18 +268,13 @@ def _layout(encoding: str) -> Encoding:
     layout = ENCODINGS.get(encoding)
     if layout is not None:
         return layout
-    known = ', '.join(ENCODINGS)
+    problem, remedy, kind = 'not supported', 'set the driver, or use image_proc', 'encoding'
     if _MEASUREMENTS.fullmatch(encoding):
-        raise ImageError(
-            f'encoding {encoding!r} is depth or measurements, not an image: expected one of '
-            f'{known}; '
-            "choose the camera's color or gray topic",
-            kind='depth',
-        )
+        problem, kind = 'depth or measurements, not an image', 'depth'
+        remedy = "choose the camera's color or gray topic"
     raise ImageError(
-        f'encoding {encoding!r} is not supported: expected one of {known}; set the driver, or use '
-        'image_proc',
-        kind='encoding',
+        f'encoding {encoding!r} is {problem}: expected one of {", ".join(ENCODINGS)}; {remedy}',
+        kind=kind,
     )
 
 
