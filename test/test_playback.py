@@ -3,10 +3,13 @@
 """Replay as `ros2 bag play`: pace, pause, step, loop, part of a bag, /clock, other topics."""
 
 from contextlib import closing, contextmanager
+import fcntl
 import math
-import signal
+import os
+import pty
 import subprocess
 import sys
+import termios
 import threading
 
 from bags import SECOND, TEXT, write_odometry, writing
@@ -283,27 +286,41 @@ def test_replay_services_pause_step_and_resume():
     assert [seconds(image.header) for image in received.of('/image')] == [100, 101, 102, 103]
 
 
-def test_replay_command_loops_over_a_part_of_a_bag(tmp_path):
-    """Odometry, other topics and the clock beside the images."""
+def test_replay_command_with_keys_loops_over_a_part_of_a_bag(tmp_path):
+    """Step and resume on a terminal; odometry, other topics and the clock beside the images."""
     path = write_odometry(
         tmp_path / 'bag', [FIRST + i * SECOND for i in range(6)], images=images(6)
     )
+    terminal, its_end = pty.openpty()
     command = [sys.executable, '-m', 'stavpr_ros.commands.replay', str(path)]
-    command += '--odometry --also --clock --loop --rate 20'.split()  # noqa: SIM905
+    command += '--odometry --also --clock --loop --start-paused --rate 20'.split()  # noqa: SIM905
     command += ['--start-offset', '3', '--duration', '2', '--ros-args', '-r', 'odom:=/robot/odom']
     with spinning('terminal') as node:
         received = Received(node, (Image, '/image'), (Odometry, '/robot/odom'), (Clock, '/clock'))
         running = subprocess.Popen(
-            command, env=environment() | {'ROS_DOMAIN_ID': str(DOMAIN)}, start_new_session=True
+            command,
+            env=environment() | {'ROS_DOMAIN_ID': str(DOMAIN)},
+            stdin=its_end,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509
         )
         try:
             received.wait(lambda _: received.of('/clock'))
+            os.write(terminal, b's')
+            received.wait(lambda _: received.of('/image'))
+            os.write(terminal, b' ')
+            assert any('resumed' in line for line in iter(running.stderr.readline, ''))
             received.wait(lambda _: len(received.of('/image')) >= 5)
-            running.send_signal(signal.SIGINT)
+            os.write(terminal, b'\x03')  # Ctrl-C
             assert running.wait(TIMEOUT) == 130
         finally:
             running.kill()
             running.wait()
+            running.stderr.close()
+            os.close(terminal)
+            os.close(its_end)
     stamps = [seconds(image.header) for image in received.of('/image')]
     assert stamps[:5] == [102, 103, 102, 103, 102]
     assert {seconds(message.header) for message in received.of('/robot/odom')} == {102, 103}
@@ -332,4 +349,4 @@ def test_replay_command_of_a_part_that_is_missing_fails(
 def test_replay_command_of_a_folder_with_odometry_fails(tmp_path, capsys):
     (tmp_path / '0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
     assert replay.main([str(tmp_path), '--odometry']) == 1
-    assert 'is no bag, which --odometry and --also require' in capsys.readouterr().err
+    assert '--odometry and --also require a bag' in capsys.readouterr().err

@@ -49,8 +49,8 @@ examples:
   ros2 run stavpr_ros replay phone.mp4 --lossless
         a video, 5 images of each second
 
-The services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger) pause, resume
-and publish the next image.
+On a terminal, space pauses and resumes, s or the right arrow publishes the next image. The
+services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger) do the same.
 
 exit codes:
   0    all images were published; the last line names how many of them the node received

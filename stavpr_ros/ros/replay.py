@@ -23,14 +23,14 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.ros.messages import record_message, time_message
-from stavpr_ros.ros.playback import Playback
+from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.ros.receipts import Receipts
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_srvs.srv import Trigger
 
-SIGNAL_POLL = 0.1  # seconds until a signal is noticed
+KEY_POLL = 0.1  # seconds until a signal, or a key, is noticed
 TRIES = 3  # how often one image is sent
 RELIABLE_QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 OTHERS_DEPTH = 1000  # messages of one topic between two images
@@ -121,6 +121,7 @@ class Replayer:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._discovery = Discovery(node, self._endpoints, options.timeout)
+        self._poll: Callable[[], None] = lambda: None
 
     @property
     def topics(self) -> Collection[str]:
@@ -155,12 +156,18 @@ class Replayer:
         """
         Publish each record when it is due; if lossless, an image after the last one's result.
 
+        While it runs, keys of the terminal pause, resume and step.
+
         :raises NoResultError: lossless, and no result after all tries.
         """
-        for i, record in enumerate(records):
-            if i == 0:
-                self.playback.start(record.time_ns)
-            self._send(record)
+        playback = self.playback
+        keys = {' ': self._toggle, 's': playback.step, '\x1b[C': playback.step}
+        with keyboard(keys) as self._poll:
+            for i, record in enumerate(records):
+                if i == 0:
+                    playback.start(record.time_ns)
+                self._send(record)
+        self._poll = lambda: None
 
     def _send(self, record: ImageRecord | MessageRecord) -> None:
         is_image = isinstance(record, ImageRecord)
@@ -213,9 +220,10 @@ class Replayer:
         return True
 
     def _spin_once(self, seconds: float) -> None:
-        """Serve one callback, or wait for one at most so long."""
+        """Serve one callback, or wait for one at most so long; read the keys."""
         with signals_deferred():
-            self._executor.spin_once(timeout_sec=min(seconds, SIGNAL_POLL))
+            self._executor.spin_once(timeout_sec=min(seconds, KEY_POLL))
+        self._poll()
 
     def _missing(self) -> str:
         """Return the endpoint that is not discovered yet; empty = none."""
