@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transport, start, spinning, discovery and end of every executable with a ROS node."""
 
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-import itertools
+import difflib
 import os
 from pathlib import Path
 import sys
@@ -137,27 +137,43 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
         executor.shutdown()
 
 
-def require_ros_arguments(arguments: Sequence[str], parameters: Container[str] = ()) -> None:
+def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = ()) -> None:
     """
     Reject arguments that are not for ROS, for a node that has no others.
 
-    :param parameters: names of parameters, of which rcl takes ``NAME:=VALUE`` without ``-p`` as a
-        remapping without effect.
-    :raises SettingsError: names the arguments.
+    :param parameters: names with which misspelled options are compared.
+    :raises SettingsError: names the arguments, and the command line to write.
     """
-    unread = own_arguments(arguments)
-    before = itertools.takewhile(lambda word: word != '--ros-args', arguments)
-    remapped = [word for word in before if word.partition(':=')[0] in parameters]
-    unread += [word for word in remapped if word not in unread]
-    if unread:
-        raise SettingsError(
-            f'nothing reads the arguments {" ".join(unread)!r}: write --ros-args -p NAME:=VALUE '
-            'for a parameter, --ros-args -r FROM:=TO for a remapping'
-        )
+    words, of_ros = [], False
+    for word in arguments:
+        if word in ('--ros-args', '--'):
+            of_ros = word == '--ros-args'
+        elif not of_ros:
+            words.append(word)
+    # rcl takes NAME:=VALUE alone as a remapping, of a parameter without effect
+    remapped = {word.partition(':=')[0] for word in words}
+    if not own_arguments(arguments) and remapped.isdisjoint(parameters):
+        return
+    line = ['--ros-args']
+    for word in words:
+        name, _, value = word.lstrip('-').partition('=')
+        near = difflib.get_close_matches(name.replace('-', '_'), parameters, 1, 0.5)
+        if word.startswith('--') and near:
+            line += ['-p', f'{near[0]}:={value}']
+        elif ':=' in word and line[-1] not in ('-p', '-r', '--param', '--remap'):
+            line += ['-p', word]
+        elif line[-1].endswith(':=') and not word.startswith('-'):
+            line[-1] += word
+        else:
+            line.append(word)
+    raise SettingsError(
+        f'nothing reads the arguments {" ".join(words)!r}: write {" ".join(line)} (parameters and '
+        'remappings are arguments of ROS)'
+    )
 
 
 def run_node(
-    make: Callable[[], AnyNode], arguments: Sequence[str] | None, parameters: Container[str] = ()
+    make: Callable[[], AnyNode], arguments: Sequence[str] | None, parameters: Iterable[str] = ()
 ) -> int:
     """
     Run a node until a signal stops the process; return the exit code.
@@ -165,7 +181,7 @@ def run_node(
     :param make: returns the node; it has ``THREADS`` for callbacks, 1 by default, and ``failed``
         if its end may lose something.
     :param arguments: without the program's name; the process's own if None. All are for ROS.
-    :param parameters: names of the node's parameters, see :func:`require_ros_arguments`.
+    :param parameters: names of the node's parameters, to correct misspelled arguments.
     """
     node = None
     try:
