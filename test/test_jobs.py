@@ -69,32 +69,24 @@ def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
 
 
 @pytest.mark.parametrize(
-    ('codes', 'shown'),
+    ('codes', 'is_new', 'forced', 'shown'),
     [
-        ([-9, 0], 'done\nout\n'),
-        ([-9] * 4, 'failed, exit code 1\nout\nkilled by signal 9\n'),
+        ([-9, 0], False, [False, False], 'done\nout\n'),
+        ([-9, 0], True, [False, True], 'done\nout\n'),
+        ([-9] * 4, False, [False] * 4, 'failed, exit code 1\nout\nkilled by signal 9\n'),
     ],
 )
-def test_run_jobs_killed_job_is_run_again(codes, shown, monkeypatch, capfd):
+def test_run_jobs_killed_job_is_run_again(codes, is_new, forced, shown, monkeypatch, capfd):
+    """It may have written its output before: another try replaces what was not there at first."""
     runs = []
 
     def run(command, **_):
-        runs.append(command)
+        runs.append('--force' in command)
         return subprocess.CompletedProcess(command, codes[len(runs) - 1], 'out\n')
 
     monkeypatch.setattr(subprocess, 'run', run)
-    assert run_jobs([Job('a', BUILD_MAP, ())], 1, None) == (codes[-1] < 0)
-    assert (len(runs), capfd.readouterr().out) == (len(codes), f'--- a: {shown}')
-
-
-@pytest.mark.parametrize('existing', NAMES)
-def test_build_map_of_several_inputs_replaces_only_its_own_maps(existing, tmp_path, monkeypatch):
-    """A killed job may have written its map before: the next try replaces it, if it was new."""
-    (tmp_path / f'{existing}.stavpr').touch()
-    ran = []
-    monkeypatch.setattr(build_map, 'run_jobs', lambda jobs, *_: ran.extend(jobs) or 0)
-    assert build_map.main(['--input', *NAMES, '--output', str(tmp_path)]) == 0
-    assert [job.name for job in ran if '--force' not in job.arguments] == [existing]
+    assert run_jobs([Job('a', BUILD_MAP, (), is_new)], 1, None) == (codes[-1] < 0)
+    assert (runs, capfd.readouterr().out) == (forced, f'--- a: {shown}')
 
 
 def test_job_names_and_arguments():

@@ -315,9 +315,9 @@ def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
     jobs = []
     for name, one in zip(job_names(arguments.input), arguments.input, strict=True):
         output = Path(f'{folder / name}.stavpr')
-        new = () if output.exists() else ('--force',)
-        options = ('--input', one, '--output', str(output), *others, *new)
-        jobs.append(Job(name, 'stavpr_ros.commands.build_map', options))
+        options = ('--input', one, '--output', str(output), *others)
+        command = 'stavpr_ros.commands.build_map'
+        jobs.append(Job(name, command, options, is_new=not output.exists()))
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
 

@@ -4,9 +4,9 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import as_completed, Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import importlib
 import io
 import logging
@@ -30,13 +30,18 @@ class Job:
 
     :param name: of its input, unique.
     :param command: full name of the module.
-    :param arguments: of its command line. A job that is killed runs again with the same: if its
-        outputs do not exist yet, give ``--force``, for another try to replace those of the first.
+    :param arguments: of its command line.
+    :param is_new: none of its outputs was there before.
     """
 
     name: str
     command: str
     arguments: tuple[str, ...]
+    is_new: bool = False
+
+    def again(self) -> 'Job':
+        """Return the job for another try; outputs that were not there before are its own."""
+        return replace(self, arguments=(*self.arguments, '--force')) if self.is_new else self
 
 
 def add_job_options(parser: argparse.ArgumentParser) -> None:
@@ -91,9 +96,15 @@ def run_jobs(jobs: Sequence[Job], processes: int | None, ray: str | None) -> int
     count = min(processes or os.cpu_count() or 1, len(jobs))
     worst = DONE
     with _processes(count) if ray is None else _cluster(ray) as submit:
-        jobs_of = {submit(job): job for job in jobs}
-        for future in as_completed(jobs_of):
-            job, error = jobs_of[future], future.exception()
+        waiting = {submit(job): (job, RETRIES) for job in jobs}
+        while waiting:
+            wait(waiting, return_when=FIRST_COMPLETED)
+            future = next(filter(Future.done, waiting))
+            job, retries = waiting.pop(future)
+            error = future.exception()
+            if error is not None and retries:
+                waiting[submit(job.again())] = job, retries - 1
+                continue
             code, text = future.result() if error is None else (FAILED, f'{error}\n')
             print(f'--- {job.name}: {"done" if code == DONE else f"failed, exit code {code}"}')
             print(text, end='', flush=True)
@@ -108,19 +119,17 @@ def _processes(count: int) -> Iterator[Callable[[Job], Future[Result]]]:
     environment = {'OMP_NUM_THREADS': threads, 'NUMBA_NUM_THREADS': threads} | os.environ
 
     def run(job: Job) -> Result:
-        command = [sys.executable, '-m', job.command, *job.arguments]
-        for _ in range(1 + RETRIES):
-            done = subprocess.run(
-                command,
-                env=environment,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                check=False,
-            )
-            if done.returncode >= 0:
-                return done.returncode, done.stdout
-        return FAILED, f'{done.stdout}killed by signal {-done.returncode}\n'
+        done = subprocess.run(
+            [sys.executable, '-m', job.command, *job.arguments],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        if done.returncode < 0:
+            raise ChildProcessError(f'{done.stdout}killed by signal {-done.returncode}')
+        return done.returncode, done.stdout
 
     with ThreadPoolExecutor(count) as pool:
         yield lambda job: pool.submit(run, job)
@@ -139,7 +148,7 @@ def _cluster(address: str) -> Iterator[Callable[[Job], Future[Result]]]:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except Exception as error:  # ConnectionError, ValueError, and others
         raise UnavailableError(f'--ray {address}: no cluster there: {error}') from error
-    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_here).remote
+    remote = ray.remote(num_cpus=1, max_retries=0, retry_exceptions=False)(run_here).remote
     try:
         yield lambda job: remote(job).future()
     finally:

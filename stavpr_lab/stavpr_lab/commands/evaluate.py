@@ -398,9 +398,9 @@ def _run_each(
     for name, query in zip(job_names(arguments.query), arguments.query, strict=True):
         own = folder / name
         written = ('--output', str(own), '--json', f'{own}.json')
-        new = () if own.exists() or Path(f'{own}.json').exists() else ('--force',)
-        given = ('--query', query, *written, *others, *new)
-        jobs.append(Job(name, 'stavpr_lab.commands.evaluate', given))
+        is_new = not (own.exists() or Path(f'{own}.json').exists())
+        given = ('--query', query, *written, *others)
+        jobs.append(Job(name, 'stavpr_lab.commands.evaluate', given, is_new))
     folder.mkdir(parents=True, exist_ok=True)
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
