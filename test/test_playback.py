@@ -349,4 +349,4 @@ def test_replay_command_of_a_part_that_is_missing_fails(
 def test_replay_command_of_a_folder_with_odometry_fails(tmp_path, capsys):
     (tmp_path / '0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
     assert replay.main([str(tmp_path), '--odometry']) == 1
-    assert '--odometry and --also require a bag' in capsys.readouterr().err
+    assert 'no bag, which --odometry and --also require' in capsys.readouterr().err

@@ -176,11 +176,12 @@ def _check(arguments: argparse.Namespace) -> None:
 def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
     from stavpr_ros.mapping import Trajectory
-    from stavpr_ros.sources.bag import read_odometry
     from stavpr_ros.sources.pose_file import read_poses
     from stavpr_ros.sources.video import is_video
 
     if arguments.odometry:
+        from stavpr_ros.sources.bag import read_odometry  # loads rosbags
+
         return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
     if not arguments.poses:
         return None
