@@ -28,6 +28,11 @@ def plain(costs, places, count, nms_radius):
     return taken
 
 
+def known(candidates):
+    """Return place and distance of each: NaN, an unknown probability, equals nothing."""
+    return [(each.place, each.distance) for each in candidates]
+
+
 def nearest_of(costs, places, distance):
     best = int(np.argmin(costs))
     return Candidate(int(places[best]), distance)
@@ -52,7 +57,7 @@ def test_ranked_candidates_equal_plain_loop(case):
     before = costs.copy()
     found = ranked_candidates(nearest, WindowSequences(costs, places), count, nms_radius)
     expected = plain(costs.tolist(), places.tolist(), count, nms_radius)
-    assert found == [Candidate(int(places[i]), float(costs[i])) for i in expected]
+    assert known(found) == [(int(places[i]), float(costs[i])) for i in expected]
     np.testing.assert_array_equal(costs, before)
 
 
@@ -62,11 +67,7 @@ def test_ranked_candidates_by_hand():
     nearest = nearest_of(costs, places, 0.05)
     ranked = ranked_candidates(nearest, WindowSequences(costs, places), 9, 2)
     # 12 is within two places of the nearest, and 13 of 14, which is nearer
-    assert ranked == [
-        Candidate(10, 0.05),
-        Candidate(14, float(np.float32(0.2))),
-        Candidate(0, 0.5),
-    ]
+    assert known(ranked) == [(10, 0.05), (14, float(np.float32(0.2))), (0, 0.5)]
 
 
 @pytest.mark.parametrize('mode', ['paper', 'robust', 'dtw'])

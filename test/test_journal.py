@@ -223,7 +223,7 @@ def header_with(**changes):
     [
         (b'', 'no JSON'),
         (b'\xff' * 100, 'no JSON'),
-        (frame(b'[' * 5000), 'nested too deeply'),
+        (frame(b'[' * 5000), 'nested too deeply|no JSON'),
         (header_with(path=7), 'another format'),
         (header_with(places='9'), 'another format'),
         (header_with(version=1), 'another format'),
