@@ -118,16 +118,7 @@ class CudaPlaceFilter:
         self._off = torch.full((K,), 1 / K, dtype=torch.float64, device=self._device)
         self._on_map = torch.zeros(K, dtype=torch.float64, device=self._device)
         self._scale = torch.ones((), dtype=torch.float64, device=self._device)
-        self.count, self._known, self._read_at = 0, 0, -1
-
-    def _sum_states(self) -> None:
-        self._on_map = self._sums[: self._shape[0]].sum(dim=1, dtype=torch.float64)
-        self._read_at = -1
-
-    def _clear_from(self, n: int) -> None:
-        """Set states and sums from place n on to 0."""
-        self._states[:, n:] = self._sums[:, n:] = 0
-        self._sum_states()
+        self.count, self._read_at = 0, -1
 
     def places_of_states(self) -> np.ndarray:
         """See :meth:`StateFilter.places_of_states`; copied from the device."""
@@ -160,8 +151,6 @@ class CudaPlaceFilter:
             self._states[:, self._gaps] = 0
             self._off.fill_((1 - s.start) / K)
             self._on_map.fill_(s.start / K)
-        elif n < self._known:
-            self._clear_from(n)
         off = self._off @ self._level_changes.double()
         before = lost = self._on_map
         if n:
@@ -190,7 +179,6 @@ class CudaPlaceFilter:
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = off.sum() + self._on_map.sum()
         self._off, self._scale = off / total, 1 / total
-        self._known = n
         self.count += 1
 
     def _read(self) -> None:
