@@ -106,17 +106,67 @@ def test_standstill_and_weight_are_relative_to_neighboring_places():
 
 def test_speed_weights_are_of_smoothed_change_over_curve():
     change = learned(drive_strips(300))
-    curve, came = change.curve, []
+    came = []
     for seen in (0.1, 0.5, 0.9, 0.3, 0.2, 0.05, 0.6):
         came.append(seen)
         mean = np.log(np.mean(came[-SMOOTHED:]) + OFFSET)
-        expected = []
-        for speed in SETTINGS.speeds:
-            low = min(int(speed), APART - 1)
-            there = curve[low] + (speed - low) * (curve[low + 1] - curve[low])
-            off = (mean - np.log(there + OFFSET)) / SETTINGS.change_deviation
-            expected.append(np.exp(-(off**2) / 2) + FLOOR)
+        there = change.expected_change(np.array(SETTINGS.speeds))
+        off = (mean - np.log(there + OFFSET)) / SETTINGS.change_deviation
+        expected = np.exp(-(off**2) / 2) + FLOOR
         np.testing.assert_allclose(change.speed_weights(seen), expected, rtol=1e-5)
+
+
+def decaying_strips(places, similarity, seed=0):
+    """Return strips (3, places, 400) whose similarity decays exponentially with the distance."""
+    rng = np.random.default_rng(seed)
+    strips = rng.standard_normal((3, places, 400)).astype(np.float32)
+    for y in range(1, places):
+        fresh = np.sqrt(1 - similarity**2) * strips[:, y]
+        strips[:, y] = similarity * strips[:, y - 1] + fresh
+    return strips / np.linalg.norm(strips, axis=2, keepdims=True)
+
+
+@pytest.mark.parametrize('step', [2, 3])
+def test_expected_change_below_one_place_is_that_of_a_denser_map(step):
+    strips = decaying_strips(300, 0.6)
+    dense, sparse = learned(strips), learned(strips[:, ::step])
+    places = np.arange(4)
+    np.testing.assert_allclose(
+        sparse.expected_change(places / step), dense.curve[places], atol=0.03
+    )
+
+
+def test_expected_change_is_the_curve_at_whole_places_and_never_decreases():
+    change = learned(drive_strips(300))
+    np.testing.assert_allclose(change.expected_change(np.arange(APART + 1)), change.curve)
+    assert (np.diff(change.expected_change(np.linspace(0, 30, 301))) >= 0).all()
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.5])
+def test_excess_is_of_motion_and_not_of_noise(noise):
+    rng = np.random.default_rng(2)
+    change, query = learned(decaying_strips(300, 0.6)), decaying_strips(60, 0.6, seed=1)
+    query += noise / 20 * rng.standard_normal(query.shape).astype(np.float32)
+    query /= np.linalg.norm(query, axis=2, keepdims=True)
+    likelihoods_of(change, query)
+    assert abs(change.excess(1.0)) < 0.04
+    assert change.excess(0.25) > 0.2
+    assert change.excess(2.0) < 0.0
+
+
+def test_images_that_are_all_unrelated_have_no_excess_at_the_speed_of_the_map():
+    rng = np.random.default_rng(3)
+    strips = rng.standard_normal((2, 3, 60, 24)).astype(np.float32)
+    strips /= np.linalg.norm(strips, axis=3, keepdims=True)
+    change = learned(strips[0])
+    likelihoods_of(change, -strips[1])
+    assert abs(change.excess(1.0)) < 0.04
+
+
+def test_excess_of_the_first_images_is_zero():
+    change = learned(drive_strips(100))
+    likelihoods_of(change, drive_strips(APART, seed=1))
+    assert change.excess(0.25) == 0.0
 
 
 def likelihoods_of(change, query):

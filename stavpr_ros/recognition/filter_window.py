@@ -21,10 +21,15 @@ from stavpr_ros.recognition.filter_paths import (
 )
 from stavpr_ros.recognition.map_change import ImageChange
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
+from stavpr_ros.recognition.path_checks import odds_factor, PathCandidate, unevenness
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 
+CALIBRATION = 2.0  # factor of the odds: matches are right more often than the filter declares
+CANDIDATES = 3  # paths that are checked, at most
+REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
+LEAST_CANDIDATE = 0.01  # probability of its place, at least
 AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
 
 
@@ -135,7 +140,7 @@ class FilterWindow(QueryWindow):
         self._middle = (length - 1) // 2
         lag = length - 1 - (0 if to_oldest else self._middle)
         self.filter = self._state_filter(width, lag, settings, layout.gaps)
-        self.change = ImageChange(places, settings)
+        self.change = ImageChange(places, settings, length)
         self._speeds, self._levels = settings.speeds, settings.levels
         self._images: deque[WindowImage] = deque(maxlen=length)
 
@@ -249,13 +254,9 @@ class FilterWindow(QueryWindow):
         if not len(belief.places):
             return self._off_map(n, first)
         places, probabilities, best = self.layout.shared(belief, n, CLOSE)
-        apart = np.abs(belief.places - places[best])
-        near = apart <= CLOSE
-        # of the sequence: its path is known within the band
-        of_sequence = max(probabilities[best], min(belief.weights[apart <= BAND].sum(), 1))
-        state = belief.states[near][np.argmax(belief.weights[near])]
-        refined, shares = self._refined(self._path(state, position), state[0], n)
-        probability, middle = float(of_sequence * shares[position]), int(refined[position])
+        chosen, of_path = self._chosen(belief, places, probabilities, best, position)
+        refined, shares = chosen.path, chosen.shares
+        probability, middle = of_path * float(shares[position]), int(refined[position])
         second, found = self._second_best(n, places, probabilities, middle, nms_radius)
         path = np.stack([np.arange(len(refined)), refined + first], axis=1).astype(np.int32)
         match = SequenceMatch(
@@ -269,7 +270,54 @@ class FilterWindow(QueryWindow):
         sequences = partial(self._sequences, n, first, places, probabilities)
         return WindowMatch(match, path, sequences, probability, shares)
 
-    def _refined(self, path: np.ndarray, level: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    def _chosen(
+        self,
+        belief: Belief,
+        places: np.ndarray,
+        probabilities: np.ndarray,
+        best: int,
+        position: int,
+    ) -> tuple[PathCandidate, float]:
+        """
+        Return the most probable path after the checks, and its probability, calibrated.
+
+        Where the checks refute a path, one through the next most probable place is checked, too.
+
+        :param places, probabilities: of the image at ``position``, (m,); probabilities near a
+            path that was checked are written: multiplied by its factor.
+        :param best: index of the most probable of them.
+        """
+        found: list[PathCandidate] = []
+        left = probabilities.copy()
+        while len(found) < CANDIDATES:
+            found.append(self._candidate(belief, places[best], left[best], position))
+            near = np.abs(places - places[best]) <= BAND
+            probabilities[near] *= found[-1].factor
+            left[near] = 0
+            best = int(np.argmax(left))
+            if found[-1].factor >= REFUTED or left[best] < LEAST_CANDIDATE:
+                break
+        chosen = max(found, key=lambda candidate: candidate.weight)
+        others = max(1 - sum(candidate.probability for candidate in found), 0.0)
+        others += sum(candidate.weight for candidate in found if candidate is not chosen)
+        weight = CALIBRATION * chosen.weight
+        return chosen, weight / max(weight + others, np.finfo(float).tiny)
+
+    def _candidate(
+        self, belief: Belief, place: int, probability: float, position: int
+    ) -> PathCandidate:
+        """Return the path of the window through a place at an image, and its checks."""
+        apart = np.abs(belief.places - place)
+        near = apart <= CLOSE
+        # of the path: it is known within the band
+        of_path = max(float(probability), min(float(belief.weights[apart <= BAND].sum()), 1.0))
+        state = belief.states[near][np.argmax(belief.weights[near])]
+        path, shares, z = self._refined(self._path(state, position), state[0])
+        moved = np.count_nonzero(np.diff(self._numbers()))
+        excess = self.change.excess((path[-1] - path[0]) / moved) if moved else 0.0
+        return PathCandidate(path, shares, of_path, odds_factor(unevenness(path, z), excess))
+
+    def _refined(self, path: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
         Return places near a path that explain the images of the window best, and their shares.
 
@@ -277,19 +325,22 @@ class FilterWindow(QueryWindow):
 
         :param path: place of each image, (l,).
         :param level: index of the mean z-normalized distance of right places.
-        :returns: places, which never go back, (l,), and probabilities of these and those close to
-            them, (l,).
+        :returns: places, which never go back, (l,), probabilities of these and those close to
+            them, (l,), and z of each image at its place, (l,).
         """
+        n = self.buffer.known
         places = path[:, None] + OFFSETS
         inside = places.clip(0, n - 1)
         exponents = np.array([image.weight for image in self._images]) * self._levels[level]
-        masses = offset_probabilities(self.buffer.at(inside), path, exponents, self._numbers(), n)
+        z = self.buffer.at(inside)
+        masses = offset_probabilities(z, path, exponents, self._numbers(), n)
         refined = path + np.rint(masses @ OFFSETS).astype(np.int64)
         lowest = self.layout.first_column(path[-1])
         refined = np.maximum.accumulate(refined.clip(lowest, n - 1))
         close = np.abs(places - refined[:, None]) <= CLOSE
         close |= self._equal(inside, refined[:, None])
-        return refined, (masses * close).sum(axis=1)
+        offsets = (refined - path).clip(-BAND, BAND) + BAND
+        return refined, (masses * close).sum(axis=1), z[np.arange(len(path)), offsets]
 
     def _numbers(self) -> np.ndarray:
         return np.array([image.number for image in self._images])

@@ -22,9 +22,12 @@ UNLIT = 0.3  # probability of such places above which equal images are no stands
 SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
 NOISE = 0.15  # deviation of the change by noise, common to all
 LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
+COMPARED = 3  # images apart up to which the window is compared with its path
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 FLOOR = 1e-3  # least relative probability of a speed
+LEAST_SIMILAR = 0.01  # similarity of neighboring places below which it is noise
+LEAST_LEFT = 0.1  # factor of the similarity by noise, below which images show no motion
 
 
 class ImageChange:
@@ -35,10 +38,11 @@ class ImageChange:
     where none is known; ``standstill`` the change below which a camera is at rest.
 
     :param places: places that there is room for.
+    :param length: images in the window of the query.
     """
 
-    def __init__(self, places: int, settings: FilterSettings) -> None:
-        self._settings = settings
+    def __init__(self, places: int, settings: FilterSettings, length: int = 20) -> None:
+        self._settings, self._length = settings, length
         self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
         self._update_curve()
@@ -117,13 +121,25 @@ class ImageChange:
         left = np.maximum(1 - self.curve, 0)  # of the similarity: it shrinks in one ratio further
         ratio = min(left[-1] / left[-2], 1) if left[-2] > 0 else 0.0
         beyond = np.arange(1, int(np.ceil(APART * speeds.max())) - APART + 1)
-        curve = np.append(self.curve, self.curve[-1] + left[-1] * (1 - ratio**beyond))
-        changes = np.interp(np.outer(speeds, range(1, APART + 1)), np.arange(len(curve)), curve)
-        changes += OFFSET
+        self._extended = np.append(self.curve, self.curve[-1] + left[-1] * (1 - ratio**beyond))
+        self._decay = float(-np.log(np.clip(left[1], LEAST_SIMILAR, 1)))
+        changes = self.expected_change(np.outer(speeds, range(1, APART + 1))) + OFFSET
         covariances = SPREAD**2 * np.eye(APART) + SCALE**2
         covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
         # by speed, and images apart
         self._expected, self._precisions = np.log(changes), np.linalg.inv(covariances)
+
+    def expected_change(self, places: np.ndarray) -> np.ndarray:
+        """
+        Return the change of images so many places apart, by the curve of the map.
+
+        The curve is known at whole places. Below one place, the similarity decays exponentially.
+
+        :param places: at least 0, any shape.
+        """
+        below = -np.expm1(-self._decay * np.minimum(places, 1))
+        beyond = np.interp(places, np.arange(len(self._extended)), self._extended)
+        return np.asarray(np.where(places < 1, below, beyond))
 
     def _find_equal(self) -> None:
         self._equal = self._from_before < self.standstill  # to the place before, up to noise
@@ -149,6 +165,7 @@ class ImageChange:
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
         self._moving: deque[np.ndarray] = deque(maxlen=APART + 1)  # latest images with motion
         self._by_apart: deque[list[float]] = deque(maxlen=SMOOTHED)  # their latest changes
+        self._of_window: deque[list[float]] = deque(maxlen=self._length)  # those of the window
 
     def next_query(self, strips: np.ndarray) -> float:
         """Return the change of the query's next image (W, d) from the one before, 1 at first."""
@@ -188,6 +205,24 @@ class ImageChange:
         relative = change / max(float(self.curve[1]), 1e-6)
         return s.weight * min(s.most_change, max(s.least_change, relative))
 
+    def excess(self, speed: float) -> float:
+        """
+        Return how much faster the window's images change than the map at a speed.
+
+        The changes of images 2 and 3 apart are compared with those expected, as mean logarithm of
+        their ratio, less the noise that the changes of neighboring images show: noise, and other
+        light, reduce the similarity of all images by one factor.
+
+        :param speed: of the path of the window, places per image, at least 0.
+        """
+        if not self._of_window:
+            return 0.0
+        expected = self.expected_change(speed * np.arange(1, COMPARED + 1)).clip(max=1)
+        left = 1 - np.mean(self._of_window, axis=0)[:COMPARED].clip(max=1)
+        noise = np.clip(left[0] / max(1 - expected[0], LEAST_SIMILAR), LEAST_LEFT, 1)
+        changes = 1 - np.minimum(left / noise, 1)
+        return float(np.log((changes + OFFSET) / (expected + OFFSET))[1:].mean())
+
     def speed_weights(self, change: float) -> np.ndarray:
         """Return the relative probability of each speed after another change, (V,)."""
         self._latest.append(change)
@@ -209,6 +244,7 @@ class ImageChange:
         newest = self._moving[-1]
         before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
         self._by_apart.append([change, *(change_between(newest, image) for image in before)])
+        self._of_window.append(self._by_apart[-1])
         off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._expected
         logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
         likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))

@@ -1,0 +1,77 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Checks of a path as a whole, after the place filter has found it.
+
+The filter takes images one by one, as independent evidence. Two properties of the window
+distinguish right paths from those through places that look alike, in all kinds of light:
+
+- **evenness**: at right places z is about equal; at look-alike ones a few images are very near and
+  others far. s and m are deviation and mean of z over the places of the path;
+- **motion**: a path that creeps explains images of any drive. e is the logarithm of the change of
+  the images over that of the map at the speed of the path
+  (:meth:`stavpr_ros.recognition.map_change.ImageChange.excess`).
+
+The odds of a path are multiplied by
+
+    exp(-10 max(0, s - max(1.4, 0.45 |m|)) - 30 max(0, e - 0.04))
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share of its mean
+UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
+LEAST_PLACES = 3  # of a path whose deviation is meaningful
+EXCESS, EXCESS_WEIGHT = 0.04, 30.0  # of right paths at most, and its weight in the odds beyond
+
+
+@dataclass(frozen=True, eq=False)
+class PathCandidate:
+    """
+    A path of the window that may be the right one.
+
+    :param path: place of each image, (l,).
+    :param shares: probability of these places and close ones, given the path, (l,).
+    :param probability: of the path by the filter.
+    :param factor: of its odds, by the checks.
+    """
+
+    path: np.ndarray
+    shares: np.ndarray
+    probability: float
+    factor: float
+
+    @property
+    def weight(self) -> float:
+        """Return the probability after the checks, not normalized."""
+        return self.probability * self.factor
+
+
+def unevenness(path: np.ndarray, z: np.ndarray) -> float:
+    """
+    Return by how much z varies more along a path than it may at right places, 0 if it does not.
+
+    Each place counts once, with its nearest image: a map of few places has none between them.
+
+    :param path: place of each image, ascending, (l,).
+    :param z: z-normalized distance of each image to its place, (l,); infinite ones do not count.
+    """
+    places, inverse = np.unique(path, return_inverse=True)
+    nearest = np.full(len(places), np.inf)
+    np.minimum.at(nearest, inverse, z)
+    nearest = nearest[np.isfinite(nearest)]
+    if len(nearest) < LEAST_PLACES:
+        return 0.0
+    return max(float(nearest.std()) - max(EVEN, -EVEN_SHARE * float(nearest.mean())), 0.0)
+
+
+def odds_factor(uneven: float, excess: float) -> float:
+    """
+    Return the factor of the odds of a path, above 0, at most 1.
+
+    :param uneven: of :func:`unevenness`.
+    :param excess: logarithm of the change of the images over that of the map along the path.
+    """
+    return float(np.exp(-UNEVEN_WEIGHT * uneven - EXCESS_WEIGHT * max(excess - EXCESS, 0.0)))

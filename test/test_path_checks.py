@@ -1,0 +1,79 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of a path as a whole: evenness of its distances, and motion."""
+
+import numpy as np
+from places import features_of, map_of, recognize_all, route_strips
+import pytest
+from stavpr_ros.recognition import filter_window, path_checks, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.path_checks import (
+    EVEN,
+    EVEN_SHARE,
+    EXCESS,
+    EXCESS_WEIGHT,
+    odds_factor,
+    UNEVEN_WEIGHT,
+    unevenness,
+)
+
+PLACES = 240
+
+
+def test_unevenness_is_deviation_beyond_the_limit():
+    path = np.arange(4)
+    assert unevenness(path, np.array([-2.0, -3.0, -2.0, -3.0])) == 0
+    assert unevenness(path, np.array([-4.0, 0.0, -4.0, 0.0])) == pytest.approx(2 - EVEN)
+
+
+def test_unevenness_allows_a_share_of_the_mean():
+    z = np.array([-8.0, -4.0, -8.0, -4.0])
+    assert EVEN_SHARE * 6 > 2
+    assert unevenness(np.arange(4), z) == 0
+
+
+def test_unevenness_counts_each_place_once_with_its_nearest_image():
+    path = np.array([3, 3, 4, 4, 5, 5])
+    assert unevenness(path, np.array([-4.0, 1.0, 1.0, -4.0, -4.0, 1.0])) == 0
+
+
+def test_unevenness_of_few_or_unknown_places_is_zero():
+    assert unevenness(np.array([3, 4]), np.array([-6.0, 0.0])) == 0
+    assert unevenness(np.arange(3), np.array([-6.0, np.inf, 0.0])) == 0
+
+
+def test_odds_factor_is_of_both_checks():
+    assert odds_factor(0.0, EXCESS) == 1
+    assert odds_factor(0.0, -1.0) == 1
+    expected = np.exp(-0.1 * UNEVEN_WEIGHT - 0.02 * EXCESS_WEIGHT)
+    assert odds_factor(0.1, EXCESS + 0.02) == pytest.approx(expected)
+
+
+def test_place_that_only_some_images_show_is_not_matched(monkeypatch):
+    route, other = route_strips(0, PLACES), route_strips(7, PLACES)
+    mixed = np.where((np.arange(PLACES) % 6 < 4)[None, :, None], route, other)
+    query = features_of(mixed[:, 40:120], 0.2, 1)
+    recognizer = PlaceRecognizer(map_of(features_of(route)), RecognizerSettings(mode='robust'))
+    matched = np.mean([match.accepted for match in recognize_all(recognizer, query)])
+    monkeypatch.setattr(path_checks, 'UNEVEN_WEIGHT', 0.0)
+    without = np.mean([match.accepted for match in recognize_all(recognizer, query)])
+    assert without > 0.4
+    assert matched < 0.1
+
+
+def test_where_the_most_probable_path_is_refuted_the_next_one_is_matched(monkeypatch):
+    route = route_strips(0, PLACES)
+    route[:, 140:220] = route[:, 40:120]
+    query = features_of(route[:, 40:120], 0.2, 1)
+    recognizer = PlaceRecognizer(
+        map_of(features_of(route, 0.05)), RecognizerSettings(mode='robust')
+    )
+
+    def refuted_first(path, z):
+        return 10.0 if path.mean() < 130 else 0.0
+
+    monkeypatch.setattr(filter_window, 'unevenness', refuted_first)
+    matches = [match for match in recognize_all(recognizer, query) if match.accepted]
+    assert len(matches) > 50
+    for match in matches:
+        assert match.place_index >= 140
+        assert match.sequence.second_best_distance >= match.distance
