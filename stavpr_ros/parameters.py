@@ -92,6 +92,15 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             bounds=(0.0, 1.0),
         ),
         NodeParameter(
+            'max_error',
+            0.0,
+            'Mode robust: rate of wrong matches, such as 0.05 or 0.01, that chooses min_probability '
+            'as measured on drives; 0 = off. With both set, the stricter applies. A rate is at '
+            'least 0.005.',
+            when='live',
+            bounds=(0.0, 1.0),
+        ),
+        NodeParameter(
             'sequence_length', 20, 'Length l of the query window.', 'images', bounds=(2, 1000)
         ),
         NodeParameter(

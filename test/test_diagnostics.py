@@ -168,6 +168,11 @@ CASES = {
         (WARN, 'none of 100 images was ever matched, the best had', NO_MATCH | {'nearest': 0.75}),
         (WARN, 'probability 0.250: compare the route, the', NO_MATCH | {'nearest': 0.75}),
         (WARN, 'or lower min_probability (0.5)', NO_MATCH | {'nearest': 0.75}),
+        (
+            WARN,
+            'or raise max_error (0.01)',
+            NO_MATCH | {'nearest': 0.75, 'max_error': 0.01},
+        ),
         (WARN, 'the best had distance 0.500: compare the route, the', NO_MATCH | PAPER),
         (WARN, 'or raise threshold (0.125)', NO_MATCH | PAPER),
         (WARN, 'ever matched: the geometric check rejects all', NO_MATCH | {'nearest': 0.25}),

@@ -18,6 +18,7 @@ from stavpr_ros.errors import (
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
 from stavpr_ros.recognition.filter_paths import BAND, CLOSE
+from stavpr_ros.recognition.filter_window import CALIBRATION, LEAST_CANDIDATE
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     EVICTED,
@@ -257,7 +258,9 @@ def test_late_matches_close_what_was_not_certain_at_first():
         near, probabilities = belief.probabilities(window.buffer.known)
         best = near[np.argmax(probabilities)]
         share = window.match_oldest(settings.nms_radius, True).shares[0]
-        assert found.probability == pytest.approx(share * of_sequence(belief, best))
+        of_path = of_sequence(belief, best)
+        calibrated = CALIBRATION * of_path / (CALIBRATION * of_path + 1 - of_path)
+        assert found.probability == pytest.approx(share * calibrated)
     assert len(late) >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
     closer.reset()
@@ -355,7 +358,8 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
             assert ranked == []
             continue
         assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
-        assert closer.candidates(1)[0] == pytest.approx([nearest.middle], abs=CLOSE)
+        if nearest.distance < 1 - LEAST_CANDIDATE:
+            assert closer.candidates(1)[0] == pytest.approx([nearest.middle], abs=CLOSE)
         if len(ranked) > 1:
             assert ranked[1].place == nearest.second_best_index
             assert ranked[1].distance == pytest.approx(nearest.second_best_distance, abs=1e-6)

@@ -50,6 +50,9 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 8, 0.9)
     assert len(match.candidates) == 1
     assert pipeline.process(message(route[9]), 10, list_candidates=False).candidates == ()
+    pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
+    match = process(pipeline, route[9:10], first=9)[0]
+    assert match.threshold == pytest.approx(0.03)
 
 
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):

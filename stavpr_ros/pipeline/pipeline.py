@@ -156,8 +156,8 @@ class Pipeline:
         Change settings, operation and map, all or nothing; None keeps the current one.
 
         A route that was recorded becomes the map of the next operation. Settings alone cannot fail
-        when they differ in threshold, min_probability, keyframes, candidates and geometric check
-        only.
+        when they differ in threshold, min_probability, max_error, keyframes, candidates and
+        geometric check only.
 
         :param settings: other settings than these take effect with the next operation or map.
         :param loaded: the map to localize on, to extend, or (loop closure) whose kind of features
@@ -172,7 +172,9 @@ class Pipeline:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
         elif (recognizer := self._recognizer) is not None:
-            recognizer.set_limits(settings.threshold, settings.min_probability)
+            recognizer.set_limits(
+                settings.threshold, settings.min_probability, settings.max_error
+            )
         self.settings = settings
         if before is None and self.threshold is not None:
             self.reset()  # images since then are not in the window

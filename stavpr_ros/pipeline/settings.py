@@ -37,7 +37,8 @@ class PipelineSettings:
 
     :param threshold: mode paper: a window is matched when its distance is below it; None = not
         set.
-    :param min_probability: mode robust: a window is matched when its probability is above it.
+    :param min_probability, max_error: mode robust, see
+        :class:`stavpr_ros.recognition.RecognizerSettings`.
     :param features: kind of the features of a route that starts without a map.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
     :param candidates: nearest places that every match lists.
@@ -47,6 +48,7 @@ class PipelineSettings:
 
     threshold: float | None = None
     min_probability: float = default('min_probability')
+    max_error: float = default('max_error')
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = default('nms_radius')
@@ -98,6 +100,7 @@ class PipelineSettings:
             odometry_error=self.odometry_error,
             time_budget_ms=self.time_budget_ms,
             min_probability=self.min_probability,
+            max_error=self.max_error,
         )
 
     @property

@@ -68,7 +68,7 @@ class SequenceRecognizer(ABC):
         positions: Positions = (),
     ) -> None:
         self._settings, self._feature_settings = settings, feature_settings
-        self.set_limits(settings.threshold, settings.min_probability)
+        self.set_limits(settings.threshold, settings.min_probability, settings.max_error)
         self._window = window
         if not settings.compares_odometry:
             positions = ()
@@ -102,18 +102,23 @@ class SequenceRecognizer(ABC):
         """Images in the window, up to l."""
         return len(self._window.buffer)
 
-    def set_limits(self, threshold: float | None, min_probability: float) -> None:
+    def set_limits(
+        self, threshold: float | None, min_probability: float, max_error: float = 0.0
+    ) -> None:
         """
         Change the limits from which on a window is matched, for the next images.
 
-        :param threshold, min_probability: see :class:`RecognizerSettings`.
+        :param threshold, min_probability, max_error: see :class:`RecognizerSettings`.
         :raises SettingsError: out of range.
         """
         self._settings = settings = replace(
-            self._settings, threshold=threshold, min_probability=min_probability
+            self._settings,
+            threshold=threshold,
+            min_probability=min_probability,
+            max_error=max_error,
         )
         threshold = settings.applied_threshold
-        self._limits = math.nan if threshold is None else threshold, settings.min_probability
+        self._limits = math.nan if threshold is None else threshold, settings.applied_probability
 
     def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -262,13 +267,16 @@ class PlaceRecognizer(SequenceRecognizer):
                 )
             self._keep_time_budget(prepared.features, features)
 
-    def set_limits(self, threshold: float | None, min_probability: float) -> None:
+    def set_limits(
+        self, threshold: float | None, min_probability: float, max_error: float = 0.0
+    ) -> None:
         """
         Change the limits; without a threshold, mode paper takes that of the map.
 
         :raises SettingsError: out of range.
         """
-        super().set_limits(self._suggested if threshold is None else threshold, min_probability)
+        threshold = self._suggested if threshold is None else threshold
+        super().set_limits(threshold, min_probability, max_error)
 
     def _keep_time_budget(
         self, prepared: LocalFeatures | Int8Features, features: LocalFeatures

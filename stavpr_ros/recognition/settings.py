@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.checks import require_above, require_at_least, require_between, require_number
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of, RobustOptions
 
 
@@ -32,6 +33,9 @@ class RecognizerSettings:
         exact.
     :param min_probability: mode robust: a window is matched when its probability is above it;
         above 0, below 1.
+    :param max_error: mode robust: rate of wrong matches that chooses this probability instead
+        (:func:`stavpr_ros.recognition.error_rate.least_probability`), 0 = off. A
+        ``min_probability`` other than the default applies as well where it is stricter.
     """
 
     threshold: float | None = None
@@ -43,6 +47,7 @@ class RecognizerSettings:
     odometry_error: float = 0.1
     time_budget_ms: float = 0.0
     min_probability: float = MIN_PROBABILITY
+    max_error: float = 0.0
 
     def __post_init__(self) -> None:
         options_of(self.mode)  # rejects an unknown mode
@@ -52,6 +57,8 @@ class RecognizerSettings:
                 f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
             )
         require_above('min_probability', self.min_probability, 0, below=1)
+        if self.max_error:
+            least_probability(self.max_error)  # rejects a rate out of range
         require_at_least('nms_radius', self.nms_radius, 0, 'places')
         require_between('odometry_error', self.odometry_error, 0, 1, '(share of the distance)')
         require_at_least('time_budget_ms', self.time_budget_ms, 0)
@@ -75,7 +82,15 @@ class RecognizerSettings:
     @property
     def applied_threshold(self) -> float | None:
         """Return the distance below which a window is matched; None = not set."""
-        return 1 - self.min_probability if self.has_probability else self.threshold
+        return 1 - self.applied_probability if self.has_probability else self.threshold
+
+    @property
+    def applied_probability(self) -> float:
+        """Return the probability above which mode robust matches a window."""
+        if not self.max_error:
+            return self.min_probability
+        given = self.min_probability != MIN_PROBABILITY
+        return max(least_probability(self.max_error), self.min_probability if given else 0)
 
     @property
     def compares_odometry(self) -> bool:

@@ -89,7 +89,10 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
     """Return the numbers behind the messages, by part."""
     counts, settings, info = health.counts, health.settings.pipeline, health.map_info
     backend = settings.matching_backend(health.settings.operation)
-    limit = 'min_probability' if settings.mode == 'robust' else 'threshold'
+    if settings.mode == 'robust':
+        limit = {'min_probability': settings.recognition().applied_probability}
+    else:
+        limit = {'threshold': settings.threshold}
     odometry = health.odometry or 'not needed'
     if health.odometry and not health.odometry_required:
         odometry += ', optional'
@@ -122,7 +125,7 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
         'recognition': {
             'operation': health.settings.operation,
             'mode': settings.mode,
-            limit: getattr(settings, limit),
+            **limit,
             'window': health.window,
             'length': settings.sequence.length,
             'last_status': counts.status or None,

@@ -208,7 +208,11 @@ def _hopeless(health: Health) -> str:
         return f'{never}: the geometric check rejects all, lower min_inliers or set it to none'
     if settings.mode == 'robust':
         best = f'probability {1 - counts.nearest:.3f}'
-        remedy = f'lower min_probability ({settings.min_probability:g})'
+        remedy = (
+            f'raise max_error ({settings.max_error:g})'
+            if settings.max_error
+            else f'lower min_probability ({settings.min_probability:g})'
+        )
     else:
         best, remedy = f'distance {counts.nearest:.3f}', f'raise threshold ({limit:g})'
     return (

@@ -146,6 +146,8 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add_parameter(group, 'mode', mode)
     least = 'mode robust: matches have a greater probability (%(default)g)'
     add_parameter(group, 'min_probability', least, metavar='P')
+    rate = 'mode robust: rate of wrong matches that chooses --min-probability; 0 = off'
+    add_parameter(group, 'max_error', rate, metavar='E')
     add_parameter(group, 'sequence_length', 'images in a window (%(default)s)', metavar='L')
     add_parameter(group, 'beta', 'places per image of a window (%(default)g)')
     add_parameter(group, 'strategy', 'spatial alignment (%(default)s)')
@@ -219,6 +221,7 @@ def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
     return PipelineSettings(
         mode=arguments.mode,
         min_probability=arguments.min_probability,
+        max_error=arguments.max_error,
         spatial=SpatialSettings(
             arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
         ),
@@ -257,7 +260,8 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
         *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
         *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
-        *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
+        *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta'),
+        'nms_radius',
         *('strategy', 'sigma', 'xi', 'vertical'),
         *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
     ]

@@ -1,0 +1,41 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The probability from which matches keep an error rate, by conformal risk control over drives.
+
+The risk of a drive is its share of wrong matches; on a drive that is nowhere on the map, the share
+of its images that are matched. The least probability t for an error rate a is such that
+
+    (sum of the risks of n drives with matches above t + 1) / (n + 1) <= a
+
+(Angelopoulos et al., "Conformal Risk Control", ICLR 2024), and that no kind of drive has more
+than a, for both ``gradient`` and SqueezeNet. The drives are listed in docs/robust_mode.md. The mean
+over drives like these is controlled, not every single drive.
+"""
+
+import numpy as np
+from stavpr_ros.errors import SettingsError
+
+# error rates, descending, and the least probability of matches that keep them
+ERRORS = np.array([0.1, 0.05, 0.02, 0.01, 0.005])
+PROBABILITIES = np.array([0.15, 0.3, 0.93, 0.97, 0.99])
+
+
+def least_probability(max_error: float) -> float:
+    """
+    Return the probability above which matches are wrong at a rate of at most ``max_error``.
+
+    Between the error rates that were measured, the logarithm of the odds is interpolated over that
+    of the rate.
+
+    :param max_error: 0.005 to below 1; above 0.1 as 0.1.
+    :raises SettingsError: out of range.
+    """
+    if not ERRORS[-1] <= max_error < 1:
+        raise SettingsError(
+            f'max_error = {max_error}: expected 0 = off, or {ERRORS[-1]:g} to below 1; smaller '
+            'rates were not measured'
+        )
+    logits = np.log(PROBABILITIES / (1 - PROBABILITIES))
+    logit = np.interp(-np.log(max_error), -np.log(ERRORS), logits)
+    return float(1 / (1 + np.exp(-logit)))
