@@ -9,4 +9,4 @@ map), ``recognition`` (frame by frame), ``sources`` (frames from folders, bags a
 ``pipeline`` (one image message at a time), ``evaluation`` (metrics, plots), ``ros`` (the node).
 """
 
-__version__ = '0.1.0'
+__version__ = '0.9.0'
