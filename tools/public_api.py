@@ -8,7 +8,7 @@ Usage, in ``make shell`` with the extra ``slam``: ``python3 tools/public_api.py`
 
 import argparse
 from collections.abc import Iterable, Iterator
-import contextlib
+from contextlib import redirect_stdout, suppress
 from enum import Enum
 import importlib
 import inspect
@@ -22,7 +22,8 @@ from xml.etree import ElementTree
 ROOT = Path(__file__).resolve().parent.parent
 FILE = ROOT / 'docs' / 'public_api.txt'
 COMMAND = 'python3 tools/public_api.py'
-SIMPLE = (bool, int, float, str, tuple, types.NoneType)  # types of defaults with a stable repr
+# Types of defaults with a stable repr, and of `no default`.
+SIMPLE = (bool, int, float, str, tuple, types.NoneType, type)
 USERS = ('stavpr_operator', 'stavpr_reader', 'stavpr_sensors')  # programs of users
 ROLES = {'publish': 'publisher', 'subscribe': 'subscriber', 'reply': 'service'}
 STANDARD = re.compile(r'parameter|transition|_states?$|type_description|/(rosout|clock)$')
@@ -69,16 +70,12 @@ def interfaces() -> Iterator[str]:
     from stavpr_ros.ros.node import PlaceRecognitionNode
     from stavpr_slam.ros.graph_node import PoseGraphNode
 
-    recognition = {'operation': 'mapping', 'publish_initialpose': True}
-    runs: list[tuple[Any, dict[str, Any]]] = [
-        (PlaceRecognitionNode, recognition | {'image_transport': transport})
-        for transport in ('raw', 'compressed')
-    ]
-    runs.append((PoseGraphNode, {}))
+    recording = {'operation': 'mapping', 'publish_initialpose': True}  # subscribes to all topics
+    runs: dict[Any, dict[str, Any]] = {PlaceRecognitionNode: recording, PoseGraphNode: {}}
     context = rclpy.Context()
     rclpy.init(context=context)
     typed: dict[str, str] = {}
-    for kind, given in runs:
+    for kind, given in runs.items():
         overrides = [Parameter(n, value=v) for n, v in (given | {'autostart': False}).items()]
         node = kind(context=context, parameter_overrides=overrides)
         node.trigger_configure()
@@ -122,8 +119,7 @@ def commands() -> Iterator[str]:
     feature_option = re.compile(f' --({"|".join(kinds())})-')
     for name, command in sorted(all_commands().items()):
         kept = mock.patch.object(argparse.ArgumentParser, 'print_help', autospec=True)
-        text = contextlib.redirect_stdout(None)
-        with kept as print_help, text, contextlib.suppress(SystemExit):
+        with kept as print_help, redirect_stdout(None), suppress(SystemExit):
             importlib.import_module(command.module).main(['--help'])
         yield name
         for call in print_help.call_args_list:
@@ -134,17 +130,14 @@ def commands() -> Iterator[str]:
 
 def signature(function: Any) -> str:
     """Return the parameters of a function or class, with defaults of simple types."""
-    words, has_star = [], False
-    for row in inspect.signature(function).parameters.values():
-        if row.name in ('self', 'cls'):
-            continue
-        if row.kind is row.KEYWORD_ONLY and not has_star:
-            words.append('*')
-        has_star |= row.kind in (row.KEYWORD_ONLY, row.VAR_POSITIONAL)
-        stars = {row.VAR_POSITIONAL: '*', row.VAR_KEYWORD: '**'}.get(row.kind, '')
-        default = repr(row.default) if isinstance(row.default, SIMPLE) else '...'
-        words.append(stars + row.name + (f'={default}' if row.default is not row.empty else ''))
-    return f'({", ".join(words)})'
+    rows = [
+        row.replace(
+            annotation=row.empty, default=row.default if isinstance(row.default, SIMPLE) else ...
+        )
+        for row in inspect.signature(function).parameters.values()
+        if row.name not in ('self', 'cls')
+    ]
+    return str(inspect.Signature(rows))
 
 
 def is_of(value: Any, module: str) -> bool:
