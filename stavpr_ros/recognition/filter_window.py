@@ -232,7 +232,7 @@ class FilterWindow(QueryWindow):
         self._images.append(WindowImage(change, weight, self.filter.count - 1))
 
     def _match(self, nms_radius: int) -> WindowMatch:
-        return self._match_image(self._middle, nms_radius)
+        return self._match_image((len(self._images) - 1) // 2, nms_radius)
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
@@ -380,7 +380,7 @@ class FilterWindow(QueryWindow):
         """Return the place that is most probable now, with the probability 0."""
         place = self.filter.most_probable(NO_PLACES)[0] + first
         match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
-        length = self.buffer.length
+        length = len(self._images)
         path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
         return WindowMatch(
             match, path, partial(self._sequences, n, first, NO_PLACES, np.empty(0)), 0.0

@@ -40,6 +40,8 @@ from stavpr_ros.recognition.window import QueryWindow
 if TYPE_CHECKING:
     from stavpr_ros.recognition.first_stage import FirstStage
 
+EARLY = 0.9  # least probability of a match before the window is full
+FEWEST = 2  # images in the window, for a match
 TIMED = 3  # images, to compare the time of one with the time budget
 
 
@@ -59,6 +61,8 @@ class SequenceRecognizer(ABC):
 
     problem = ''
     stages = ''
+
+    _matches_early = False  # before the window is full, where the place is probable enough
 
     def __init__(
         self,
@@ -165,7 +169,7 @@ class SequenceRecognizer(ABC):
         """
         buffer = self._window.buffer
         columns = self._window.layout.columns_of(places - buffer.first)
-        return buffer.at(columns[None])[buffer.length - len(buffer) :]
+        return buffer.at(columns[None])
 
     def _require_one_image(self, features: Any, where: str) -> None:
         if not isinstance(features, LocalFeatures):
@@ -196,13 +200,23 @@ class SequenceRecognizer(ABC):
         )
         self._motion.trajectory.append(position)
         if buffer.full:
-            self._found = self._window.match(settings.nms_radius)
-            match = match.of_window(self._found, match.position)
-            is_known = len(self._motion.positions) and np.isfinite(position[0])
-            if is_known and match.sequence is not None:
-                session = self._window.layout.session_of(match.sequence.middle)
-                match = self._motion.weighed(match, buffer.first, session)
+            match = self._of_window(match, position)
+        elif self._matches_early and len(buffer) >= FEWEST:
+            sure = max(min_probability, EARLY)
+            early = replace(match, threshold=1 - sure, min_probability=sure)
+            early = self._of_window(early, position)
+            match = early if early.accepted else match
         self._newest = match
+        return match
+
+    def _of_window(self, match: Match, position: np.ndarray) -> Match:
+        """Return the match by the images in the window."""
+        self._found = self._window.match(self._settings.nms_radius)
+        match = match.of_window(self._found, match.position)
+        is_known = len(self._motion.positions) and np.isfinite(position[0])
+        if is_known and match.sequence is not None:
+            session = self._window.layout.session_of(match.sequence.middle)
+            match = self._motion.weighed(match, self._window.buffer.first, session)
         return match
 
 
@@ -254,6 +268,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self._centering = prepared.centering
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
         if isinstance(self._window, FilterWindow):
+            self._matches_early = True
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
         # where a first stage compares vectors of whole images: it, and their centering
         self._vectors: tuple[FirstStage, MeanCentering] | None = None

@@ -41,7 +41,7 @@ class RelativeMotion:
     """
 
     def __init__(self, length: int, error: float, positions: Positions) -> None:
-        self._length, self._error, self.positions = length, error, positions
+        self._error, self.positions = error, positions
         self.trajectory: deque[np.ndarray] = deque(maxlen=LONGEST * length)
         self.reset()
 
@@ -69,8 +69,9 @@ class RelativeMotion:
         high = min(first + len(self.positions), session[1], place + reach)
         track = np.array(self.positions[low - first : high - first])
         trajectory = np.array(self.trajectory)
-        after, agreed = self._length - 1 - (self._length - 1) // 2, 1.0
-        for count in {self._length, min(len(trajectory), self._length + self._followed)}:
+        length, agreed = len(match.window_stamps), 1.0
+        after = length - 1 - match.position
+        for count in {length, min(len(trajectory), length + self._followed)}:
             part = trajectory[-count:]
             found = agreement(
                 track, (place - low, newest - low), part, count - 1 - after, self._error

@@ -42,13 +42,12 @@ def with_same_places(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
 
 def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) -> np.ndarray:
     """Return the place of a reference that each image shows, -1 = none, (m,)."""
-    recognizer = PlaceRecognizer(
-        reference, RecognizerSettings(mode='robust', min_probability=SURE)
-    )
+    settings = RecognizerSettings(mode='robust', min_probability=SURE)
+    recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length
     found, near = (np.full(len(images), -1) for _ in range(2))
     for i, image in enumerate(images.tolist()):
         match = recognizer.update(place_map.features[image : image + 1])
-        if match.accepted:
+        if match.accepted and len(match.window_stamps) == length:
             window = i - len(match.window_stamps) + 1 + match.path[:, 0]
             near[window] = match.path[:, 1]
             found[window[(len(window) - 1) // 2]] = match.place_index

@@ -183,13 +183,14 @@ class SequenceBuffer:
         return row
 
     def at(self, columns: np.ndarray) -> np.ndarray:
-        """Return entries of the window, oldest row first, by their columns, (l, m) each."""
+        """Return entries of the images in the window, oldest first, by columns, (len, m) each."""
         entries: np.ndarray = self.memory[self._ring(), columns]
         return entries
 
     def _ring(self) -> np.ndarray:
-        """Return the rows of one copy of the window, oldest first, (l, 1)."""
-        rows: np.ndarray = (self.oldest + np.arange(self.length)[:, None]) % self.length
+        """Return the rows of one copy of the images in the window, oldest first, (len, 1)."""
+        newest = self._count + np.arange(-len(self), 0)[:, None]
+        rows: np.ndarray = newest % self.length
         return rows
 
     def clear(self) -> None:
@@ -268,7 +269,7 @@ class QueryWindow(ABC):
 
     def match(self, nms_radius: int) -> WindowMatch:
         """
-        Return the match of a full window.
+        Return the match of the images in the window, in mode paper of a full one.
 
         :param nms_radius: of the non-maximum suppression, places.
         """
@@ -276,7 +277,7 @@ class QueryWindow(ABC):
 
     @abstractmethod
     def _match(self, nms_radius: int) -> WindowMatch:
-        """Return the match of a full window, in columns of the buffer."""
+        """Return the match of the images in the window, in columns of the buffer."""
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """

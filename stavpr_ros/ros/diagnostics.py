@@ -89,6 +89,7 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
     """Return the numbers behind the messages, by part."""
     counts, settings, info = health.counts, health.settings.pipeline, health.map_info
     backend = settings.matching_backend(health.settings.operation)
+    limit: dict[str, Value]
     if settings.mode == 'robust':
         limit = {'min_probability': settings.recognition().applied_probability}
     else:

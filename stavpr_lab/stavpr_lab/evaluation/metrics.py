@@ -230,7 +230,8 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     Assign the matches of windows to images: each to the image in the middle of its window.
 
     Images before the middle of the first matched window or after that of the last one take their
-    place from that window's warping path, with its distance.
+    place from that window's warping path, with its distance. Windows that are not full do not
+    count.
 
     :param matches: one an image, in order: that of the window that ends with the image.
     :param length: images in a window, l.
@@ -238,7 +239,11 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     """
     found = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
-    ends = [end for end, match in enumerate(matches) if match.sequence is not None]
+    ends = [
+        end
+        for end, match in enumerate(matches)
+        if match.sequence is not None and not 0 < len(match.window_stamps) < length
+    ]
 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
