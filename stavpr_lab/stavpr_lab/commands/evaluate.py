@@ -45,7 +45,6 @@ ground truth (--truth), none by default:
 
 another drive (they combine; applied in the order speed, stop, reverse, drop):
   --remove-from-map 100:150   the map lacks the places 100 to 149: are images of them matched?
-  --mirror                    every image mirrored left-right: no match is right
   --reverse                   the last image comes first
   --speed 3, 0.5, varying     images are left out or repeated; varying: 1/2 to 2
   --stop 60:100               the query stops at image 60 for 100 images more
@@ -111,7 +110,6 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     pairs: dict[str, Any] = {'type': _pair, 'action': 'append', 'default': []}
     removal = 'leave places FIRST .. LAST - 1 out of the map; may be repeated'
     add('--remove-from-map', metavar='FIRST:LAST', help=removal, **pairs)
-    add('--mirror', action='store_true', help='mirror the images of the query left-right')
     add('--reverse', action='store_true', help='drive the query in reverse order')
     speed = 'images of the query per image, varying, or stop (30 images in the middle)'
     add('--speed', '--warp', metavar='X', help=speed)
@@ -193,7 +191,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
 def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     if arguments.exclude_places is None:
         arguments.exclude_places = EXCLUDE_PLACES
-    names = ('unknown', 'remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop')
+    names = ('unknown', 'remove_from_map', 'reverse', 'speed', 'stop', 'drop')
     for name in names:
         if getattr(arguments, name):
             parser.error(f'--loop-closure: --{name.replace("_", "-")} needs a --map')
@@ -255,7 +253,7 @@ def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dic
     poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
     names = [
         *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
-        *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
+        *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
         *('strategy', 'sigma', 'xi', 'vertical'),

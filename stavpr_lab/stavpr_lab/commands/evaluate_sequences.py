@@ -8,7 +8,7 @@ from pathlib import Path
 import time
 
 import numpy as np
-from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource, mirrored
+from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_ros.commands.feature_options import (
@@ -100,13 +100,11 @@ class _Loader:
         """Open a folder, a video, a bag, a saved map or descriptors."""
         if is_saved_map(path) or is_descriptors(path):
             crop = 'crop_map' if name == 'map' else 'crop_query'
-            unusable = (crop, 'mirror') if name == 'query' else (crop,)
-            for option in unusable:
-                if getattr(self._arguments, option):
-                    raise SettingsError(
-                        f'--{option.replace("_", "-")}: {path} is a saved map or an array, which '
-                        'has no images'
-                    )
+            if getattr(self._arguments, crop):
+                raise SettingsError(
+                    f'--{crop.replace("_", "-")}: {path} is a saved map or an array, which has '
+                    'no images'
+                )
             return self._read(path) if is_descriptors(path) else self._load_map(path)
         if Path(path).suffix == '.stavpr':
             return load_map(path)  # raises the reason why it is none
@@ -115,14 +113,12 @@ class _Loader:
         return self.extract(name, source)
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
-        """Extract the features of a source, cropped and mirrored as the options want it."""
+        """Extract the features of a source, cropped as the options state."""
         given, extractor = self._arguments, self._chosen()
         # unknown places are cropped as the query is
         source = cropped(
             source, *((0, given.crop_map) if name == 'map' else (given.crop_query, 0))
         )
-        if name == 'query' and given.mirror:
-            source = mirrored(source)
         began = time.perf_counter()
         extracted = build_map(source, extractor)
         milliseconds = (time.perf_counter() - began) * 1e3
@@ -267,7 +263,6 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     changes = replace(
         warp,
         removed=tuple(arguments.remove_from_map),
-        mirror=arguments.mirror,
         reverse=arguments.reverse,
         drop=arguments.drop,
         seed=arguments.drop_seed,
@@ -289,7 +284,7 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
 def _description(arguments: argparse.Namespace) -> str:
     """Return the changes of the drive as text of the title."""
     parts = [f'without places {a} .. {b - 1}' for a, b in arguments.remove_from_map]
-    parts += [name for name in ('mirror', 'reverse') if getattr(arguments, name)]
+    parts += ['reverse'] if arguments.reverse else []
     if arguments.speed:
         parts.append(f'speed {arguments.speed}')
     if arguments.drop:
