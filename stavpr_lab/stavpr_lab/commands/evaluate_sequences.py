@@ -1,16 +1,18 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of the command ``evaluate``: images, saved maps, data sets, ground truth."""
+"""The inputs of the command ``evaluate``: images, maps, data sets, ground truth, settings."""
 
 import argparse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import time
+from typing import Any
 
 import numpy as np
 from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
+from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.commands.feature_options import (
     kind_options,
     make_extractor,
@@ -20,6 +22,7 @@ from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
+from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_path import is_bag
 from stavpr_ros.sources.folder import text_of
@@ -75,6 +78,43 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
         }
         sequences = _of_paths(arguments, opened, loader.times)
     return _changed(sequences, arguments)
+
+
+def node_settings(arguments: argparse.Namespace) -> PipelineSettings:
+    """
+    Return the settings of the parsed options as the node has them, without a threshold.
+
+    :raises SettingsError: one is out of its range.
+    """
+    return PipelineSettings(
+        mode=arguments.mode,
+        min_probability=arguments.min_probability,
+        spatial=SpatialSettings(
+            arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
+        ),
+        sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
+        nms_radius=arguments.nms_radius,
+        time_budget_ms=arguments.time_budget_ms,
+    )
+
+
+def settings_json(arguments: argparse.Namespace, sequences: Sequences) -> dict[str, Any]:
+    """Return everything that decides the numbers."""
+    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
+    names = [
+        *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
+        *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
+        *('crop_map', 'crop_query', 'truth', *poses),
+        *('mode', 'min_probability', 'sequence_length', 'beta', 'nms_radius'),
+        *('strategy', 'sigma', 'xi', 'vertical'),
+        *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
+    ]
+    settings: dict[str, Any] = {}
+    for name in names:
+        value = getattr(arguments, name)
+        settings[name] = text_of(value) if isinstance(value, str) else value
+    features = sequences.query.settings.to_json()
+    return {**settings, 'tolerance': sequences.tolerance, 'features': features}
 
 
 def is_saved_map(path: str | None) -> bool:
