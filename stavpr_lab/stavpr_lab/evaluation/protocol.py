@@ -8,7 +8,7 @@ difficult as a whole: the intervals are of a circular block bootstrap. The publi
 these tolerances and lengths: docs/evaluation.md.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -225,6 +225,18 @@ def evaluate_protocol(
             traverses = query, place_map.features
             queries, places = (image_vectors(each, method == 'centered') for each in traverses)
             found = match_sequences(1 - queries @ places.T, method)
-        for length, ranking in found:
-            by_tolerance = {t: evaluate_recalls(ranking, truth) for t, truth in truths.items()}
-            yield ProtocolRow(method, length, by_tolerance)
+        yield from protocol_rows(method, found, truths)
+
+
+def protocol_rows(
+    method: str, found: Iterable[tuple[int, Ranking]], truths: Mapping[int, GroundTruth]
+) -> Iterator[ProtocolRow]:
+    """
+    Evaluate the matches of a method.
+
+    :param found: length and matches.
+    :param truths: of the same queries, by tolerance.
+    """
+    for length, ranking in found:
+        by_tolerance = {t: evaluate_recalls(ranking, truth) for t, truth in truths.items()}
+        yield ProtocolRow(method, length, by_tolerance)
