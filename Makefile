@@ -88,7 +88,7 @@ bench-quick: build ## the same for up to 20,000 places, in two to three minutes 
 
 protocol: override EXTRAS += evaluation
 protocol: build ## measure recalls by method, tolerance and sequence length (ARGS=)
-	@$(RUN) python benchmarks/protocol.py $(ARGS)
+	@OMP_WAIT_POLICY=PASSIVE $(RUN) python benchmarks/protocol.py $(ARGS)
 
 accuracy: override EXTRAS += evaluation
 accuracy: build ## measure the accuracy on the data sets (ARGS=)

@@ -23,6 +23,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.protocol import (
     Estimate,
     evaluate_protocol,
+    LENGTHS,
     match_sequences,
     METHODS,
     protocol_rows,
@@ -47,6 +48,7 @@ CASES = {  # map and query; image i shows place i
 }
 DARK = 8.0  # standard deviation of the gray levels, below which an image shows nothing
 STILL = 2.0  # mean change of the gray levels since the image before, below which a camera rests
+FEW = (5, 20)  # images of sequences of SqueezeNet on Nordland, 0.1 s an image and length
 PATCHES = 'p'
 LABELS = FEATURES | {PATCHES: 'patches of SeqSLAM'}
 # of docs/evaluation.md: data set, tolerance, images
@@ -87,7 +89,10 @@ def patches(path: Path) -> np.ndarray:
 
 
 def rows(
-    paths: Sequence[Path], kept: np.ndarray, making: dict[str, FeatureExtractor]
+    paths: Sequence[Path],
+    kept: np.ndarray,
+    making: dict[str, FeatureExtractor],
+    lengths: Sequence[int],
 ) -> Iterator[ProtocolRow]:
     """
     Yield the rows of all methods on a map and a query, in which image i shows place i.
@@ -99,33 +104,40 @@ def rows(
     truths = {t: GroundTruth.identity(len(kept), len(kept), t) for t in TOLERANCES}
     if not making:
         D = differences(*(patches(path)[kept] for path in reversed(paths)))
-        yield from protocol_rows('seqslam', match_sequences(D, 'seqslam'), truths)
+        yield from protocol_rows('seqslam', match_sequences(D, 'seqslam', lengths), truths)
     for method in METHODS if making else ():
         extractor = making['paper' if method == 'paper' else 'robust']
         places, query = (select_places(features(path, extractor), kept) for path in paths)
-        yield from evaluate_protocol(places, query.features, truths, methods=(method,))
+        yield from evaluate_protocol(places, query.features, truths, None, (method,), lengths)
 
 
-def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+def measure(
+    folder: Path, chosen: Sequence[str], quick: bool
+) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Yield key and rows of each data set with each kind of features; report those left out."""
     cases = [
         (name, [folder / path for path in paths])
         for name, paths in CASES.items()
         if not (quick and TRAIN in paths[0])
     ]
-    for feature in ('g',) if quick else LABELS:
+    for feature in chosen:
         try:
             making = extractors(feature, folder) if feature in FEATURES else {}
         except UnavailableError as error:
             print(f'left out: {LABELS[feature]}: {error}', file=sys.stderr)
             continue
         for name, paths in cases:
+            costly = feature == 'o' and name.startswith('nordland')
+            if costly and name != 'nordland':
+                continue
             sources = [open_source(path) for path in paths]
             variants = {name: np.arange(len(sources[0]))}
             if TRAIN in str(paths[0]):
                 variants[f'{name}_clean'] = clean(*sources)
             for variant, kept in variants.items():
-                found = [row.to_json() for row in rows(paths, kept, making)]
+                found = [
+                    row.to_json() for row in rows(paths, kept, making, FEW if costly else LENGTHS)
+                ]
                 yield f'{variant}/{feature}', [row | {'queries': len(kept)} for row in found]
 
 
@@ -175,9 +187,13 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    options = options_parser(__doc__, 'gradient features, without Nordland').parse_args(arguments)
+    parser = options_parser(__doc__, 'gradient features, without Nordland')
+    kinds = tuple(LABELS)
+    parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
+    options = parser.parse_args(arguments)
+    chosen = ('g',) if options.quick else options.features
     about, began, results = environment(named_commit=options.commit), time.perf_counter(), {}
-    for key, found in measure(data_folder(), options.quick):
+    for key, found in measure(data_folder(), chosen, options.quick):
         results[key] = found
         print(f'{key}: {time.perf_counter() - began:.0f} s', file=sys.stderr)
     path = options.output / f'protocol{"-quick" if options.quick else ""}.json'

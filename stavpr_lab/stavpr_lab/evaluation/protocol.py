@@ -189,13 +189,16 @@ def recognize_sequences(
 
     :param backend: backend and precision of :class:`stavpr_ros.recognition.PlaceRecognizer`.
     """
+    single = 1 in lengths
     for length in lengths:
-        if length <= len(query):
-            sequence = replace(settings.sequence, length=max(2, length))
-            one = replace(settings, sequence=sequence)
+        if 1 < length <= len(query):
+            one = replace(settings, sequence=replace(settings.sequence, length=length))
             recognizer = PlaceRecognizer(place_map, one, *backend)
             found = recognize_traverse(recognizer, query, len(place_map), one)
-            yield length, found.single if length == 1 else found.sequence
+            if single:  # the same of all lengths
+                yield 1, found.single
+            single = False
+            yield length, found.sequence
 
 
 def evaluate_protocol(
@@ -204,6 +207,7 @@ def evaluate_protocol(
     truths: Mapping[int, GroundTruth],
     settings: RecognizerSettings | None = None,
     methods: Sequence[str] = METHODS,
+    lengths: Sequence[int] = LENGTHS,
     backend: tuple[str, str] = ('cpu', 'float32'),
 ) -> Iterator[ProtocolRow]:
     """
@@ -214,17 +218,18 @@ def evaluate_protocol(
     :param settings: of modes paper and robust but for mode and length.
     :param methods: of :data:`METHODS`. ``plain`` and ``centered`` compare vectors of whole images
         along lines at the speed of the map; ``centered`` subtracts the mean of each traverse.
+    :param lengths: ascending; those greater than N are left out.
     :param backend: backend and precision of :class:`stavpr_ros.recognition.PlaceRecognizer`.
     :raises InputError: ground truth of another number of images.
     """
     for method in methods:
         if method in MODES:
             one = replace(settings or RecognizerSettings(), mode=method)
-            found = recognize_sequences(place_map, query, one, LENGTHS, backend)
+            found = recognize_sequences(place_map, query, one, lengths, backend)
         else:
             traverses = query, place_map.features
             queries, places = (image_vectors(each, method == 'centered') for each in traverses)
-            found = match_sequences(1 - queries @ places.T, method)
+            found = match_sequences(1 - queries @ places.T, method, lengths)
         yield from protocol_rows(method, found, truths)
 
 
