@@ -34,7 +34,7 @@ from tqdm import tqdm
 SETTINGS = RecognizerSettings(mode='robust')
 LONG = 1000  # places from which a route is driven only around the removed stretch
 SHORTEST, LONGEST = 20, 40  # places of a removed stretch
-LONG_STRETCHES = 200  # of a long route, at random; others have one at each place
+LONG_STRETCHES = 100  # of a long route, at random; others have one at each place
 STRETCHES = (
     f'stretches have {SHORTEST} to {LONGEST} places, at random, and begin at {{step}} place '
     f'(Nordland: {{long}} random ones)'

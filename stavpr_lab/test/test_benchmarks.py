@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks, end to end on tiny sizes: matching, comparison, accuracy, off the map, city."""
+"""The benchmarks, end to end on tiny sizes: matching, comparison, accuracy, protocol, city."""
 # ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
 from dataclasses import replace
@@ -9,6 +9,8 @@ from pathlib import Path
 import sys
 
 import cv2
+from evaluation_commands import write_images
+from fixtures import route_images
 import numpy as np
 import pytest
 from scipy.spatial.distance import cosine
@@ -25,6 +27,7 @@ import matching
 import off_map
 import off_map_page
 import peaks
+import protocol
 import report
 import results
 from stavpr_lab.evaluation.ground_truth import GroundTruth
@@ -145,7 +148,7 @@ def test_detours_begin_at_each_place_or_at_random_on_long_routes():
     assert [first for first, _ in short] == list(range(81))
     assert {last - first for first, last in short[:61]} >= {20, 30, 40}
     assert all(20 <= last - first <= 40 and last <= 100 for first, last in short)
-    assert len(long) == len(set(long)) == 100
+    assert len(long) == len(set(long)) == 50
     assert len({first % 10 for first, _ in long}) == 10
 
 
@@ -159,6 +162,36 @@ def test_first_right_match_counts_images_since_start():
     matches += [match(Status.MATCH, 5), match(Status.NO_MATCH, 2), match(Status.MATCH, 3)]
     assert off_map.first_right(matches, truth, 4) == 6  # windows of 4: image 3 is the middle
     assert off_map.first_right(matches[:5], truth, 4) is None
+
+
+# ------------------------------------------------ the protocol
+
+
+def test_protocol_of_folders_has_a_row_of_each_method_and_length(monkeypatch, tmp_path):
+    """Thirty images and the same darker; the train's without three of a stop and a black one."""
+    images = route_images(30)
+    images[10:14], images[20] = [images[9]] * 4, images[20] * 0
+    for name, factor in (('day', 1), ('night', 0.5), ('nordland_summer', 1)):
+        darker = [(image * factor).astype(np.uint8) for image in images]
+        write_images(tmp_path / name, darker)
+    cases = {'walk': ('day', 'night'), 'nordland': ('nordland_summer', 'nordland_summer')}
+    monkeypatch.setattr(protocol, 'CASES', cases)
+    monkeypatch.setattr(protocol, 'TRAIN', 'nordland')
+    monkeypatch.setattr(protocol, 'EXCERPT', (('walk', 2, 20), ('nordland_clean', 1, 5)))
+    found = dict(protocol.measure(tmp_path, ('g', 'p'), quick=False))
+    names = ('walk', 'nordland', 'nordland_clean')
+    assert list(found) == [f'{name}/{feature}' for feature in 'gp' for name in names]
+    assert [row['method'] for row in found['walk/p']] == ['seqslam'] * 4
+    assert [len(found[f'{name}/g']) for name in names] == [24, 24, 24]
+    assert {row['queries'] for row in found['nordland_clean/p']} == {25}
+    robust = found['nordland_clean/g'][-1]
+    assert (robust['method'], robust['length']) == ('robust', 20)
+    assert robust['recalls']['2']['recall_at_1']['value'] == 1
+    results_of = json.loads(json.dumps(found, allow_nan=False))
+    page = '\n'.join(protocol.markdown(results.environment(named_commit='abc'), results_of))
+    assert page.count('| gradient | robust | 20 |') == 3
+    row = next(line for line in protocol.excerpt(results_of) if 'gradient | robust' in line)
+    assert row.startswith('| gradient | robust | 1.000 (1.000-1.000), 1.000 |')
 
 
 # ------------------------------------------------ the city
