@@ -172,7 +172,7 @@ def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> O
 
 
 def stretches(pair: Pair, coarser: int = 1) -> list[tuple[int, int]]:
-    """Return the stretches (first, last) of the map that detours pass, of random lengths."""
+    """Return first place and end of each stretch that is removed, of random lengths."""
     n, rng = len(pair.places), np.random.default_rng(0)
     firsts = np.arange(n - SHORTEST + 1)
     if pair.long:
