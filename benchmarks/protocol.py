@@ -7,10 +7,10 @@ Recall@1 and recall at 100 % precision by method, tolerance and sequence length,
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 import sys
-import time
 from typing import Any
 
 from accuracy import extractors, FEATURES
@@ -21,13 +21,13 @@ from results import environment, heading, options_parser, table, write_json, wri
 from stavpr_lab.evaluation.drive import FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.protocol import (
-    Estimate,
+    evaluate_matches,
     evaluate_protocol,
     LENGTHS,
     match_sequences,
     METHODS,
-    protocol_rows,
-    ProtocolRow,
+    Recalls,
+    text,
     TOLERANCES,
 )
 from stavpr_lab.evaluation.seqslam import differences, preprocess, SeqSlamSettings
@@ -58,7 +58,8 @@ EXCERPT = (
     ('gardens_point', 2, 20),
     ('walk_night', 2, 20),
 )
-Results = dict[str, list[dict[str, Any]]]
+Row = dict[str, Any]
+Results = dict[str, list[Row]]
 
 
 def clean(*traverses: FrameSource) -> np.ndarray:
@@ -93,9 +94,9 @@ def rows(
     kept: np.ndarray,
     making: dict[str, FeatureExtractor],
     lengths: Sequence[int],
-) -> Iterator[ProtocolRow]:
+) -> Iterator[Recalls]:
     """
-    Yield the rows of all methods on a map and a query, in which image i shows place i.
+    Yield the numbers of all methods on a map and a query, in which image i shows place i.
 
     :param paths: of the map and of the query.
     :param kept: the images of both that are used, shape (K,), int64.
@@ -104,84 +105,63 @@ def rows(
     truths = {t: GroundTruth.identity(len(kept), len(kept), t) for t in TOLERANCES}
     if not making:
         D = differences(*(patches(path)[kept] for path in reversed(paths)))
-        yield from protocol_rows('seqslam', match_sequences(D, 'seqslam', lengths), truths)
+        yield from evaluate_matches('seqslam', match_sequences(D, 'seqslam', lengths), truths)
     for method in METHODS if making else ():
         extractor = making['paper' if method == 'paper' else 'robust']
         places, query = (select_places(features(path, extractor), kept) for path in paths)
         yield from evaluate_protocol(places, query.features, truths, None, (method,), lengths)
 
 
-def measure(
-    folder: Path, chosen: Sequence[str], quick: bool
-) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+def measure(folder: Path, chosen: Sequence[str], quick: bool) -> Iterator[tuple[str, list[Row]]]:
     """Yield key and rows of each data set with each kind of features; report those left out."""
-    cases = [
-        (name, [folder / path for path in paths])
-        for name, paths in CASES.items()
-        if not (quick and TRAIN in paths[0])
-    ]
     for feature in chosen:
         try:
             making = extractors(feature, folder) if feature in FEATURES else {}
         except UnavailableError as error:
             print(f'left out: {LABELS[feature]}: {error}', file=sys.stderr)
             continue
-        for name, paths in cases:
-            costly = feature == 'o' and name.startswith('nordland')
-            if costly and name != 'nordland':
+        for name, traverses in CASES.items():
+            long, costly = TRAIN in traverses[0], TRAIN in traverses[0] and feature == 'o'
+            if (long and quick) or (costly and name != 'nordland'):
                 continue
+            paths = [folder / path for path in traverses]
             sources = [open_source(path) for path in paths]
             variants = {name: np.arange(len(sources[0]))}
-            if TRAIN in str(paths[0]):
+            if long:
                 variants[f'{name}_clean'] = clean(*sources)
             for variant, kept in variants.items():
-                found = [
-                    row.to_json() for row in rows(paths, kept, making, FEW if costly else LENGTHS)
-                ]
-                yield f'{variant}/{feature}', [row | {'queries': len(kept)} for row in found]
-
-
-def text(estimate: dict[str, float]) -> str:
-    """Return an estimate with its interval."""
-    return str(Estimate(**estimate))
+                found = rows(paths, kept, making, FEW if costly else LENGTHS)
+                yield f'{variant}/{feature}', [asdict(row) for row in found]
 
 
 def excerpt(results: Results) -> list[str]:
     """Return the table of docs/evaluation.md: recall@1, recall at 100 % precision."""
-    cells: dict[tuple[str, str], list[str]] = {}
-    for column, (name, tolerance, length) in enumerate(EXCERPT):
-        for feature in LABELS:
+    lines: dict[tuple[str, str], list[str]] = {}
+    for column, (name, *wanted) in enumerate(EXCERPT):
+        for feature, label in LABELS.items():
             for row in results.get(f'{name}/{feature}', ()):
-                if row['length'] == length:
-                    found = row['recalls'][str(tolerance)]
-                    full = found['recall_at_100_precision']['value']
-                    line = cells.setdefault((LABELS[feature], row['method']), ['-'] * len(EXCERPT))
-                    line[column] = f'{text(found["recall_at_1"])}, {full:.3f}'
+                if [row['tolerance'], row['length']] == wanted:
+                    line = lines.setdefault((label, row['method']), ['-'] * len(EXCERPT))
+                    full = row['recall_at_100_precision'][0]
+                    line[column] = f'{text(row["recall_at_1"])}, {full:.3f}'
     head = [f'`{name}` +-{t}, {length} images' for name, t, length in EXCERPT]
-    return table(['features', 'method', *head], [[*key, *row] for key, row in cells.items()])
+    return table(['features', 'method', *head], [[*key, *line] for key, line in lines.items()])
 
 
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
-    """Return the lines of the page: a table a data set."""
+    """Return the lines of the page: a table of each data set with each kind of features."""
     lines = heading('Recalls by tolerance and sequence length', about)
     lines += ['Cells: best F1 / recall@1 / recall at 100 % precision, with 95 % intervals.', '']
-    for name in dict.fromkeys(key.split('/')[0] for key in results):
-        found = []
-        for feature in LABELS:
-            for row in results.get(f'{name}/{feature}', ()):
-                cells = [
-                    ' / '.join(
-                        [
-                            f'{each["f1"]:.3f}',
-                            text(each['recall_at_1']),
-                            text(each['recall_at_100_precision']),
-                        ]
-                    )
-                    for each in row['recalls'].values()
-                ]
-                found.append([LABELS[feature], row['method'], str(row['length']), *cells])
-        tolerances = [f'+-{t}' for t in TOLERANCES]
-        lines += [f'## {name}', '', *table(['features', 'method', 'images', *tolerances], found)]
+    head = ['method', 'images', *(f'+-{t}' for t in TOLERANCES)]
+    for key, found in results.items():
+        name, feature = key.split('/')
+        cells: dict[tuple[str, str], list[str]] = {}
+        for row in found:
+            estimates = text(row['recall_at_1']), text(row['recall_at_100_precision'])
+            cell = ' / '.join([f'{row["f1"]:.3f}', *estimates])
+            cells.setdefault((row['method'], str(row['length'])), []).append(cell)
+        body = [[*start, *line] for start, line in cells.items()]
+        lines += [f'## {name}, {LABELS[feature]}', '', *table(head, body)]
     return lines
 
 
@@ -191,16 +171,12 @@ def main(arguments: list[str] | None = None) -> int:
     kinds = tuple(LABELS)
     parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
     options = parser.parse_args(arguments)
-    chosen = ('g',) if options.quick else options.features
-    about, began, results = environment(named_commit=options.commit), time.perf_counter(), {}
-    for key, found in measure(data_folder(), chosen, options.quick):
-        results[key] = found
-        print(f'{key}: {time.perf_counter() - began:.0f} s', file=sys.stderr)
+    about, chosen = environment(named_commit=options.commit), options.features
+    results = dict(measure(data_folder(), ('g',) if options.quick else chosen, options.quick))
     path = options.output / f'protocol{"-quick" if options.quick else ""}.json'
     write_json(path, about | {'results': results})
     write_lines(path.with_suffix('.md'), markdown(about, results))
-    print(*excerpt(results), sep='\n')
-    print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its .md')
+    print(*excerpt(results), f'wrote {path} and its .md', sep='\n')
     return 0
 
 

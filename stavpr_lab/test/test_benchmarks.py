@@ -35,6 +35,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
 from stavpr_ros.recognition.match import Match, Status
+from stavpr_ros.sources import open_source
 
 PEAKS = Peaks(1e9, 1e10)
 
@@ -167,31 +168,24 @@ def test_first_right_match_counts_images_since_start():
 # ------------------------------------------------ the protocol
 
 
-def test_protocol_of_folders_has_a_row_of_each_method_and_length(monkeypatch, tmp_path):
-    """Thirty images and the same darker; the train's without three of a stop and a black one."""
+def test_protocol_of_folders_has_all_methods_and_leaves_stops_out(monkeypatch, tmp_path):
+    """Thirty images and the same darker, with a stop of four images and a black one."""
     images = route_images(30)
     images[10:14], images[20] = [images[9]] * 4, images[20] * 0
-    for name, factor in (('day', 1), ('night', 0.5), ('nordland_summer', 1)):
-        darker = [(image * factor).astype(np.uint8) for image in images]
-        write_images(tmp_path / name, darker)
-    cases = {'walk': ('day', 'night'), 'nordland': ('nordland_summer', 'nordland_summer')}
-    monkeypatch.setattr(protocol, 'CASES', cases)
-    monkeypatch.setattr(protocol, 'TRAIN', 'nordland')
-    monkeypatch.setattr(protocol, 'EXCERPT', (('walk', 2, 20), ('nordland_clean', 1, 5)))
+    for name, factor in (('day', 1), ('night', 0.5)):
+        write_images(tmp_path / name, [(each * factor).astype(np.uint8) for each in images])
+    monkeypatch.setattr(protocol, 'CASES', {'walk': ('day', 'night')})
+    monkeypatch.setattr(protocol, 'TRAIN', 'day')
+    monkeypatch.setattr(protocol, 'EXCERPT', (('walk', 2, 5), ('walk_clean', 1, 20)))
     found = dict(protocol.measure(tmp_path, ('g', 'p'), quick=False))
-    names = ('walk', 'nordland', 'nordland_clean')
-    assert list(found) == [f'{name}/{feature}' for feature in 'gp' for name in names]
-    assert [row['method'] for row in found['walk/p']] == ['seqslam'] * 4
-    assert [len(found[f'{name}/g']) for name in names] == [24, 24, 24]
-    assert {row['queries'] for row in found['nordland_clean/p']} == {25}
-    robust = found['nordland_clean/g'][-1]
-    assert (robust['method'], robust['length']) == ('robust', 20)
-    assert robust['recalls']['2']['recall_at_1']['value'] == 1
-    results_of = json.loads(json.dumps(found, allow_nan=False))
-    page = '\n'.join(protocol.markdown(results.environment(named_commit='abc'), results_of))
-    assert page.count('| gradient | robust | 20 |') == 3
-    row = next(line for line in protocol.excerpt(results_of) if 'gradient | robust' in line)
-    assert row.startswith('| gradient | robust | 1.000 (1.000-1.000), 1.000 |')
+    assert list(found) == ['walk/g', 'walk_clean/g', 'walk/p', 'walk_clean/p']
+    assert [len(rows) for rows in found.values()] == [96, 96, 16, 16]
+    stored = json.loads(json.dumps(found, allow_nan=False))
+    (line,) = (row for row in protocol.excerpt(stored) if 'gradient | robust' in row)
+    assert line.endswith('| 1.000 (1.000-1.000), 1.000 |')
+    page = '\n'.join(protocol.markdown(results.environment(named_commit='abc'), stored))
+    assert page.count('\n| robust | 20 |') == 2
+    assert len(protocol.clean(*(open_source(tmp_path / name) for name in ('day', 'night')))) == 25
 
 
 # ------------------------------------------------ the city

@@ -3,10 +3,11 @@
 """``evaluate --protocol``: a table of recalls by method, tolerance and sequence length."""
 
 import argparse
+from dataclasses import asdict
 import json
 
 from stavpr_lab.commands.evaluate_sequences import load_sequences, node_settings, settings_json
-from stavpr_lab.evaluation.protocol import evaluate_protocol, ProtocolRow, TOLERANCES
+from stavpr_lab.evaluation.protocol import evaluate_protocol, text, TOLERANCES
 from stavpr_lab.evaluation.report import jsonable
 from stavpr_ros.output_file import JSON, require_replaceable, write_output
 
@@ -30,28 +31,21 @@ def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace)
         require_replaceable(arguments.json, JSON, arguments.force)
     settings = node_settings(arguments).recognition()
     sequences = load_sequences(arguments)
-    drive, reference = sequences.drive, sequences.reference
+    drive, query, reference = sequences.drive, sequences.query.features, sequences.reference
     assert reference is not None  # without --loop-closure
     truths = {t: drive.recorded.widened(t).on_places(drive.places) for t in TOLERANCES}
     backend = arguments.backend, arguments.precision
-    query = sequences.query.features
     rows = list(evaluate_protocol(reference, query, truths, settings, backend=backend))
     print(f'{sequences.title}, with 95 % intervals')
-    for tolerance in TOLERANCES:
-        print(*_lines(rows, tolerance), sep='\n')
+    for t in TOLERANCES:
+        print(f'\n+- {t:<9}{"images":>6}{"F1":>7}  {"recall@1":21}  at 100 % precision')
+        for row in rows:
+            if row.tolerance == t:
+                columns = f'{text(row.recall_at_1)}  {text(row.recall_at_100_precision)}'
+                print(f'{row.method:12}{row.length:6}{row.f1:7.3f}  {columns}')
     if arguments.json:
-        numbers = [row.to_json() for row in rows]
-        document = {'settings': settings_json(arguments, sequences), 'protocol': numbers}
-        text = json.dumps(jsonable(document), indent=2) + '\n'
-        write_output(arguments.json, text, JSON, arguments.force)
+        found = [asdict(row) for row in rows]
+        document = {'settings': settings_json(arguments, sequences), 'protocol': found}
+        numbers = json.dumps(jsonable(document), indent=2) + '\n'
+        write_output(arguments.json, numbers, JSON, arguments.force)
         print(f'numbers: {arguments.json}')
-
-
-def _lines(rows: list[ProtocolRow], tolerance: int) -> list[str]:
-    """Return the table of one tolerance."""
-    lines = ['', f'+- {tolerance:<9}{"images":>6}{"F1":>7}  {"recall@1":21}  at 100 % precision']
-    for row in rows:
-        found = row.recalls[tolerance]
-        estimates = f'{found.recall_at_1}  {found.recall_at_100_precision}'
-        lines.append(f'{row.method:12}{row.length:6}{found.f1:7.3f}  {estimates}')
-    return lines

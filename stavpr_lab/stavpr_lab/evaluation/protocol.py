@@ -1,16 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Recall@1 and recall at 100 % precision by tolerance and sequence length, with intervals.
+Recall@1 and recall at 100 % precision by tolerance and sequence length, with 95 % intervals.
 
-Errors of neighboring images are correlated, by windows that share images and by scenes that are
-difficult as a whole: the intervals are of a circular block bootstrap. The publications that use
-these tolerances and lengths: docs/evaluation.md.
+Sources, methods and the choice of the block length: docs/evaluation.md.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from stavpr_lab.evaluation.evaluate import recognize_traverse
@@ -25,77 +22,42 @@ from stavpr_ros.recognition.robust import MODES
 TOLERANCES = (0, 1, 2, 10)  # places
 LENGTHS = (1, 4, 5, 10, 20)  # images
 METHODS = ('plain', 'centered', 'seqslam', *MODES)
-BLOCK = 40  # images
-FEWEST_BLOCKS = 5
-RESAMPLES = 1000
-LEVEL = 0.95
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """
-    A number with its interval.
-
-    :param value: of all images.
-    :param low, high: 95 % interval.
-    """
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f'{self.value:.3f} ({self.low:.3f}-{self.high:.3f})'
+BLOCK, FEWEST_BLOCKS = 40, 5  # images of a block at most, blocks of a query at least
+INTERVAL = (0.025, 0.975)  # quantiles
+Estimate = tuple[float, ...]  # value, low and high bound of its interval
 
 
 @dataclass(frozen=True)
 class Recalls:
     """
-    Numbers of the matches of queries at one tolerance.
+    Numbers of a method with sequences of one length, at one tolerance.
 
     :param f1: largest F1.
     :param recall_at_1: share of the queries with a place in the map whose match is correct.
     :param recall_at_100_precision: largest share of them that is accepted without a wrong match.
     """
 
+    method: str
+    length: int
+    tolerance: int
     f1: float
     recall_at_1: Estimate
     recall_at_100_precision: Estimate
 
-    def __str__(self) -> str:
-        return f'{self.f1:.3f} / {self.recall_at_1} / {self.recall_at_100_precision}'
+
+def text(estimate: Sequence[float]) -> str:
+    """Return an estimate with its interval as text."""
+    return '{:.3f} ({:.3f}-{:.3f})'.format(*estimate)
 
 
-@dataclass(frozen=True)
-class ProtocolRow:
+def block_samples(count: int, resamples: int = 1000, seed: int = 0) -> np.ndarray:
     """
-    A method with sequences of one length.
-
-    :param recalls: by tolerance.
-    """
-
-    method: str
-    length: int
-    recalls: dict[int, Recalls]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the numbers for a JSON file; tolerances become text."""
-        return asdict(self) | {'recalls': {str(t): asdict(r) for t, r in self.recalls.items()}}
-
-
-def block_length(count: int) -> int:
-    """Return the images of a block of ``count`` images: 40, but a fifth of them at most."""
-    return max(1, min(BLOCK, count // FEWEST_BLOCKS))
-
-
-def block_samples(count: int, resamples: int = RESAMPLES, seed: int = 0) -> np.ndarray:
-    """
-    Draw images in blocks of successive ones; the first image follows the last one.
+    Draw images for a circular block bootstrap.
 
     :param count: images N.
-    :returns: shape (resamples, N), int64.
+    :returns: images in blocks of successive ones, shape (resamples, N), int64.
     """
-    block = block_length(count)
+    block = max(1, min(BLOCK, count // FEWEST_BLOCKS))
     size = resamples, -(-count // block), 1
     firsts = np.random.default_rng(seed).integers(count, size=size)
     return ((firsts + np.arange(block)) % count).reshape(resamples, -1)[:, :count]
@@ -108,40 +70,43 @@ def recalls(
     Return recall@1 and recall at 100 % precision; NaN where no query has a place in the map.
 
     :param correct: the match is correct, shape (..., N), bool.
-    :param scores: distances of the matches, +inf = none, of the same shape.
+    :param scores: distances of the matches, of the same shape; +inf = none.
     :param has_match: the query's place is in the map, of the same shape, bool.
     :returns: two arrays of shape (...), float64.
     """
     smallest_wrong = np.where(correct, np.inf, scores).min(axis=-1, keepdims=True)
     accepted = correct & (scores < smallest_wrong)
-    with np.errstate(invalid='ignore'):
-        first, full = (mask.sum(axis=-1) / has_match.sum(axis=-1) for mask in (correct, accepted))
-    return first, full
+    counts = np.where(has_match.any(axis=-1), has_match.sum(axis=-1), np.nan)
+    return correct.sum(axis=-1) / counts, accepted.sum(axis=-1) / counts
 
 
-def evaluate_recalls(ranking: Ranking, ground_truth: GroundTruth) -> Recalls:
+def evaluate_matches(
+    method: str, found: Iterable[tuple[int, Ranking]], truths: Mapping[int, GroundTruth]
+) -> Iterator[Recalls]:
     """
-    Compare the first place of each query with the ground truth.
+    Compare matches with the ground truth at each tolerance.
 
-    :raises InputError: there are no queries.
+    :param found: length of the sequences and matches.
+    :param truths: of the same queries, by tolerance.
     """
-    metrics = evaluate_ranking(ranking, ground_truth)
-    columns = ground_truth.accepts(ranking.best), ranking.scores, ground_truth.has_match
-    images = block_samples(len(ranking))
-    sampled = recalls(*(column[images] for column in columns))
-    quantiles = (1 - LEVEL) / 2, (1 + LEVEL) / 2
-    first, full = (
-        Estimate(float(value), *(float(bound) for bound in np.nanquantile(values, quantiles)))
-        if np.isfinite(values).any()
-        else Estimate(np.nan, np.nan, np.nan)
-        for value, values in zip(recalls(*columns), sampled, strict=True)
-    )
-    return Recalls(metrics.best.f1, first, full)
+    for length, ranking in found:
+        images = block_samples(len(ranking))
+        for tolerance, truth in truths.items():
+            f1 = evaluate_ranking(ranking, truth).best.f1
+            columns = truth.accepts(ranking.best), ranking.scores, truth.has_match
+            sampled = recalls(*(column[images] for column in columns))
+            first, full = (
+                (float(value), *map(float, np.quantile(values[~np.isnan(values)], INTERVAL)))
+                if truth.has_match.any()
+                else (np.nan, np.nan, np.nan)
+                for value, values in zip(recalls(*columns), sampled, strict=True)
+            )
+            yield Recalls(method, length, tolerance, f1, first, full)
 
 
 def image_vectors(features: LocalFeatures, centered: bool = False) -> np.ndarray:
     """
-    Return one unit-norm vector an image: its weighted strips.
+    Return the weighted strips of each image as one unit-norm vector.
 
     :param features: of N images.
     :param centered: without the mean of the N images.
@@ -159,46 +124,21 @@ def match_sequences(
     D: np.ndarray, method: str, lengths: Sequence[int] = LENGTHS
 ) -> Iterator[tuple[int, Ranking]]:
     """
-    Match sequences along straight lines through the distances of images.
+    Match sequences of each length along straight lines through the distances of images.
 
     :param D: shape (N, n), row = query image.
-    :param method: ``seqslam``: several speeds, after local contrast enhancement (without lengths
-        of 1, which it leaves no information); else at the speed of the map.
-    :returns: length and matches for each length of at most N.
+    :param method: ``seqslam``, without sequences of 1 image, which contrast enhancement leaves no
+        information; else lines at the speed of the map.
     """
+    enhanced = method == 'seqslam'
     for length in lengths:
-        if method == 'seqslam' and 1 < length <= len(D):
-            places, scores = match_differences(D, SeqSlamSettings(length=length))
-        elif method != 'seqslam' and length <= len(D):
-            one_speed = SeqSlamSettings(length=length, slowest=1, fastest=1)
-            places, scores = match_lines(D, one_speed)
-        else:
-            continue
-        yield length, Ranking(places[:, None], scores)
-
-
-def recognize_sequences(
-    place_map: PlaceMap,
-    query: LocalFeatures,
-    settings: RecognizerSettings,
-    lengths: Sequence[int] = LENGTHS,
-    backend: tuple[str, str] = ('cpu', 'float32'),
-) -> Iterator[tuple[int, Ranking]]:
-    """
-    Recognize a traverse with windows of each length; 1 = the nearest place of each image alone.
-
-    :param backend: backend and precision of :class:`stavpr_ros.recognition.PlaceRecognizer`.
-    """
-    single = 1 in lengths
-    for length in lengths:
-        if 1 < length <= len(query):
-            one = replace(settings, sequence=replace(settings.sequence, length=length))
-            recognizer = PlaceRecognizer(place_map, one, *backend)
-            found = recognize_traverse(recognizer, query, len(place_map), one)
-            if single:  # the same of all lengths
-                yield 1, found.single
-            single = False
-            yield length, found.sequence
+        if enhanced < length <= len(D):
+            settings = SeqSlamSettings(length=length)
+            if enhanced:
+                places, scores = match_differences(D, settings)
+            else:
+                places, scores = match_lines(D, replace(settings, slowest=1, fastest=1))
+            yield length, Ranking(places[:, None], scores)
 
 
 def evaluate_protocol(
@@ -209,39 +149,43 @@ def evaluate_protocol(
     methods: Sequence[str] = METHODS,
     lengths: Sequence[int] = LENGTHS,
     backend: tuple[str, str] = ('cpu', 'float32'),
-) -> Iterator[ProtocolRow]:
+) -> Iterator[Recalls]:
     """
-    Evaluate methods with sequences of each length.
+    Evaluate methods with sequences of each length, shorter than the query.
 
     :param query: features of N images.
     :param truths: of the N images, by tolerance.
-    :param settings: of modes paper and robust but for mode and length.
-    :param methods: of :data:`METHODS`. ``plain`` and ``centered`` compare vectors of whole images
-        along lines at the speed of the map; ``centered`` subtracts the mean of each traverse.
-    :param lengths: ascending; those greater than N are left out.
+    :param settings: of modes paper and robust, except mode and length.
+    :param methods: of :data:`METHODS`; ``centered`` subtracts the mean of each traverse.
     :param backend: backend and precision of :class:`stavpr_ros.recognition.PlaceRecognizer`.
     :raises InputError: ground truth of another number of images.
     """
     for method in methods:
         if method in MODES:
             one = replace(settings or RecognizerSettings(), mode=method)
-            found = recognize_sequences(place_map, query, one, lengths, backend)
+            found = _recognized(place_map, query, one, lengths, backend)
         else:
             traverses = query, place_map.features
             queries, places = (image_vectors(each, method == 'centered') for each in traverses)
             found = match_sequences(1 - queries @ places.T, method, lengths)
-        yield from protocol_rows(method, found, truths)
+        yield from evaluate_matches(method, found, truths)
 
 
-def protocol_rows(
-    method: str, found: Iterable[tuple[int, Ranking]], truths: Mapping[int, GroundTruth]
-) -> Iterator[ProtocolRow]:
-    """
-    Evaluate the matches of a method.
-
-    :param found: length and matches.
-    :param truths: of the same queries, by tolerance.
-    """
-    for length, ranking in found:
-        by_tolerance = {t: evaluate_recalls(ranking, truth) for t, truth in truths.items()}
-        yield ProtocolRow(method, length, by_tolerance)
+def _recognized(
+    place_map: PlaceMap,
+    query: LocalFeatures,
+    settings: RecognizerSettings,
+    lengths: Sequence[int],
+    backend: tuple[str, str],
+) -> Iterator[tuple[int, Ranking]]:
+    """Recognize with windows of each length; 1 = each image alone, the same in all windows."""
+    single = 1 in lengths
+    for length in lengths:
+        if 1 < length <= len(query):
+            one = replace(settings, sequence=replace(settings.sequence, length=length))
+            recognizer = PlaceRecognizer(place_map, one, *backend)
+            found = recognize_traverse(recognizer, query, len(place_map), one)
+            if single:
+                yield 1, found.single
+            single = False
+            yield length, found.sequence
