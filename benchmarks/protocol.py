@@ -83,17 +83,8 @@ def features(path: Path, making: FeatureExtractor) -> PlaceMap:
     return build_map(open_source(path), making, thumbnails=False, progress=False)
 
 
-@cache
-def patches(path: Path) -> np.ndarray:
-    """Return the images of a folder as SeqSLAM compares them, shape (N, pixels), float32."""
-    return preprocess((frame.image for frame in open_source(path)), SeqSlamSettings())
-
-
 def rows(
-    paths: Sequence[Path],
-    kept: np.ndarray,
-    making: dict[str, FeatureExtractor],
-    lengths: Sequence[int],
+    paths: Sequence[Path], kept: np.ndarray, making: dict[str, Any], lengths: Sequence[int]
 ) -> Iterator[Recalls]:
     """
     Yield the numbers of all methods on a map and a query, in which image i shows place i.
@@ -104,7 +95,8 @@ def rows(
     """
     truths = {t: GroundTruth.identity(len(kept), len(kept), t) for t in TOLERANCES}
     if not making:
-        D = differences(*(patches(path)[kept] for path in reversed(paths)))
+        frames = ((frame.image for frame in open_source(path)) for path in reversed(paths))
+        D = differences(*(preprocess(images, SeqSlamSettings())[kept] for images in frames))
         yield from evaluate_matches('seqslam', match_sequences(D, 'seqslam', lengths), truths)
     for method in METHODS if making else ():
         extractor = making['paper' if method == 'paper' else 'robust']
@@ -112,9 +104,9 @@ def rows(
         yield from evaluate_protocol(places, query.features, truths, None, (method,), lengths)
 
 
-def measure(folder: Path, chosen: Sequence[str], quick: bool) -> Iterator[tuple[str, list[Row]]]:
+def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[Row]]]:
     """Yield key and rows of each data set with each kind of features; report those left out."""
-    for feature in chosen:
+    for feature in ('g',) if quick else LABELS:
         try:
             making = extractors(feature, folder) if feature in FEATURES else {}
         except UnavailableError as error:
@@ -167,12 +159,9 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    parser = options_parser(__doc__, 'gradient features, without Nordland')
-    kinds = tuple(LABELS)
-    parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
-    options = parser.parse_args(arguments)
-    about, chosen = environment(named_commit=options.commit), options.features
-    results = dict(measure(data_folder(), ('g',) if options.quick else chosen, options.quick))
+    options = options_parser(__doc__, 'gradient features, without Nordland').parse_args(arguments)
+    about = environment(named_commit=options.commit)
+    results = dict(measure(data_folder(), options.quick))
     path = options.output / f'protocol{"-quick" if options.quick else ""}.json'
     write_json(path, about | {'results': results})
     write_lines(path.with_suffix('.md'), markdown(about, results))

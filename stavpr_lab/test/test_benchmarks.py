@@ -177,7 +177,8 @@ def test_protocol_of_folders_has_all_methods_and_leaves_stops_out(monkeypatch, t
     monkeypatch.setattr(protocol, 'CASES', {'walk': ('day', 'night')})
     monkeypatch.setattr(protocol, 'TRAIN', 'day')
     monkeypatch.setattr(protocol, 'EXCERPT', (('walk', 2, 5), ('walk_clean', 1, 20)))
-    found = dict(protocol.measure(tmp_path, ('g', 'p'), quick=False))
+    monkeypatch.setattr(protocol, 'LABELS', {'g': 'gradient', 'p': 'patches'})
+    found = dict(protocol.measure(tmp_path, quick=False))
     assert list(found) == ['walk/g', 'walk_clean/g', 'walk/p', 'walk_clean/p']
     assert [len(rows) for rows in found.values()] == [96, 96, 16, 16]
     stored = json.loads(json.dumps(found, allow_nan=False))

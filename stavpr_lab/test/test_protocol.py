@@ -9,7 +9,6 @@ from stavpr_lab.commands import evaluate
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, Ranking
 from stavpr_lab.evaluation.protocol import (
-    block_samples,
     evaluate_matches,
     image_vectors,
     LENGTHS,
@@ -55,15 +54,6 @@ def test_recalls_equal_metrics_of_random_rankings():
     assert found.recall_at_1[0] == expected.recall_at[1]
     assert found.recall_at_100_precision[0] == full
     assert 0 < full < expected.recall_at[1] < 1
-
-
-@pytest.mark.parametrize(('count', 'block'), [(3, 1), (100, 20), (400, 40)])
-def test_blocks_are_successive_images_and_cover_all_alike(count, block):
-    images = block_samples(count, resamples=2000)
-    assert images.shape == (2000, count)
-    blocks = images[:, : count // block * block].reshape(2000, -1, block)
-    assert (np.diff(blocks) % count == 1).all()
-    np.testing.assert_allclose(np.bincount(images.reshape(-1)), 2000, rtol=0.15)
 
 
 @pytest.mark.parametrize('run_length', [1, 40])

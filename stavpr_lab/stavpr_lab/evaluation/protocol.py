@@ -178,14 +178,11 @@ def _recognized(
     lengths: Sequence[int],
     backend: tuple[str, str],
 ) -> Iterator[tuple[int, Ranking]]:
-    """Recognize with windows of each length; 1 = each image alone, the same in all windows."""
-    single = 1 in lengths
+    """Recognize with windows of each length; 1 = each image alone."""
     for length in lengths:
-        if 1 < length <= len(query):
-            one = replace(settings, sequence=replace(settings.sequence, length=length))
+        if length <= len(query):
+            window = replace(settings.sequence, length=max(2, length))
+            one = replace(settings, sequence=window)
             recognizer = PlaceRecognizer(place_map, one, *backend)
             found = recognize_traverse(recognizer, query, len(place_map), one)
-            if single:
-                yield 1, found.single
-            single = False
-            yield length, found.sequence
+            yield length, found.single if length == 1 else found.sequence
