@@ -28,7 +28,7 @@ COVERAGE := stavpr_ros:95 stavpr_slam:88 stavpr_lab:91
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo animation evaluate test test-long coverage crash-test lint docs bench bench-quick accuracy off-map \
+.PHONY: help setup build demo animation evaluate test test-long coverage crash-test lint docs bench bench-quick accuracy protocol off-map \
 	shell clean distclean development
 
 help: ## list the targets (the default)
@@ -98,6 +98,10 @@ bench: build ## measure speed and memory beside lower bounds and peers (ARGS=)
 
 bench-quick: build ## the same for up to 20,000 places, in two to three minutes (ARGS=)
 	@$(RUN) python benchmarks/matching.py --quick $(ARGS)
+
+protocol: override EXTRAS += evaluation
+protocol: build ## measure recalls by method, tolerance and sequence length (ARGS=)
+	@OMP_WAIT_POLICY=PASSIVE $(RUN) python benchmarks/protocol.py $(ARGS)
 
 accuracy: override EXTRAS += evaluation
 accuracy: build ## measure the accuracy on the data sets (ARGS=)

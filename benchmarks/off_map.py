@@ -17,7 +17,7 @@ from typing import Any
 from accuracy import extractors, FEATURES, long_cases, short_cases
 from data import data_folder
 import numpy as np
-from off_map_page import DAY, markdown, NIGHT, Results, summary_section
+from off_map_page import DAY, LEVEL, markdown, NIGHT, Results, summary_section
 from results import environment, options_parser, ROOT, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
@@ -33,8 +33,13 @@ from tqdm import tqdm
 
 SETTINGS = RecognizerSettings(mode='robust')
 LONG = 1000  # places from which a route is driven only around the removed stretch
-REMOVED, LONG_REMOVED = (40, 70, 100), (40, 100, 200)
-STEP, LONG_STEP = 10, 100  # places from one removed stretch to the next
+SHORTEST, LONGEST = 20, 40  # places of a removed stretch
+LONG_STRETCHES = 100  # of a long route, at random; others have one at each place
+STRETCHES = (
+    f'stretches have {SHORTEST} to {LONGEST} places, at random, and begin at {{step}} place '
+    f'(Nordland: {{long}} random ones)'
+)
+STEP, LONG_STEP = 10, 100  # places from one start to the next
 BEFORE, AFTER = 80, 60  # images driven around the removed stretch of a long route
 COARSER = 4  # of --quick: so many times coarser steps, every fourth pair of floors
 START_IMAGES, SMALL_MAP = 30, 40
@@ -79,6 +84,11 @@ class Outcome:
     has_match: np.ndarray
     unseen: np.ndarray
 
+    @property
+    def sure(self) -> np.ndarray:
+        """Return the wrong matches whose probability is 0.95 or more, shape (N,), bool."""
+        return self.accepted & ~self.correct & (self.probabilities >= LEVEL)
+
     @classmethod
     def pooled(cls, outcomes: Sequence['Outcome']) -> 'Outcome':
         """Return the images of several drives as one."""
@@ -97,12 +107,14 @@ class Outcome:
             'images': len(self.accepted),
             'matched': counts.accepted,
             'wrong': counts.false_positives,
+            'sure': int(np.count_nonzero(self.sure)),
             'precision': counts.precision,
             'recall': counts.recall,
             'f1': max(each.f1 for each in curve),
             'recall_at_100_precision': max(each.recall for each in curve if each.precision == 1),
             'unseen': int(np.count_nonzero(self.unseen)),
             'unseen_matched': int(np.count_nonzero(self.unseen & self.accepted)),
+            'unseen_sure': int(np.count_nonzero(self.unseen & self.sure)),
         }
 
     def calibration(self) -> dict[str, Any]:
@@ -159,19 +171,21 @@ def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> O
     )
 
 
-def detours(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[Outcome]]]:
-    """Yield the outcomes of all positions of a removed stretch, for each length of it."""
-    n = len(pair.places)
-    step = (LONG_STEP if pair.long else STEP) * coarser
-    for removed in LONG_REMOVED if pair.long else REMOVED:
-        found = []
-        firsts = range(0, n - removed + 1, step) if 2 * removed <= n else range(0)
-        for first in firsts:
-            last = first + removed
-            shown = slice(max(0, first - BEFORE), last + AFTER) if pair.long else slice(None)
-            found.append(changed(pair, DriveChanges(removed=((first, last),)), shown))
-        if found:
-            yield f'{pair.name}/{removed}', found
+def stretches(pair: Pair, coarser: int = 1) -> list[tuple[int, int]]:
+    """Return first place and end of each stretch that is removed, of random lengths."""
+    n, rng = len(pair.places), np.random.default_rng(0)
+    firsts = np.arange(n - SHORTEST + 1)
+    if pair.long:
+        firsts = np.sort(rng.choice(firsts, LONG_STRETCHES, replace=False))
+    lasts = np.minimum(firsts + rng.integers(SHORTEST, LONGEST + 1, len(firsts)), n)
+    return list(zip(firsts[::coarser].tolist(), lasts[::coarser].tolist(), strict=True))
+
+
+def detours(pair: Pair, coarser: int = 1) -> Iterator[Outcome]:
+    """Yield the outcome of each stretch that the map lacks."""
+    for first, last in stretches(pair, coarser):
+        shown = slice(max(0, first - BEFORE), last + AFTER) if pair.long else slice(None)
+        yield changed(pair, DriveChanges(removed=((first, last),)), shown)
 
 
 def drives(pair: Pair) -> Iterator[tuple[str, Outcome]]:
@@ -261,13 +275,12 @@ class Measurement:
         self.driven += pooled
         if not pair.long:
             self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
-        for name, outcomes in detours(pair, self.coarser):
-            each = [one.numbers() for one in outcomes]
-            shares = [one['unseen_matched'] / one['unseen'] for one in each if one['unseen']]
-            values = Outcome.pooled(outcomes).numbers() | {'positions': len(each)}
-            values |= {'worst': max(shares, default=0.0)}
-            self.add('detours', name, values)
-            self.left += outcomes
+        outcomes = list(detours(pair, self.coarser))
+        each = [one.numbers() for one in outcomes]
+        shares = [one['unseen_matched'] / one['unseen'] for one in each if one['unseen']]
+        values = Outcome.pooled(outcomes).numbers() | {'positions': len(each)}
+        self.add('detours', pair.name, values | {'worst': max(shares, default=0.0)})
+        self.left += outcomes
         for name, counts in starts(pair, self.coarser):
             self.add('start', name, start_numbers(counts))
 
@@ -292,6 +305,7 @@ class Measurement:
         worst = max(shares, key=shares.__getitem__)
         matched = int(np.count_nonzero(pooled.accepted))
         values = {'images': len(pooled.accepted), 'matched': matched, 'pairs': len(pairs)}
+        values['sure'] = int(np.count_nonzero(pooled.sure))
         self.add('floors', name, values | {'worst_pair': worst, 'worst': shares[worst]})
         return found
 
@@ -357,7 +371,8 @@ def main(arguments: list[str] | None = None) -> int:
     results = measure(data_folder(), chosen, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     page = path.with_suffix('.md') if options.quick else ROOT / 'docs/off_map.md'
-    about |= {'steps': steps}
+    step = 'each' if steps == 1 else f'every {steps}th'
+    about |= {'stretches': STRETCHES.format(step=step, long=LONG_STRETCHES // steps)}
     write_json(path, about | {'results': results})
     write_lines(page, markdown(about, results))
     print(*summary_section(results), sep='\n')

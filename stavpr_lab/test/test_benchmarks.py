@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks, end to end on tiny sizes: matching, comparison, accuracy, off the map, city."""
+"""The benchmarks, end to end on tiny sizes: matching, comparison, accuracy, protocol, city."""
 # ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
 from dataclasses import replace
@@ -9,6 +9,8 @@ from pathlib import Path
 import sys
 
 import cv2
+from evaluation_commands import write_images
+from fixtures import route_images
 import numpy as np
 import pytest
 from scipy.spatial.distance import cosine
@@ -25,6 +27,7 @@ import matching
 import off_map
 import off_map_page
 import peaks
+import protocol
 import report
 import results
 from stavpr_lab.evaluation.ground_truth import GroundTruth
@@ -32,6 +35,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
 from stavpr_ros.recognition.match import Match, Status
+from stavpr_ros.sources import open_source
 
 PEAKS = Peaks(1e9, 1e10)
 
@@ -98,6 +102,9 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     assert (found['images'], found['matched'], found['wrong']) == (10, 6, 2)
     assert (found['precision'], found['recall']) == (4 / 6, 4 / 8)
     assert (found['unseen'], found['unseen_matched']) == (2, 2)
+    assert (found['sure'], found['unseen_sure']) == (0, 0)  # 0.6
+    sure = replace(outcome, probabilities=np.array([1, 0.9, 0.95, 0.2, np.nan])).numbers()
+    assert (sure['sure'], sure['unseen_sure']) == (1, 1)
     assert found['recall_at_100_precision'] == 0.5  # above 0.6
     assert found['f1'] == 3 / 4  # three of four right, one wrong
     bins = outcome.calibration()['bins']
@@ -109,7 +116,7 @@ def test_table_of_synthetic_route_has_every_section(monkeypatch):
     places, noise = (data.make_features(60, 24, 7, seed) for seed in (0, 1))
     strips = unit_norm(places.strips + 0.3 * noise.strips)
     maps = [descriptor_map(replace(places, strips=each)) for each in (places.strips, strips)]
-    monkeypatch.setattr(off_map, 'REMOVED', (20, 40))  # more than half of the map: no row
+    monkeypatch.setattr(off_map, 'LONGEST', 20)
     monkeypatch.setattr(off_map, 'STEP', 20)
     measurement = off_map.Measurement('g')
     measurement.pair(off_map.Pair('route', *maps, GroundTruth.identity(60, 60, 2)))
@@ -117,21 +124,33 @@ def test_table_of_synthetic_route_has_every_section(monkeypatch):
     rows = measurement.finish()
     same = rows['drives/g/route/same']
     assert (same['images'], same['precision'], same['recall']) == (60, 1, 1)
-    detour = rows['detours/g/route/20']
-    assert detour['positions'] == 3  # 0:20, 20:40, 40:60
-    assert detour['unseen'] == 15 + 10 + 15  # those within five places of the map are left out
-    assert 'detours/g/route/40' not in rows
+    detour = rows['detours/g/route']
+    assert detour['positions'] == 41  # 0:20 to 40:60
+    assert detour['unseen'] == 39 * 10 + 2 * 15  # without those within five places of the map
     start = rows['start/g/route/whole map']
     assert (start['starts'], start['right']) == (1, 1)  # at 20; one at 40 leaves no 30 images
     floors = rows['floors/g/tower']
     assert (floors['pairs'], floors['images']) == (2, 120)
     assert floors['matched'] >= 100  # the same place under another name
-    about = results.environment(named_commit='abc')
+    about = results.environment(named_commit='abc') | {'stretches': 'each begins at a place'}
     text = '\n'.join(off_map_page.markdown(about, json.loads(json.dumps(rows, allow_nan=False))))
-    unseen = detour['unseen_matched'] / 40
-    assert f'| detours: unseen images matched | {unseen:.1%} of 40 |' in text
+    matched = f'{detour["unseen_matched"] / 420:.1%} of 420, {detour["unseen_sure"]} declared 0.95'
+    assert f'| detours: unseen images matched | {matched} or more |' in text
     for row in ('other floors', 'lowest precision', 'reverse order', 'start', 'calibration'):
         assert f'\n| {row}' in text
+
+
+def test_detours_begin_at_each_place_or_at_random_on_long_routes():
+    truth = GroundTruth.identity(1100, 1100)
+    short, long = (
+        off_map.stretches(off_map.Pair('route', range(n), range(n), truth), coarser)
+        for n, coarser in ((100, 1), (1100, 2))
+    )
+    assert [first for first, _ in short] == list(range(81))
+    assert {last - first for first, last in short[:61]} >= {20, 30, 40}
+    assert all(20 <= last - first <= 40 and last <= 100 for first, last in short)
+    assert len(long) == len(set(long)) == 50
+    assert len({first % 10 for first, _ in long}) == 10
 
 
 def test_first_right_match_counts_images_since_start():
@@ -144,6 +163,30 @@ def test_first_right_match_counts_images_since_start():
     matches += [match(Status.MATCH, 5), match(Status.NO_MATCH, 2), match(Status.MATCH, 3)]
     assert off_map.first_right(matches, truth, 4) == 6  # windows of 4: image 3 is the middle
     assert off_map.first_right(matches[:5], truth, 4) is None
+
+
+# ------------------------------------------------ the protocol
+
+
+def test_protocol_of_folders_has_all_methods_and_leaves_stops_out(monkeypatch, tmp_path):
+    """Thirty images and the same darker, with a stop of four images and a black one."""
+    images = route_images(30)
+    images[10:14], images[20] = [images[9]] * 4, images[20] * 0
+    for name, factor in (('day', 1), ('night', 0.5)):
+        write_images(tmp_path / name, [(each * factor).astype(np.uint8) for each in images])
+    monkeypatch.setattr(protocol, 'CASES', {'walk': ('day', 'night')})
+    monkeypatch.setattr(protocol, 'TRAIN', 'day')
+    monkeypatch.setattr(protocol, 'EXCERPT', (('walk', 2, 5), ('walk_clean', 1, 20)))
+    monkeypatch.setattr(protocol, 'LABELS', {'g': 'gradient', 'p': 'patches'})
+    found = dict(protocol.measure(tmp_path, quick=False))
+    assert list(found) == ['walk/g', 'walk_clean/g', 'walk/p', 'walk_clean/p']
+    assert [len(rows) for rows in found.values()] == [96, 96, 16, 16]
+    stored = json.loads(json.dumps(found, allow_nan=False))
+    (line,) = (row for row in protocol.excerpt(stored) if 'gradient | robust' in row)
+    assert line.endswith('| 1.000 (1.000-1.000), 1.000 |')
+    page = '\n'.join(protocol.markdown(results.environment(named_commit='abc'), stored))
+    assert page.count('\n| robust | 20 |') == 2
+    assert len(protocol.clean(*(open_source(tmp_path / name) for name in ('day', 'night')))) == 25
 
 
 # ------------------------------------------------ the city

@@ -284,22 +284,6 @@ def test_evaluate_combines_drive_options(folders, report):
     assert found['settings']['remove_from_map'] == [[20, 40]]
 
 
-def test_evaluate_mirrored_equals_images_mirrored_before(folders, report, run, tmp_path):
-    """No match of them is right; the map's images are not mirrored."""
-    files = sorted((folders / 'query').iterdir())
-    images = [cv2.imread(str(file))[:, ::-1, ::-1] for file in files]
-    paths = [*pair(folders), '--query', write_images(tmp_path / 'm', images)]
-    before = report(*paths)[1]
-    found, rows, _ = report(*pair(folders), '--mirror')
-    assert [row['sequence_distance'] for row in rows] == [r['sequence_distance'] for r in before]
-    assert found['sequence']['queries_with_match'] == 0
-    assert found['decision']['wrongly_matched'] == found['decision']['matched']
-    query = build_map(open_source(folders / 'query'), FeatureExtractor(), progress=False)
-    save_map(query, tmp_path / 'q.stavpr')
-    code, _, errors = run('--map', folders / 'map', '--query', tmp_path / 'q.stavpr', '--mirror')
-    assert (code, 'has no images' in errors) == (2, True)
-
-
 def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, report, tmp_path):
     found, rows, text = report(*pair(folders))
     calibration = found['calibration']

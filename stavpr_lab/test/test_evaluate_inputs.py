@@ -69,7 +69,6 @@ def test_evaluate_exports_strips_of_images(run, route, tmp_path):
         (['--features', 'onnx'], '--features onnx'),
         (['--gradient-cell', 32], '--gradient-cell'),
         (['--crop-map', 0.2], 'saved map or an array'),
-        (['--mirror'], 'saved map or an array'),
     ],
 )
 def test_evaluate_of_descriptors_rejects_options_of_images(run, pair, options, word):

@@ -26,7 +26,7 @@ from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 
-CALIBRATION = 2.0  # factor of the odds: matches are right more often than the filter declares
+CALIBRATION = 2.0  # factor of the odds of being on the map, which the filter declares too low
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
 LEAST_CANDIDATE = 0.01  # probability of its place, at least
@@ -298,10 +298,11 @@ class FilterWindow(QueryWindow):
             if found[-1].factor >= REFUTED or left[best] < LEAST_CANDIDATE:
                 break
         chosen = max(found, key=lambda candidate: candidate.weight)
-        others = max(1 - sum(candidate.probability for candidate in found), 0.0)
-        others += sum(candidate.weight for candidate in found if candidate is not chosen)
-        weight = CALIBRATION * chosen.weight
-        return chosen, weight / max(weight + others, np.finfo(float).tiny)
+        on_map = min(float(belief.weights.sum()), 1.0)
+        unchecked = max(on_map - sum(candidate.probability for candidate in found), 0.0)
+        weight, every = chosen.weight, unchecked + sum(candidate.weight for candidate in found)
+        odds_sum = every + (1 - on_map) / CALIBRATION
+        return chosen, weight / max(odds_sum, np.finfo(float).tiny)
 
     def _candidate(
         self, belief: Belief, place: int, probability: float, position: int

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from stavpr_lab.commands.evaluate_sequences import Sequences
     from stavpr_lab.evaluation.evaluate import Evaluation
     from stavpr_lab.evaluation.report import Report
-    from stavpr_ros.pipeline.settings import PipelineSettings
     from stavpr_ros.recognition import RecognizerSettings
 
 OUTPUT = 'evaluation_output'
@@ -45,7 +44,6 @@ ground truth (--truth), none by default:
 
 another drive (they combine; applied in the order speed, stop, reverse, drop):
   --remove-from-map 100:150   the map lacks the places 100 to 149: are images of them matched?
-  --mirror                    every image mirrored left-right: no match is right
   --reverse                   the last image comes first
   --speed 3, 0.5, varying     images are left out or repeated; varying: 1/2 to 2
   --stop 60:100               the query stops at image 60 for 100 images more
@@ -59,6 +57,7 @@ examples:
   evaluate --map monday/ --query tuesday/ --truth pairs.csv --remove-from-map 40:90
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
   evaluate --map summer.csv --query netvlad.mat:winter --truth identity --tolerance 2
+  evaluate --map map.npy --query query.npy --truth identity --protocol
   evaluate --map summer/ --query winter/ --export arrays/
   evaluate --map summer/ --query drives/*.bag --output reports/ --processes 4
   evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
@@ -100,6 +99,12 @@ def _parser() -> argparse.ArgumentParser:
     export = 'write the features of map and query as map.npy and query.npy'
     add('--export', metavar='FOLDER', help=export)
     add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
+    protocol = (
+        'instead of a report: recall@1 and recall at 100 %% precision, with 95 %% intervals, at '
+        'tolerances 0, 1, 2, 10, of sequences of 1, 4, 5, 10, 20 images, in both modes and by '
+        'plain sequence matching'
+    )
+    add('--protocol', action='store_const', const=True, help=protocol)
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_job_options(parser)
     add_feature_options(parser)
@@ -111,7 +116,6 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     pairs: dict[str, Any] = {'type': _pair, 'action': 'append', 'default': []}
     removal = 'leave places FIRST .. LAST - 1 out of the map; may be repeated'
     add('--remove-from-map', metavar='FIRST:LAST', help=removal, **pairs)
-    add('--mirror', action='store_true', help='mirror the images of the query left-right')
     add('--reverse', action='store_true', help='drive the query in reverse order')
     speed = 'images of the query per image, varying, or stop (30 images in the middle)'
     add('--speed', '--warp', metavar='X', help=speed)
@@ -195,7 +199,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
 def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     if arguments.exclude_places is None:
         arguments.exclude_places = EXCLUDE_PLACES
-    names = ('unknown', 'remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop')
+    names = ('unknown', 'remove_from_map', 'reverse', 'speed', 'stop', 'drop')
     for name in names:
         if getattr(arguments, name):
             parser.error(f'--loop-closure: --{name.replace("_", "-")} needs a --map')
@@ -207,28 +211,6 @@ def _check_loop_closure(parser: argparse.ArgumentParser, arguments: argparse.Nam
         parser.error('--loop-closure goes with --truth FILE or poses')
     if arguments.exclude_places < 1:
         parser.error(f'--exclude-places {arguments.exclude_places} must be at least 1')
-
-
-def node_settings(arguments: argparse.Namespace) -> 'PipelineSettings':
-    """
-    Return the settings of the parsed options as the node has them, without a threshold.
-
-    :raises SettingsError: one is out of its range.
-    """
-    from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-    from stavpr_ros.pipeline.settings import PipelineSettings
-
-    return PipelineSettings(
-        mode=arguments.mode,
-        min_probability=arguments.min_probability,
-        max_error=arguments.max_error,
-        spatial=SpatialSettings(
-            arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
-        ),
-        sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
-        nms_radius=arguments.nms_radius,
-        time_budget_ms=arguments.time_budget_ms,
-    )
 
 
 def _evaluate(
@@ -251,30 +233,12 @@ def _evaluate(
     return evaluate_on_map(sequences.reference, query, ground_truth, settings, unknown, **common)
 
 
-def _settings_json(arguments: argparse.Namespace, sequences: 'Sequences') -> dict[str, Any]:
-    """Return everything that decides the numbers."""
-    from stavpr_ros.sources.folder import text_of
-
-    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
-    names = [
-        *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
-        *('remove_from_map', 'mirror', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
-        *('crop_map', 'crop_query', 'truth', *poses),
-        *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta'),
-        'nms_radius',
-        *('strategy', 'sigma', 'xi', 'vertical'),
-        *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
-    ]
-    settings: dict[str, Any] = {}
-    for name in names:
-        value = getattr(arguments, name)
-        settings[name] = text_of(value) if isinstance(value, str) else value
-    features = sequences.query.settings.to_json()
-    return {**settings, 'tolerance': sequences.tolerance, 'features': features}
-
-
 def _report(arguments: argparse.Namespace) -> 'Report':
-    from stavpr_lab.commands.evaluate_sequences import load_sequences
+    from stavpr_lab.commands.evaluate_sequences import (
+        load_sequences,
+        node_settings,
+        settings_json,
+    )
     from stavpr_lab.evaluation.report import Report
 
     began = time.perf_counter()
@@ -297,7 +261,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         query=sequences.query,
         reference=sequences.reference or sequences.query,
         title=f'{sequences.title}, {_truth_text(truth, sequences.tolerance)}',
-        settings=_settings_json(arguments, sequences),
+        settings=settings_json(arguments, sequences),
         times=times,
         drive=sequences.drive,
         default_threshold=settings.applied_threshold,
@@ -394,7 +358,7 @@ def _run_each(
     parser: argparse.ArgumentParser, arguments: argparse.Namespace, args: list[str]
 ) -> int:
     """Evaluate each query: a report and the numbers in a folder of its name; the exit code."""
-    for option in ('json', 'export', 'window', 'dataset', 'query_poses'):
+    for option in ('json', 'export', 'window', 'dataset', 'query_poses', 'protocol'):
         if getattr(arguments, option) is not None:
             parser.error(f'--{option.replace("_", "-")} goes with one --query')
     folder, others = Path(arguments.output or OUTPUT), other_arguments(args, '--query')
@@ -421,7 +385,12 @@ def main(args: list[str] | None = None) -> int:
             return _run_each(parser, arguments, sys.argv[1:] if args is None else args)
         arguments.query = arguments.query[0] if arguments.query else None
         _check(parser, arguments)
-        _run(arguments)
+        if arguments.protocol:
+            from stavpr_lab.commands.evaluate_protocol import run_protocol
+
+            run_protocol(parser, arguments)
+        else:
+            _run(arguments)
         return None
 
     return run_program('evaluate', work)

@@ -1,16 +1,18 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs of the command ``evaluate``: images, saved maps, data sets, ground truth."""
+"""The inputs of the command ``evaluate``: images, maps, data sets, ground truth, settings."""
 
 import argparse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import time
+from typing import Any
 
 import numpy as np
-from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource, mirrored
+from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
+from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.commands.feature_options import (
     kind_options,
     make_extractor,
@@ -20,6 +22,7 @@ from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
+from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_path import is_bag
 from stavpr_ros.sources.folder import text_of
@@ -77,6 +80,45 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
     return _changed(sequences, arguments)
 
 
+def node_settings(arguments: argparse.Namespace) -> PipelineSettings:
+    """
+    Return the settings of the parsed options as the node has them, without a threshold.
+
+    :raises SettingsError: one is out of its range.
+    """
+    return PipelineSettings(
+        mode=arguments.mode,
+        min_probability=arguments.min_probability,
+        max_error=arguments.max_error,
+        spatial=SpatialSettings(
+            arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
+        ),
+        sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
+        nms_radius=arguments.nms_radius,
+        time_budget_ms=arguments.time_budget_ms,
+    )
+
+
+def settings_json(arguments: argparse.Namespace, sequences: Sequences) -> dict[str, Any]:
+    """Return everything that decides the numbers."""
+    poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
+    names = [
+        *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
+        *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
+        *('crop_map', 'crop_query', 'truth', *poses),
+        *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta'),
+        'nms_radius',
+        *('strategy', 'sigma', 'xi', 'vertical'),
+        *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
+    ]
+    settings: dict[str, Any] = {}
+    for name in names:
+        value = getattr(arguments, name)
+        settings[name] = text_of(value) if isinstance(value, str) else value
+    features = sequences.query.settings.to_json()
+    return {**settings, 'tolerance': sequences.tolerance, 'features': features}
+
+
 def is_saved_map(path: str | None) -> bool:
     """Return whether a path is a map file, by its content; False for an unreadable path."""
     return path is not None and Path(path).is_file() and is_map(path)
@@ -100,13 +142,11 @@ class _Loader:
         """Open a folder, a video, a bag, a saved map or descriptors."""
         if is_saved_map(path) or is_descriptors(path):
             crop = 'crop_map' if name == 'map' else 'crop_query'
-            unusable = (crop, 'mirror') if name == 'query' else (crop,)
-            for option in unusable:
-                if getattr(self._arguments, option):
-                    raise SettingsError(
-                        f'--{option.replace("_", "-")}: {path} is a saved map or an array, which '
-                        'has no images'
-                    )
+            if getattr(self._arguments, crop):
+                raise SettingsError(
+                    f'--{crop.replace("_", "-")}: {path} is a saved map or an array, which has '
+                    'no images'
+                )
             return self._read(path) if is_descriptors(path) else self._load_map(path)
         if Path(path).suffix == '.stavpr':
             return load_map(path)  # raises the reason why it is none
@@ -115,14 +155,12 @@ class _Loader:
         return self.extract(name, source)
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
-        """Extract the features of a source, cropped and mirrored as the options want it."""
+        """Extract the features of a source, cropped as the options state."""
         given, extractor = self._arguments, self._chosen()
         # unknown places are cropped as the query is
         source = cropped(
             source, *((0, given.crop_map) if name == 'map' else (given.crop_query, 0))
         )
-        if name == 'query' and given.mirror:
-            source = mirrored(source)
         began = time.perf_counter()
         extracted = build_map(source, extractor)
         milliseconds = (time.perf_counter() - began) * 1e3
@@ -267,7 +305,6 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     changes = replace(
         warp,
         removed=tuple(arguments.remove_from_map),
-        mirror=arguments.mirror,
         reverse=arguments.reverse,
         drop=arguments.drop,
         seed=arguments.drop_seed,
@@ -289,7 +326,7 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
 def _description(arguments: argparse.Namespace) -> str:
     """Return the changes of the drive as text of the title."""
     parts = [f'without places {a} .. {b - 1}' for a, b in arguments.remove_from_map]
-    parts += [name for name in ('mirror', 'reverse') if getattr(arguments, name)]
+    parts += ['reverse'] if arguments.reverse else []
     if arguments.speed:
         parts.append(f'speed {arguments.speed}')
     if arguments.drop:

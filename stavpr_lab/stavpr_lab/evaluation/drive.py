@@ -5,10 +5,10 @@ A recorded query driven differently: faster, with stops, dropped images, backwar
 
 A :class:`Drive` is the indices of the images that are shown and of the places that the map keeps,
 and their ground truth; :func:`stavpr_ros.mapping.select_places` applies them.
-:func:`mirrored` and :func:`cropped` change the images themselves.
+:func:`cropped` changes the images themselves.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 import math
@@ -47,7 +47,6 @@ class DriveChanges:
     How a query is driven; they apply in the order speed, stops, reverse, drop.
 
     :param removed: stretches (first, last) of the map, first .. last - 1, that it is made without.
-    :param mirror: images are mirrored left-right and thus show no place of the map.
     :param reverse: the last image comes first.
     :param drop: probability with which each image is left out.
     :param seed: of the images that are left out.
@@ -58,7 +57,6 @@ class DriveChanges:
     """
 
     removed: tuple[tuple[int, int], ...] = ()
-    mirror: bool = False
     reverse: bool = False
     drop: float = 0.0
     seed: int = 0
@@ -154,10 +152,7 @@ class DriveChanges:
         """
         images, places = self.images(ground_truth.N), self.places(ground_truth.n)
         recorded = ground_truth.select(images)
-        truth = recorded.on_places(places)
-        if self.mirror:
-            truth = replace(truth, keys=truth.keys[:0])
-        return Drive(images, places, truth, recorded, self.removed)
+        return Drive(images, places, recorded.on_places(places), recorded, self.removed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,29 +208,31 @@ class FrameSource(Protocol):
         """Yield one image after the other."""
 
 
-class ChangedSource:
+class CroppedSource:
     """
-    A source whose images are changed one by one; stamps and identifiers stay.
+    A source whose images lose columns at both sides; stamps and identifiers stay.
 
-    :param change: returns the changed image of a frame.
+    :param left, right: fractions of the width, rounded to pixels.
     """
 
-    def __init__(self, source: FrameSource, change: Callable[[Frame], np.ndarray]) -> None:
-        self._source, self._change = source, change
+    def __init__(self, source: FrameSource, left: float, right: float) -> None:
+        self._source, self._left, self._right = source, left, right
 
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self._source)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield one changed image after the other."""
+        """Yield one cropped image after the other."""
         for frame in self._source:
-            yield replace(frame, image=np.ascontiguousarray(self._change(frame)))
-
-
-def mirrored(source: FrameSource) -> FrameSource:
-    """Mirror every image of a source left-right."""
-    return ChangedSource(source, lambda frame: frame.image[:, ::-1])
+            width = frame.image.shape[1]
+            first, last = _pixels(self._left * width), width - _pixels(self._right * width)
+            if first >= last:
+                raise ImageError(
+                    f'{frame.identifier} is {width} pixels wide: cropping {self._left} on the '
+                    f'left and {self._right} on the right leaves none'
+                )
+            yield replace(frame, image=np.ascontiguousarray(frame.image[:, first:last]))
 
 
 def _pixels(width: float) -> int:
@@ -255,15 +252,4 @@ def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
             f'cropping {left} on the left and {right} on the right: expected fractions >= 0, '
             'below 1 together'
         )
-
-    def crop(frame: Frame) -> np.ndarray:
-        width = frame.image.shape[1]
-        first, last = _pixels(left * width), width - _pixels(right * width)
-        if first >= last:
-            raise ImageError(
-                f'{frame.identifier} is {width} pixels wide: cropping {left} on the left and '
-                f'{right} on the right leaves none'
-            )
-        return frame.image[:, first:last]
-
-    return source if left == right == 0 else ChangedSource(source, crop)
+    return source if left == right == 0 else CroppedSource(source, left, right)

@@ -28,7 +28,7 @@ class SeqSlamSettings:
     :param patch: side of the squares that are normalized, pixels; divides width and height.
     :param contrast_window: places around each one, half before and half after, whose differences
         normalize its own (R_window); >= 2.
-    :param length: images in a window (ds), >= 2.
+    :param length: images in a window (ds), >= 1.
     :param slowest: map images per query image (V_min), > 0.
     :param fastest: the same (V_max), >= slowest.
     :param speed_step: between the speeds of the search (V_step), > 0.
@@ -75,7 +75,17 @@ def seqslam(
 
 def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, np.ndarray]:
     """
-    Match each query image with the map from the differences of the images.
+    Match each query image with the map from the differences of the images, contrast enhanced.
+
+    :param D: differences, shape (N, n), finite, float32 or float64; row = query image, in order.
+    :returns: those of :func:`match_lines`.
+    """
+    return match_lines(enhance_contrast(D, settings.contrast_window), settings)
+
+
+def match_lines(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Match each query image with the map along straight lines through differences.
 
     A window of ``length`` query images is compared with every straight line through the map; the
     window's middle image takes its place from the best line. The first and last images, which are
@@ -91,13 +101,12 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     windows = N - settings.length + 1
     if windows < 1 or n <= settings.lines[:, -1].min():
         return places, scores
-    enhanced = enhance_contrast(D, settings.contrast_window)
-    totals = np.full((len(settings.lines), windows, n), np.inf, enhanced.dtype)
+    totals = np.full((len(settings.lines), windows, n), np.inf, D.dtype)
     for total, line in zip(totals, settings.lines, strict=True):
         starts = max(0, n - line[-1])  # those whose line ends inside the map
         total[:, :starts] = 0
         for position, offset in enumerate(line if starts else ()):
-            total[:, :starts] += enhanced[position : position + windows, offset : offset + starts]
+            total[:, :starts] += D[position : position + windows, offset : offset + starts]
     rows, starts = np.arange(windows), totals.min(axis=0).argmin(axis=1)
     speeds = totals[:, rows, starts].argmin(axis=0)  # the slowest on a tie
     lines = settings.lines[speeds] + starts[:, None]
