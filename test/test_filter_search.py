@@ -15,6 +15,7 @@ from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.filter_paths import smooth
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART
+from stavpr_ros.recognition.recognizer import EARLY
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 PLACES, LENGTH = 240, 12
@@ -55,7 +56,7 @@ def test_query_at_other_speed_is_matched(recognizer, route, speed):
 def test_match_is_path_and_second_best_of_its_window(recognizer, route):
     answers = drive(recognizer, route[:, 20:120])
     for answer in answers[: LENGTH - 1]:
-        assert answer.status is Status.WARMING_UP
+        assert answer.status is Status.WARMING_UP or answer.probability > EARLY
     for i, answer in enumerate(answers[LENGTH + 3 :], LENGTH + 3):
         found, path = answer.sequence, answer.path
         assert answer.status is Status.MATCH
@@ -108,7 +109,7 @@ def test_path_follows_images_whose_speed_changes(recognizer, route):
     off = [
         np.abs(answer.path[:, 1] - places[i - LENGTH + 1 : i + 1])
         for i, answer in enumerate(answers)
-        if answer.accepted
+        if answer.accepted and len(answer.path) == LENGTH
     ]
     assert len(off) > 0.8 * len(places)
     assert np.mean(np.concatenate(off) <= 2) > 0.98

@@ -259,7 +259,8 @@ def test_late_matches_close_what_was_not_certain_at_first():
         best = near[np.argmax(probabilities)]
         share = window.match_oldest(settings.nms_radius, True).shares[0]
         of_path = of_sequence(belief, best)
-        calibrated = CALIBRATION * of_path / (CALIBRATION * of_path + 1 - of_path)
+        on_map = belief.weights.sum()
+        calibrated = of_path / (on_map + (1 - on_map) / CALIBRATION)
         assert found.probability == pytest.approx(share * calibrated)
     assert len(late) >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())

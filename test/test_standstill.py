@@ -38,7 +38,11 @@ def noisy(strips, seed=0):
 def matched(recognizer, features):
     """Return the place of each image that has a match, by image."""
     matches = [recognizer.update(features[i : i + 1]) for i in range(len(features))]
-    return {i - 10: match.sequence.middle for i, match in enumerate(matches) if match.accepted}
+    return {
+        i - 10: match.sequence.middle
+        for i, match in enumerate(matches)
+        if match.accepted and len(match.window_stamps) == 20
+    }
 
 
 def robust():

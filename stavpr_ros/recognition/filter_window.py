@@ -137,7 +137,7 @@ class FilterWindow(QueryWindow):
         layout, settings = layout or ColumnLayout(), settings or FilterSettings()
         length, width = sequence.length, layout.width(places)
         super().__init__(self._buffer(sequence, width), layout, normalizes, around)
-        self._middle = (length - 1) // 2
+        self._middle, self._to_oldest = (length - 1) // 2, to_oldest
         lag = length - 1 - (0 if to_oldest else self._middle)
         self.filter = self._state_filter(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings, length)
@@ -151,6 +151,11 @@ class FilterWindow(QueryWindow):
         self, width: int, lag: int, settings: FilterSettings, gaps: np.ndarray
     ) -> StateFilter:
         return PlaceFilter(width, lag, settings, gaps)
+
+    @property
+    def matches_early(self) -> bool:
+        """Whether a window that is not full can have a match: unless read at its oldest image."""
+        return not self._to_oldest
 
     @property
     def changes(self) -> tuple[float, ...]:

@@ -62,8 +62,6 @@ class SequenceRecognizer(ABC):
     problem = ''
     stages = ''
 
-    _matches_early = False  # before the window is full, where the place is probable enough
-
     def __init__(
         self,
         settings: RecognizerSettings,
@@ -201,7 +199,7 @@ class SequenceRecognizer(ABC):
         self._motion.trajectory.append(position)
         if buffer.full:
             match = self._of_window(match, position)
-        elif self._matches_early and len(buffer) >= FEWEST:
+        elif self._window.matches_early and len(buffer) >= FEWEST:
             sure = max(min_probability, EARLY)
             early = replace(match, threshold=1 - sure, min_probability=sure)
             early = self._of_window(early, position)
@@ -268,7 +266,6 @@ class PlaceRecognizer(SequenceRecognizer):
         self._centering = prepared.centering
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
         if isinstance(self._window, FilterWindow):
-            self._matches_early = True
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
         # where a first stage compares vectors of whole images: it, and their centering
         self._vectors: tuple[FirstStage, MeanCentering] | None = None

@@ -235,6 +235,11 @@ class QueryWindow(ABC):
         self._normalizes, self._around = normalizes, around
 
     @property
+    def matches_early(self) -> bool:
+        """Whether a window that is not full can have a match."""
+        return False
+
+    @property
     def changes(self) -> tuple[float, ...]:
         """Change of each image from the one before, oldest first; empty without a filter."""
         return ()

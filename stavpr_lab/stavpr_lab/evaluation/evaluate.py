@@ -228,7 +228,7 @@ def recognize_traverse(
         nearest = smallest_indices(row, ranks)
         if len(nearest):
             single.places[i, : len(nearest)], single.scores[i] = nearest, row[nearest[0]]
-        if match.sequence is not None:
+        if match.sequence is not None and is_full(match, length):
             image = i - (length - 1) + middle
             found = np.asarray(online.candidates(ranks)[0])
             candidates[image, : len(found)] = found

@@ -225,6 +225,11 @@ def _counts(
     ]
 
 
+def is_full(match: Match, length: int) -> bool:
+    """Return whether a match is of a full window, by its path; True without a path."""
+    return not len(match.path) or int(match.path[-1, 0]) >= length - 1
+
+
 def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> ImageMatches:
     """
     Assign the matches of windows to images: each to the image in the middle of its window.
@@ -239,11 +244,8 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     """
     found = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
-    ends = [
-        end
-        for end, match in enumerate(matches)
-        if match.sequence is not None and not 0 < len(match.window_stamps) < length
-    ]
+    found_at = (end for end, match in enumerate(matches) if match.sequence is not None)
+    ends = [end for end in found_at if is_full(matches[end], length)]
 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
