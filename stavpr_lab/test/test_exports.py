@@ -21,9 +21,9 @@ def run(monkeypatch, capsys, tmp_path, route):
     command = runner(evaluate, monkeypatch, capsys)
     folders = ['--map', tmp_path / 'map', '--query', tmp_path / 'query', '--sequence-length', 5]
 
-    def run(name, *options, output='numbers.json'):
+    def run(name, *options):
         export = ['--export', tmp_path / 'out', '--export-format', name]
-        return command(*folders, *export, '--json', tmp_path / output, *options)
+        return command(*folders, *export, '--json', tmp_path / 'numbers.json', *options)
 
     return run
 
@@ -66,13 +66,9 @@ def test_export_vpr_tutorial_gives_its_metrics_our_numbers(run, tmp_path):
     recall = truth['GTsoft'][S.argmax(axis=0), np.arange(N)].mean()
     single = read_json((tmp_path / 'numbers.json').read_text())['single']
     assert recall == pytest.approx(single['recall_at_1'])
-    options = ['--truth', tmp_path / 'out/GT.npz', '--force']
-    assert run('hloc', *options, output='again.json')[0] == 0
-    again = read_json((tmp_path / 'again.json').read_text())['single']
-    assert again['recall_at_20'] == single['recall_at_20']
 
 
-def test_export_hloc_names_images_below_one_folder(run, tmp_path, route):
+def test_export_hloc_names_images_below_one_folder(run, tmp_path):
     assert run('hloc')[0] == 0
     pairs = [line.split() for line in (tmp_path / 'out/pairs.txt').read_text().splitlines()]
     assert all((tmp_path / name).is_file() for pair in pairs for name in pair)
@@ -82,13 +78,10 @@ def test_export_hloc_names_images_below_one_folder(run, tmp_path, route):
     assert [place.removeprefix('map/') for place in best.values()] == [
         query.removeprefix('query/') for query in best
     ]
-    write_images(tmp_path / 'a place', route[:N])
+    (tmp_path / 'a place').symlink_to(tmp_path / 'map')
     code, _, errors = run('hloc', '--map', tmp_path / 'a place', '--force')
     assert (code, 'has a space' in errors) == (1, True)
-
-
-def test_export_of_image_names_requires_folders(run, tmp_path):
-    np.save(tmp_path / 'v.npy', np.random.default_rng(0).standard_normal((N, 8)))
-    arrays = ['--map', tmp_path / 'v.npy', '--query', tmp_path / 'v.npy']
+    np.save(tmp_path / 'v.npy', np.eye(N))
+    arrays = ['--map', tmp_path / 'v.npy', '--query', tmp_path / 'v.npy', '--force']
     code, _, errors = run('hloc', *arrays)
     assert (code, 'give --map and --query as folders' in errors) == (1, True)

@@ -14,6 +14,7 @@ from stavpr_ros.output_file import ANY, atomic_output, NPY, require_replaceable,
 
 if TYPE_CHECKING:
     from stavpr_lab.evaluation.report import Report
+    from stavpr_ros.features import LocalFeatures
     from stavpr_ros.recognition import RecognizerSettings
 
 FORMATS = {  # their files
@@ -48,15 +49,20 @@ def export(
     elif arguments.export_format == 'vpr_methods_evaluation':
         files, positions = _image_files(arguments, report), _positions(arguments, report)
         for i, name in enumerate(('database', 'queries')):
-            features = (report.reference, report.query)[i].features
-            rows = (features.strips * features.weights[:, :, None]).transpose(1, 0, 2)
-            _write_npy(folder / f'{name}_descriptors.npy', rows.reshape(len(rows), -1), force)
+            rows = image_vectors((report.reference, report.query)[i].features)
+            _write_npy(folder / f'{name}_descriptors.npy', rows, force)
             _link_images(files[i], positions[i], folder / name)
     else:
         write_descriptors(report.query.features, folder / 'query.npy', force)
         if report.reference is not report.query:
             write_descriptors(report.reference.features, folder / 'map.npy', force)
     print(f'{arguments.export_format}: {folder}')
+
+
+def image_vectors(features: 'LocalFeatures') -> np.ndarray:
+    """Return a unit-norm vector of each image, its strips side by side, shape (n, W d)."""
+    strips = (features.strips * features.weights[:, :, None]).transpose(1, 0, 2)
+    return np.ascontiguousarray(strips.reshape(len(features), -1), np.float32)
 
 
 def _image_files(arguments: argparse.Namespace, report: 'Report') -> list[list[Path]]:

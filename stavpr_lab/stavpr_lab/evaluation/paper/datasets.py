@@ -59,6 +59,7 @@ LAYOUTS = {
         ('berlina100', 'a100'), ('reference', 'ref', '2'), ('live', 'query', '1'), 2, paired=False
     ),
 }
+OXFORD = ('oxfordrobotcar', 'robotcar', 'oxford')
 PAIR = ('database',), ('query', 'queries')  # names of map and query
 FIELD_LAYOUTS = {
     **{
@@ -72,13 +73,7 @@ FIELD_LAYOUTS = {
     },
     'st_lucia': Layout(('stlucia',), *PAIR, 0, reader=utm_names),
     'st_lucia_small': Layout(('stlucia',), ('1009090845',), ('1808091545',), 0, paired=False),
-    'robotcar': Layout(
-        ('oxfordrobotcar', 'robotcar', 'oxford'),
-        ('20150317110844',),
-        ('20141216184424',),
-        0,
-        reader=robotcar,
-    ),
+    'robotcar': Layout(OXFORD, ('20150317110844',), ('20141216184424',), 0, reader=robotcar),
     'sfu': Layout(('sfu', 'sfumountain'), ('dry',), ('jan',), 0, paired=False),
     'utm': Layout((), *PAIR, 0, reader=utm_names),
 }
@@ -131,10 +126,14 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
     places: FrameSource
     query: FrameSource
     if layout.reader is not None:
-        places, query, ground_truth = _with_positions(
-            layout, layout.reader, map_folder, query_folder
+        reference, queries = (
+            read_traverse(layout.reader, path) for path in (map_folder, query_folder)
         )
-        ground_truth = ground_truth.widened(tolerance)
+        places, query = reference.source, queries.source
+        poses = queries.poses, reference.poses
+        ground_truth = GroundTruth.from_poses(*poses, layout.meters, layout.degrees)
+        counted = queries.counted[ground_truth.keys // ground_truth.n]
+        ground_truth = replace(ground_truth, keys=ground_truth.keys[counted]).widened(tolerance)
     else:
         places, query = _images(map_folder), _images(query_folder)
         if layout.paired and len(query) == len(places):
@@ -145,16 +144,6 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
     if name.startswith(SYNTH):
         places, query = cropped(places, 0, CROP_MAP), cropped(query, CROP_QUERY, 0)
     return Dataset(places, query, ground_truth, tolerance)
-
-
-def _with_positions(
-    layout: Layout, reader: Reader, map_folder: Path, query_folder: Path
-) -> tuple[FrameSource, FrameSource, GroundTruth]:
-    """Return map, query and the ground truth of the queries that count."""
-    places, query = (read_traverse(reader, folder) for folder in (map_folder, query_folder))
-    truth = GroundTruth.from_poses(query.poses, places.poses, layout.meters, layout.degrees)
-    counted = query.counted[truth.keys // truth.n]
-    return places.source, query.source, replace(truth, keys=truth.keys[counted])
 
 
 def _images(folder: Path) -> FolderSource:
