@@ -18,7 +18,7 @@ SPACING = 2.0  # meters between images of RobotCar, which has 16 a second
 
 
 @dataclass(frozen=True)
-class Traverse:
+class PosedTraverse:
     """
     Images with positions.
 
@@ -32,10 +32,10 @@ class Traverse:
     counted: np.ndarray
 
 
-Reader = Callable[[Path], Traverse]
+Reader = Callable[[Path], PosedTraverse]
 
 
-def read_traverse(reader: Reader, folder: Path) -> Traverse:
+def read_traverse(reader: Reader, folder: Path) -> PosedTraverse:
     """
     Read a traverse in one of the layouts below.
 
@@ -50,16 +50,16 @@ def read_traverse(reader: Reader, folder: Path) -> Traverse:
         ) from error
 
 
-def utm_names(folder: Path) -> Traverse:
+def utm_names(folder: Path) -> PosedTraverse:
     """Read the format of VPR-datasets-downloader: images ``@easting@northing@...@.jpg``."""
     images = FolderSource(folder)
     # the eighth field, pano_id, and those after it follow the order of the recording
     images.files.sort(key=lambda file: list(map(natural_key, file.name.split('@')[7:])))
     positions = [[float(field) for field in file.name.split('@')[1:3]] for file in images.files]
-    return Traverse(images, _poses(positions), np.ones(len(images), bool))
+    return PosedTraverse(images, _poses(positions), np.ones(len(images), bool))
 
 
-def msls(folder: Path) -> Traverse:
+def msls(folder: Path) -> PosedTraverse:
     """Read ``query`` or ``database`` of a city of Mapillary Street-Level Sequences."""
     names = ('raw', 'postprocessed', 'subtask_index')
     tables = [_table(folder / f'{name}.csv') for name in names]
@@ -69,12 +69,12 @@ def msls(folder: Path) -> Traverse:
     images.files = [folder / 'images' / f'{row["key"]}.jpg' for row in rows]
     positions = [[float(row['easting']), float(row['northing'])] for row in rows]
     headings = [float(row['ca']) for row in rows]
-    return Traverse(
+    return PosedTraverse(
         images, _poses(positions, headings), np.array([row['all'] == 'True' for row in rows])
     )
 
 
-def robotcar(folder: Path) -> Traverse:
+def robotcar(folder: Path) -> PosedTraverse:
     """Read ``stereo/left`` and ``gps/ins.csv`` of Oxford RobotCar: an image every 2 m."""
     images, rows = FolderSource(folder / 'stereo/left'), _table(folder / 'gps/ins.csv')
     stamps = np.array([int(file.stem) for file in images.files])
@@ -87,7 +87,7 @@ def robotcar(folder: Path) -> Traverse:
             kept.append(i)
     images.files = [images.files[i] for i in kept]
     source = ChangedSource(images, _demosaiced)
-    return Traverse(source, _poses(positions[kept]), np.ones(len(kept), bool))
+    return PosedTraverse(source, _poses(positions[kept]), np.ones(len(kept), bool))
 
 
 def _demosaiced(frame: Frame) -> np.ndarray:
