@@ -31,8 +31,8 @@ from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import open_source
 import torch
 
-LENGTHS = 5, 10, 20  # images in a window: defaults of seqNet, of pySeqSLAM and ours
-MARGIN = max(LENGTHS) // 2  # first and last images, in the middle of no window: not counted
+LONGEST = 20  # images in a window, our default; 5 and 10 are those of seqNet and of pySeqSLAM
+MARGIN = LONGEST // 2  # first and last images, in the middle of no window: not counted
 PLACES = 300  # of Nordland: seqNet takes a millisecond for each pair of windows of 20 images
 PROJECTION = 64  # dimensions of a strip of the network, for the same reason
 Matches = tuple[np.ndarray, np.ndarray]  # place of each image, and its distance
@@ -91,23 +91,47 @@ def seqmatch(folder: Path, places: np.ndarray, queries: np.ndarray, length: int)
     return scores.argmin(axis=0), scores.min(axis=0)
 
 
+def centered(rows: np.ndarray) -> np.ndarray:
+    """Return vectors (n, D) less their mean, of unit norm, a common preparation of descriptors."""
+    rows = rows - rows.mean(axis=0)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def differences(places: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Return cosine distances of vectors, shape (n, N)."""
+    # black images have no contrast, and a division by zero makes all of pySeqSLAM's values NaN
+    noise = np.random.default_rng(0).uniform(0, 1e-6, (len(places), len(queries)))
+    return 1 - places @ queries.T + noise
+
+
+def peer_methods(
+    options: Any, places: np.ndarray, queries: np.ndarray
+) -> Iterator[tuple[str, Matches]]:
+    """Yield name and matches of each method of another group for vectors (n, D) and (N, D)."""
+    S = places @ queries.T
+    best = load(options.vpr_tutorial / 'matching/matching.py').best_match_per_query(S)
+    yield 'VPR_Tutorial, single images', (best.argmax(axis=0), -S.max(axis=0))
+    for length in (5, LONGEST):
+        yield f'seqNet seqMatch, l = {length}', seqmatch(options.seqnet, places, queries, length)
+    D = differences(places, queries)
+    for length in (10, LONGEST):
+        yield f'pySeqSLAM, l = {length}', pyseqslam(options.pyseqslam, D, length)
+
+
 def methods(
     options: Any, place_map: PlaceMap, query: PlaceMap, truth: GroundTruth
 ) -> Iterator[tuple[str, Matches]]:
     """Yield name and matches of each method."""
     places, queries = (image_vectors(each.features) for each in (place_map, query))
-    S = places @ queries.T
-    best = load(options.vpr_tutorial / 'matching/matching.py').best_match_per_query(S)
-    yield 'VPR_Tutorial, single images', (best.argmax(axis=0), -S.max(axis=0))
-    for length in LENGTHS[:1] + LENGTHS[2:]:
-        yield f'seqNet seqMatch, l = {length}', seqmatch(options.seqnet, places, queries, length)
-    # black images have no contrast, and a division by zero makes all of pySeqSLAM's values NaN
-    D = 1 - S + np.random.default_rng(0).uniform(0, 1e-6, S.shape)
-    for length in LENGTHS[1:]:
-        yield f'pySeqSLAM, l = {length}', pyseqslam(options.pyseqslam, D, length)
-    for length in LENGTHS[1:]:
+    yield from peer_methods(options, places, queries)
+    for name, matches in peer_methods(options, centered(places), centered(queries)):
+        yield f'{name}, centered', matches
+    for length in (10, LONGEST):
         settings = SeqSlamSettings(length=length)
-        yield f'ours, SeqSLAM, l = {length}', match_differences(D.T, settings)
+        yield (
+            f'ours, SeqSLAM, l = {length}',
+            match_differences(differences(places, queries).T, settings),
+        )
     for mode in ('paper', 'robust'):
         settings = RecognizerSettings(threshold=1.0, mode=mode)
         results = evaluate_on_map(place_map, query.features, truth, settings).results
