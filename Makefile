@@ -21,11 +21,14 @@ SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
 TESTS := test stavpr_slam/test stavpr_lab/test
-TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN) pytest -n 2 --dist loadfile $(TESTS)
+PYTEST = pytest -n 2 --dist loadfile $(TESTS)
+TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN)
+# Package and least percentage of its lines and branches that the tests reach.
+COVERAGE := stavpr_ros:95 stavpr_slam:88 stavpr_lab:91
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo animation evaluate test test-long crash-test lint docs bench bench-quick accuracy off-map \
+.PHONY: help setup build demo animation evaluate test test-long coverage crash-test lint docs bench bench-quick accuracy off-map \
 	shell clean distclean development
 
 help: ## list the targets (the default)
@@ -64,10 +67,20 @@ evaluate: build ## report the matches of QUERY= on MAP=; metrics with TRUTH= (AR
 		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
 
 test: lint docs ## lint, build the documentation, and run the tests but the long ones (ARGS=)
-	@$(TEST) -m 'not long' $(ARGS)
+	@$(TEST) $(PYTEST) -m 'not long' $(ARGS)
 
 test-long: development ## run the tests that take minutes each (ARGS=)
-	@$(TEST) -m long $(ARGS)
+	@$(TEST) $(PYTEST) -m long $(ARGS)
+
+coverage: development ## run the tests, and require the lines and branches that they reach (ARGS=)
+	@rm -f .coverage .coverage.*
+	@$(TEST) coverage run --data-file=$(CURDIR)/.coverage .venv/bin/$(PYTEST) -m 'not long' $(ARGS)
+	@$(RUN) coverage combine --quiet
+	@for row in $(COVERAGE); do \
+		echo "$${row%:*}: at least $${row#*:} %"; \
+		$(RUN) coverage report --skip-covered --fail-under="$${row#*:}" \
+			--include="$${row%:*}/*" || exit 1; \
+	done
 
 crash-test: development ## kill, stop and disturb a recording node for HOURS=; nothing may be lost
 	@$(RUN) bash -c 'PYTHONPATH="test/shared:$$PYTHONPATH" python test/crash_run.py $(HOURS)'

@@ -18,9 +18,11 @@ from glob import glob
 import os
 from pathlib import Path
 import sys
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
+MANIFEST = ElementTree.parse('package.xml')
 NAME = 'stavpr_ros'
 SIBLINGS = ('stavpr_slam', 'stavpr_lab')
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
@@ -39,8 +41,9 @@ of the workspace, make links beside it, then build again:
 """
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']
-TEST = ['hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
+TEST = ['catkin-pkg>=1.0', 'hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
 LINT = [
+    'coverage>=7.10',
     'flake8>=7.0',
     'flake8-builtins>=2.1',
     'flake8-comprehensions>=3.14',
@@ -73,12 +76,15 @@ for sibling in SIBLINGS if WHEEL else ():
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=MANIFEST.findtext('version'),
     description='STA-VPR place recognition by spatio-temporal alignment, as a ROS 2 node.',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    project_urls={url.get('type'): url.text for url in MANIFEST.iter('url')},
     license='Apache-2.0',
     author='The stavpr_ros authors',
-    maintainer='The stavpr_ros maintainers',
-    maintainer_email='maintainers@stavpr-ros.org',
+    maintainer=MANIFEST.findtext('maintainer'),
+    maintainer_email=MANIFEST.find('maintainer').get('email'),
     packages=packages,
     package_dir={sibling: f'{sibling}/{sibling}' for sibling in SIBLINGS},
     package_data={'': ['py.typed', '*.html', '*.jinja']},

@@ -5,6 +5,7 @@
 from importlib.util import find_spec
 from pathlib import Path
 import sys
+from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / folder) for folder in ('.', 'stavpr_slam', 'stavpr_lab')]
@@ -12,7 +13,7 @@ sys.path[:0] = [str(ROOT / folder) for folder in ('.', 'stavpr_slam', 'stavpr_la
 project = 'stavpr_ros'
 author = 'The stavpr_ros authors'
 copyright = '2026, The stavpr_ros authors'  # noqa: A001
-release = version = '0.1.0'
+release = version = ElementTree.parse(ROOT / 'package.xml').findtext('version')
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.viewcode']
 source_suffix = {'.rst': 'restructuredtext', '.md': 'markdown'}

@@ -6,7 +6,7 @@ STA-VPR place recognition: spatio-temporal alignment of image sequences, and a R
 Importing the package itself loads nothing heavy; import what you need from its folders:
 ``alignment`` (the mathematics), ``features`` (image to local features), ``mapping`` (the reference
 map), ``recognition`` (frame by frame), ``sources`` (frames from folders, bags and messages),
-``pipeline`` (one image message at a time), ``evaluation`` (metrics, plots), ``ros`` (the node).
+``pipeline`` (one image message at a time), ``ros`` (the node).
 """
 
-__version__ = '0.1.0'
+__version__ = '0.9.0'

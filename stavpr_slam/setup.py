@@ -2,18 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
 
+from xml.etree import ElementTree
+
 from setuptools import find_packages, setup
 
+MANIFEST = ElementTree.parse('package.xml')
 NAME = 'stavpr_slam'
 
 setup(
     name=NAME,
-    version='0.1.0',
+    version=MANIFEST.findtext('version'),
     description='SLAM with the loop closures of stavpr_ros: pose graph and bridges.',
     license='Apache-2.0',
     author='The stavpr_ros authors',
-    maintainer='The stavpr_ros maintainers',
-    maintainer_email='maintainers@stavpr-ros.org',
+    maintainer=MANIFEST.findtext('maintainer'),
+    maintainer_email=MANIFEST.find('maintainer').get('email'),
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={'': ['py.typed', '*.html', '*.jinja']},
     data_files=[

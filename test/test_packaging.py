@@ -12,6 +12,7 @@ import sys
 from xml.etree import ElementTree
 import zipfile
 
+from catkin_pkg.changelog import get_changelog_from_path
 from interface_packages import INTERFACES
 from processes import executable
 import pytest
@@ -24,6 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {
     'stavpr_ros': ROOT, 'stavpr_slam': ROOT / 'stavpr_slam', 'stavpr_lab': ROOT / 'stavpr_lab'
 }  # fmt: skip
+FOLDERS = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
 EXTRAS = ('onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam')
 
 # Import name: distribution on PyPI, where they differ.
@@ -127,20 +129,35 @@ def test_dependencies_between_packages_are_declared():
 
 
 def test_versions_agree(monkeypatch):
-    folders = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
-    versions = [manifest(folder).findtext('version') for folder in folders]
+    versions = [manifest(folder).findtext('version') for folder in FOLDERS]
     citation = (ROOT / 'CITATION.cff').read_text(encoding='utf-8')
     versions.append(re.search(r'^version: (.+)$', citation, re.MULTILINE).group(1))
     versions += [setup_arguments(package, monkeypatch)['version'] for package in PACKAGES]
     assert set(versions) == {stavpr_ros.__version__}
+    for folder in FOLDERS:
+        changelog = get_changelog_from_path(folder)
+        newest = next(version for version, date, _ in changelog.foreach_version() if date)
+        assert newest == stavpr_ros.__version__
+        assert changelog.get_content_of_version(newest)
 
 
-@pytest.mark.parametrize('folder', ['.', 'stavpr_msgs', 'stavpr_slam', 'stavpr_lab'])
+def test_project_urls_and_placeholders_are_in_the_manifests():
+    """A placeholder anywhere else would be released."""
+    (url,) = {url.text.removesuffix('/issues') for url in manifest(ROOT).iter('url')}
+    (address,) = {manifest(folder).find('maintainer').get('email') for folder in FOLDERS}
+    patterns = ('*.*', 'docs/*.*', 'stavpr_*/*.*', '.github/*/*.yml')
+    files = [path for pattern in patterns for path in ROOT.glob(pattern) if path.is_file()]
+    texts = {path: path.read_bytes() for path in files if path.suffix != '.md'}
+    assert [path for path in texts if url.encode() in texts[path]] == [ROOT / 'package.xml']
+    found = {path for path in texts if address.encode() in texts[path]}
+    assert found == {folder / 'package.xml' for folder in FOLDERS}
+
+
+@pytest.mark.parametrize('folder', FOLDERS)
 def test_license_file_is_there(folder):
-    element = manifest(ROOT / folder).find('license')
+    element = manifest(folder).find('license')
     assert element.text == 'Apache-2.0'
-    assert 'Apache License' in (ROOT / folder / element.get('file')).read_text(encoding='utf-8')
-    assert (ROOT / folder / 'CHANGELOG.rst').is_file()
+    assert 'Apache License' in (folder / element.get('file')).read_text(encoding='utf-8')
 
 
 def test_dependencies_are_recent_or_pinned():

@@ -20,11 +20,17 @@ from stavpr_ros.ros.rclpy_workarounds import rclpy_implementation, ros_arguments
         ('--map x', '-p map_path:=x'),
         ('--min-probability=0.9 --ros-args -p a:=b', '-p min_probability:=0.9'),
         ('--ros-args -p a:=b -- -r image:=/camera', '-r image:=/camera'),
+        ('--params-file x.yaml', '--params-file x.yaml'),
     ],
 )
 def test_arguments_that_nothing_reads_are_rejected_with_the_right_line(arguments, line):
     with pytest.raises(SettingsError, match=rf'write --ros-args {line} \('):
         require_ros_arguments(arguments.split(), BY_NAME)
+
+
+def test_arguments_like_no_parameter_are_rejected_without_a_guess():
+    with pytest.raises(SettingsError, match='write --ros-args -p NAME:=VALUE with a NAME that'):
+        require_ros_arguments(['--map=x'], ['map_frame', 'robots', 'keyframe_distance'])
 
 
 @pytest.mark.parametrize('arguments', ['', '--ros-args -p map_path:=x', 'image:=/camera'])

@@ -33,6 +33,8 @@ SERVICE_SECONDS = 2.0  # until a node shows its parameter service; tools may hav
 # read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
 PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 PROFILES_FILE = 'config/fastdds_large_images.xml'
+SIMILARITY = 0.54  # of names: --map is map_path (0.55), and not map_frame (0.50)
+ROS_OPTIONS = ('enclave', 'log-level', 'param', 'params-file', 'remap')
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -154,11 +156,14 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
     remapped = {word.partition(':=')[0] for word in words}
     if not own_arguments(arguments) and remapped.isdisjoint(parameters):
         return
-    line = ['--ros-args']
+    line, unknown = ['--ros-args'], ''
     for word in words:
         name, _, value = word.lstrip('-').partition('=')
-        near = difflib.get_close_matches(name.replace('-', '_'), parameters, 1, 0.5)
-        if word.startswith('--') and near:
+        near = difflib.get_close_matches(name.replace('-', '_'), parameters, 1, SIMILARITY)
+        if word.startswith('--') and name not in ROS_OPTIONS:
+            if not near:
+                line, unknown = ['--ros-args -p NAME:=VALUE'], ' with a NAME that --help lists'
+                break
             line += ['-p', f'{near[0]}:={value}']
         elif ':=' in word and line[-1] not in ('-p', '-r', '--param', '--remap'):
             line += ['-p', word]
@@ -167,8 +172,8 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
         else:
             line.append(word)
     raise SettingsError(
-        f'nothing reads the arguments {" ".join(words)!r}: write {" ".join(line)} (parameters and '
-        'remappings are arguments of ROS)'
+        f'nothing reads the arguments {" ".join(words)!r}: write {" ".join(line)}{unknown} '
+        '(parameters and remappings are arguments of ROS)'
     )
 
 

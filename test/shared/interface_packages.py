@@ -32,7 +32,7 @@ ament_package()
 """
 PACKAGE = """<package format="3">
   <name>{name}</name><version>0.0.0</version><description>For tests.</description>
-  <maintainer email="maintainers@stavpr-ros.org">The stavpr_ros maintainers</maintainer>
+  <maintainer email="tests@example.com">The stavpr_ros maintainers</maintainer>
   <license>BSD</license>
   <buildtool_depend>ament_cmake</buildtool_depend>
   <buildtool_depend>rosidl_default_generators</buildtool_depend>

@@ -126,7 +126,7 @@ def _pairs(result: LoopResult, place_map: PlaceMap) -> list[MatchPair]:
         image = place_map.thumbnail(query)
         if image is None:
             raise InputError('the map of the traverse has no thumbnails')
-        caption = f'image {query}: image {place}, distance {result.distances[i]:.2f}'
+        caption = f'query image {query}: place {place}, distance {result.distances[i]:.2f}'
         pairs.append(MatchPair(image, place_map.thumbnail(place), caption, outcome))
     return pairs
 
@@ -166,7 +166,7 @@ def _draw_traverse(
             axes.plot(earlier, later, color=plots.BRIGHT[outcome], ms=size, label=label, **dots)
     note = 'not compared:\nlater, or too recent'
     axes.text(N * 0.97, N * 0.04, note, ha='right', va='top', color=plots.QUIET)
-    axes.set(xlabel='earlier image', ylabel='later image')
+    axes.set(xlabel='place: earlier image', ylabel='query image')
     axes.set(xlim=(-0.5, N - 0.5), ylim=(N - 0.5, -0.5))
     for handle in plots.legend_above(axes, 3).get_lines():
         handle.set(markersize=10, alpha=1)
@@ -180,7 +180,8 @@ def draw_loops(result: LoopResult, place_map: PlaceMap, title: str, folder: Path
     :returns: its path.
     """
     path = folder / 'loop.png'
-    with plots.titled_page(path, 12.5, 5.9, title, result.summary()) as figure:
+    pairs = 'Pairs: query image on the left, its place (an earlier image) on the right'
+    with plots.titled_page(path, 12.5, 5.9, title, f'{result.summary()}\n{pairs}') as figure:
         halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.1))
         left, right = halves
         _draw_traverse(left, left.add_subplot(), result, _compared_distances(result, place_map))

@@ -115,7 +115,7 @@ class PoseGraphNode(ManagedNode):
         self._tf_type: Any = tf_message() if given['publish_tf'] else None
         self._graph: GraphProcess | None = None
         self._entities: list[Any] = []
-        self._publishers: list[Any] = []
+        self._made_publishers: list[Any] = []
         self._forget()
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -142,8 +142,8 @@ class PoseGraphNode(ManagedNode):
         """Create the publishers, and start the process of the graph."""
 
         def make(*given: Any) -> Any:
-            self._publishers.append(self.create_lifecycle_publisher(*given))
-            return self._publishers[-1]
+            self._made_publishers.append(self.create_lifecycle_publisher(*given))
+            return self._made_publishers[-1]
 
         self._edges = make(MarkerArray, '~/edges', LATCHED)
         self._tf: Any = make(self._tf_type, '/tf', 100) if self._tf_type else None
@@ -184,9 +184,9 @@ class PoseGraphNode(ManagedNode):
         """Forget the graph."""
         self._stop()
         self._forget()
-        for publisher in self._publishers:
+        for publisher in self._made_publishers:
             self.destroy_publisher(publisher)
-        self._publishers = []
+        self._made_publishers = []
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
