@@ -48,6 +48,18 @@ def test_sweep_configurations_vary_one_parameter():
         sweep_configurations('gamma')
 
 
+def test_experiments_field_prints_recall_at_the_tolerance_of_each_data_set(
+    nordland, tmp_path, run
+):
+    code, text, errors = run('field', *nordland[:2], '--gradient-cell', 32)
+    assert code == 0, errors
+    lines = text.splitlines()
+    assert lines[0] == 'field: recall_at_1'
+    assert lines[3].split('  ')[0] == 'nordland_winter, identity +-10'
+    assert lines[3].split()[-4:] == ['1.000'] * 4
+    assert any(line.startswith('nordland_winter_1, identity +-1 ') for line in lines)
+
+
 def test_experiments_print_our_numbers_beside_the_published(nordland, tmp_path, run):
     out = tmp_path / 'out.json'
     code, text, errors = run('ablation', *nordland, '--json', out, '--gradient-cell', 32)

@@ -11,7 +11,7 @@ from typing import Any, TYPE_CHECKING
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program
 from stavpr_ros.errors import SourceError
-from stavpr_ros.output_file import HTML, JSON, NPY, require_replaceable
+from stavpr_ros.output_file import HTML, JSON, require_replaceable
 from stavpr_ros.parameters import default
 
 if TYPE_CHECKING:
@@ -42,6 +42,13 @@ ground truth (--truth), none by default:
                pairs, or a place a query; an image: white at row i, column j accepts place j for
                query i; --tolerance is 0 then
 
+formats (--export-format):
+  arrays                  map.npy and query.npy, which --map and --query read
+  vpr_methods_evaluation  database_descriptors.npy and queries_descriptors.npy, and the folders
+                          database and queries: links @easting@northing@... to the images
+  vpr_tutorial            S.npy, similarities of single images, and GT.npz: rows are places
+  hloc                    pairs.txt: a line for each of the best places, query and reference
+
 another drive (they combine; applied in the order speed, stop, reverse, drop):
   --remove-from-map 100:150   the map lacks the places 100 to 149: are images of them matched?
   --reverse                   the last image comes first
@@ -59,6 +66,7 @@ examples:
   evaluate --map summer.csv --query netvlad.mat:winter --truth identity --tolerance 2
   evaluate --map map.npy --query query.npy --truth identity --protocol
   evaluate --map summer/ --query winter/ --export arrays/
+  evaluate --map summer/ --query winter/ --export pairs/ --export-format hloc
   evaluate --map summer/ --query drives/*.bag --output reports/ --processes 4
   evaluate --dataset gardens_point=data/gardens_point --strategy vanilla
 
@@ -67,6 +75,7 @@ exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
 
 
 def _parser() -> argparse.ArgumentParser:
+    from stavpr_lab.commands.evaluate_export import FORMATS
     from stavpr_ros.commands.feature_options import add_feature_options
 
     parser = make_parser('evaluate', DESCRIPTION, EPILOG)
@@ -96,8 +105,10 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument_group('output').add_argument
     add('--json', metavar='FILE', help='write the numbers')
     add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
-    export = 'write the features of map and query as map.npy and query.npy'
+    export = 'write the features of map and query as map.npy and query.npy, or --export-format'
     add('--export', metavar='FOLDER', help=export)
+    formats = 'of --export: arrays, or files of another program, see below (%(default)s)'
+    add('--export-format', choices=tuple(FORMATS), default='arrays', help=formats)
     add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
     protocol = (
         'instead of a report: recall@1 and recall at 100 %% precision, with 95 %% intervals, at '
@@ -184,6 +195,8 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error('give --map or, for the query on its own past, --loop-closure')
     if (arguments.exclude_places is not None or arguments.late_closures) and not loop:
         parser.error('--exclude-places and --late-closures: each goes with --loop-closure')
+    if loop and arguments.export_format != 'arrays':
+        parser.error('--export-format: files of other programs need a --map')
     if loop:
         _check_loop_closure(parser, arguments)
     compares = arguments.tolerance is not None or arguments.unknown or arguments.mode == 'paper'
@@ -315,18 +328,8 @@ def _print_metrics(report: 'Report') -> None:
         )
 
 
-def _export(report: 'Report', folder: Path, force: bool) -> None:
-    from stavpr_ros.features.descriptors import write_descriptors
-
-    traverses = {'query': report.query}
-    if report.reference is not report.query:
-        traverses['map'] = report.reference
-    for name, place_map in traverses.items():
-        write_descriptors(place_map.features, folder / f'{name}.npy', force)
-    print(f'arrays: {folder}')
-
-
 def _run(arguments: argparse.Namespace) -> None:
+    from stavpr_lab.commands.evaluate_export import export, require_exportable
     from stavpr_lab.evaluation.report import chosen_window
     from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
 
@@ -339,14 +342,12 @@ def _run(arguments: argparse.Namespace) -> None:
         if Path(folder).is_dir():
             require_replaceable(Path(folder) / PAGE, HTML, arguments.force)
     if arguments.export:
-        Path(arguments.export).mkdir(parents=True, exist_ok=True)
-        for name in ('map', 'query'):
-            require_replaceable(Path(arguments.export) / f'{name}.npy', NPY, arguments.force)
+        require_exportable(arguments)
     report = _report(arguments)
     chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
     _print_report(report)
     if arguments.export:
-        _export(report, Path(arguments.export), arguments.force)
+        export(arguments, report, node_settings(arguments).recognition())
     if arguments.json:
         write_json(report, Path(arguments.json), arguments.force)
         print(f'numbers: {arguments.json}')

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_lab experiments``: the paper's tables, computed and published."""
+"""``ros2 run stavpr_lab experiments``: tables of the paper and of the field."""
 
 import argparse
 import json
@@ -21,7 +21,8 @@ EMPTY = '-'
 
 DESCRIPTION = """
 Runs one of the paper's experiments on several data sets with several kinds of features and prints
-the table beside the published numbers (F1; the paper has no others).
+the table beside the published numbers (F1; the paper has no others); or, on the data sets of the
+field, recall@1 at the tolerance of each.
 """
 
 EPILOG = """
@@ -32,10 +33,13 @@ experiments:
   strategies   sliding window, vanilla DTW, adaptive DTW
   fast         random projection (GRP) and restricted alignment (RA), off and on
   robust_options  the paper, mode robust, and robust without each of its options
+  field        single images, and sequences in both modes, on the field's data sets: recall@1
   sweep        one of l, beta, xi, sigma, W (--parameter), all others at their defaults
 
-data sets: nordland gardens_point gardens_point_night ua berlin_a100; synth_ before a name crops
-the images as synth-Nord
+data sets of the paper: nordland gardens_point gardens_point_night ua berlin_a100; of the field:
+nordland_winter nordland_spring nordland_fall nordland_winter_1 msls_cph msls_sf st_lucia
+st_lucia_small robotcar sfu utm (docs/datasets.md); synth_ before a name crops the images as
+synth-Nord
 
 examples:
   experiments paper --data folder_of_all --datasets nordland synth_nordland gardens_point
@@ -43,6 +47,7 @@ examples:
       --onnx-layer x
   experiments paper --data all --features onnx --onnx-model m.onnx --onnx-layer x \\
       --ssm-layers y x --descriptors netvlad=arrays/netvlad
+  experiments field --data folder_of_all
   experiments sweep --parameter sigma --values 0 0.5 1 2 --data all
 
 exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
@@ -57,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('experiment', choices=(*PRESETS, 'sweep'), help='see below')
     add('--data', metavar='FOLDER', help='the folder of all data sets')
-    datasets = 'data sets to run (those of the paper in --data)'
+    datasets = 'data sets to run (those of the paper, or of the field, in --data)'
     add('--datasets', nargs='+', metavar='NAME[=FOLDER]', help=datasets)
     add('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
     add('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
@@ -87,7 +92,7 @@ def _columns(arguments: argparse.Namespace) -> 'tuple[Configuration, ...]':
 
 def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError]':
     """Open the requested data sets, or all; of one that is not found, return why."""
-    from stavpr_lab.evaluation.paper.datasets import open_dataset
+    from stavpr_lab.evaluation.paper.datasets import FIELD, open_dataset
     from stavpr_lab.evaluation.paper.published import F1
 
     found: dict[str, Dataset | SourceError] = {}
@@ -100,13 +105,14 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError
         return found
     if not arguments.data:
         raise SettingsError('give --data FOLDER, or --datasets NAME=FOLDER')
-    for name in F1:
+    names = FIELD if arguments.experiment == 'field' else tuple(F1)
+    for name in names:
         try:
             found[name] = open_dataset(name, arguments.data)
         except SourceError as error:
             found[name] = error
     if all(isinstance(each, SourceError) for each in found.values()):
-        raise SourceError(f'none of the data sets {", ".join(F1)} is in {arguments.data}')
+        raise SourceError(f'none of the data sets {", ".join(names)} is in {arguments.data}')
     return found
 
 
@@ -221,6 +227,11 @@ def _number(value: float | None) -> str:
     return EMPTY if value is None else f'{value:.3f}'
 
 
+def _metric(experiment: str) -> str:
+    """Return the metric of a table, by its name in :meth:`Metrics.to_json`."""
+    return 'recall_at_1' if experiment == 'field' else 'f1'
+
+
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_lab.evaluation.report import jsonable
 
@@ -228,6 +239,7 @@ def _run(arguments: argparse.Namespace) -> None:
         require_replaceable(arguments.json, JSON, arguments.force)
     folders = _check(arguments)
     columns, datasets = _columns(arguments), _datasets(arguments)
+    metric = _metric(arguments.experiment)
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
     blanks: dict[str, list[str]] = {}  # data sets and columns, by reason
@@ -244,14 +256,19 @@ def _run(arguments: argparse.Namespace) -> None:
         numbers = {
             key: None if found is None else found.to_json() for key, found in metrics.items()
         }
-        cells = [None if row is None else row['f1'] for row in numbers.values()]
-        rows.append([name, arguments.features, *map(_number, cells)])
+        cells = [None if row is None else row[metric] for row in numbers.values()]
+        label = name
+        if metric != 'f1' and not isinstance(dataset, SourceError):
+            label = f'{name}, {dataset.criterion}'
+        rows.append([label, arguments.features, *map(_number, cells)])
         results.append({'dataset': name, 'features': arguments.features, 'results': numbers})
-        for backbone, published in _published(name, columns).items():
+        published_rows = _published(name, columns) if metric == 'f1' else {}
+        for backbone, published in published_rows.items():
             rows.append(['', f'published, {backbone}', *map(_number, published)])
             named = dict(zip([column.name for column in columns], published, strict=True))
             results.append({'dataset': name, 'published': backbone, 'f1': named})
-    print(f'{arguments.experiment}, mode {arguments.mode}: f1')
+    mode = f', mode {arguments.mode}' if metric == 'f1' else ''  # the field's table has both
+    print(f'{arguments.experiment}{mode}: {metric}')
     print(_table(rows))
     for reason, where in blanks.items():
         print(f'{EMPTY} {"; ".join(where)}: {reason}')

@@ -90,7 +90,8 @@ class GroundTruth:
         * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
           single column is the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
         * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
-          shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none.
+          shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none. ``GTsoft`` of an
+          .npz, as VPR_Tutorial publishes it, has the shape (n, N).
         * Black and white image, N high and n wide: white at row i, column j accepts place j for
           query i. For loop closures, where both are one traverse, see :meth:`loop_closures`.
 

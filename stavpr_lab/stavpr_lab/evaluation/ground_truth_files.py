@@ -13,6 +13,7 @@ from stavpr_ros.sources.folder import SUFFIXES
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
 NAME = 'truth'  # of the array to read from an .npz with several
+TRANSPOSED = 'GTsoft'  # in the files of VPR_Tutorial: shape (n, N), the tolerance included
 QUERY_WORDS = ('query', 'live', 'current')
 PLACE_WORDS = ('place', 'ref', 'map', 'database', 'historical')
 BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and white
@@ -141,6 +142,8 @@ def _load(path: Path) -> np.ndarray:
             return loaded
         with loaded:
             names = loaded.files
+            if TRANSPOSED in names:
+                return loaded[TRANSPOSED].T
             if len(names) == 1 or NAME in names:
                 return loaded[names[0] if len(names) == 1 else NAME]
     except Exception as error:  # damage raises errors of any type, of NumPy, zipfile and tokenize

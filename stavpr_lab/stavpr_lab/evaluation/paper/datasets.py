@@ -1,14 +1,15 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's data sets on disk: the folders of map and query, and their ground truth."""
+"""Data sets of the paper and of the field on disk: folders of map and query, ground truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import re
 
 from stavpr_lab.evaluation.drive import cropped, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.ground_truth_files import ARRAYS, TEXT
+from stavpr_lab.evaluation.paper.traverses import msls, read_traverse, Reader, robotcar, utm_names
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.sources.folder import FolderSource, SUFFIXES
 
@@ -16,7 +17,8 @@ SYNTH = 'synth_'  # before a name: the same with both traverses cropped
 CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query image (synth-Nord)
 GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
 DEPTH = 4  # levels of folders, the root among them
-PARENTS = ('images', 'data', 'datasets', 'test')  # folders of folders
+PARENTS = ('images', 'data', 'datasets', 'test', 'trainval')  # folders of folders
+KEPT = 'cleanImageNames.txt'  # beside the traverses: names of the images that count
 # Parts of folder names besides the traverse: sizes, rates, kinds of files.
 NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|gr[ae]yscale|jpg|png|test')
 
@@ -29,9 +31,11 @@ class Layout:
     :param folders: names, or their first parts, of the data set's folder.
     :param map_names: names of the folder of the map.
     :param query_names: names of that of the query.
-    :param tolerance: the paper's, places.
+    :param tolerance: the paper's or the field's, places.
     :param paired: the same index is the ground truth where both have equally many images; else a
         file is needed.
+    :param reader: of traverses whose images have positions, which are the ground truth then.
+    :param meters, degrees: of these, the largest distance and angle to a correct place.
     """
 
     folders: tuple[str, ...]
@@ -39,11 +43,15 @@ class Layout:
     query_names: tuple[str, ...]
     tolerance: int
     paired: bool = True
+    reader: Reader | None = None
+    meters: float = 25.0
+    degrees: float | None = None
 
 
+NORDLAND = ('nordland',)
 GARDENS = ('gardenspoint', 'gardenpoint', 'gardens', 'garden', 'gpw', 'gp')
 LAYOUTS = {
-    'nordland': Layout(('nordland',), ('summer',), ('winter',), 3),
+    'nordland': Layout(NORDLAND, ('summer',), ('winter',), 3),
     'gardens_point': Layout(GARDENS, ('dayleft',), ('dayright',), 2),
     'gardens_point_night': Layout(GARDENS, ('dayleft',), ('nightright',), 2),
     'ua': Layout(('ua', 'uacampus', 'uadataset'), ('day',), ('evening',), 3),
@@ -51,6 +59,29 @@ LAYOUTS = {
         ('berlina100', 'a100'), ('reference', 'ref', '2'), ('live', 'query', '1'), 2, paired=False
     ),
 }
+OXFORD = ('oxfordrobotcar', 'robotcar', 'oxford')
+PAIR = ('database',), ('query', 'queries')  # names of map and query
+FIELD_LAYOUTS = {
+    **{
+        f'nordland_{season}': Layout(NORDLAND, ('summer',), (season,), 10)
+        for season in ('winter', 'spring', 'fall')
+    },
+    'nordland_winter_1': Layout(NORDLAND, ('summer',), ('winter',), 1),
+    **{
+        f'msls_{city}': Layout((city, 'msls', 'mapillarysls'), *PAIR, 0, reader=msls, degrees=40.0)
+        for city in ('cph', 'sf')
+    },
+    'st_lucia': Layout(('stlucia',), *PAIR, 0, reader=utm_names),
+    'st_lucia_small': Layout(('stlucia',), ('1009090845',), ('1808091545',), 0, paired=False),
+    'robotcar': Layout(OXFORD, ('20150317110844',), ('20141216184424',), 0, reader=robotcar),
+    'sfu': Layout(('sfu', 'sfumountain'), ('dry',), ('jan',), 0, paired=False),
+    'utm': Layout((), *PAIR, 0, reader=utm_names),
+}
+FIELD = (  # rows of the field's table
+    *(name for name in FIELD_LAYOUTS if name != 'utm'),
+    *(name for name in LAYOUTS if name != 'nordland'),
+)
+LAYOUTS |= FIELD_LAYOUTS
 NAMES = (*LAYOUTS, *(SYNTH + name for name in LAYOUTS))
 
 
@@ -62,13 +93,19 @@ class Dataset:
     :param map: images of the map, in the order of the route.
     :param query: images of the query.
     :param ground_truth: of the query's images, tolerance included.
-    :param tolerance: the paper's or the requested one, places.
+    :param tolerance: that of the data set or the requested one, places.
     """
 
     map: FrameSource
     query: FrameSource
     ground_truth: GroundTruth
     tolerance: int
+
+    @property
+    def criterion(self) -> str:
+        """Return which places are correct, for a table."""
+        around = f' +-{self.tolerance}' if self.tolerance else ''
+        return f'{self.ground_truth.kind}{around}'
 
 
 def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> Dataset:
@@ -77,7 +114,7 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
 
     :param name: one of ``NAMES``; ``synth_`` before a name crops both traverses as synth-Nord.
     :param root: its own folder, or a folder around it.
-    :param tolerance: places; None = the paper's.
+    :param tolerance: places; None = that of the data set.
     :raises SettingsError: an unknown name.
     :raises SourceError: it is not found; names the folders that were searched.
     """
@@ -85,17 +122,41 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
         raise SettingsError(f'data set {name!r} is unknown: take one of {", ".join(NAMES)}')
     layout = LAYOUTS[name.removeprefix(SYNTH)]
     folder, map_folder, query_folder = _find(name, layout, Path(root))
-    places: FrameSource = FolderSource(map_folder)
-    query: FrameSource = FolderSource(query_folder)
     tolerance = layout.tolerance if tolerance is None else tolerance
-    if layout.paired and len(query) == len(places):
-        ground_truth = GroundTruth.identity(len(query), len(places), tolerance)
+    places: FrameSource
+    query: FrameSource
+    if layout.reader is not None:
+        reference, queries = (
+            read_traverse(layout.reader, path) for path in (map_folder, query_folder)
+        )
+        places, query = reference.source, queries.source
+        poses = queries.poses, reference.poses
+        ground_truth = GroundTruth.from_poses(*poses, layout.meters, layout.degrees)
+        counted = queries.counted[ground_truth.keys // ground_truth.n]
+        ground_truth = replace(ground_truth, keys=ground_truth.keys[counted]).widened(tolerance)
     else:
-        file = _ground_truth_file(name, folder, len(query), len(places))
-        ground_truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
+        places, query = _images(map_folder), _images(query_folder)
+        if layout.paired and len(query) == len(places):
+            ground_truth = GroundTruth.identity(len(query), len(places), tolerance)
+        else:
+            file = _ground_truth_file(name, folder, len(query), len(places))
+            ground_truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
     if name.startswith(SYNTH):
         places, query = cropped(places, 0, CROP_MAP), cropped(query, CROP_QUERY, 0)
     return Dataset(places, query, ground_truth, tolerance)
+
+
+def _images(folder: Path) -> FolderSource:
+    """Return the images of a traverse, those that the list beside it names where there is one."""
+    images, names = FolderSource(folder), folder.parent / KEPT
+    if names.is_file():
+        kept = set(names.read_text(encoding='utf-8', errors='replace').split())
+        images.files = [file for file in images.files if file.name in kept]
+        if not images.files:
+            raise SourceError(
+                f'{folder} has none of the images that {names} lists; remove the list'
+            )
+    return images
 
 
 def _letters(name: str) -> str:

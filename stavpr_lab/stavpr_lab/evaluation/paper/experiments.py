@@ -86,6 +86,12 @@ PRESETS: dict[str, tuple[Configuration, ...]] = {
         Configuration('ra', 'RA', SpatialSettings(xi=XI)),
         FAST,
     ),
+    'field': (
+        Configuration('no_alignment', 'single image', NO_ALIGNMENT, temporal=False),
+        Configuration('spatial', 'aligned image', temporal=False),
+        replace(STA_VPR, title='mode paper', robust_options=PAPER),
+        Configuration('robust', 'mode robust', robust_options=ROBUST),
+    ),
     'robust_options': (
         replace(STA_VPR, robust_options=PAPER),
         Configuration('robust', 'robust', robust_options=ROBUST),
