@@ -94,9 +94,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'max_error',
             0.0,
-            'Mode robust: rate of wrong matches, such as 0.05 or 0.01, that chooses min_probability '
-            'as measured on drives; 0 = off. With both set, the stricter applies. A rate is at '
-            'least 0.005.',
+            'Mode robust: rate of wrong matches, at least 0.005, that chooses min_probability as '
+            'measured on drives; 0 = off. With both set, the stricter applies.',
             when='live',
             bounds=(0.0, 1.0),
         ),

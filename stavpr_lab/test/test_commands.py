@@ -352,7 +352,10 @@ def test_demo_on_bag_and_folder_reports_matches(run, traverse, tmp_path):
     assert '24.png' in result.stdout
     assert '24 of 24 images matched' in result.stdout
     records = read_records(output / 'matches.jsonl')
-    assert [match['status'] for match in records] == ['WARMING_UP'] * 19 + ['MATCH'] * 5
+    statuses = [match['status'] for match in records]
+    first = statuses.index('MATCH')
+    assert statuses == ['WARMING_UP'] * first + ['MATCH'] * (24 - first)
+    assert 1 <= first <= 19
     assert records[-1]['newest_index'] == 23
     assert cv2.imread(str(output / 'demo.png')).std() > 5
     assert 'Traceback' not in (output / 'node.log').read_text()

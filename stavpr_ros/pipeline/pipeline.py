@@ -172,9 +172,7 @@ class Pipeline:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
         elif (recognizer := self._recognizer) is not None:
-            recognizer.set_limits(
-                settings.threshold, settings.min_probability, settings.max_error
-            )
+            recognizer.set_limits(settings.threshold, settings.min_probability, settings.max_error)
         self.settings = settings
         if before is None and self.threshold is not None:
             self.reset()  # images since then are not in the window

@@ -186,8 +186,7 @@ class SequenceRecognizer(ABC):
 
         :param position: of the newest image by odometry, (2,); NaN = unknown.
         """
-        settings, buffer = self._settings, self._window.buffer
-        threshold, min_probability = self._limits
+        buffer, (threshold, min_probability) = self._window.buffer, self._limits
         match = Match(
             Status.WARMING_UP,
             f'{len(buffer)} of {buffer.length} images in the window',

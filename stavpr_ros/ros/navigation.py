@@ -11,7 +11,7 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.recognition import Match
+from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.messages import matched_pose_message, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
@@ -65,8 +65,12 @@ class Navigation:
             moved = map_to_odometry(pose, odometry)
             self._transform = transform_message(moved, map_frame, odometry_frame)
         # a whole window without a match, or a new window
-        lost = self._unmatched >= self._settings.pipeline.sequence.length - 1
-        self._unmatched = 0 if match.accepted else self._unmatched + 1
+        length = self._settings.pipeline.sequence.length
+        lost = self._unmatched >= length - 1
+        if match.status is Status.WARMING_UP:
+            self._unmatched = length
+        else:
+            self._unmatched = 0 if match.accepted else self._unmatched + 1
         with until_shutdown(self._node):
             if self._tf is not None and self._transform is not None:
                 self._transform.header.stamp = header.stamp  # without a match, the last transform

@@ -330,6 +330,7 @@ def _print_metrics(report: 'Report') -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_lab.commands.evaluate_export import export, require_exportable
+    from stavpr_lab.commands.evaluate_sequences import node_settings
     from stavpr_lab.evaluation.report import chosen_window
     from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
 

@@ -19,6 +19,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import (
     evaluate_ranking,
     image_matches,
+    is_full,
     Metrics,
     Ranking,
     RANKS,

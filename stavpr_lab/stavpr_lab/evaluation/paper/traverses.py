@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traverses of public data sets whose images have positions, in their published layouts."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from stavpr_lab.evaluation.drive import ChangedSource, FrameSource
+from stavpr_lab.evaluation.drive import FrameSource
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.folder import FolderSource, natural_key
 from stavpr_ros.sources.frame import Frame
@@ -86,8 +86,23 @@ def robotcar(folder: Path) -> PosedTraverse:
         if not kept or np.hypot(*(positions[i] - positions[kept[-1]])) >= SPACING:
             kept.append(i)
     images.files = [images.files[i] for i in kept]
-    source = ChangedSource(images, _demosaiced)
-    return PosedTraverse(source, _poses(positions[kept]), np.ones(len(kept), bool))
+    return PosedTraverse(Demosaiced(images), _poses(positions[kept]), np.ones(len(kept), bool))
+
+
+class Demosaiced:
+    """A source of the stereo camera whose images become RGB; stamps and identifiers stay."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self._source)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield one RGB image after the other."""
+        for frame in self._source:
+            yield replace(frame, image=_demosaiced(frame))
 
 
 def _demosaiced(frame: Frame) -> np.ndarray:
