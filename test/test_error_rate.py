@@ -21,5 +21,5 @@ def test_smaller_error_rates_choose_greater_probabilities():
 
 @pytest.mark.parametrize('rate', [0.0, 0.001, 1.0, -0.1, float('nan')])
 def test_error_rates_that_were_not_measured_are_rejected(rate):
-    with pytest.raises(SettingsError, match='max_error = .*: expected 0 = off'):
+    with pytest.raises(SettingsError, match=r'max_error = .*: expected 0 = off'):
         least_probability(rate)

@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
     export = 'write the features of map and query as map.npy and query.npy, or --export-format'
     add('--export', metavar='FOLDER', help=export)
-    formats = 'of --export: arrays, or files of another program, see below (%(default)s)'
+    formats = 'of --export: arrays, or files of another program, listed below (%(default)s)'
     add('--export-format', choices=tuple(FORMATS), default='arrays', help=formats)
     add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
     protocol = (
