@@ -195,7 +195,7 @@ def test_read_descriptors_of_bits_has_hamming_distances(tmp_path, monkeypatch):
         assert features.settings.backbone.bits
     np.save(path, bits.astype(np.int8))
     with pytest.raises(
-        SourceError, match='int8 .* expected uint8, .*leave --descriptors-bits out'
+        SourceError, match=r'int8 .* expected uint8, .*leave --descriptors-bits out'
     ):
         read_descriptors(path, bits=True)
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """ONNX files as other programs write them: batches, inputs, layers, several files, devices."""
 
+import itertools
 from pathlib import Path
 import re
 from types import SimpleNamespace
@@ -123,7 +124,7 @@ def test_registers_of_tokens_are_excluded_or_rejected(saved):
     found = extractor(path, 'tokens', strips=4, prefix_tokens=5).extract(IMAGES)
     np.testing.assert_array_equal(found.strips, expected.strips)
     with pytest.raises(
-        SettingsError, match='68 without the first 1: .*prefix_tokens = 5 leaves 8'
+        SettingsError, match=r'68 without the first 1: .*prefix_tokens = 5 leaves 8'
     ):
         extractor(path, 'tokens')
 
@@ -142,7 +143,7 @@ def test_vector_of_a_whole_image_as_of_megaloc(saved, batch):
     path = saved(*nodes, shape=(batch, 3, 64, 64), s=shape, half=weights)
     made = extractor(path, 'descriptor')
     features = made.extract(IMAGES)
-    with pytest.raises(SettingsError, match='one vector of 8448 numbers .* expected W = 1'):
+    with pytest.raises(SettingsError, match=r'one vector of 8448 numbers .* expected W = 1'):
         extractor(path, 'descriptor', strips=7)
     assert (made.settings.strips, features.strips.shape) == (1, (1, 4, 8448))
     maps = extractor(saved(), 'y', strips=1).extract(IMAGES).strips[0]
@@ -210,6 +211,16 @@ def test_other_inputs_are_rejected_by_name(saved, changes, named):
 def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(saved, node, layer, named):
     with pytest.raises(SettingsError, match=named):
         extractor(saved(node, s=np.array((4, 512))), layer).extract(IMAGES)
+
+
+def test_missing_layer_of_a_large_network_is_an_error_that_lists_outputs_first(saved, tmp_path):
+    names = ['y', *(f'layer {i}' for i in range(99))]
+    chain = [helper.make_node('Identity', [a], [b]) for a, b in itertools.pairwise(names)]
+    model = onnx.load(saved(*chain))
+    model.graph.output[0].name = names[-1]
+    onnx.save(model, tmp_path / 'b.onnx')
+    with pytest.raises(SettingsError, match=r'its layers are layer 98, y, layer 0, .*, \.\.\.$'):
+        extractor(tmp_path / 'b.onnx', 'missing')
 
 
 def test_weights_in_another_file_are_rejected_with_the_remedy(saved, tmp_path):
