@@ -78,13 +78,8 @@ def read_descriptors(path: str, source: str = '', bits: bool = False) -> LocalFe
         )
     if (array.dtype == np.uint8) != bits:
         raise SourceError(
-            f'descriptors {path}: {array.dtype} {array.shape}: '
-            + (
-                'expected uint8, 8 bits a number: leave --descriptors-bits out'
-                if bits
-                else f'these are {8 * array.shape[-1]} bits a row with --descriptors-bits true; '
-                'numbers must be saved as another type, such as float32'
-            )
+            f'descriptors {path}: {array.dtype} {array.shape}: expected uint8 for bits, 8 a '
+            'number, with --descriptors-bits true, and another type, such as float32, for numbers'
         )
     n, W = len(array), 1 if array.ndim == 2 else array.shape[1]
     if W > MOST_STRIPS:
