@@ -89,6 +89,7 @@ def test_read_descriptors_executes_nothing(tmp_path, name, words):
         (np.zeros((5, 0)), r'\(5, 0\)'),
         (np.zeros((5, 2), complex), 'complex128'),
         (np.zeros((1, 1025, 1)), 'W = 1025'),
+        (np.zeros((5, 64), np.uint8), r'uint8 \(5, 64\): expected .* --descriptors-bits true'),
         (np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))), 'row 7 has NaN'),
     ],
 )
@@ -175,6 +176,26 @@ def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, monkeyp
     np.save(tmp_path / 'a.npy', stored)
     features = read_descriptors(str(tmp_path / 'a.npy'))
     np.testing.assert_allclose(features.strips[0], unit(whole.astype('f8')), atol=1e-6)
+
+
+def test_read_descriptors_of_bits_has_hamming_distances(tmp_path, monkeypatch):
+    """Of vectors and of strips; other arrays are rejected."""
+    monkeypatch.setattr(descriptors, 'AT_ONCE', 4)
+    bits = np.random.default_rng(2).integers(0, 2, (6, 3, 16))
+    for name, array, own in (
+        ('vectors', np.packbits(bits.reshape(6, 48), axis=1), bits.reshape(6, 1, 48)),
+        ('strips', np.packbits(bits, axis=2), bits),
+    ):
+        path = str(tmp_path / f'{name}.npy')
+        np.save(path, array)
+        features = read_descriptors(path, bits=True)
+        hamming = (own[:, None] != own[None]).sum(-1).transpose(2, 0, 1)
+        cosine = 1 - features.strips @ features.strips.transpose(0, 2, 1)
+        np.testing.assert_allclose(cosine, 2 * hamming / own.shape[2], atol=1e-6)
+        assert features.settings.backbone.bits
+    np.save(path, bits.astype(np.int8))
+    with pytest.raises(SourceError, match=r'int8 \(6, 3, 16\): expected uint8 for bits'):
+        read_descriptors(path, bits=True)
 
 
 def test_read_descriptors_takes_the_only_array_that_can_be_meant(tmp_path, vectors):

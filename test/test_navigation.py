@@ -3,13 +3,18 @@
 """The transform from map to odometry, and the initial pose."""
 
 import math
+from pathlib import Path
+import re
+import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from pipelines import at, LENGTH, localizing, message, SECOND
+from processes import environment, TIMEOUT
 import pytest
+from rclpy.qos import qos_profile_services_default
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.ros.messages import pose_message
@@ -116,3 +121,35 @@ def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeyp
     start(wait=False, publish_tf=True)
     robot.until_logged('publish_tf requires the package tf2_msgs: install it')
     robot.until_state('unconfigured')
+
+
+def test_example_of_bridges_publishes_a_pose_at_the_start_and_on_each_request(robot, start, route):
+    """Of its map only; the topics have the QoS of Isaac ROS Visual SLAM 4.6."""
+    page = Path(__file__).parents[1] / 'docs' / 'bridges.md'
+    code = re.search('```python\n(.*?)```', page.read_text(), re.DOTALL)[1]
+    command = [sys.executable, '-c', code, '--ros-args', '-p', 'min_probability:=0.05']
+    kind = PoseWithCovarianceStamped
+    hints = robot.listen(kind, 'initial_pose', qos_profile_services_default)
+    requests = robot.node.create_publisher(kind, 'trigger_hint', 10)
+    start()
+    ids = (robot.until_map(state='loaded').map_id, '0123456789abcdef')
+    programs = [
+        subprocess.Popen([*command, '-p', f'map_id:="{each}"'], env=environment()) for each in ids
+    ]
+    try:
+        robot.until(lambda: requests.get_subscription_count() == len(ids), 'both programs')
+        assert not hints  # the window is empty
+        for count, first in enumerate((0, 20, 40), 1):
+            matches = robot.drive(route[first : first + 3 * LENGTH])
+            if first:
+                requests.publish(kind())
+            robot.until(lambda count=count: len(hints) == count, 'a pose')
+            places = {match.newest_index: match.header.stamp for match in matches}
+            header, pose = hints[-1].header, hints[-1].pose
+            assert header.frame_id == 'map'
+            assert header.stamp == places[int(pose.pose.position.x)]
+            assert pose.covariance[0] >= 0.01
+    finally:
+        for program in programs:
+            program.terminate()
+            program.wait(TIMEOUT)

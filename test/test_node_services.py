@@ -250,8 +250,9 @@ def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
     assert robot.drive(route[:1])[0].status == PlaceMatch.WARMING_UP
 
 
-def test_relocalize_returns_the_last_match_and_candidates(robot, start, route):
-    """As many as requested, or as parameter candidates."""
+def test_relocalize_returns_the_last_match_with_candidates_and_pose(robot, start, route):
+    """As many as requested, or as parameter candidates; the pose is that of ~/pose."""
+    poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
     start(candidates=3, **PAPER)
     match = robot.drive(route[30 : 30 + LENGTH])[-1]
     invalid = image_message(route[0])
@@ -262,8 +263,12 @@ def test_relocalize_returns_the_last_match_and_candidates(robot, start, route):
         assert str(response.match) == str(match)  # NaN equals NaN
         assert len(response.candidates) == expected
         assert response.candidates[0].place_index == match.place_index
+        robot.until(lambda: bool(poses), 'a pose')
+        assert (response.has_pose, response.pose) == (True, poses[-1])
+        assert response.pose.pose.pose.position.x == match.newest_index
     noise = np.random.default_rng(1).integers(0, 256, (96, 128, 3), np.uint8)
     strange = robot.drive([noise] * LENGTH)[-1]
     assert strange.status == PlaceMatch.NO_MATCH
     response = robot.does(Relocalize, 'relocalize')  # though there is no match
     assert (str(response.match), response.message) == (str(strange), strange.reason)
+    assert (response.has_pose, response.pose) == (False, PoseWithCovarianceStamped())

@@ -39,7 +39,7 @@ def saved(tmp_path):
             [conv, *nodes],
             'net',
             [helper.make_tensor_value_info('x', dtype, shape)],
-            [helper.make_tensor_value_info('y', FLOAT, ['b', 8, 8, 8])],
+            [helper.make_tensor_value_info([conv, *nodes][-1].output[0], FLOAT, ['b', 8, 8, 8])],
             [onnx.numpy_helper.from_array(value, name) for name, value in arrays.items()],
         )
         opset = [helper.make_opsetid('', 13)]
@@ -49,9 +49,9 @@ def saved(tmp_path):
     return save
 
 
-def extractor(path, layer='y', size=64, **changes):
+def extractor(path, layer='y', size=64, strips=None, **changes):
     settings = settings_class('onnx')(model=str(path), layer=layer, size=size, **changes)
-    return FeatureExtractor('onnx', settings)
+    return FeatureExtractor('onnx', settings, strips)
 
 
 def single(made):
@@ -104,6 +104,45 @@ def test_wrong_settings_are_rejected_by_name(saved, changes, error, named):
 def test_batch_of_convolutions_may_be_stated(saved, batch):
     made = extractor(saved(shape=(batch, 3, 64, 64)))
     np.testing.assert_allclose(made.extract(IMAGES).strips, single(made), atol=1e-5)
+
+
+def test_registers_of_tokens_are_excluded_or_rejected(saved):
+    """Tokens of DINOv3: class, four registers, then the patches row by row."""
+    nodes = (
+        helper.make_node('Reshape', ['y', 's'], ['flat']),
+        helper.make_node('Transpose', ['flat'], ['patches'], perm=[0, 2, 1]),
+        helper.make_node('Pad', ['patches', 'pads', 'large'], ['tokens']),
+    )
+    pads, large = np.array((0, 5, 0, 0, 0, 0)), np.float32(1e6)
+    path = saved(*nodes, s=np.array((0, 8, 64)), pads=pads, large=large)
+    expected = extractor(path, 'y', strips=4).extract(IMAGES)
+    found = extractor(path, 'tokens', strips=4, prefix_tokens=5).extract(IMAGES)
+    np.testing.assert_array_equal(found.strips, expected.strips)
+    with pytest.raises(
+        SettingsError, match=r'68 without the first 1: .*prefix_tokens = 5 leaves 8'
+    ):
+        extractor(path, 'tokens')
+
+
+@pytest.mark.parametrize('batch', ['b', 1])
+def test_vector_of_a_whole_image_as_of_megaloc(saved, batch):
+    """8448 numbers of float16 weights that are cast, of unit norm, one row an image."""
+    weights = np.random.default_rng(2).standard_normal((512, 8448)).astype(np.float16)
+    nodes = (
+        helper.make_node('Reshape', ['y', 's'], ['flat']),
+        helper.make_node('Cast', ['half'], ['weights'], to=FLOAT),
+        helper.make_node('MatMul', ['flat', 'weights'], ['product']),
+        helper.make_node('LpNormalization', ['product'], ['descriptor'], axis=1, p=2),
+    )
+    shape = np.array((1 if batch == 1 else -1, 512))
+    path = saved(*nodes, shape=(batch, 3, 64, 64), s=shape, half=weights)
+    made = extractor(path, 'descriptor')
+    features = made.extract(IMAGES)
+    assert (made.settings.strips, features.strips.shape) == (1, (1, 4, 8448))
+    maps = extractor(saved(), 'y', strips=1).extract(IMAGES).strips[0]
+    product = maps @ weights
+    expected = product / np.linalg.norm(product, axis=1, keepdims=True)
+    np.testing.assert_allclose(features.strips[0], expected, atol=1e-5)
 
 
 MEAN = helper.make_node('ReduceMean', ['y'], ['m'], axes=[0, 2, 3], keepdims=1)
@@ -159,7 +198,7 @@ def test_other_inputs_are_rejected_by_name(saved, changes, named):
         (RESHAPE, 'z', r'rejects images of size 64.*Reshape'),
         (MEAN_OF_ALL, 'z', r'returns \(\) for 1 image'),
         (ARGMAX, 'z', 'is int64, expected float numbers'),
-        (RESHAPE, '', "no layer '': its layers are y, z"),
+        (RESHAPE, '', "no layer '': its layers are z, y"),
     ],
 )
 def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(saved, node, layer, named):

@@ -138,7 +138,7 @@ def test_extractor_of_tokens_equals_that_of_their_map(network, route):
         ({'layer': 'map', 'strips': 9}, r'Wf = 8 .*W = 9'),
         ({'layer': 'map', 'pooling': 'max'}, "pooling = 'max'"),
         ({'layer': 'map', 'vector': 'map'}, "vector = 'map' is what the strips are made of"),
-        ({'layer': 'map', 'vector': 'local'}, r"no layer 'local'.*its layers are conv, map"),
+        ({'layer': 'map', 'vector': 'local'}, "no layer 'local'.* are global, conv, map"),
         ({'layer': 'map', 'vector': 'conv'}, r"'conv'.*\(1, 16, 8, 8\).*expected one vector"),
     ],
 )

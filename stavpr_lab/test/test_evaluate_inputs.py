@@ -102,6 +102,23 @@ def test_map_of_descriptors_takes_descriptors_only(
         assert (code, option[0] in errors) == (2, True)
 
 
+def test_map_of_bits_takes_bits_without_the_option(
+    run, pair, vectors, tmp_path, monkeypatch, capsys
+):
+    """The map has the setting; a query of numbers is rejected."""
+    path, saved = tmp_path / 'bits.npy', tmp_path / 'bits.stavpr'
+    np.save(path, np.packbits(vectors > 0, axis=1))
+    build = runner(build_map, monkeypatch, capsys)
+    code, _, errors = build('--input', path, '--output', saved)
+    assert (code, 'with --descriptors-bits true' in errors) == (1, True)
+    code, output, _ = build('--input', path, '--output', saved, '--descriptors-bits', 'true')
+    assert (code, '1 strips of 24 dimensions' in output) == (0, True)
+    options = ['--map', saved, *pair[4:], '--json', tmp_path / 'a.json', '--force', '--query']
+    assert run(*options, path)[0] == 0
+    code, _, errors = run(*options, pair[3])
+    assert (code, 'expected uint8 for bits' in errors) == (1, True)
+
+
 @pytest.mark.long
 def test_evaluate_of_several_queries_equals_each(run, pair, vectors, tmp_path):
     np.save(tmp_path / 'other.npy', vectors[::-1])

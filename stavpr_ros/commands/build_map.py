@@ -263,7 +263,8 @@ def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
                 'leave it out'
             )
     require_at_least('--every', arguments.every, 1)
-    features = read_descriptors(arguments.input, arguments.descriptors_source or '')
+    source, bits = arguments.descriptors_source or '', bool(arguments.descriptors_bits)
+    features = read_descriptors(arguments.input, source, bits)
     poses = _poses(arguments, len(features))
     assert poses is None or isinstance(poses, np.ndarray)
     return descriptor_map(features[:: arguments.every], poses)

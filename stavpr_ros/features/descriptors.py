@@ -4,7 +4,8 @@
 Features that another program computed: NumPy, CSV and MATLAB arrays of descriptors.
 
 An array has the shape (n, D), one vector an image, or (n, W, D), W local features from left to
-right. Nothing in a file is executed: no pickles, no MATLAB objects.
+right. Arrays of uint8 are binary descriptors, D bytes of 8 bits, and never read as numbers.
+Nothing in a file is executed: no pickles, no MATLAB objects.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -43,15 +44,17 @@ def is_descriptors(path: str | None) -> bool:
     return path is not None and _PATH.fullmatch(path) is not None
 
 
-def read_descriptors(path: str, source: str = '') -> LocalFeatures:
+def read_descriptors(path: str, source: str = '', bits: bool = False) -> LocalFeatures:
     """
     Read the descriptors of a traverse.
 
     :param path: ``FILE`` (.npy, .npz, .csv, .mat), or ``FILE:NAME`` for one of several arrays.
     :param source: what computed them; those of map and query must be equal.
-    :returns: unit-norm features (W, n, d); W = 1 for an array (n, D).
+    :param bits: the array is uint8, and each bit a dimension, -1 or 1: the cosine distance is
+        2 / d times the Hamming distance. The most significant bit is the first.
+    :returns: unit-norm features (W, n, d); W = 1 for an array (n, D); d = D, or 8 D of bits.
     :raises SourceError: the file cannot be read, has no such array, or other numbers or another
-        shape than expected.
+        shape than expected; it is uint8 without ``bits``, or not with them.
     """
     found = _PATH.fullmatch(path)
     if found is None:
@@ -73,15 +76,24 @@ def read_descriptors(path: str, source: str = '') -> LocalFeatures:
             f'descriptors {path}: {array.dtype} {array.shape}: expected real numbers (n, D) or '
             '(n, W, D), one row an image'
         )
+    if (array.dtype == np.uint8) != bits:
+        raise SourceError(
+            f'descriptors {path}: {array.dtype} {array.shape}: expected uint8 for bits, 8 a '
+            'number, with --descriptors-bits true, and another type, such as float32, for numbers'
+        )
     n, W = len(array), 1 if array.ndim == 2 else array.shape[1]
     if W > MOST_STRIPS:
         raise SourceError(f'descriptors {path}: W = {W} strips, at most {MOST_STRIPS}')
-    strips, weights = np.empty((W, n, array.shape[-1]), np.float32), np.empty((W, n), np.float32)
+    dimension = array.shape[-1] * (8 if bits else 1)
+    strips, weights = np.empty((W, n, dimension), np.float32), np.empty((W, n), np.float32)
     for low in range(0, n, AT_ONCE):  # it may be in its file
         part = slice(low, low + AT_ONCE)
-        rows = _float32(array[part].reshape(-1, W, array.shape[-1]), path, low)
+        rows = array[part].reshape(-1, W, array.shape[-1])
+        if bits:
+            rows = np.unpackbits(rows, axis=-1).astype(np.int8) * 2 - 1
+        rows = _float32(rows, path, low)
         strips[:, part], weights[:, part] = normalize(rows.transpose(1, 0, 2))
-    settings = FeatureSettings('descriptors', DescriptorSettings(source=source), W)
+    settings = FeatureSettings('descriptors', DescriptorSettings(source=source, bits=bits), W)
     return LocalFeatures(strips, weights, settings)
 
 

@@ -118,7 +118,9 @@ class Onnx:
         for layer in self._layers:
             if layer in layers:
                 continue
-            shown = ', '.join(layers[:60]) + (', ...' if len(layers) > 60 else '')
+            outputs = [value.name for value in model.graph.output]
+            named = outputs + [each for each in layers if each not in outputs]
+            shown = ', '.join(named[:60]) + (', ...' if len(named) > 60 else '')
             raise SettingsError(f'{name} has no layer {layer!r}: its layers are {shown}')
         weights = {tensor.name for tensor in model.graph.initializer}
         inputs = [value for value in model.graph.input if value.name not in weights]

@@ -148,7 +148,10 @@ class OnnxSettings(NetworkSettings):
 class DescriptorSettings:
     """Settings of features that another program computed, read from arrays."""
 
+    BEFORE: ClassVar[dict[str, Any]] = {'bits': False}
+
     source: str = setting('', help='what computed the descriptors, such as netvlad')
+    bits: bool = setting(False, help='arrays are uint8 with 8 bits a number, as of numpy.packbits')
 
 
 @dataclass(frozen=True)

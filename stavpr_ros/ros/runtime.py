@@ -83,6 +83,7 @@ class Runtime:
         self._epoch = self._pipeline_epoch = 0
         self._explained: set[str] = set()
         self.last_match = PlaceMatch()  # published for the last image in the window
+        self.last_frame = ''  # of the poses of its places
         self.problem = ''
         self._maps = MapLoader(
             node,
@@ -346,7 +347,7 @@ class Runtime:
             self._statistics.dropped(match.cause)
             self._log_cause(match)
             return
-        self.last_match = message
+        self.last_match, self.last_frame = message, frames.frame
         place = message.newest_index if match.status is Status.MAPPED else message.place_index
         self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
 

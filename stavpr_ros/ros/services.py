@@ -14,7 +14,7 @@ from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.saving import write_map
 from stavpr_ros.recognition import Match, Status
-from stavpr_ros.ros.messages import candidates_message, match_message
+from stavpr_ros.ros.messages import candidates_message, match_message, matched_pose_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
 from std_msgs.msg import Header
@@ -127,9 +127,12 @@ class Services:
             # call
             match = runtime.pipeline.relocalize(count)
             response.match = runtime.last_match
-            header = response.match.header
-            candidates = candidates_message(header, match, runtime.pipeline.places)
+            header, places = response.match.header, runtime.pipeline.places
+            candidates = candidates_message(header, match, places)
             response.candidates = candidates.candidates if candidates is not None else []
+            pose = matched_pose_message(header, match, places, runtime.last_frame)
+            response.has_pose = pose is not None
+            response.pose = pose or response.pose
 
         runtime.worker.run(relocalize)
         return response.match.reason or f'place {response.match.place_index}'

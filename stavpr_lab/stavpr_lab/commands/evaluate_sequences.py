@@ -170,11 +170,13 @@ class _Loader:
     def _read(self, path: str) -> PlaceMap:
         """Read descriptors; those of the map and the query must be comparable."""
         require_descriptors_alone(self._arguments, path)
-        source = self._arguments.descriptors_source
+        source, bits = self._arguments.descriptors_source, self._arguments.descriptors_bits
         first = self._saved
-        if source is None and first is not None and first.settings.kind == 'descriptors':
-            source = first.settings.backbone.source
-        features = read_descriptors(path, source or '')
+        if first is not None and first.settings.kind == 'descriptors':
+            own = first.settings.backbone
+            source = own.source if source is None else source
+            bits = own.bits if bits is None else bits
+        features = read_descriptors(path, source or '', bool(bits))
         if first is not None:
             require_comparable(features, first.settings, first.dimension)
         found = descriptor_map(features)
@@ -197,7 +199,7 @@ class _Loader:
                     f'--{name} {requested}: the map {path} was made with {present}; leave it out'
                 )
         # a map does not state where its model is
-        usable = f'--{found.settings.kind}-model', '--descriptors-source'
+        usable = f'--{found.settings.kind}-model', '--descriptors-source', '--descriptors-bits'
         options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
         for option, value in options.items():
             if value is not None and option not in usable:
