@@ -13,8 +13,8 @@ QUERY ?=
 LOOP ?=
 TRUTH ?=
 HOURS ?= 1
-ARM_ROOT ?=
-ARM_SITE ?=
+ARM_ROOT ?= build/arm/root
+ARM_SITE ?= build/arm/site
 QEMU ?= qemu-aarch64-static
 ARGS ?=
 export MAP QUERY LOOP SLAM TRUTH
@@ -75,7 +75,7 @@ test: lint docs ## lint, build the documentation, and run the tests but the long
 test-long: development ## run the tests that take minutes each (ARGS=)
 	@$(TEST) $(PYTEST) -m long $(ARGS)
 
-test-arm: build ## compare aarch64, emulated, with this processor (ARM_ROOT= ARM_SITE= QEMU=, CONTRIBUTING.md)
+test-arm: build ## compare aarch64, emulated, with this processor (set up by CONTRIBUTING.md)
 	@$(RUN) python tools/arm.py --root '$(ARM_ROOT)' --site '$(ARM_SITE)' --qemu '$(QEMU)'
 
 coverage: development ## run the tests, and require the lines and branches that they reach (ARGS=)

@@ -3,9 +3,9 @@
 """
 Test kernels, maps and recognition on aarch64 without a board, in QEMU's user mode.
 
-Usage, in ``make shell``: ``python tools/arm.py --root PATH --site PATH [--qemu PATH]``, or
-``make test-arm ARM_ROOT=PATH ARM_SITE=PATH``. CONTRIBUTING.md, section "ARM without a board", has
-the steps that make both folders. Times under emulation say nothing about a board.
+Usage, in ``make shell``: ``python tools/arm.py --root PATH --site PATH [--qemu PATH]``, or ``make
+test-arm``. CONTRIBUTING.md, section "ARM without a board", has the steps that make both folders.
+Times under emulation say nothing about a board.
 """
 
 import argparse
