@@ -13,6 +13,9 @@ QUERY ?=
 LOOP ?=
 TRUTH ?=
 HOURS ?= 1
+ARM_ROOT ?= build/arm/root
+ARM_SITE ?= build/arm/site
+QEMU ?= qemu-aarch64-static
 ARGS ?=
 export MAP QUERY LOOP SLAM TRUTH
 
@@ -28,8 +31,8 @@ COVERAGE := stavpr_ros:95 stavpr_slam:88 stavpr_lab:91
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo animation evaluate test test-long coverage crash-test lint docs bench bench-quick accuracy protocol off-map \
-	shell clean distclean development
+.PHONY: help setup build demo animation evaluate test test-long test-arm coverage crash-test lint docs bench bench-quick accuracy \
+	protocol off-map shell clean distclean development
 
 help: ## list the targets (the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
@@ -71,6 +74,9 @@ test: lint docs ## lint, build the documentation, and run the tests but the long
 
 test-long: development ## run the tests that take minutes each (ARGS=)
 	@$(TEST) $(PYTEST) -m long $(ARGS)
+
+test-arm: build ## compare aarch64, emulated, with this processor (set up by CONTRIBUTING.md)
+	@$(RUN) python tools/arm.py --root '$(ARM_ROOT)' --site '$(ARM_SITE)' --qemu '$(QEMU)'
 
 coverage: development ## run the tests, and require the lines and branches that they reach (ARGS=)
 	@rm -f .coverage .coverage.*

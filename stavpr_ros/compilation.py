@@ -3,17 +3,21 @@
 """Compilation of the kernels: cached on disk, without the interpreter's lock, IEEE numbers."""
 
 from collections.abc import Callable
+import ctypes
 import logging
 import multiprocessing
 import os
 from pathlib import Path
+import platform
 import shutil
 import tempfile
 
+from llvmlite import binding
 import numba as nb
 from numba.core import event
 from tqdm import tqdm
 
+AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hwcap.h
 COMPILING = 'compiling kernels, once, about 30 s'
 KERNELS = 104  # that `stavpr warm` compiles, for the progress bar
 
@@ -21,6 +25,20 @@ KERNELS = 104  # that `stavpr warm` compiles, for the progress bar
 # it.
 if nb.config.THREADING_LAYER == 'default':
     nb.config.THREADING_LAYER = 'threadsafe'
+
+
+def _has_dotprod() -> bool:
+    """Whether this is an ARM processor with ``sdot``, as the kernel of Linux reports it."""
+    if (platform.system(), platform.machine()) != ('Linux', 'aarch64'):
+        return False
+    getauxval = ctypes.CDLL(None).getauxval
+    getauxval.argtypes, getauxval.restype = [ctypes.c_ulong], ctypes.c_ulong
+    return bool(getauxval(AT_HWCAP) & HWCAP_ASIMDDP)
+
+
+# LLVM's list of the host's features lacks dotprod, even where the processor's name implies it
+if nb.config.CPU_FEATURES is None and _has_dotprod():
+    nb.config.CPU_FEATURES = f'{binding.get_host_cpu_features().flatten()},+neon,+dotprod'
 
 
 def _is_writable(folder: Path) -> bool:

@@ -6,6 +6,7 @@
 from dataclasses import replace
 import json
 from pathlib import Path
+import re
 import sys
 
 import cv2
@@ -14,7 +15,7 @@ from fixtures import route_images
 import numpy as np
 import pytest
 from scipy.spatial.distance import cosine
-from stavpr_ros.recognition.robust import norms_of, unit_norm
+from stavpr_ros.recognition.robust import FilterSettings, norms_of, unit_norm
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
@@ -22,7 +23,8 @@ sys.path.insert(0, str(BENCHMARKS))
 import accuracy
 import city
 import data
-from lower_bounds import Peaks
+import lower_bounds
+from lower_bounds import Peaks, Sizes, Work
 import matching
 import off_map
 import off_map_page
@@ -211,3 +213,20 @@ def test_simulated_places_have_mean_and_neighbors_of_real_ones():
     features, first = city.city(real, 500, seed=0)
     np.testing.assert_allclose(features[first : first + 60].strips, unit, atol=1e-3, rtol=0)
     assert len(features) == 500
+
+
+def test_bounds_of_boards_follow_from_costs_and_peaks():
+    page, sizes = (BENCHMARKS.parent / 'docs' / 'boards.md').read_text(), Sizes(100_000, 224)
+    alignment = lower_bounds.spatial_alignment(sizes)
+    parts = alignment, lower_bounds.filter_update(sizes, FilterSettings())
+    product = lower_bounds.product(sizes, 'float32')
+    row = r'^\| [^|]+ \| ([\d.]+) \| ([\d,]+), ([\d,]+|-) \| ([\d.]+)[^|]* \| ([\d.]+)'
+    found = re.findall(row, page, re.M)
+    assert len(found) == 4
+    for texts in found:
+        numbers = (float(text.replace(',', '').replace('-', 'inf')) for text in texts)
+        bandwidth, peak, int8_peak, *bounds = numbers
+        read = Work(sizes.n * sizes.W * (sizes.d + 4), product.operations * peak / int8_peak)
+        peaks_ = Peaks(1e9 * bandwidth, 1e9 * peak)
+        expected = [lower_bounds.bound_seconds([each, *parts], peaks_) for each in (product, read)]
+        assert bounds == pytest.approx([1e3 * seconds for seconds in expected], rel=0.02)

@@ -17,9 +17,10 @@ processor has (:data:`INSTRUCTIONS`).
 
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 import numba as nb
 from numba.core import types
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES, load, load_splat, splat, store, Vector
@@ -60,9 +61,9 @@ def choose_instruction(features: str, lanes: int) -> str:
     )
 
 
-INSTRUCTION = choose_instruction(
-    nb.config.CPU_FEATURES or binding.get_host_cpu_features().flatten(), LANES
-)
+# of numba's compiler, which is fixed by the first function that the process has compiled
+_, _, FEATURES = cpu_target.target_context.codegen().magic_tuple()
+INSTRUCTION = choose_instruction(FEATURES, LANES)
 
 
 def _filled(vector: ir.VectorType, value: int) -> ir.Constant:
