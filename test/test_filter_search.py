@@ -76,6 +76,13 @@ def test_match_is_path_and_second_best_of_its_window(recognizer, route):
         assert [c.place for c in ranked[1:2]] in ([], [answers[-1].sequence.second_best_index])
 
 
+def test_window_that_is_not_full_has_no_candidates_without_a_match(recognizer):
+    for answer in drive(recognizer, route_strips(7, 3)):
+        assert answer.status is Status.WARMING_UP
+    assert recognizer.ranked(3) == []
+    assert not len(recognizer.candidates(3)[0])
+
+
 @settings(max_examples=25)
 @given(st.integers(1, 5), st.integers(1, 5), st.integers(0, 999))
 def test_smoothed_offsets_equal_sums_over_all_sequences(images, offsets, seed):

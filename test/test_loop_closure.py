@@ -18,7 +18,7 @@ from stavpr_ros.errors import (
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
 from stavpr_ros.recognition.filter_paths import BAND, CLOSE
-from stavpr_ros.recognition.filter_window import CALIBRATION, LEAST_CANDIDATE
+from stavpr_ros.recognition.filter_window import LEAST_CANDIDATE
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     EVICTED,
@@ -259,9 +259,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
         best = near[np.argmax(probabilities)]
         share = window.match_oldest(settings.nms_radius, True).shares[0]
         of_path = of_sequence(belief, best)
-        on_map = belief.weights.sum()
-        calibrated = of_path / (on_map + (1 - on_map) / CALIBRATION)
-        assert found.probability == pytest.approx(share * calibrated)
+        assert found.probability == pytest.approx(share * of_path)
     assert len(late) >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
     closer.reset()

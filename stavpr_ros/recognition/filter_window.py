@@ -138,6 +138,7 @@ class FilterWindow(QueryWindow):
         length, width = sequence.length, layout.width(places)
         super().__init__(self._buffer(sequence, width), layout, normalizes, around)
         self._middle, self._to_oldest = (length - 1) // 2, to_oldest
+        self._calibration = 1.0 if to_oldest else CALIBRATION  # loop closure is not too modest
         lag = length - 1 - (0 if to_oldest else self._middle)
         self.filter = self._state_filter(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings, length)
@@ -306,7 +307,7 @@ class FilterWindow(QueryWindow):
         on_map = min(float(belief.weights.sum()), 1.0)
         unchecked = max(on_map - sum(candidate.probability for candidate in found), 0.0)
         weight, every = chosen.weight, unchecked + sum(candidate.weight for candidate in found)
-        odds_sum = every + (1 - on_map) / CALIBRATION
+        odds_sum = every + (1 - on_map) / self._calibration
         return chosen, weight / max(odds_sum, np.finfo(float).tiny)
 
     def _candidate(

@@ -138,7 +138,7 @@ class SequenceRecognizer(ABC):
         its second best.
 
         :param count: most candidates, at least 0.
-        :returns: empty before the first full window.
+        :returns: empty while the window has no match and is not full.
         :raises InputError: count below 0.
         """
         match, nearest = self._newest, None
@@ -202,7 +202,10 @@ class SequenceRecognizer(ABC):
             sure = max(min_probability, EARLY)
             early = replace(match, threshold=1 - sure, min_probability=sure)
             early = self._of_window(early, position)
-            match = early if early.accepted else match
+            if early.accepted:
+                match = early
+            else:
+                self._found = WindowMatch()
         self._newest = match
         return match
 
