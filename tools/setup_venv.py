@@ -219,7 +219,8 @@ def install(extras: list, torch_index: str) -> None:
         run_logged('torch', title, [*pip, *index, '-r', unlocked[0]])
         options = [part for file in files for part in ('-r', file)]
         title = f'Installing {", ".join(locked)}: a few minutes the first time'
-        run_logged('pip', title, [*pip, '--require-hashes', *options])
+        # The files name every package; pip before 24 takes NAME[EXTRA] from outside them.
+        run_logged('pip', title, [*pip, '--require-hashes', '--no-deps', *options])
         if unlocked[1:]:
             constraints = ['-c', requirements / 'constraints.txt']
             run_logged('cuda', 'Installing cuda', [*pip, '-r', unlocked[1], *constraints])
