@@ -176,6 +176,7 @@ CASES = {
         (WARN, 'the best had distance 0.500: compare the route, the', NO_MATCH | PAPER),
         (WARN, 'or raise threshold (0.125)', NO_MATCH | PAPER),
         (WARN, 'ever matched: the geometric check rejects all', NO_MATCH | {'nearest': 0.25}),
+        (WARN, 'the geometric check', NO_MATCH | {'nearest': 0.75, 'applied_threshold': 0.8}),
     ],
     'processing': [
         (OK, '11.5 ms an image, 29.9 results per second', {}),
@@ -283,6 +284,7 @@ def test_values_of_map_are_complete():
 
 
 def test_values_of_recognition_are_complete():
+    assert 'min_probability=0.750' in values('recognition', applied_threshold=0.25)
     found = values('recognition', recent_edges={'pnp': 3, 'dropped': 2})
     assert ' '.join(found) == (
         'operation=localization mode=robust min_probability=0.500 window=20 length=20 '

@@ -20,6 +20,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 from stavpr_ros.errors import InputError, MapFileError, OutputError, SettingsError
 from stavpr_ros.mapping import is_map, load_map, open_map, PlaceMap, save_map, Session, verify_map
+from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.stored_features import StoredFeatures
 
 
@@ -101,6 +102,22 @@ def test_threshold_is_a_section_that_older_readers_ignore(example, tmp_path):
     assert manifest['sections']['threshold'] == {'version': 1, 'required': False, 'data': 0.25}
     with pytest.raises(InputError, match=r'threshold = 0\.0: expected a distance above 0'):
         dataclasses.replace(example, threshold=0.0)
+
+
+def test_error_risks_are_a_section_that_older_readers_ignore(example, tmp_path):
+    path, risks = tmp_path / 'route.stavpr', ErrorRisks('robust', 3, (0.2, 0.9), (1.5, 0.0))
+    save_map(dataclasses.replace(example, error_risks=risks), path)
+    assert load_map(path).error_risks == risks
+    manifest, _ = parts_of(path.read_bytes())
+    assert manifest['sections'] == {
+        'error_risks': {
+            'version': 1,
+            'required': False,
+            'data': json.loads(json.dumps(vars(risks))),
+        }
+    }
+    save_map(open_map(path), tmp_path / 'half', 'float16')  # as map compact
+    assert open_map(tmp_path / 'half').error_risks == risks
 
 
 def test_reader_written_from_the_documentation_finds_the_same(example, saved):
@@ -303,6 +320,14 @@ def _poses(row) -> dict[str, np.ndarray]:
     return {'poses': np.tile(np.array(row, float), (24, 1))}
 
 
+RISKS = {'method': 'robust', 'units': 3, 'probabilities': [0.2, 0.9], 'risks': [1.5, 0]}
+
+
+def _error_risks(data):
+    section = {'version': 1, 'required': False, 'data': data}
+    return lambda manifest: manifest['sections'].update(error_risks=section)
+
+
 HAND_MADE = [
     ({'stamps': np.zeros((24, 3), np.int64)}, None, r'stamps is I64 \(24, 3\)'),
     ({'stamps': np.full(24, 2**62)}, None, 'a stamp is out of range'),
@@ -353,6 +378,15 @@ HAND_MADE = [
     ({}, network(scale=float('inf')), 'no number'),
     ({}, network(std=[0, 0, 0]), 'std not 0'),
     ({}, network(mean=['a', 'b', 'c']), r'mean\[0\]'),
+    ({}, _error_risks(None), 'section error_risks is None'),
+    ({}, _error_risks(RISKS | {'more': 1}), "unknown 'more'"),
+    ({}, _error_risks(RISKS | {'units': True}), r'units is True'),
+    ({}, _error_risks(RISKS | {'method': 'a' * 257}), 'at most 256 characters'),
+    ({}, _error_risks(RISKS | {'risks': ['0', '0']}), r"risks\[0\] is '0'"),
+    ({}, _error_risks(RISKS | {'risks': [0.0]}), 'as many risks'),
+    ({}, _error_risks(RISKS | {'probabilities': [0.5] * 2**16}), 'a list of 1 to 256'),
+    ({}, _error_risks(RISKS | {'probabilities': [0.5, 10**400]}), 'between 0 and 1|too large'),
+    ({}, _error_risks(RISKS | {'units': 1}), 'at most 1 each'),
 ]
 
 

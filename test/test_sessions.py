@@ -20,6 +20,8 @@ from stavpr_ros.mapping import (
     select_places,
     select_session,
 )
+from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
@@ -207,3 +209,15 @@ def test_related_places_stay_related(town):
 def test_map_with_impossible_relations_is_rejected(town, same_as, message):
     with pytest.raises(InputError, match=message):
         replace(town[0], same_as=same_as)
+
+
+def test_calibration_stays_with_its_route_only(town):
+    """It is that of drives on these places: others, or a session without the rest, have none."""
+    risks = ErrorRisks('robust', 1, (0.5,), (0.0,))
+    one = replace(town[0], error_risks=risks)
+    assert merge_maps([one, one], ['a', 'b']).error_risks is None
+    merged = replace(merge_maps([one, one], ['a', 'b']), error_risks=risks)
+    assert select_session(merged, 'a').error_risks is None
+    assert select_places(one, np.arange(9)).error_risks == risks
+    assert GrowingMap.from_map(one, PLACES).snapshot().error_risks is None
+    assert with_principal_components(one, 4).error_risks is None

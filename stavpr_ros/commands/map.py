@@ -179,6 +179,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
     from stavpr_ros.mapping.stored_features import StoredFeatures
 
     features, settings, n = place_map.features, place_map.settings, len(place_map)
+    risks = place_map.error_risks
     assert isinstance(features, StoredFeatures)
     vectors = features[:1].vectors
     beside = '' if vectors is None else f' and a vector of {vectors.shape[1]}'
@@ -199,6 +200,9 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         'threshold': 'none'
         if place_map.threshold is None
         else f'{place_map.threshold:.3f}, mode paper',
+        'error rate': 'none'
+        if risks is None
+        else f'at least {risks.bounds[-1]:.3g}, kept by {risks.units} blocks: {risks.method}',
         'stamps': f'{_time(int(known.min()))} to {_time(int(known.max()))}'
         if len(known)
         else 'unknown',

@@ -2,23 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parts of a map file, checked against each other and the manifest, as a map."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
-from stavpr_ros.mapping.map_schema import identity_fields, INTRINSICS, number, record
+from stavpr_ros.mapping.map_schema import (
+    Check,
+    ERROR_RISKS,
+    identity_fields,
+    INTRINSICS,
+    number,
+    record,
+)
 from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 
+T = TypeVar('T')
 # parts that are read, and compared with their hashes, later
 LARGE = ('strips', 'thumbnails', 'vectors/vectors', 'statistics/codes')
 THUMBNAILS_AT_ONCE = 2**24  # bytes
@@ -82,6 +91,13 @@ def map_content(file: MapFile) -> PlaceMap:
     if STATISTICS in known:
         features.statistics = statistics_of(file, arrays)
         features.has_stale_statistics = features.statistics is None
+
+    def section(name: str, check: Check, make: Callable[..., T]) -> T | None:
+        if name not in known:
+            return None
+        check(data := sections[name]['data'], f'section {name}')
+        return make(**{k: tuple(v) if type(v) is list else v for k, v in data.items()})
+
     return PlaceMap(
         features=features,
         projection=projection,
@@ -91,23 +107,17 @@ def map_content(file: MapFile) -> PlaceMap:
         thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
         sessions=tuple(Session(**session) for session in manifest['sessions']),
         session_index=arrays.get('session'),
-        camera=_camera(sections['intrinsics']['data']) if 'intrinsics' in known else None,
+        camera=section('intrinsics', INTRINSICS, Camera),
         same_as=arrays.get('same_places/same_as'),
         threshold=_threshold(sections['threshold']['data']) if 'threshold' in known else None,
         map_id=file.map_id,
+        error_risks=section('error_risks', ERROR_RISKS, ErrorRisks),
     )
 
 
 def _threshold(data: Any) -> float:
     number(data, 'section threshold')
     return float(data)
-
-
-def _camera(data: Any) -> Camera:
-    """Return the camera of section intrinsics."""
-    INTRINSICS(data, 'section intrinsics')
-    values: dict[str, Any] = {k: tuple(v) if type(v) is list else v for k, v in data.items()}
-    return Camera(**values)
 
 
 def _settings(content: dict[str, Any]) -> FeatureSettings:

@@ -63,6 +63,8 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
         data['same_places'] = None
     if place_map.threshold is not None:
         data['threshold'] = place_map.threshold
+    if place_map.error_risks is not None:
+        data['error_risks'] = asdict(place_map.error_risks)
     if place_map.features.vectors is not None:
         data['vectors'] = None
     if statistics is not None:  # the writer knows the hash of the features

@@ -157,6 +157,14 @@ INTRINSICS = record(
         'mount': list_of(number, 7, 7),
     }
 )
+ERROR_RISKS = record(
+    {
+        'method': text(),
+        'units': integer(1),
+        'probabilities': list_of(number, 1, 256),
+        'risks': list_of(number, 1, 256),
+    }
+)
 _SETTING_TYPES: dict[Any, Check] = {
     bool: boolean,
     int: integer(-(2**31)),

@@ -15,7 +15,9 @@ from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, te
 FORMAT, VERSION = 'stavpr-map', 2
 MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 # name: highest known version
-KNOWN_SECTIONS = {'intrinsics': 1, 'same_places': 1, 'statistics': 1, 'threshold': 1, 'vectors': 1}
+KNOWN_SECTIONS = dict.fromkeys(
+    ('error_risks', 'intrinsics', 'same_places', 'statistics', 'threshold', 'vectors'), 1
+)
 _METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MOST_HEADER)))
 _TENSOR = record(
     {

@@ -14,7 +14,7 @@ from stavpr_ros.mapping.place_map import PlaceMap, Session
 
 def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
     """
-    Return one map with the places of all, in their order.
+    Return one map with the places of all, in their order; without threshold and error risks.
 
     :param names: id and name of the session that a map without sessions becomes; one each.
     :raises FeatureMismatchError: features of different settings.
@@ -72,14 +72,16 @@ def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> P
     chosen = (place_map.session_index == number) == keep
     if not chosen.any():
         raise InputError(f'without session {session_id!r} no place is left')
-    return select_places(place_map, np.flatnonzero(chosen))
+    chosen_map = select_places(place_map, np.flatnonzero(chosen))
+    return replace(chosen_map, error_risks=None)  # those of drives on all sessions
 
 
 def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     """
     Return a map of selected places.
 
-    A place that is the same as one left out is the same as itself only.
+    A place that is the same as one left out is the same as itself only. Threshold and error risks
+    stay: they are those of drives on the same route.
 
     :param places: ascending, (m,), int64.
     """

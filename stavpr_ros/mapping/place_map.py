@@ -13,6 +13,7 @@ import numpy as np
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.jpeg import is_thumbnail, MOST_PIXELS
 from stavpr_ros.units import SECOND
 
@@ -78,6 +79,7 @@ class PlaceMap:
         :func:`stavpr_ros.recognition.threshold.suggest_threshold` returns it; None = unknown.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
         read from a file.
+    :param error_risks: of drives on this map, which ``max_error`` is kept by; None = unknown.
     """
 
     partial: ClassVar[bool] = False  # places are fetched from elsewhere on use
@@ -93,6 +95,7 @@ class PlaceMap:
     same_as: np.ndarray | None = None
     threshold: float | None = None
     map_id: str = ''
+    error_risks: ErrorRisks | None = None
 
     def __post_init__(self) -> None:
         n = len(self.features)

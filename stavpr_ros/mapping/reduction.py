@@ -54,6 +54,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
         projection=projection,
         threshold=None,
         map_id='',
+        error_risks=None,
     )
 
 

@@ -111,10 +111,8 @@ class Pipeline:
     @property
     def threshold(self) -> float | None:
         """Return the distance below which a window is matched: as set, or the map's; or None."""
-        applied = self.settings.applied_threshold
-        if applied is None and self.operation == 'localization' and self._map is not None:
-            return self._map.threshold
-        return applied
+        recognizer = self._recognizer
+        return recognizer.threshold if recognizer else self.settings.applied_threshold
 
     @property
     def window_fill(self) -> int:

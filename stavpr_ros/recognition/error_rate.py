@@ -15,20 +15,24 @@ these is controlled, not every single drive.
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.mapping.error_risks import ErrorRisks
 
 # error rates, descending, and the least probability of matches that keep them
 ERRORS = np.array([0.1, 0.05, 0.02, 0.01, 0.005])
 PROBABILITIES = np.array([0.15, 0.3, 0.93, 0.97, 0.99])
 
 
-def least_probability(max_error: float) -> float:
+def least_probability(max_error: float, risks: ErrorRisks | None = None) -> float:
     """
     Return the probability above which matches are wrong at a rate of at most ``max_error``.
 
     Between the error rates that were measured, the logarithm of the odds is interpolated over that
     of the rate.
 
-    :param max_error: 0.005 to below 1; above 0.1 as 0.1.
+    :param max_error: 0.005 to below 1; above 0.1 as 0.1 without risks.
+    :param risks: of drives on the map, instead of those that were measured. Where there are too
+        few, or too many wrong matches, for the rate: the probability above which the mean of
+        their rates is not above it, or that of those that were measured; the stricter applies.
     :raises SettingsError: out of range.
     """
     if not ERRORS[-1] <= max_error < 1:
@@ -38,4 +42,10 @@ def least_probability(max_error: float) -> float:
         )
     logits = np.log(PROBABILITIES / (1 - PROBABILITIES))
     logit = np.interp(-np.log(max_error), -np.log(ERRORS), logits)
-    return float(1 / (1 + np.exp(-logit)))
+    probability = float(1 / (1 + np.exp(-logit)))
+    if risks is None:
+        return probability
+    is_kept = risks.bounds[-1] <= max_error
+    rates = risks.bounds if is_kept else np.array(risks.risks) / risks.units
+    own = risks.probabilities[int(np.argmax(np.append(rates[:-1] <= max_error, True)))]
+    return own if is_kept else max(own, probability)

@@ -104,6 +104,11 @@ class SequenceRecognizer(ABC):
         """Images in the window, up to l."""
         return len(self._window.buffer)
 
+    @property
+    def threshold(self) -> float | None:
+        """Return the distance below which a window is matched: as set, or by the map; or None."""
+        return None if math.isnan(self._limits[0]) else self._limits[0]
+
     def set_limits(
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
     ) -> None:
@@ -249,6 +254,7 @@ class PlaceRecognizer(SequenceRecognizer):
         require_type('place_map', place_map, PlaceMap, maps)
         require_type('settings', settings, RecognizerSettings, given)
         backend = choose_backend(backend)
+        settings = replace(settings, error_risks=place_map.error_risks)
         features, options = place_map.features, settings.applied_options
         self._suggested = place_map.threshold
         poses = place_map.poses if place_map.has_poses else None
@@ -271,8 +277,9 @@ class PlaceRecognizer(SequenceRecognizer):
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
         # where a first stage compares vectors of whole images: it, and their centering
         self._vectors: tuple[FirstStage, MeanCentering] | None = None
-        # of the start, for the log: statistics that were learned again, and the time budget
-        self.stages = prepared.note
+        # of the start, for the log: statistics that were learned again, an error rate that is not
+        # kept, and the time budget
+        self.stages = '; '.join(filter(None, [prepared.note, settings.error_note]))
         if settings.time_budget_ms and len(features):
             if backend == 'cuda':
                 raise SettingsError(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.checks import require_above, require_at_least, require_between, require_number
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of, RobustOptions
 
@@ -36,6 +37,8 @@ class RecognizerSettings:
     :param max_error: mode robust: rate of wrong matches that chooses this probability instead
         (:func:`stavpr_ros.recognition.error_rate.least_probability`), 0 = off. A
         ``min_probability`` other than the default applies as well where it is stricter.
+    :param error_risks: of drives with these settings, for ``max_error``; :class:`PlaceRecognizer`
+        takes those of its map.
     """
 
     threshold: float | None = None
@@ -48,6 +51,7 @@ class RecognizerSettings:
     time_budget_ms: float = 0.0
     min_probability: float = MIN_PROBABILITY
     max_error: float = 0.0
+    error_risks: ErrorRisks | None = None
 
     def __post_init__(self) -> None:
         options_of(self.mode)  # rejects an unknown mode
@@ -90,7 +94,38 @@ class RecognizerSettings:
         if not self.max_error:
             return self.min_probability
         given = self.min_probability != MIN_PROBABILITY
-        return max(least_probability(self.max_error), self.min_probability if given else 0)
+        probability = least_probability(self.max_error, self._own_risks)
+        return max(probability, self.min_probability if given else 0)
+
+    @property
+    def method(self) -> str:
+        """Return what error risks depend on, as text."""
+        spatial, sequence = self.spatial, self.sequence
+        mode = self.mode if self.robust_options is None else 'own options'
+        return (
+            f'{mode}, length {sequence.length}, beta {sequence.beta:g}, {spatial.strategy}, '
+            f'sigma {spatial.sigma:g}, xi {spatial.xi}, vertical {spatial.vertical}'
+        )
+
+    @property
+    def error_note(self) -> str:
+        """Return why ``max_error`` is not kept by the error risks; '' = it is, or none is set."""
+        if not self.max_error or (risks := self.error_risks) is None:
+            return ''
+        least = risks.bounds[-1]
+        if self._own_risks is not None and least <= self.max_error:
+            return ''
+        return (
+            f'max_error = {self.max_error:g} is not kept by the calibration of the map '
+            f'({risks.units} blocks, {least:.3g} at least, with {risks.method!a}): the built-in '
+            f'table, or stricter, applies (with {self.method!a})'
+        )
+
+    @property
+    def _own_risks(self) -> ErrorRisks | None:
+        """Return the error risks if they are of these settings."""
+        risks = self.error_risks
+        return risks if risks is not None and risks.method == self.method else None
 
     @property
     def compares_odometry(self) -> bool:

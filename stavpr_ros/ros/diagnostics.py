@@ -90,8 +90,8 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
     counts, settings, info = health.counts, health.settings.pipeline, health.map_info
     backend = settings.matching_backend(health.settings.operation)
     limit: dict[str, Value]
-    if settings.mode == 'robust':
-        limit = {'min_probability': settings.recognition().applied_probability}
+    if settings.mode == 'robust' and health.limit is not None:
+        limit = {'min_probability': 1 - health.limit}
     else:
         limit = {'threshold': settings.threshold}
     odometry = health.odometry or 'not needed'

@@ -47,6 +47,13 @@ class Health:
     odometry_fault: str = ''  # why no odometry can arrive on its topic
     camera: str = 'not needed'  # whether the camera of the edges is known, or why not
     contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown
+    applied_threshold: float | None = None  # that of the recognizer; None = that of the settings
+
+    @property
+    def limit(self) -> float | None:
+        """Return the distance below which a window is matched, None = not set."""
+        own = self.settings.pipeline.applied_threshold
+        return own if self.applied_threshold is None else self.applied_threshold
 
     @property
     def map_path(self) -> str:
@@ -200,7 +207,7 @@ def _hopeless(health: Health) -> str:
             f'{length}): record a longer map, with smaller keyframe distances, or set a shorter '
             'sequence_length'
         )
-    tried, limit = counts.answered.total['no match'], settings.applied_threshold
+    tried, limit = counts.answered.total['no match'], health.limit
     if counts.answered.total['match'] or tried < HOPELESS * length:
         return ''
     never = f'none of {tried} images was ever matched'

@@ -304,6 +304,7 @@ class Runtime:
             camera='not needed' if camera is None else camera.state,
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.contrast,
+            applied_threshold=pipeline.threshold,
         )
 
     # images

@@ -11,6 +11,7 @@ import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
+from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.recognition import prepared_map
 from stavpr_ros.sources.frame import Frame
 
@@ -42,7 +43,8 @@ def example_map(projection: int | None = None) -> PlaceMap:
 def example_files(folder: Path) -> list[bytes]:
     """Return the content of map files of both storages, with and without a projection."""
     save_map(example_map(), folder / 'float32')
-    projected = example_map(projection=16)
+    risks = ErrorRisks('robust', 3, (0.2, 0.9), (1.5, 0.0))
+    projected = dataclasses.replace(example_map(projection=16), error_risks=risks)
     with patch.object(prepared_map, 'LEAST_PLACES', 1):
         statistics = prepared_map.statistics_of_map(projected, 'float16')
         assert statistics is not None
