@@ -247,7 +247,7 @@ def report(run, tmp_path):
 
 
 @pytest.mark.parametrize('mode', ['robust', 'paper'])
-def test_evaluate_with_places_removed_counts_unseen_images(folders, report, mode):
+def test_evaluate_with_places_removed_counts_unseen_images(folders, report, tmp_path, mode):
     """Without places 20 .. 39, images 25 .. 34 are more than five places from the map."""
     options = ['--mode', mode, '--remove-from-map', '20:40', '--remove-from-map', '50:53']
     found, rows, text = report(*pair(folders), *options, '--tolerance', 0)
@@ -266,6 +266,14 @@ def test_evaluate_with_places_removed_counts_unseen_images(folders, report, mode
     decision, threshold = found['decision'], found['sequence']['threshold']
     assert (decision['matched'], decision['wrongly_matched']) == (sum(accepted), wrong)
     assert decision['rule'] == ('default' if mode == 'robust' else 'best F1')
+    rate, (low, high) = decision['error_rate'], decision['error_rate_interval']
+    assert (rate, low <= rate <= high) == (wrong / sum(accepted), True)
+    least, most = decision['recall_interval']
+    assert least < decision['recall'] < most
+    interval = f'error rate {rate:.3f} ({low:.3f}-{high:.3f}), recall {decision["recall"]:.3f}'
+    assert f'{interval} ({least:.3f}-{most:.3f}), with 95 % intervals' in text
+    page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')
+    assert f'error rate of {rate:.3f} ({low:.3f}-{high:.3f})' in page or mode == 'paper'
     limit = 0.5 if mode == 'robust' else threshold
     assert accepted == [int(float(row['sequence_distance']) < limit) for row in rows]
 

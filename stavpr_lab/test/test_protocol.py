@@ -9,6 +9,7 @@ from stavpr_lab.commands import evaluate
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, Ranking
 from stavpr_lab.evaluation.protocol import (
+    error_rate_and_recall,
     evaluate_matches,
     image_vectors,
     LENGTHS,
@@ -54,6 +55,32 @@ def test_recalls_equal_metrics_of_random_rankings():
     assert found.recall_at_1[0] == expected.recall_at[1]
     assert found.recall_at_100_precision[0] == full
     assert 0 < full < expected.recall_at[1] < 1
+
+
+def test_error_rate_and_recall_by_hand():
+    """Of ten images eight are in the map; of six matches two are wrong, one of them off it."""
+    accepted = np.array([1, 1, 1, 1, 1, 1, 0, 0, 0, 0], bool)
+    correct = np.array([1, 1, 1, 1, 0, 0, 1, 0, 0, 0], bool)
+    has_match = np.array([1, 1, 1, 1, 1, 0, 1, 1, 1, 0], bool)
+    (rate, *interval), (recall, *recalled) = error_rate_and_recall(accepted, correct, has_match)
+    assert (rate, recall) == (2 / 6, 4 / 7)
+    assert 0 <= interval[0] < rate < interval[1] <= 1
+    assert 0 <= recalled[0] < recall < recalled[1] <= 1
+    # no right place: of all images
+    rate, recall = error_rate_and_recall(accepted, correct & False, has_match & False)
+    assert (rate[0], np.isnan(recall).all()) == (0.6, True)
+    rate, recall = error_rate_and_recall(accepted & False, correct, has_match)
+    assert (np.isnan(rate).all(), recall) == (True, (0, 0, 0))
+
+
+@pytest.mark.parametrize('run_length', [1, 40])
+def test_interval_of_the_error_rate_has_the_width_of_independent_runs(run_length):
+    wrong = np.repeat(np.random.default_rng(0).random(4000 // run_length) < 0.2, run_length)
+    every = np.ones(4000, bool)
+    (rate, low, high), _ = error_rate_and_recall(every, ~wrong, every)
+    assert low < rate < high
+    width = 3.92 * np.sqrt(0.2 * 0.8 * run_length / 4000)
+    assert high - low == pytest.approx(width, rel=0.35)
 
 
 @pytest.mark.parametrize('run_length', [1, 40])

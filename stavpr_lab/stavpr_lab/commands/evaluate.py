@@ -3,6 +3,7 @@
 """``ros2 run stavpr_lab evaluate``: matches of one traverse on the map of another, and metrics."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 import sys
 import time
@@ -255,11 +256,15 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_lab.evaluation.report import Report
 
     began = time.perf_counter()
-    settings = node_settings(arguments)
+    settings = node_settings(arguments).recognition()
     sequences = load_sequences(arguments)
+    if sequences.reference is not None:
+        settings = replace(settings, error_risks=sequences.reference.error_risks)
+    if settings.error_note:
+        print(settings.error_note)
     truth = sequences.drive.truth.kind
     loaded = time.perf_counter()
-    evaluation = _evaluate(arguments, sequences, settings.recognition())
+    evaluation = _evaluate(arguments, sequences, settings)
     ended = time.perf_counter()
     milliseconds = sorted(evaluation.results.seconds * 1e3)
     times = {
@@ -294,9 +299,16 @@ def _print_report(report: 'Report') -> None:
         _print_metrics(report)
     decision = report.decision()
     wrong = f', {decision["wrongly_matched"]} of them wrongly' if report.has_truth else ''
+    if report.default_threshold is not None:
+        print(f'matched above the probability {1 - report.default_threshold:.4g}')
     print(
         f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images{wrong}'
     )
+    if report.has_truth:
+        from stavpr_lab.evaluation.protocol import text
+
+        rate, recall = map(text, report.estimates)
+        print(f'error rate {rate}, recall {recall}, with 95 % intervals')
     print(
         f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
         f'{report.times["total_s"]:.1f} s in all'

@@ -63,6 +63,35 @@ def block_samples(count: int, resamples: int = 1000, seed: int = 0) -> np.ndarra
     return ((firsts + np.arange(block)) % count).reshape(resamples, -1)[:, :count]
 
 
+def error_rate_and_recall(
+    accepted: np.ndarray, correct: np.ndarray, has_match: np.ndarray
+) -> tuple[Estimate, Estimate]:
+    """
+    Return the share of wrong ones among accepted matches, and recall, with 95 % intervals.
+
+    Where no image has a right place, the first is the share of accepted images. What is not
+    defined is NaN; samples in which it is not are left out of the interval.
+
+    :param accepted, correct, has_match: of N images, shape (N,), bool.
+    """
+    right, wrong, missed = accepted & correct, accepted & ~correct, ~accepted & has_match
+    answered = accepted if has_match.any() else np.ones_like(accepted)
+    columns = np.array([wrong, answered, right, right | missed])
+    samples = (block_samples(len(accepted), 100, seed) for seed in range(10))  # in less memory
+    sampled = [columns[:, images].sum(axis=2) for images in samples]
+    counts = np.column_stack([columns.sum(axis=1), *sampled])
+    with np.errstate(invalid='ignore'):
+        shares = counts[::2] / counts[1::2]
+    return _with_interval(shares[0]), _with_interval(shares[1])
+
+
+def _with_interval(values: np.ndarray) -> Estimate:
+    """Return the first of the values, and the interval of the others."""
+    known = values[1:][~np.isnan(values[1:])]
+    interval = np.quantile(known, INTERVAL) if len(known) else (np.nan, np.nan)
+    return float(values[0]), float(interval[0]), float(interval[1])
+
+
 def recalls(
     correct: np.ndarray, scores: np.ndarray, has_match: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -96,9 +125,7 @@ def evaluate_matches(
             columns = truth.accepts(ranking.best), ranking.scores, truth.has_match
             sampled = recalls(*(column[images] for column in columns))
             first, full = (
-                (float(value), *map(float, np.quantile(values[~np.isnan(values)], INTERVAL)))
-                if truth.has_match.any()
-                else (np.nan, np.nan, np.nan)
+                _with_interval(np.append(value, values))
                 for value, values in zip(recalls(*columns), sampled, strict=True)
             )
             yield Recalls(method, length, tolerance, f1, first, full)

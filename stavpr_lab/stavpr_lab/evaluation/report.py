@@ -11,6 +11,7 @@ import numpy as np
 from stavpr_lab.evaluation.drive import Drive
 from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_lab.evaluation.metrics import accepted_counts, ConfusionCounts
+from stavpr_lab.evaluation.protocol import error_rate_and_recall, Estimate
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap
 
@@ -75,6 +76,12 @@ class Report:
         has_match = self.evaluation.ground_truth.has_match
         return accepted_counts(self.accepted, self.evaluation.correct, has_match)
 
+    @cached_property
+    def estimates(self) -> tuple[Estimate, Estimate]:
+        """Return error rate and recall of :attr:`accepted`, with 95 % intervals."""
+        has_match = self.evaluation.ground_truth.has_match
+        return error_rate_and_recall(self.accepted, self.evaluation.correct, has_match)
+
     def decision(self) -> dict[str, Any]:
         """Return how many images are matched and, with ground truth, how many of them wrongly."""
         counts = self.counts
@@ -89,6 +96,9 @@ class Report:
             'wrongly_matched': counts.false_positives,
             'precision': counts.precision,
             'recall': counts.recall,
+            'error_rate': self.estimates[0][0],
+            'error_rate_interval': self.estimates[0][1:],
+            'recall_interval': self.estimates[1][1:],
         }
 
     def unseen(self) -> list[dict[str, int]]:

@@ -16,6 +16,7 @@ from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import RANKS
 from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
+from stavpr_lab.evaluation.protocol import text
 from stavpr_lab.evaluation.report import jsonable, METRICS, Report
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.robust import evenly
@@ -63,6 +64,8 @@ def html_page(
         colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
         cards=_cards(evaluation) if report.has_truth else [],
         decision=report.decision(),
+        error_rate=text(report.estimates[0]),
+        recall=text(report.estimates[1]),
         unseen=report.unseen() if report.has_truth else [],
         unseen_distance=UNSEEN_DISTANCE,
         calibration=evaluation.calibration and evaluation.calibration.to_json(),
