@@ -94,8 +94,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'max_error',
             0.0,
-            'Mode robust: rate of wrong matches, at least 0.005, that chooses min_probability as '
-            'measured on drives; 0 = off. With both set, the stricter applies.',
+            'Mode robust: rate of wrong matches, at least 0.005, that chooses min_probability, by '
+            'the calibration of the map (evaluate --calibrate) or as measured on drives; 0 = off. '
+            'With both set, the stricter applies.',
             when='live',
             bounds=(0.0, 1.0),
         ),

@@ -66,6 +66,7 @@ examples:
   evaluate --query loop/ --loop-closure --exclude-places 50 --truth closures.png
   evaluate --map summer.csv --query netvlad.mat:winter --truth identity --tolerance 2
   evaluate --map map.npy --query query.npy --truth identity --protocol
+  evaluate --map route.stavpr --query tuesday/ --truth pairs.csv --calibrate
   evaluate --map summer/ --query winter/ --export arrays/
   evaluate --map summer/ --query winter/ --export pairs/ --export-format hloc
   evaluate --map summer/ --query drives/*.bag --output reports/ --processes 4
@@ -117,6 +118,11 @@ def _parser() -> argparse.ArgumentParser:
         'plain sequence matching'
     )
     add('--protocol', action='store_const', const=True, help=protocol)
+    calibrate = (
+        'instead of a report: write the error rate of drives that are made of the query into the '
+        'saved map, which --max-error is kept by; add: to those that it has'
+    )
+    add('--calibrate', nargs='?', const='new', choices=('new', 'add'), help=calibrate)
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_job_options(parser)
     add_feature_options(parser)
@@ -372,7 +378,7 @@ def _run_each(
     parser: argparse.ArgumentParser, arguments: argparse.Namespace, args: list[str]
 ) -> int:
     """Evaluate each query: a report and the numbers in a folder of its name; the exit code."""
-    for option in ('json', 'export', 'window', 'dataset', 'query_poses', 'protocol'):
+    for option in ('json', 'export', 'window', 'dataset', 'query_poses', 'protocol', 'calibrate'):
         if getattr(arguments, option) is not None:
             parser.error(f'--{option.replace("_", "-")} goes with one --query')
     folder, others = Path(arguments.output or OUTPUT), other_arguments(args, '--query')
@@ -403,6 +409,10 @@ def main(args: list[str] | None = None) -> int:
             from stavpr_lab.commands.evaluate_protocol import run_protocol
 
             run_protocol(parser, arguments)
+        elif arguments.calibrate:
+            from stavpr_lab.commands.evaluate_calibrate import run_calibrate
+
+            run_calibrate(parser, arguments)
         else:
             _run(arguments)
         return None

@@ -11,7 +11,10 @@ from stavpr_lab.evaluation.protocol import evaluate_protocol, text, TOLERANCES
 from stavpr_lab.evaluation.report import jsonable
 from stavpr_ros.output_file import JSON, require_replaceable, write_output
 
-OF_REPORTS = ('loop_closure', 'tolerance', 'unknown', 'odometry', 'output', 'export', 'window')
+OF_REPORTS = (
+    *('loop_closure', 'tolerance', 'unknown', 'odometry', 'output', 'export', 'window'),
+    'calibrate',
+)
 
 
 def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

@@ -1,0 +1,99 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``evaluate --calibrate``: the error rate of drives on a map, written into its file."""
+
+import argparse
+from dataclasses import replace
+import math
+
+from stavpr_lab.commands.evaluate_sequences import is_saved_map, load_sequences, node_settings
+from stavpr_lab.evaluation.evaluate import recognize_all
+from stavpr_lab.evaluation.metrics import image_matches
+from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.mapping import open_map, save_map, select_places, verify_map
+from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.stored_features import StoredFeatures
+from stavpr_ros.output_file import FileVersion, MAP, require_replaceable
+from stavpr_ros.recognition import PlaceRecognizer
+from stavpr_ros.recognition.error_rate import ERRORS, least_probability
+from stavpr_ros.recognition.prepared_map import statistics_of_map, with_codes
+from tqdm import tqdm
+
+WINDOWS = 2  # of a block: as many images as that of the bootstrap has
+OTHERS = (
+    *('loop_closure', 'dataset', 'unknown', 'odometry', 'json', 'output', 'export', 'window'),
+    *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'max_error'),
+)
+
+
+def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """
+    Drive the query on the map, write the error risks into its file, and print what they keep.
+
+    :param parser: for errors of options that contradict this.
+    :raises StavprError: an input cannot be read, they do not fit together, or the file of the map
+        was replaced meanwhile or cannot be written; it stays as it was.
+    """
+    for name in OTHERS:
+        if getattr(arguments, name):
+            parser.error(f'--calibrate: leave --{name.replace("_", "-")} out')
+    if arguments.truth is None or arguments.mode != 'robust':
+        parser.error('--calibrate needs --truth identity|poses|FILE, and --mode robust')
+    path = arguments.map
+    if not is_saved_map(path):
+        parser.error(f'--calibrate: --map {path} is no saved map; make one by build_map')
+    require_replaceable(path, MAP, True)
+    version = FileVersion.of(path)
+    settings = node_settings(arguments).recognition()
+    sequences = load_sequences(arguments)
+    reference, features = sequences.reference, sequences.query.features
+    assert reference is not None  # without --loop-closure
+    before = reference.error_risks if arguments.calibrate == 'add' else None
+    if arguments.calibrate == 'add' and (before is None or before.method != settings.method):
+        raise SettingsError(
+            f'--calibrate add: {path} has no calibration of these settings ({settings.method}): '
+            'leave add out'
+        )
+    block, driven = WINDOWS * settings.sequence.length, []
+    drives = list(made_drives(sequences.drive.truth, block))
+    for drive in tqdm(drives, desc='calibrating', unit='drive', disable=None):
+        places = select_places(reference, drive.places) if drive.removed else reference
+        recognizer = PlaceRecognizer(places, settings, arguments.backend, arguments.precision)
+        matches = recognize_all(recognizer, features[drive.images])
+        driven.append((drive, image_matches(matches, settings.sequence.length)))
+    risks = measured_risks(driven, block, settings.method)
+    print(
+        f'{sequences.title}: {risks.units} blocks of {block} images, as recorded, at other speeds '
+        'and with detours'
+    )
+    risks = risks if before is None else joined(risks, before)
+    _print(risks)
+    print(f'calibration in {path}, id {_store(path, version, reference.map_id, risks)}')
+
+
+def _print(risks: ErrorRisks) -> None:
+    """Print the probability that each error rate chooses, and where the map does not keep it."""
+    print(f'{"max_error":>9}  matched above')
+    least = risks.bounds[-1]
+    for rate in ERRORS.tolist():
+        needed = math.ceil(1 / rate - 1e-9) - 1
+        why = f'{needed} blocks are needed' if needed > risks.units else 'too many wrong matches'
+        note = '' if least <= rate else f'not calibrated: {why}'
+        print(f'{rate:9g}  {least_probability(rate, risks):<13.4g}  {note}'.rstrip())
+    print(
+        f'{risks.units} blocks in all keep {least:.3g} at least; where not calibrated, the '
+        'stricter of the built-in table and the mean of the blocks applies'
+    )
+
+
+def _store(path: str, version: FileVersion | None, map_id: str, risks: ErrorRisks) -> str:
+    """Write a map again, with risks; return its id."""
+    place_map = open_map(path)
+    verify_map(place_map)
+    if version is None or place_map.map_id != map_id:
+        raise SettingsError(f'{path} was replaced meanwhile: start again')
+    learned, features = statistics_of_map(place_map), place_map.features
+    if learned is not None and isinstance(features, StoredFeatures) and features.has_codes:
+        learned = with_codes(learned, place_map, features.storage)
+    return save_map(replace(place_map, error_risks=risks), path, '', version, learned)
