@@ -233,7 +233,8 @@ class FilterWindow(QueryWindow):
             self.filter.update(z, weight, speeds, likelihoods, not_near)
         else:
             by_place = self.layout.gathered(self.filter.places_of_states()[: len(z)])
-            if self.change.is_dark_stretch(by_place):
+            newest = self.layout.gathered(self.buffer.newest()[: len(z)])
+            if self.change.is_dark_stretch(by_place, newest):
                 self.filter.update(z, 0.0, ones, ones)
         self._images.append(WindowImage(change, weight, self.filter.count - 1))
 
