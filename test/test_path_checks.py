@@ -7,10 +7,12 @@ from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.recognition import filter_window, path_checks, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.path_checks import (
+    AT_REST,
     EVEN,
     EVEN_SHARE,
     EXCESS,
     EXCESS_WEIGHT,
+    least_at_rest,
     odds_factor,
     UNEVEN_WEIGHT,
     unevenness,
@@ -46,6 +48,13 @@ def test_odds_factor_is_of_both_checks():
     assert odds_factor(0.0, -1.0) == 1
     expected = np.exp(-0.1 * UNEVEN_WEIGHT - 0.02 * EXCESS_WEIGHT)
     assert odds_factor(0.1, EXCESS + 0.02) == pytest.approx(expected)
+
+
+def test_camera_at_rest_needs_less_where_its_images_are_near():
+    assert least_at_rest(np.array([-1.0]), -2.0, 0.25) == pytest.approx(AT_REST)
+    assert least_at_rest(np.array([np.inf, 0.0]), -2.0, 0.25) == pytest.approx(AT_REST)
+    near = least_at_rest(np.array([-2.0, -4.0]), -2.0, 0.25)  # mean -3: logarithm 6 - 2
+    assert near / (1 - near) == pytest.approx(9 * np.exp(-0.75 * 4))
 
 
 def test_place_that_only_some_images_show_is_not_matched(monkeypatch):

@@ -3,7 +3,7 @@
 """Long standstills, in the map, of the query, and of a route: all their images count as one."""
 
 import numpy as np
-from places import features_of, map_of
+from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.features import FeatureSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -65,6 +65,36 @@ def test_query_is_matched_during_a_long_standstill_and_after_it():
     found = matched(PlaceRecognizer(place_map, robust()), noisy(query, 9))
     assert len(found) > len(places) - 60
     assert all(abs(place - places[image]) <= 2 for image, place in found.items())
+
+
+def standing(strips, images=60, seed=0):
+    """Return features of a drive that ends with a standstill of so many equal images."""
+    last = strips.shape[1] - 1
+    return features_of(strips, 0.2, seed)[np.r_[:last, np.full(images, last)]]
+
+
+def test_camera_that_stops_beyond_the_map_is_not_matched_for_as_long_as_it_stands():
+    """With images that are somewhat near, for which the filter has not left the map yet."""
+    held = 0
+    for seed in range(12):
+        known, unknown = route_strips(seed, PLACES), route_strips(90 + seed, 8)
+        beyond = 0.2 * known[:, 100:108] + 0.8 * unknown
+        query = standing(np.concatenate([known[:, 40:100], beyond], axis=1), seed=seed)
+        matches = recognize_all(PlaceRecognizer(map_of(features_of(known)), robust()), query)
+        held += any(match.accepted for match in matches[-50:])
+    assert held <= 1  # of 12
+
+
+def test_match_of_a_standing_camera_is_held():
+    """Its path is that of the images before the stop, and then only of the place."""
+    known = route_strips(0, PLACES)
+    settings = RecognizerSettings(mode='robust', min_probability=0.9)
+    query = standing(known[:, 40:80])
+    matches = recognize_all(PlaceRecognizer(map_of(features_of(known)), settings), query)[-50:]
+    assert all(match.accepted for match in matches)
+    assert len({match.probability for match in matches}) == 1
+    assert matches[0].path[0, 1] == pytest.approx(79 - 9, abs=2)
+    assert set(matches[-1].path[:, 1]) == {matches[-1].place_index} == {79}
 
 
 def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():

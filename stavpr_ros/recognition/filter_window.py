@@ -3,7 +3,7 @@
 """The window of mode robust: a place filter, read at the middle of the window."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -21,7 +21,12 @@ from stavpr_ros.recognition.filter_paths import (
 )
 from stavpr_ros.recognition.map_change import ImageChange
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.path_checks import odds_factor, PathCandidate, unevenness
+from stavpr_ros.recognition.path_checks import (
+    least_at_rest,
+    odds_factor,
+    PathCandidate,
+    unevenness,
+)
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
@@ -143,7 +148,9 @@ class FilterWindow(QueryWindow):
         self.filter = self._state_filter(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings, length)
         self._speeds, self._levels = settings.speeds, settings.levels
+        self._weight = settings.weight
         self._images: deque[WindowImage] = deque(maxlen=length)
+        self._held: WindowMatch | None = None  # match of a camera at rest
 
     def _buffer(self, sequence: SequenceSettings, width: int) -> SequenceBuffer:
         return SequenceBuffer(sequence.length, width, sequence.k, copies=1)
@@ -174,6 +181,7 @@ class FilterWindow(QueryWindow):
         self.filter.reset()
         self.change.reset()
         self._images.clear()
+        self._held = None
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -237,9 +245,24 @@ class FilterWindow(QueryWindow):
             if self.change.is_dark_stretch(by_place, newest):
                 self.filter.update(z, 0.0, ones, ones)
         self._images.append(WindowImage(change, weight, self.filter.count - 1))
+        if self._held is not None:
+            self._held = _moved_on(self._held) if self._is_resting(self._middle) else None
 
     def _match(self, nms_radius: int) -> WindowMatch:
-        return self._match_image((len(self._images) - 1) // 2, nms_radius)
+        """
+        Return the match of the middle image; that of a camera at rest, for as long as it rests.
+
+        A window of equal images would show neither how even the path to them was nor how fast.
+        """
+        middle = (len(self._images) - 1) // 2
+        found = self._held or self._match_image(middle, nms_radius)
+        self._held = found if self._is_resting(middle) else None
+        return found
+
+    def _is_resting(self, position: int) -> bool:
+        """Whether the camera has not moved since an image; of a full window in localization."""
+        is_equal = self._images[position].number == self._images[-1].number
+        return is_equal and self.buffer.full and not self._to_oldest
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
@@ -275,7 +298,8 @@ class FilterWindow(QueryWindow):
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
         sequences = partial(self._sequences, n, first, places, probabilities)
-        return WindowMatch(match, path, sequences, probability, shares)
+        least = chosen.least * float(shares[position]) if self._is_resting(position) else 0.0
+        return WindowMatch(match, path, sequences, probability, shares, least)
 
     def _chosen(
         self,
@@ -321,9 +345,13 @@ class FilterWindow(QueryWindow):
         of_path = max(float(probability), min(float(belief.weights[apart <= BAND].sum()), 1.0))
         state = belief.states[near][np.argmax(belief.weights[near])]
         path, shares, z = self._refined(self._path(state, position), state[0])
-        moved = np.count_nonzero(np.diff(self._numbers()))
+        numbers = self._numbers()
+        moved = np.count_nonzero(np.diff(numbers))
         excess = self.change.excess((path[-1] - path[0]) / moved) if moved else 0.0
-        return PathCandidate(path, shares, of_path, odds_factor(unevenness(path, z), excess))
+        factor = odds_factor(unevenness(path, z), excess)
+        at_rest = z[numbers == numbers[-1]]
+        least = least_at_rest(at_rest, self._levels[state[0]], self._weight)
+        return PathCandidate(path, shares, of_path, factor, least)
 
     def _refined(self, path: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
@@ -399,8 +427,21 @@ class FilterWindow(QueryWindow):
         images = self._numbers()
         back = images[-1] - images
         lag = int(back[position])
+        if self.buffer.full and not self._to_oldest:  # at a standstill, images before it as well
+            lag = max(lag, int(min(back[0], len(images) - 1 - self._middle)))
         places = self.filter.path(state, lag)
+        lag = int(np.count_nonzero(places >= 0)) - 1  # since the path has entered the map
         slope = (places[0] - places[lag]) / lag if lag else self._speeds[state[3]]
         earlier = np.maximum(back - lag, 0) * slope
         path = places[np.minimum(back, lag)].astype(np.int64) - np.rint(earlier).astype(np.int64)
         return np.maximum(path, self.layout.first_column(places[0]))
+
+
+def _moved_on(found: WindowMatch) -> WindowMatch:
+    """Return the match of a window after one more image of a camera at rest."""
+    if found.nearest is None:
+        return found
+    path, shares = found.path.copy(), np.append(found.shares[1:], found.shares[-1:])
+    path[:-1, 1] = found.path[1:, 1]
+    nearest = replace(found.nearest, first=int(path[0, 1]))
+    return replace(found, nearest=nearest, path=path, shares=shares)

@@ -75,6 +75,7 @@ class WindowMatch:
     :param shares: probability of each place of the path and its neighbors, given the sequence,
         (m,); empty in mode paper.
     :param sequences: returns all sequences; valid until the next match of the window.
+    :param least_probability: below which it is no match whatever the limits: of a camera at rest.
     """
 
     nearest: SequenceMatch | None = None
@@ -82,6 +83,7 @@ class WindowMatch:
     sequences: Callable[[], WindowSequences] = WindowSequences
     probability: float = math.nan
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
+    least_probability: float = 0.0
 
     def path_ratios(self, position: int) -> np.ndarray:
         """Return the shares over that of the place of one image of the window, (m,)."""

@@ -15,6 +15,13 @@ distinguish right paths from those through places that look alike, in all kinds 
 The odds of a path are multiplied by
 
     exp(-10 max(0, s - max(1.4, 0.45 |m|)) - 30 max(0, e - 0.04))
+
+The place of a camera at rest is not confirmed by later images. Its path needs the odds
+
+    9 exp(-(1 - alpha) max(0, mu z - mu^2 / 2))
+
+with the mean z of the images at rest: less than 9, as of the first images of a drive, where they
+are near, with the weight that the filter does not give to an image of many.
 """
 
 from dataclasses import dataclass
@@ -24,6 +31,7 @@ import numpy as np
 EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share of its mean
 UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
 LEAST_PLACES = 3  # of a path whose deviation is meaningful
+AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
 EXCESS, EXCESS_WEIGHT = 0.04, 30.0  # of right paths at most, and its weight in the odds beyond
 
 
@@ -36,12 +44,14 @@ class PathCandidate:
     :param shares: probability of these places and close ones, given the path, (l,).
     :param probability: of the path by the filter.
     :param factor: of its odds, by the checks.
+    :param least: its probability, at least, if the camera is at rest.
     """
 
     path: np.ndarray
     shares: np.ndarray
     probability: float
     factor: float
+    least: float
 
     @property
     def weight(self) -> float:
@@ -75,3 +85,16 @@ def odds_factor(uneven: float, excess: float) -> float:
     :param excess: logarithm of the change of the images over that of the map along the path.
     """
     return float(np.exp(-UNEVEN_WEIGHT * uneven - EXCESS_WEIGHT * max(excess - EXCESS, 0.0)))
+
+
+def least_at_rest(z: np.ndarray, level: float, weight: float) -> float:
+    """
+    Return the probability that a path needs where the camera is at rest.
+
+    :param z: z-normalized distances of the images at rest to their place, (m,), m > 0.
+    :param level: mean z of right places on this drive, mu.
+    :param weight: of an image among others, alpha.
+    """
+    nearness = max(level * float(z.mean()) - level**2 / 2, 0.0)
+    odds = AT_REST / (1 - AT_REST) * np.exp(-(1 - weight) * nearness)
+    return float(odds / (1 + odds))

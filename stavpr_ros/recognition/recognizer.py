@@ -216,7 +216,10 @@ class SequenceRecognizer(ABC):
 
     def _of_window(self, match: Match, position: np.ndarray) -> Match:
         """Return the match by the images in the window."""
-        self._found = self._window.match(self._settings.nms_radius)
+        self._found = found = self._window.match(self._settings.nms_radius)
+        if found.least_probability > match.min_probability:
+            least = found.least_probability
+            match = replace(match, threshold=1 - least, min_probability=least)
         match = match.of_window(self._found, match.position)
         is_known = len(self._motion.positions) and np.isfinite(position[0])
         if is_known and match.sequence is not None:
