@@ -10,7 +10,6 @@ from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.map_change import (
     AHEAD,
     APART,
-    FARTHER,
     FLOOR,
     ImageChange,
     OFFSET,
@@ -216,13 +215,11 @@ def test_dark_stretch_is_where_places_of_map_are_equal_or_soon_will_be():
     strips = drive_strips(60)
     strips[:, 30:41] = 0  # 31..40 equal the one before
     change = learned(strips)
-    z = np.zeros(60)
-    dark = [change.is_dark_stretch(probable_at(place, 60), z) for place in range(60)]
-    assert dark == [30 + STRETCH - AHEAD < place < 40 for place in range(60)]
-    assert not change.is_dark_stretch(np.zeros(60), z)
+    dark = [change.is_dark_stretch(probable_at(place, 60)) for place in range(60)]
+    assert dark == [30 + STRETCH - AHEAD < place <= 40 for place in range(60)]
+    assert not change.is_dark_stretch(np.zeros(60))
     change.evict(5)
-    found = [change.is_dark_stretch(probable_at(place, 55), z[5:]) for place in range(55)]
-    assert found == dark[5:]
+    assert [change.is_dark_stretch(probable_at(place, 55)) for place in range(55)] == dark[5:]
 
 
 def test_dark_stretch_needs_probability_of_such_places():
@@ -230,28 +227,15 @@ def test_dark_stretch_needs_probability_of_such_places():
     strips[:, 30:41] = 0
     change, by_place = learned(strips), np.zeros(60)
     by_place[5], by_place[35] = 0.72, 0.28
-    z = np.zeros(60)
-    assert not change.is_dark_stretch(by_place, z)
+    assert not change.is_dark_stretch(by_place)
     by_place[5], by_place[35] = 0.68, 0.32
-    assert change.is_dark_stretch(by_place, z)
-    assert change.is_dark_stretch(by_place / 100, z)  # relative to the probability on the map
-
-
-def test_dark_stretch_ahead_is_not_where_the_image_is_nearer_to_its_place():
-    strips, z = drive_strips(60), np.zeros(60)
-    strips[:, 30:41] = 0
-    change = learned(strips)
-    z[28] = -3
-    assert not change.is_dark_stretch(probable_at(28, 60), z)
-    z[30:41] = -3 + FARTHER
-    assert change.is_dark_stretch(probable_at(28, 60), z)
-    z[28] = 3
-    assert change.is_dark_stretch(probable_at(28, 60), z)
+    assert change.is_dark_stretch(by_place)
+    assert change.is_dark_stretch(by_place / 100)  # relative to the probability on the map
 
 
 def test_dark_stretch_of_route_knows_its_newest_places():
     strips = drive_strips(30)
     strips[:, 20:26] = 0
     route = learned_on_route(strips, 30)
-    assert route.is_dark_stretch(probable_at(22, 30), np.zeros(30))
-    assert not route.is_dark_stretch(probable_at(28, 30), np.zeros(30))
+    assert route.is_dark_stretch(probable_at(22, 30))
+    assert not route.is_dark_stretch(probable_at(28, 30))

@@ -241,8 +241,7 @@ class FilterWindow(QueryWindow):
             self.filter.update(z, weight, speeds, likelihoods, not_near)
         else:
             by_place = self.layout.gathered(self.filter.places_of_states()[: len(z)])
-            newest = self.layout.gathered(self.buffer.newest()[: len(z)])
-            if self.change.is_dark_stretch(by_place, newest):
+            if self.change.is_dark_stretch(by_place):
                 self.filter.update(z, 0.0, ones, ones)
         self._images.append(WindowImage(change, weight, self.filter.count - 1))
         if self._held is not None:

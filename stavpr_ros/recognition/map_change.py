@@ -18,7 +18,6 @@ APART = 5  # places apart up to which the map's changes are learned
 STANDING = 0.05  # weight of a place by its change, up to which the curve is not learned from it
 AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
-FARTHER = 0.5  # deviations that the image may be farther from the stretch than from a place before
 UNLIT = 0.3  # probability of such places above which equal images are no standstill
 SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
 NOISE = 0.15  # deviation of the change by noise, common to all
@@ -145,7 +144,7 @@ class ImageChange:
     def _find_equal(self) -> None:
         self._equal = self._from_before < self.standstill  # to the place before, up to noise
 
-    def is_dark_stretch(self, by_place: np.ndarray, z: np.ndarray) -> bool:
+    def is_dark_stretch(self, by_place: np.ndarray) -> bool:
         """
         Whether equal images are expected where the camera is: places of the map are equal there.
 
@@ -156,9 +155,8 @@ class ImageChange:
         for _ in range(STRETCH - 1):  # equal places before, too
             equal[1:] &= equal[:-1].copy()
         ahead = np.zeros(n, bool)
-        for places in range(1, min(AHEAD, n)):
-            is_near = z[places:] <= z[: n - places] + FARTHER
-            ahead[: n - places] |= equal[places:] & is_near
+        for places in range(min(AHEAD, n)):
+            ahead[: n - places] |= equal[places:]
         return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
 
     def reset(self) -> None:
