@@ -28,6 +28,7 @@ from stavpr_ros.recognition.path_checks import (
     unevenness,
 )
 from stavpr_ros.recognition.place_filter import PlaceFilter
+from stavpr_ros.recognition.place_means import PlaceMeans
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 
@@ -121,8 +122,9 @@ class FilterWindow(QueryWindow):
     :param settings: model of the filter.
     :param layout: of the places.
     :param normalizes, around: see :class:`stavpr_ros.recognition.window.QueryWindow`.
-    :param to_oldest: states are followed back to the oldest image of the window, which
-        :meth:`match_oldest` requires, instead of the middle one.
+    :param to_oldest: for loop closure: states are followed back to the oldest image of the
+        window, which :meth:`match_oldest` requires, instead of the middle one, and the mean z of
+        each place is subtracted (:mod:`stavpr_ros.recognition.place_means`).
 
     ``change`` compares images, ``filter`` contains the states.
     """
@@ -151,6 +153,7 @@ class FilterWindow(QueryWindow):
         self._weight = settings.weight
         self._images: deque[WindowImage] = deque(maxlen=length)
         self._held: WindowMatch | None = None  # match of a camera at rest
+        self._means = PlaceMeans()
 
     def _buffer(self, sequence: SequenceSettings, width: int) -> SequenceBuffer:
         return SequenceBuffer(sequence.length, width, sequence.k, copies=1)
@@ -196,12 +199,15 @@ class FilterWindow(QueryWindow):
         assert isinstance(self.filter, PlaceFilter)
         self.filter.evict(count)
         self.change.evict(count)
+        self._means.evict(count)
 
     def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
         """See :meth:`QueryWindow.push`."""
-        row = self._as_columns(row)
+        row, change = self._as_columns(row), self.change.next_query(strips)
+        if self._to_oldest:
+            row = self._means.subtracted(row, self.change.is_standstill(change))
         self.buffer.push(row, stamp)
-        self._update(row, self.change.next_query(strips))
+        self._update(row, change)
 
     def add(self, row: np.ndarray, stamp: int, change: float) -> None:
         """

@@ -1,0 +1,90 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Means of places over the latest images, and loop closure on a new street in a known light."""
+
+import numpy as np
+from places import features_of, route_strips
+import pytest
+from stavpr_ros.recognition import RecognizerSettings
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.place_means import DELAY, IMAGES, NEAREST, PlaceMeans, PRIOR
+
+EXCLUDED = 50
+
+
+def expected_means(rows, places):
+    """Return the means by the definition, (places,), of rows that count, oldest first."""
+    weights = (1 - 1 / IMAGES) ** np.arange(len(rows))[::-1]
+    known = [np.append(row, np.full(places - len(row), row[-1])) for row in rows]
+    clipped = np.maximum(np.reshape(known, (len(rows), places)), NEAREST)
+    return weights @ clipped / (weights.sum() + PRIOR)
+
+
+def test_means_are_weighted_ones_of_earlier_rows_with_unknown_places_as_the_last():
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(0, 2, 3 + i).astype(np.float32) for i in range(12)]
+    means = PlaceMeans()
+    for i, row in enumerate(rows):
+        counted = rows[: max(0, i - DELAY)]
+        less = means.subtracted(row, False)
+        np.testing.assert_allclose(less, row - expected_means(counted, len(row)), atol=1e-5)
+
+
+def test_images_at_a_standstill_do_not_count():
+    rng = np.random.default_rng(1)
+    rows = rng.normal(0, 1, (20, 8)).astype(np.float32)
+    one, other = PlaceMeans(), PlaceMeans()
+    for row in rows:
+        one.subtracted(row, False)
+        other.subtracted(row, False)
+        other.subtracted(row - 3, True)
+    np.testing.assert_array_equal(one.subtracted(rows[0], False), other.subtracted(rows[0], False))
+
+
+def test_places_that_are_excluded_count_as_mean_0():
+    means = PlaceMeans()
+    for _ in range(10):
+        means.subtracted(np.array([np.inf, 1.0], np.float32), False)
+    less = means.subtracted(np.array([2.0, 2.0], np.float32), False)
+    assert less[0] == 2
+    assert less[1] < 2
+    assert means.subtracted(np.array([np.inf, 1.0], np.float32), False)[0] == np.inf
+
+
+def test_evicted_places_take_their_means_with_them():
+    rng = np.random.default_rng(2)
+    rows = rng.normal(0, 1, (30, 40)).astype(np.float32)
+    whole, evicted = PlaceMeans(), PlaceMeans()
+    for row in rows:
+        whole.subtracted(row, False)
+        evicted.subtracted(row, False)
+    evicted.evict(7)
+    for row in rows:
+        kept = evicted.subtracted(row[7:], False)
+        np.testing.assert_array_equal(kept, whole.subtracted(row, False)[7:])
+    evicted.evict(33)
+    assert len(evicted.subtracted(np.empty(0, np.float32), False)) == 0
+
+
+def drive(strips, noise=0.3):
+    """Return the matches of a route with images of these strips."""
+    features = features_of(strips, noise)
+    closer = LoopCloser(RecognizerSettings(mode='robust'), EXCLUDED, features.settings)
+    return [closer.update(features[i : i + 1]) for i in range(len(features))]
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_stretch_that_looks_like_an_earlier_one_throughout_is_not_closed(monkeypatch, seed):
+    """From place 200 on, all images share content with places 60 to 75: none is passed again."""
+    strips = route_strips(seed, 300)
+    shared = 1.6 * np.random.default_rng(seed + 50).standard_normal((7, 1, strips.shape[2]))
+    strips[:, 60:75] += shared
+    strips[:, 200:260] += shared
+    assert not any(match.accepted for match in drive(strips))
+    twice = drive(np.concatenate([strips, strips], axis=1))
+    places = [match.sequence.middle for match in twice if match.accepted]
+    off = [place - i for i, place in enumerate(places, 1)]
+    assert len(places) > 280
+    assert max(off) - min(off) <= 4
+    monkeypatch.setattr(PlaceMeans, 'subtracted', lambda self, z, is_standstill: z)
+    assert sum(match.accepted for match in drive(strips)) > 20
