@@ -5,7 +5,7 @@ How near each place of a route is to the latest images, wherever they were taken
 
 Images of one light are nearer to each other than to all others, and certain places of that light
 are near to a whole stretch of images. A camera that moves passes a place in a few images: what is
-near to many in a row looks alike. Of the latest images, q = 0 the newest, the mean
+near to many in a row looks alike. Over the latest images, the newest that counts q = 0, the mean
 
     m[y] = sum_q w_q max(-1.5, z_q[y]) / (sum_q w_q + P),    w_q = (1 - 1/T)^q, T = 40, P = 10,
 
