@@ -53,6 +53,34 @@ def test_query_at_other_speed_is_matched(recognizer, route, speed):
     assert right[matched >= 0].mean() > 0.95
 
 
+def test_camera_that_is_carried_elsewhere_is_matched_by_the_images_since(recognizer, route):
+    images, seen = np.r_[20:80, 160:200], []
+    for count, answer in enumerate(drive(recognizer, route[:, images])[60:], 1):
+        if answer.accepted:
+            shown = len(answer.window_stamps)
+            assert answer.path[-1, 0] == shown - 1 == len(answer.window_changes) - 1
+            assert shown == LENGTH or answer.probability > EARLY
+            image = 60 + count - shown + answer.position
+            assert abs(answer.place_index - images[image]) <= 2
+            seen += [count] if image >= 60 else []
+    assert seen[0] < MIDDLE
+    assert len(seen) > 36
+
+
+def test_camera_off_the_map_is_not_matched_by_its_newest_images(recognizer, route):
+    unknown = route_strips(7, 60)
+    answers = drive(recognizer, np.concatenate([route[:, 20:80], unknown], axis=1))
+    assert not any(answer.accepted for answer in answers[60 + LENGTH :])
+
+
+def test_map_of_every_third_place_is_matched_by_faint_images():
+    """A speed between two of the model would cost more than these images show."""
+    strips = route_strips(3, PLACES)
+    place_map = map_of(features_of(strips[:, ::3]))
+    answers = drive(PlaceRecognizer(place_map, RecognizerSettings(mode='robust')), strips, 5.0)
+    assert np.mean([answer.accepted for answer in answers[20:]]) > 0.7  # without 1/3: 0.52
+
+
 def test_match_is_path_and_second_best_of_its_window(recognizer, route):
     answers = drive(recognizer, route[:, 20:120])
     for answer in answers[: LENGTH - 1]:

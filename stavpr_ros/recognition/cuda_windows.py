@@ -39,9 +39,9 @@ class DeviceBuffer(SequenceBuffer):
         row: np.ndarray = self._slots[self.oldest - 1][0].cpu().numpy()
         return row
 
-    def at(self, columns: np.ndarray) -> np.ndarray:
+    def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
         """See :meth:`SequenceBuffer.at`; copied from the device."""
-        rows = torch.from_numpy(self._ring())
+        rows = torch.from_numpy(self._ring(images))
         entries: np.ndarray = self.memory[rows, torch.from_numpy(columns)].cpu().numpy()
         return entries
 

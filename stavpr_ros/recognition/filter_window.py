@@ -5,6 +5,7 @@
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +37,8 @@ CALIBRATION = 2.0  # factor of the odds of being on the map, which the filter de
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
 LEAST_CANDIDATE = 0.01  # probability of its place, at least
+FEWEST = 2  # images of a match
+ON_MAP = 0.5  # probability above which the newest images can have a match
 AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
 
 
@@ -154,6 +157,7 @@ class FilterWindow(QueryWindow):
         self._images: deque[WindowImage] = deque(maxlen=length)
         self._held: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
+        self._entered = 0  # number of the image with which the latest path came to the map
 
     def _buffer(self, sequence: SequenceSettings, width: int) -> SequenceBuffer:
         return SequenceBuffer(sequence.length, width, sequence.k, copies=1)
@@ -162,11 +166,6 @@ class FilterWindow(QueryWindow):
         self, width: int, lag: int, settings: FilterSettings, gaps: np.ndarray
     ) -> StateFilter:
         return PlaceFilter(width, lag, settings, gaps)
-
-    @property
-    def matches_early(self) -> bool:
-        """Whether a window that is not full can have a match: unless read at its oldest image."""
-        return not self._to_oldest
 
     @property
     def changes(self) -> tuple[float, ...]:
@@ -184,7 +183,7 @@ class FilterWindow(QueryWindow):
         self.filter.reset()
         self.change.reset()
         self._images.clear()
-        self._held = None
+        self._held, self._entered = None, 0
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -269,6 +268,41 @@ class FilterWindow(QueryWindow):
         is_equal = self._images[position].number == self._images[-1].number
         return is_equal and self.buffer.full and not self._to_oldest
 
+    def match_newest(self, nms_radius: int) -> tuple[WindowMatch, int]:
+        """See :meth:`QueryWindow.match_newest`."""
+        count = 0 if self._to_oldest else self._since_entering()
+        if count < FEWEST:
+            return WindowMatch(), 0
+        images = self._images
+        self._images = deque(islice(images, len(images) - count, None))
+        found = self.layout.in_places(self._match_image((count - 1) // 2, nms_radius))
+        self._images = images
+        return found, count
+
+    def _since_entering(self) -> int:
+        """
+        Return how many of the newest images to match, if the whole window shows nothing.
+
+        Those since the most probable path has come to the map, at most as many as states are
+        followed back; all of a window that is not full.
+
+        :returns: 0 if the path has been on the map for longer than the window.
+        """
+        belief = self.filter.belief(self.buffer.known, 0)
+        if not belief.weights.sum() > ON_MAP:
+            return 0
+        if not self.buffer.full:
+            return len(self._images)
+        numbers = self._numbers()
+        lag = min(len(self._images) - 1 - self._middle, int(numbers[-1]))
+        path = self.filter.path(belief.states[np.argmax(belief.weights)], lag)
+        known = int(np.count_nonzero(path >= 0))
+        if known <= lag:
+            self._entered = int(numbers[-1]) - known + 1
+        if self._entered < numbers[0]:
+            return 0
+        return int(np.count_nonzero(numbers >= max(self._entered, numbers[-1] - lag)))
+
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
         self._images[self._middle].is_matched = is_matched
@@ -352,7 +386,9 @@ class FilterWindow(QueryWindow):
         path, shares, z = self._refined(self._path(state, position), state[0])
         numbers = self._numbers()
         moved = np.count_nonzero(np.diff(numbers))
-        excess = self.change.excess((path[-1] - path[0]) / moved) if moved else 0.0
+        is_whole = len(self._images) == len(self.buffer)
+        speed = (path[-1] - path[0]) / max(moved, 1)
+        excess = self.change.excess(speed) if moved and is_whole else 0.0
         factor = odds_factor(unevenness(path, z), excess)
         at_rest = z[numbers == numbers[-1]]
         least = least_at_rest(at_rest, self._levels[state[0]], self._weight)
@@ -373,7 +409,7 @@ class FilterWindow(QueryWindow):
         places = path[:, None] + OFFSETS
         inside = places.clip(0, n - 1)
         exponents = np.array([image.weight for image in self._images]) * self._levels[level]
-        z = self.buffer.at(inside)
+        z = self.buffer.at(inside, len(inside))
         masses = offset_probabilities(z, path, exponents, self._numbers(), n)
         refined = path + np.rint(masses @ OFFSETS).astype(np.int64)
         lowest = self.layout.first_column(path[-1])

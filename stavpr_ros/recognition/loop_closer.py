@@ -22,8 +22,11 @@ from stavpr_ros.recognition.window import QueryWindow
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
 AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
-# A route's mean follows its light late: until then all its images change little
-MODEL = FilterSettings(speed_weight=0)
+# A route's mean follows its light late: until then all its images change little. Most of a route
+# passes no earlier place: its model has fewer speeds, and comes to the map less.
+MODEL = FilterSettings(
+    speeds=(0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5), enter=0.003, speed_weight=0
+)
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
 
 

@@ -66,7 +66,7 @@ class PlaceFilter:
     """
     See :class:`stavpr_ros.recognition.filter_window.StateFilter`, and the module; on the CPU.
 
-    A state takes 4 bytes, and half a byte for each image of the lag: 247 bytes a place with the
+    A state takes 4 bytes, and half a byte for each image of the lag: 274 bytes a place with the
     default speeds and levels and a lag of 10.
 
     :param places: places that there is room for.

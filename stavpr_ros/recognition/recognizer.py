@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from stavpr_ros.recognition.first_stage import FirstStage
 
 EARLY = 0.9  # least probability of a match before the window is full
-FEWEST = 2  # images in the window, for a match
 TIMED = 3  # images, to compare the time of one with the time budget
 
 
@@ -201,26 +200,32 @@ class SequenceRecognizer(ABC):
             window_changes=self._window.changes,
         )
         self._motion.trajectory.append(position)
+        found = WindowMatch()
         if buffer.full:
-            match = self._of_window(match, position)
-        elif self._window.matches_early and len(buffer) >= FEWEST:
+            found = self._window.match(self._settings.nms_radius)
+            match = self._of_window(match, found, position)
+        if not match.accepted:
             sure = max(min_probability, EARLY)
-            early = replace(match, threshold=1 - sure, min_probability=sure)
-            early = self._of_window(early, position)
-            if early.accepted:
-                match = early
-            else:
-                self._found = WindowMatch()
-        self._newest = match
+            newest, count = self._window.match_newest(self._settings.nms_radius)
+            if count:
+                early = replace(
+                    match,
+                    threshold=1 - sure,
+                    min_probability=sure,
+                    window_stamps=match.window_stamps[-count:],
+                    window_changes=match.window_changes[-count:],
+                )
+                early = self._of_window(early, newest, position)
+                match, found = (early, newest) if early.accepted else (match, found)
+        self._found, self._newest = found, match
         return match
 
-    def _of_window(self, match: Match, position: np.ndarray) -> Match:
-        """Return the match by the images in the window."""
-        self._found = found = self._window.match(self._settings.nms_radius)
+    def _of_window(self, match: Match, found: WindowMatch, position: np.ndarray) -> Match:
+        """Return the match by what a window showed."""
         if found.least_probability > match.min_probability:
             least = found.least_probability
             match = replace(match, threshold=1 - least, min_probability=least)
-        match = match.of_window(self._found, match.position)
+        match = match.of_window(found, match.position)
         is_known = len(self._motion.positions) and np.isfinite(position[0])
         if is_known and match.sequence is not None:
             session = self._window.layout.session_of(match.sequence.middle)

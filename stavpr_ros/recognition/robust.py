@@ -87,7 +87,7 @@ class FilterSettings:
     """
     Model of the filter; tuned on the data sets named in docs/robust_mode.md.
 
-    :param speeds: places that the query passes an image.
+    :param speeds: places that the query passes an image; between two, a path costs evidence.
     :param levels: mean z-normalized distance of right places, from bad to good conditions.
     :param weight: alpha of an image that differs from the one before as neighboring places of the
         map do.
@@ -104,7 +104,7 @@ class FilterSettings:
         means of five, are not independent.
     """
 
-    speeds: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
+    speeds: tuple[float, ...] = (0.0, 0.25, 0.33, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
     levels: tuple[float, ...] = (-1.4, -2.3, -3.4)
     weight: float = 0.28
     most_change: float = 2.0
@@ -114,7 +114,7 @@ class FilterSettings:
     keep_speed: float = 0.98
     spread: float = 0.05
     leave: float = 0.01
-    enter: float = 0.003
+    enter: float = 0.006
     start: float = 0.9
     change_deviation: float = 0.5
     speed_weight: float = 0.25

@@ -182,14 +182,18 @@ class SequenceBuffer:
         row: np.ndarray = self._slots[self.oldest - 1][0]
         return row
 
-    def at(self, columns: np.ndarray) -> np.ndarray:
-        """Return entries of the images in the window, oldest first, by columns, (len, m) each."""
-        entries: np.ndarray = self.memory[self._ring(), columns]
+    def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
+        """
+        Return entries of the newest images, oldest first, by columns, (images, m).
+
+        :param images: their number; None = all in the window.
+        """
+        entries: np.ndarray = self.memory[self._ring(images), columns]
         return entries
 
-    def _ring(self) -> np.ndarray:
-        """Return the rows of one copy of the images in the window, oldest first, (len, 1)."""
-        newest = self._count + np.arange(-len(self), 0)[:, None]
+    def _ring(self, images: int | None = None) -> np.ndarray:
+        """Return the rows of one copy of the newest images, oldest first, (images, 1)."""
+        newest = self._count + np.arange(-(images or len(self)), 0)[:, None]
         rows: np.ndarray = newest % self.length
         return rows
 
@@ -235,11 +239,6 @@ class QueryWindow(ABC):
         self._normalizes, self._around = normalizes, around
 
     @property
-    def matches_early(self) -> bool:
-        """Whether a window that is not full can have a match."""
-        return False
-
-    @property
     def changes(self) -> tuple[float, ...]:
         """Change of each image from the one before, oldest first; empty without a filter."""
         return ()
@@ -283,6 +282,15 @@ class QueryWindow(ABC):
     @abstractmethod
     def _match(self, nms_radius: int) -> WindowMatch:
         """Return the match of the images in the window, in columns of the buffer."""
+
+    def match_newest(self, nms_radius: int) -> tuple[WindowMatch, int]:
+        """
+        Return the match of the newest images, since the camera has come to the map.
+
+        :returns: the match, and of how many images: 0 where the full window shows the same, or in
+            loop closure and mode paper.
+        """
+        return WindowMatch(), 0
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """
