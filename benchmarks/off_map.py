@@ -17,7 +17,7 @@ from typing import Any
 from accuracy import extractors, FEATURES, long_cases, short_cases
 from data import data_folder
 import numpy as np
-from off_map_page import DAY, LEVEL, markdown, NIGHT, Results, summary_section
+from off_map_page import DAY, JUMP, LEVEL, markdown, NIGHT, Results, summary_section
 from results import environment, options_parser, ROOT, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
@@ -200,9 +200,11 @@ def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> in
     Return how many images it took until a match was right; None = none was.
 
     :param truth: of the images.
+    :param length: of a window whose images are not counted by stamps.
     """
     for count, match in enumerate(matches, 1):
-        image = count - length + (length - 1) // 2  # the middle of the window
+        shown = len(match.window_stamps) or length
+        image = count - shown + (shown - 1) // 2  # the middle of the window
         if match.accepted and match.sequence is not None and image >= 0:
             places = np.full(truth.N, -1)
             places[image] = match.sequence.middle
@@ -212,19 +214,25 @@ def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> in
 
 
 def starts(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[int | None]]]:
-    """Yield the images until the first right match, for starts on the map and on a small one."""
+    """Yield the images until the first right match, for starts and jumps on the map."""
     n, step = len(pair.query), (LONG_STEP if pair.long else STEP) * coarser
-    counts: dict[str, list[int | None]] = {'whole map': [], f'map of {SMALL_MAP} places': []}
+    names = 'whole map', f'map of {SMALL_MAP} places', JUMP
+    counts: dict[str, list[int | None]] = {name: [] for name in names}
     for start in range(STEP, n - START_IMAGES, step):
         images = np.arange(start, start + START_IMAGES)
         first = min(max(0, start - 5), len(pair.places) - SMALL_MAP)
-        stretches = (0, len(pair.places)), (first, first + SMALL_MAP)
-        for found, stretch in zip(counts.values(), stretches, strict=True):
+        whole, before = (0, len(pair.places)), (start + n // 2) % (n - START_IMAGES)
+        stretches = whole, (first, first + SMALL_MAP), whole
+        for (name, found), stretch in zip(counts.items(), stretches, strict=True):
             kept = np.arange(*stretch)
             truth = pair.truth.select(images).on_places(kept)
             if truth.has_match.any():
-                matches = matches_of(select_places(pair.places, kept), pair.query.features[images])
-                found.append(first_right(matches, truth, SETTINGS.sequence.length))
+                shown = images
+                if name == JUMP:
+                    shown = np.append(np.arange(before, before + START_IMAGES), images)
+                matches = matches_of(select_places(pair.places, kept), pair.query.features[shown])
+                length = SETTINGS.sequence.length
+                found.append(first_right(matches[-START_IMAGES:], truth, length))
     for name, found in counts.items():
         yield f'{pair.name}/{name}', found
 

@@ -9,6 +9,7 @@ from accuracy import FEATURES
 from results import heading, table
 
 DAY, NIGHT = 'gardens_point', 'walk_night'
+JUMP = 'after a jump'  # from half of the query away
 LEVEL = 0.95  # declared probability whose precision the summary gives
 Results = dict[str, dict[str, Any]]
 TEXT = """\
@@ -91,12 +92,10 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
     label, value = 'recall at 100 % precision, all speeds', 'recall_at_100_precision'
     best(f'{label}, by day', [f'{DAY}/all'], 0.9 if g else 0.95, value)
     best(f'{label}, day / night', [f'{NIGHT}/all'], 0.7 if g else 0.9, value)
-    begun = of('start')
-    if begun:
-        right = percent(total(begun, 'right'), total(begun, 'starts'))
-        longest = max((row['longest'] or 0 for row in begun.values()), default=0)
-        text = f'{right}; at most {longest} images'
-        found['start in the middle: right within 30 images'] = text, f'{25 if g else 20} images'
+    for label, is_jump in (('start in the middle', False), (JUMP, True)):
+        begun = {k: row for k, row in of('start').items() if k.endswith(JUMP) == is_jump}
+        if begun:
+            found[f'{label}: right within 30 images'] = _begun(begun), f'{25 if g else 20} images'
     for name, row in of('calibration').items():
         if row['images']:
             text = f'{row["expected_calibration_error"]:.3f}'
@@ -106,6 +105,15 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
                     label = f'precision where {LEVEL} or more is declared, {name}'
                     found[label] = f'{level["precision"]:.3f}', '>= 0.93'
     return found
+
+
+def _begun(rows: dict[str, Any]) -> str:
+    """Return how many starts were right, and the images until then."""
+    right, count = (sum(row[name] for row in rows.values()) for name in ('right', 'starts'))
+    medians = [row['median'] for row in rows.values() if row['median']] or [0]
+    longest = max((row['longest'] or 0 for row in rows.values()), default=0)
+    text = f'{percent(right, count)}; medians {min(medians):.0f} to {max(medians):.0f}'
+    return f'{text}, at most {longest} images'
 
 
 def summary_section(results: Results) -> list[str]:
