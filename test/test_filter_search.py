@@ -54,7 +54,7 @@ def test_query_at_other_speed_is_matched(recognizer, route, speed):
 
 
 def test_camera_that_is_carried_elsewhere_is_matched_by_the_images_since(recognizer, route):
-    images, seen = np.r_[20:80, 160:200], []
+    images, since = np.r_[20:80, 160:200], []
     for count, answer in enumerate(drive(recognizer, route[:, images])[60:], 1):
         if answer.accepted:
             shown = len(answer.window_stamps)
@@ -62,9 +62,9 @@ def test_camera_that_is_carried_elsewhere_is_matched_by_the_images_since(recogni
             assert shown == LENGTH or answer.probability > EARLY
             image = 60 + count - shown + answer.position
             assert abs(answer.place_index - images[image]) <= 2
-            seen += [count] if image >= 60 else []
-    assert seen[0] < MIDDLE
-    assert len(seen) > 36
+            since += [count] if image >= 60 else []
+    assert since[0] < MIDDLE
+    assert len(since) > 36
 
 
 def test_camera_off_the_map_is_not_matched_by_its_newest_images(recognizer, route):

@@ -269,7 +269,7 @@ class FilterWindow(QueryWindow):
         return is_equal and self.buffer.full and not self._to_oldest
 
     def match_newest(self, nms_radius: int) -> tuple[WindowMatch, int]:
-        """See :meth:`QueryWindow.match_newest`."""
+        """Return the match of the newest images: :meth:`QueryWindow.match_newest`."""
         count = 0 if self._to_oldest else self._since_entering()
         if count < FEWEST:
             return WindowMatch(), 0

@@ -10,7 +10,7 @@ near to many in a row looks alike. Over the latest images, the newest that count
     m[y] = sum_q w_q max(-1.5, z_q[y]) / (sum_q w_q + P),    w_q = (1 - 1/T)^q, T = 40, P = 10,
 
 is subtracted from z[y], so that wrong places have mean 0 not only over the places of an image, but
-also over the images of a place. The two images before do not count yet, nor any at a standstill:
+also over the images of a place. The six images before do not count yet, nor any at a standstill:
 the right place is near to them as well. A place that was not compared with an image counts as the
 last one that was.
 """
@@ -22,7 +22,7 @@ import numpy as np
 IMAGES = 40  # T: time constant of the mean
 PRIOR = 10  # P: images at mean 0 that it starts from
 NEAREST = -1.5  # least z that counts: a single image must not determine the mean
-DELAY = 2  # latest images that do not count yet
+DELAY = 6  # latest images that do not count yet: a slow camera shows a place for as long
 
 
 class PlaceMeans:
