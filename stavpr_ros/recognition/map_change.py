@@ -9,6 +9,7 @@ places in between is learned from the map, so that the query's changes show how 
 """
 
 from collections import deque
+import math
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
@@ -22,7 +23,7 @@ UNLIT = 0.3  # probability of such places above which equal images are no stands
 SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
 NOISE = 0.15  # deviation of the change by noise, common to all
 LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
-COMPARED = 3  # images apart up to which the window is compared with its path
+COMPARED = np.arange(1, 4)  # images apart that the window is compared with its path at
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 FLOOR = 1e-3  # least relative probability of a speed
@@ -217,11 +218,16 @@ class ImageChange:
         """
         if not self._of_window:
             return 0.0
-        expected = self.expected_change(speed * np.arange(1, COMPARED + 1)).clip(max=1)
-        left = 1 - np.mean(self._of_window, axis=0)[:COMPARED].clip(max=1)
-        noise = np.clip(left[0] / max(1 - expected[0], LEAST_SIMILAR), LEAST_LEFT, 1)
-        changes = 1 - np.minimum(left / noise, 1)
-        return float(np.log((changes + OFFSET) / (expected + OFFSET))[1:].mean())
+        images = len(self._of_window)
+        changes = [min(sum(each) / images, 1) for each in zip(*self._of_window, strict=True)]
+        expected = np.minimum(self.expected_change(speed * COMPARED), 1).tolist()
+        noise = (1 - changes[0]) / max(1 - expected[0], LEAST_SIMILAR)
+        noise = min(max(noise, LEAST_LEFT), 1)
+        logs = [
+            math.log((1 - min((1 - change) / noise, 1) + OFFSET) / (each + OFFSET))
+            for change, each in zip(changes, expected, strict=True)
+        ]
+        return sum(logs[1:]) / len(logs[1:])
 
     def speed_weights(self, change: float) -> np.ndarray:
         """Return the relative probability of each speed after another change, (V,)."""
@@ -244,7 +250,7 @@ class ImageChange:
         newest = self._moving[-1]
         before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
         self._by_apart.append([change, *(change_between(newest, image) for image in before)])
-        self._of_window.append(self._by_apart[-1])
+        self._of_window.append(self._by_apart[-1][: len(COMPARED)])
         off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._expected
         logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
         likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))

@@ -25,6 +25,7 @@ are near, with the weight that the filter does not give to an image of many.
 """
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
@@ -68,13 +69,15 @@ def unevenness(path: np.ndarray, z: np.ndarray) -> float:
     :param path: place of each image, ascending, (l,).
     :param z: z-normalized distance of each image to its place, (l,); infinite ones do not count.
     """
-    places, inverse = np.unique(path, return_inverse=True)
-    nearest = np.full(len(places), np.inf)
-    np.minimum.at(nearest, inverse, z)
-    nearest = nearest[np.isfinite(nearest)]
+    by_place: dict[int, float] = {}  # few numbers: plain Python takes a tenth of NumPy's time
+    for place, each in zip(path.tolist(), z.tolist(), strict=True):
+        by_place[place] = min(each, by_place.get(place, math.inf))
+    nearest = [each for each in by_place.values() if each < math.inf]
     if len(nearest) < LEAST_PLACES:
         return 0.0
-    return max(float(nearest.std()) - max(EVEN, -EVEN_SHARE * float(nearest.mean())), 0.0)
+    mean = sum(nearest) / len(nearest)
+    deviation = math.sqrt(sum((each - mean) ** 2 for each in nearest) / len(nearest))
+    return max(deviation - max(EVEN, -EVEN_SHARE * mean), 0.0)
 
 
 def odds_factor(uneven: float, excess: float) -> float:
@@ -84,7 +87,7 @@ def odds_factor(uneven: float, excess: float) -> float:
     :param uneven: of :func:`unevenness`.
     :param excess: logarithm of the change of the images over that of the map along the path.
     """
-    return float(np.exp(-UNEVEN_WEIGHT * uneven - EXCESS_WEIGHT * max(excess - EXCESS, 0.0)))
+    return math.exp(-UNEVEN_WEIGHT * uneven - EXCESS_WEIGHT * max(excess - EXCESS, 0.0))
 
 
 def least_at_rest(z: np.ndarray, level: float, weight: float) -> float:
@@ -96,5 +99,5 @@ def least_at_rest(z: np.ndarray, level: float, weight: float) -> float:
     :param weight: of an image among others, alpha.
     """
     nearness = max(level * float(z.mean()) - level**2 / 2, 0.0)
-    odds = AT_REST / (1 - AT_REST) * np.exp(-(1 - weight) * nearness)
-    return float(odds / (1 + odds))
+    odds = AT_REST / (1 - AT_REST) * math.exp(-(1 - weight) * nearness)
+    return odds / (1 + odds)
