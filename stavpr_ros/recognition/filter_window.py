@@ -468,7 +468,7 @@ class FilterWindow(QueryWindow):
         images = self._numbers()
         back = images[-1] - images
         lag = int(back[position])
-        if self.buffer.full and not self._to_oldest:  # at a standstill, images before it as well
+        if self._is_resting(position):  # images before the standstill as well
             lag = max(lag, int(min(back[0], len(images) - 1 - self._middle)))
         places = self.filter.path(state, lag)
         lag = int(np.count_nonzero(places >= 0)) - 1  # since the path has entered the map
