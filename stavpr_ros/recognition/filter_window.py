@@ -337,7 +337,7 @@ class FilterWindow(QueryWindow):
             second_best_distance=1 - found if found > 0 else float('nan'),
         )
         sequences = partial(self._sequences, n, first, places, probabilities)
-        least = chosen.least * float(shares[position]) if self._is_resting(position) else 0.0
+        least = chosen.least * float(shares[position])
         return WindowMatch(match, path, sequences, probability, shares, least)
 
     def _chosen(
@@ -385,13 +385,15 @@ class FilterWindow(QueryWindow):
         state = belief.states[near][np.argmax(belief.weights[near])]
         path, shares, z = self._refined(self._path(state, position), state[0])
         numbers = self._numbers()
-        moved = np.count_nonzero(np.diff(numbers))
+        moved = numbers[-1] - numbers[0]
         is_whole = len(self._images) == len(self.buffer)
         speed = (path[-1] - path[0]) / max(moved, 1)
         excess = self.change.excess(speed) if moved and is_whole else 0.0
         factor = odds_factor(unevenness(path, z), excess)
-        at_rest = z[numbers == numbers[-1]]
-        least = least_at_rest(at_rest, self._levels[state[0]], self._weight)
+        least = 0.0
+        if self._is_resting(position):
+            at_rest = z[numbers == numbers[-1]]
+            least = least_at_rest(at_rest, self._levels[state[0]], self._weight)
         return PathCandidate(path, shares, of_path, factor, least)
 
     def _refined(self, path: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
