@@ -13,6 +13,7 @@ from stavpr_ros.recognition.path_checks import (
     EXCESS,
     EXCESS_WEIGHT,
     least_at_rest,
+    NEWEST,
     odds_factor,
     UNEVEN_WEIGHT,
     unevenness,
@@ -25,6 +26,8 @@ def test_unevenness_is_deviation_beyond_the_limit():
     path = np.arange(4)
     assert unevenness(path, np.array([-2.0, -3.0, -2.0, -3.0])) == 0
     assert unevenness(path, np.array([-4.0, 0.0, -4.0, 0.0])) == pytest.approx(2 - EVEN)
+    found = unevenness(path, np.array([-4.0, 0.0, -4.0, 0.0]), NEWEST)
+    assert found == pytest.approx(2 - NEWEST * EVEN)
 
 
 def test_unevenness_allows_a_share_of_the_mean():
@@ -77,7 +80,7 @@ def test_where_the_most_probable_path_is_refuted_the_next_one_is_matched(monkeyp
         map_of(features_of(route, 0.05)), RecognizerSettings(mode='robust')
     )
 
-    def refuted_first(path, z):
+    def refuted_first(path, z, part):
         return 10.0 if path.mean() < 130 else 0.0
 
     monkeypatch.setattr(filter_window, 'unevenness', refuted_first)

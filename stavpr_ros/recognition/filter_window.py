@@ -24,6 +24,7 @@ from stavpr_ros.recognition.map_change import ImageChange
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.path_checks import (
     least_at_rest,
+    NEWEST,
     odds_factor,
     PathCandidate,
     unevenness,
@@ -389,7 +390,7 @@ class FilterWindow(QueryWindow):
         is_whole = len(self._images) == len(self.buffer)
         speed = (path[-1] - path[0]) / max(moved, 1)
         excess = self.change.excess(speed) if moved and is_whole else 0.0
-        factor = odds_factor(unevenness(path, z), excess)
+        factor = odds_factor(unevenness(path, z, 1.0 if is_whole else NEWEST), excess)
         least = 0.0
         if self._is_resting(position):
             at_rest = z[numbers == numbers[-1]]

@@ -31,6 +31,7 @@ import numpy as np
 
 EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share of its mean
 UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
+NEWEST = 0.7  # share of both that the newest images of a window may have
 LEAST_PLACES = 3  # of a path whose deviation is meaningful
 AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
 EXCESS, EXCESS_WEIGHT = 0.04, 30.0  # of right paths at most, and its weight in the odds beyond
@@ -60,7 +61,7 @@ class PathCandidate:
         return self.probability * self.factor
 
 
-def unevenness(path: np.ndarray, z: np.ndarray) -> float:
+def unevenness(path: np.ndarray, z: np.ndarray, part: float = 1.0) -> float:
     """
     Return by how much z varies more along a path than it may at right places, 0 if it does not.
 
@@ -68,6 +69,7 @@ def unevenness(path: np.ndarray, z: np.ndarray) -> float:
 
     :param path: place of each image, ascending, (l,).
     :param z: z-normalized distance of each image to its place, (l,); infinite ones do not count.
+    :param part: of the limit: ``NEWEST`` for the newest images of a window alone.
     """
     by_place: dict[int, float] = {}  # few numbers: plain Python takes a tenth of NumPy's time
     for place, each in zip(path.tolist(), z.tolist(), strict=True):
@@ -77,7 +79,7 @@ def unevenness(path: np.ndarray, z: np.ndarray) -> float:
         return 0.0
     mean = sum(nearest) / len(nearest)
     deviation = math.sqrt(sum((each - mean) ** 2 for each in nearest) / len(nearest))
-    return max(deviation - max(EVEN, -EVEN_SHARE * mean), 0.0)
+    return max(deviation - part * max(EVEN, -EVEN_SHARE * mean), 0.0)
 
 
 def odds_factor(uneven: float, excess: float) -> float:
