@@ -9,8 +9,9 @@ of its images that are matched. The least probability t for an error rate a is s
     (sum of the risks of n drives with matches above t + 1) / (n + 1) <= a
 
 (Angelopoulos et al., "Conformal Risk Control", ICLR 2024), rounded up so that no kind of drive has
-more than a, except dropped images. docs/robust_mode.md lists the drives. The mean over drives like
-these is controlled, not every single drive.
+more than a, except dropped images and maps of every third image, whose wrong matches are near.
+docs/robust_mode.md lists the drives. The mean over drives like these is controlled, not every
+single drive.
 """
 
 import numpy as np
