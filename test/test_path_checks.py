@@ -7,7 +7,6 @@ from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.recognition import filter_window, path_checks, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.path_checks import (
-    AT_REST,
     EVEN,
     EVEN_SHARE,
     EXCESS,
@@ -15,6 +14,7 @@ from stavpr_ros.recognition.path_checks import (
     least_at_rest,
     NEWEST,
     odds_factor,
+    SURE_AT_REST,
     UNEVEN_WEIGHT,
     unevenness,
 )
@@ -54,8 +54,8 @@ def test_odds_factor_is_of_both_checks():
 
 
 def test_camera_at_rest_needs_less_where_its_images_are_near():
-    assert least_at_rest(np.array([-1.0]), -2.0, 0.25) == pytest.approx(AT_REST)
-    assert least_at_rest(np.array([np.inf, 0.0]), -2.0, 0.25) == pytest.approx(AT_REST)
+    assert least_at_rest(np.array([-1.0]), -2.0, 0.25) == pytest.approx(SURE_AT_REST)
+    assert least_at_rest(np.array([np.inf, 0.0]), -2.0, 0.25) == pytest.approx(SURE_AT_REST)
     near = least_at_rest(np.array([-2.0, -4.0]), -2.0, 0.25)  # mean -3: logarithm 6 - 2
     assert near / (1 - near) == pytest.approx(9 * np.exp(-0.75 * 4))
 

@@ -156,7 +156,7 @@ class FilterWindow(QueryWindow):
         self._speeds, self._levels = settings.speeds, settings.levels
         self._weight = settings.weight
         self._images: deque[WindowImage] = deque(maxlen=length)
-        self._held: WindowMatch | None = None  # match of a camera at rest
+        self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._entered = 0  # number of the image with which the latest path came to the map
 
@@ -184,7 +184,7 @@ class FilterWindow(QueryWindow):
         self.filter.reset()
         self.change.reset()
         self._images.clear()
-        self._held, self._entered = None, 0
+        self._at_rest, self._entered = None, 0
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -250,8 +250,8 @@ class FilterWindow(QueryWindow):
             if self.change.is_dark_stretch(by_place):
                 self.filter.update(z, 0.0, ones, ones)
         self._images.append(WindowImage(change, weight, self.filter.count - 1))
-        if self._held is not None:
-            self._held = _moved_on(self._held) if self._is_resting(self._middle) else None
+        if self._at_rest is not None:
+            self._at_rest = _moved_on(self._at_rest) if self._is_resting(self._middle) else None
 
     def _match(self, nms_radius: int) -> WindowMatch:
         """
@@ -260,8 +260,8 @@ class FilterWindow(QueryWindow):
         A window of equal images would show neither how even the path to them was nor how fast.
         """
         middle = (len(self._images) - 1) // 2
-        found = self._held or self._match_image(middle, nms_radius)
-        self._held = found if self._is_resting(middle) else None
+        found = self._at_rest or self._match_image(middle, nms_radius)
+        self._at_rest = found if self._is_resting(middle) else None
         return found
 
     def _is_resting(self, position: int) -> bool:

@@ -33,7 +33,7 @@ EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share o
 UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
 NEWEST = 0.7  # share of both that the newest images of a window may have
 LEAST_PLACES = 3  # of a path whose deviation is meaningful
-AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
+SURE_AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
 EXCESS, EXCESS_WEIGHT = 0.04, 30.0  # of right paths at most, and its weight in the odds beyond
 
 
@@ -101,5 +101,5 @@ def least_at_rest(z: np.ndarray, level: float, weight: float) -> float:
     :param weight: of an image among others, alpha.
     """
     nearness = max(level * float(z.mean()) - level**2 / 2, 0.0)
-    odds = AT_REST / (1 - AT_REST) * math.exp(-(1 - weight) * nearness)
+    odds = SURE_AT_REST / (1 - SURE_AT_REST) * math.exp(-(1 - weight) * nearness)
     return odds / (1 + odds)
