@@ -12,7 +12,13 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
-from stavpr_ros.recognition.filter_paths import smooth
+from stavpr_ros.recognition.filter_paths import (
+    BAND,
+    mean_offsets,
+    offset_probabilities,
+    OFFSETS,
+    smooth,
+)
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.recognizer import EARLY
@@ -126,14 +132,43 @@ def test_smoothed_offsets_equal_sums_over_all_sequences(images, offsets, seed):
         for i, (before, after) in enumerate(pairwise(sequence), 1):
             p *= moves[i, after - before + 2] if abs(after - before) <= 2 else 0
         expected[range(images), sequence] += p
-    smooth(likelihoods, moves, masses)
+    log = smooth(likelihoods, moves, masses)
     np.testing.assert_allclose(masses, expected / expected.sum(axis=1, keepdims=True), atol=1e-9)
+    assert log == pytest.approx(np.log(expected[0].sum()))
 
 
 def test_smoothed_offsets_without_any_likely_one_are_equal():
     masses = np.ones((3, 4))
     smooth(np.zeros((3, 4)), np.ones((3, 5)), masses)
     np.testing.assert_allclose(masses, 0.25)
+
+
+def offset_errors(true_offsets, images=20, seeds=200):
+    """Return the mean errors of places by both models and by the filter's, in faint light."""
+    errors = np.zeros(2)
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        offsets = true_offsets(rng, images).clip(-BAND, BAND)
+        path, numbers = np.arange(100, 100 + images), np.arange(images)
+        z = rng.normal(size=(images, len(OFFSETS)))
+        z[numbers, offsets + BAND] -= 1.4
+        window = z, path, np.full(images, 0.28 * -1.4), numbers, 200
+        found = mean_offsets(*window), offset_probabilities(*window) @ OFFSETS
+        errors += [np.abs(np.rint(each) - offsets).mean() / seeds for each in found]
+    return errors
+
+
+def test_places_of_a_camera_that_advances_evenly_are_nearer():
+    error, by_filter = offset_errors(lambda rng, images: np.full(images, rng.integers(-2, 3)))
+    assert error < 0.8 * by_filter
+
+
+def test_places_of_a_camera_that_loses_images_are_nearer_too():
+    steps = np.array([-1, 0, 1])
+    error, by_filter = offset_errors(
+        lambda rng, images: rng.choice(steps, images, p=[0.25, 0.5, 0.25]).cumsum()
+    )
+    assert error < by_filter
 
 
 def test_path_follows_images_whose_speed_changes(recognizer, route):

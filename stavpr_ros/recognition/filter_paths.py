@@ -16,6 +16,10 @@ The path of a state is then refined (:func:`offset_probabilities`): the speeds o
 few, and before the middle of the window the path is a straight line. The offset of each image's
 place from it is a hidden Markov model: it changes little from image to image, and the evidence is
 the filter's, at the path's level. The forward-backward algorithm gives its probabilities.
+
+The place of an image is the mean of two such models (:func:`mean_offsets`): in one the camera
+advances evenly, in the other it does not, as where images are lost. Each counts by the likelihood
+of the window.
 """
 
 from dataclasses import dataclass
@@ -34,7 +38,14 @@ CLOSE = 2  # places: the probability of a place is that of its neighbors within 
 BAND = 5  # places to either side of the filter's path
 START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
 STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
+EVEN_STEPS = np.array([0.0, 0.01, 0.98, 0.01, 0.0])  # of a camera that advances evenly
+EVEN_DEVIATION = 1.5  # places: START_DEVIATION of it
+EVEN = 0.1  # probability of such a camera
+EVIDENCE = 1.5  # factor of alpha between places that are near to each other
+LEAST_DEVIATION = 0.5  # places: START_DEVIATION where few images moved
 OFFSETS = np.arange(-BAND, BAND + 1)
+IMPOSSIBLE = 1e-20  # least likelihood of an image
+MOST_LOG = 700.0  # whose exponential is a float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +102,43 @@ def offset_probabilities(
     :param n: places.
     :returns: shape (l, S); each row sums to 1.
     """
-    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(STEPS)))
-    _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
+    return _smoothed(z, path, exponents, images, n, STEPS, START_DEVIATION)[0]
+
+
+def mean_offsets(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
+) -> np.ndarray:
+    """
+    Return the mean offset of each image from a path, (l,), float64.
+
+    With the likelihoods p of the window if the camera advances evenly and q if not, and the means
+    by both, it is (0.1 p even + 0.9 q uneven) / (0.1 p + 0.9 q).
+
+    The deviation at the oldest image is in proportion to the images that moved: the filter knows
+    the path of a slow camera by the images before the window.
+
+    :param z, path, exponents, images, n: see :func:`offset_probabilities`.
+    """
+    moved = (images[-1] - images[0]) / max(len(images) - 1, 1)
+    window = z, path, EVIDENCE * exponents, images, n
+    even, p = _smoothed(*window, EVEN_STEPS, max(EVEN_DEVIATION * moved, LEAST_DEVIATION))
+    uneven, q = _smoothed(*window, STEPS, max(START_DEVIATION * moved, LEAST_DEVIATION))
+    share = 1 / (1 + (1 - EVEN) / EVEN * np.exp(min(q - p, MOST_LOG)))
+    mean: np.ndarray = (share * even + (1 - share) * uneven) @ OFFSETS
+    return mean
+
+
+def _smoothed(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
+    steps: np.ndarray, deviation: float,
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """Return the probability of each offset, (l, S), and the log-likelihood of the window."""
+    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(steps)))
+    _window_likelihoods(z, path, exponents, images, n, steps, likelihoods, moves)
     masses = np.empty(z.shape)
-    masses[0] = np.exp(-0.5 * (OFFSETS / START_DEVIATION) ** 2)
-    smooth(likelihoods, moves, masses)
-    return masses
+    masses[0] = np.exp(-0.5 * (OFFSETS / deviation) ** 2)
+    masses[0] /= masses[0].sum()
+    return masses, smooth(likelihoods, moves, masses)
 
 
 # ------------------------------------------------ kernels
@@ -252,7 +294,7 @@ def find_most_probable(by_place, maxima, excluded):
 @kernel
 def _window_likelihoods(
     z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
-    likelihoods: np.ndarray, moves: np.ndarray,
+    steps: np.ndarray, likelihoods: np.ndarray, moves: np.ndarray,
 ) -> None:  # fmt: skip
     """Write the input of :func:`smooth`; parameters: see :func:`offset_probabilities`."""
     for i in range(len(path)):
@@ -262,12 +304,12 @@ def _window_likelihoods(
         step = path[i] - path[i - 1] if i else 0
         same = i > 0 and images[i] == images[i - 1]
         for d in range(-2, 3):
-            moved = STEPS[d + 2] if step + d >= 0 else 0
+            moved = steps[d + 2] if step + d >= 0 else 0
             moves[i, d + 2] = (1 if d == 0 else 0) if same else moved
 
 
 @kernel
-def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> None:
+def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> float:
     """
     Write the probability of each offset at each image, by the forward-backward algorithm.
 
@@ -276,8 +318,10 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> No
     :param likelihoods: of each image at each offset, (l, S).
     :param moves: probability that the offset becomes 2 less, ..., 2 more before an image, (l, 5).
     :param masses: (l, S), written; its first row contains the probabilities before all images.
+    :returns: logarithm of the likelihood of all images.
     """
     l, S = likelihoods.shape
+    log = 0.0
     for i in range(l):
         for s in range(S):
             if i:
@@ -285,7 +329,7 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> No
                 for d in range(max(-2, s - S + 1), min(2, s) + 1):
                     masses[i, s] += masses[i - 1, s - d] * moves[i, d + 2]
             masses[i, s] *= likelihoods[i, s]
-        _normalize(masses[i])
+        log += np.log(max(_normalize(masses[i]), IMPOSSIBLE))
     later, weighed = np.ones(S), np.empty(S)
     for i in range(l - 2, -1, -1):
         for s in range(S):
@@ -301,11 +345,13 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> No
         if total > 0:
             for s in range(S):
                 masses[i, s] *= later[s] / total
+    return log
 
 
 @kernel
-def _normalize(masses: np.ndarray) -> None:
-    """Make a row's sum 1; that of a row of zeros, evenly."""
+def _normalize(masses: np.ndarray) -> float:
+    """Make a row's sum 1, that of a row of zeros evenly, and return the sum before."""
     total = masses.sum()
     for s in range(len(masses)):
         masses[s] = masses[s] / total if total > 0 else 1 / len(masses)
+    return total

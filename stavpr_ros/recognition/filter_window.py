@@ -15,6 +15,7 @@ from stavpr_ros.recognition.filter_paths import (
     BAND,
     Belief,
     CLOSE,
+    mean_offsets,
     NEGLIGIBLE,
     NO_PLACES,
     offset_probabilities,
@@ -384,8 +385,8 @@ class FilterWindow(QueryWindow):
         # of the path: it is known within the band
         of_path = max(float(probability), min(float(belief.weights[apart <= BAND].sum()), 1.0))
         state = belief.states[near][np.argmax(belief.weights[near])]
-        path, shares, z = self._refined(self._path(state, position), state[0])
         numbers = self._numbers()
+        path, shares, placed, z = self._refined(self._path(state, position), numbers, state[0])
         moved = numbers[-1] - numbers[0]
         is_whole = len(self._images) == len(self.buffer)
         speed = (path[-1] - path[0]) / max(moved, 1)
@@ -395,32 +396,44 @@ class FilterWindow(QueryWindow):
         if self._is_resting(position):
             at_rest = z[numbers == numbers[-1]]
             least = least_at_rest(at_rest, self._levels[state[0]], self._weight)
-        return PathCandidate(path, shares, of_path, factor, least)
+        return PathCandidate(placed, shares, of_path, factor, least)
 
-    def _refined(self, path: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _refined(
+        self, path: np.ndarray, numbers: np.ndarray, level: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """
-        Return places near a path that explain the images of the window best, and their shares.
+        Return the places near a path that explain the images of the window best.
 
-        The place of an image is at the mean of the offset from the path.
+        The path is checked where the evidence of the filter has its mean; places are estimated
+        with more (:func:`stavpr_ros.recognition.filter_paths.mean_offsets`), which would make
+        paths through look-alike places more even as well.
 
         :param path: place of each image, (l,).
+        :param numbers: of the images, (l,).
         :param level: index of the mean z-normalized distance of right places.
-        :returns: places, which never go back, (l,), probabilities of these and those close to
-            them, (l,), and z of each image at its place, (l,).
+        :returns: places that are checked, (l,), probability of those close to the estimated
+            places, (l,), these, (l,), and z of each image at the place that is checked, (l,).
         """
         n = self.buffer.known
         places = path[:, None] + OFFSETS
         inside = places.clip(0, n - 1)
         exponents = np.array([image.weight for image in self._images]) * self._levels[level]
         z = self.buffer.at(inside, len(inside))
-        masses = offset_probabilities(z, path, exponents, self._numbers(), n)
-        refined = path + np.rint(masses @ OFFSETS).astype(np.int64)
+        window = z, path, exponents, numbers, n
+        masses = offset_probabilities(*window)
+        checked = self._ascending(path, masses @ OFFSETS)
+        placed = self._ascending(path, mean_offsets(*window))
+        close = np.abs(places - placed[:, None]) <= CLOSE
+        close |= self._equal(inside, placed[:, None])
+        offsets = (checked - path).clip(-BAND, BAND) + BAND
+        shares = (masses * close).sum(axis=1)
+        return checked, shares, placed, z[np.arange(len(path)), offsets]
+
+    def _ascending(self, path: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        """Return places at offsets from a path, (l,), which never go back."""
+        places = path + np.rint(offsets).astype(np.int64)
         lowest = self.layout.first_column(path[-1])
-        refined = np.maximum.accumulate(refined.clip(lowest, n - 1))
-        close = np.abs(places - refined[:, None]) <= CLOSE
-        close |= self._equal(inside, refined[:, None])
-        offsets = (refined - path).clip(-BAND, BAND) + BAND
-        return refined, (masses * close).sum(axis=1), z[np.arange(len(path)), offsets]
+        return np.maximum.accumulate(places.clip(lowest, self.buffer.known - 1))
 
     def _numbers(self) -> np.ndarray:
         return np.array([image.number for image in self._images])
