@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+import sys
 from typing import Any, Protocol
 
 import numpy as np
@@ -38,7 +39,7 @@ from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuf
 CALIBRATION = 2.0  # factor of the odds of being on the map, which the filter declares too low
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
-LEAST_CANDIDATE = 0.01  # probability of its place, at least
+LEAST_CANDIDATE = REFUTED  # probability of its place, at least: above that of refuted ones
 FEWEST = 2  # images of a match
 ON_MAP = 0.5  # probability above which the newest images can have a match
 AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
@@ -295,7 +296,7 @@ class FilterWindow(QueryWindow):
             return 0
         if not self.buffer.full:
             return len(self._images)
-        numbers = self._numbers()
+        numbers = np.array([image.number for image in self._images])
         lag = min(len(self._images) - 1 - self._middle, int(numbers[-1]))
         path = self.filter.path(belief.states[np.argmax(belief.weights)], lag)
         known = int(np.count_nonzero(path >= 0))
@@ -329,7 +330,7 @@ class FilterWindow(QueryWindow):
         refined, shares = chosen.path, chosen.shares
         probability, middle = of_path * float(shares[position]), int(refined[position])
         second, found = self._second_best(n, places, probabilities, middle, nms_radius)
-        path = np.stack([np.arange(len(refined)), refined + first], axis=1).astype(np.int32)
+        path = _numbered(refined + first)
         match = SequenceMatch(
             first=int(path[0, 1]),
             last=int(path[-1, 1]),
@@ -360,21 +361,18 @@ class FilterWindow(QueryWindow):
         :param best: index of the most probable of them.
         """
         found: list[PathCandidate] = []
-        left = probabilities.copy()
         while len(found) < CANDIDATES:
-            found.append(self._candidate(belief, places[best], left[best], position))
-            near = np.abs(places - places[best]) <= BAND
-            probabilities[near] *= found[-1].factor
-            left[near] = 0
-            best = int(np.argmax(left))
-            if found[-1].factor >= REFUTED or left[best] < LEAST_CANDIDATE:
+            found.append(self._candidate(belief, places[best], probabilities[best], position))
+            probabilities[np.abs(places - places[best]) <= BAND] *= found[-1].factor
+            best = int(np.argmax(probabilities))
+            if found[-1].factor >= REFUTED or probabilities[best] < LEAST_CANDIDATE:
                 break
         chosen = max(found, key=lambda candidate: candidate.weight)
         on_map = min(float(belief.weights.sum()), 1.0)
         unchecked = max(on_map - sum(candidate.probability for candidate in found), 0.0)
         weight, every = chosen.weight, unchecked + sum(candidate.weight for candidate in found)
         odds_sum = every + (1 - on_map) / self._calibration
-        return chosen, weight / max(odds_sum, np.finfo(float).tiny)
+        return chosen, weight / max(odds_sum, sys.float_info.min)
 
     def _candidate(
         self, belief: Belief, place: int, probability: float, position: int
@@ -385,11 +383,12 @@ class FilterWindow(QueryWindow):
         # of the path: it is known within the band
         of_path = max(float(probability), min(float(belief.weights[apart <= BAND].sum()), 1.0))
         state = belief.states[near][np.argmax(belief.weights[near])]
-        numbers = self._numbers()
-        path, shares, placed, z = self._refined(self._path(state, position), numbers, state[0])
-        moved = numbers[-1] - numbers[0]
+        numbers = np.array([image.number for image in self._images])
+        path = self._path(state, numbers, position)
+        path, shares, placed, z = self._refined(path, numbers, state[0])
+        moved = int(numbers[-1] - numbers[0])
         is_whole = len(self._images) == len(self.buffer)
-        speed = (path[-1] - path[0]) / max(moved, 1)
+        speed = float(path[-1] - path[0]) / max(moved, 1)
         excess = self.change.excess(speed) if moved and is_whole else 0.0
         factor = odds_factor(unevenness(path, z, 1.0 if is_whole else NEWEST), excess)
         least = 0.0
@@ -408,15 +407,15 @@ class FilterWindow(QueryWindow):
         with more (:func:`stavpr_ros.recognition.filter_paths.mean_offsets`), which would make
         paths through look-alike places more even as well.
 
-        :param path: place of each image, (l,).
-        :param numbers: of the images, (l,).
+        :param path: place of each image, ascending, (l,).
+        :param numbers: of the images, (l,): equal ones are of a camera at rest.
         :param level: index of the mean z-normalized distance of right places.
         :returns: places that are checked, (l,), probability of those close to the estimated
             places, (l,), these, (l,), and z of each image at the place that is checked, (l,).
         """
         n = self.buffer.known
         places = path[:, None] + OFFSETS
-        inside = places.clip(0, n - 1)
+        inside = np.minimum(np.maximum(places, 0), n - 1)
         exponents = np.array([image.weight for image in self._images]) * self._levels[level]
         z = self.buffer.at(inside, len(inside))
         window = z, path, exponents, numbers, n
@@ -424,27 +423,20 @@ class FilterWindow(QueryWindow):
         checked = self._ascending(path, masses @ OFFSETS)
         placed = self._ascending(path, mean_offsets(*window))
         close = np.abs(places - placed[:, None]) <= CLOSE
-        close |= self._equal(inside, placed[:, None])
-        offsets = (checked - path).clip(-BAND, BAND) + BAND
+        first, last = self.layout.positions_of(inside[[0, -1], [0, -1]]).tolist()
+        stretches = self.change.stretches(first, last + 1)
+        if stretches[-1] - stretches[0] < last - first:  # equal places are as one
+            own, others = map(self.layout.positions_of, (inside, placed[:, None]))
+            close |= stretches[own - first] == stretches[others - first]
+        offsets = np.minimum(np.maximum(checked - path, -BAND), BAND) + BAND
         shares = (masses * close).sum(axis=1)
         return checked, shares, placed, z[np.arange(len(path)), offsets]
 
     def _ascending(self, path: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         """Return places at offsets from a path, (l,), which never go back."""
         places = path + np.rint(offsets).astype(np.int64)
-        lowest = self.layout.first_column(path[-1])
-        return np.maximum.accumulate(places.clip(lowest, self.buffer.known - 1))
-
-    def _numbers(self) -> np.ndarray:
-        return np.array([image.number for image in self._images])
-
-    def _equal(self, columns: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """Return which columns are in one stretch of equal places with others, as if one place."""
-        places, others = self.layout.positions_of(columns), self.layout.positions_of(others)
-        first = min(places.min(), others.min())
-        stretches = self.change.stretches(first, max(places.max(), others.max()) + 1)
-        equal: np.ndarray = stretches[places - first] == stretches[others - first]
-        return equal
+        places = np.maximum(places, self.layout.first_column(path[-1]))
+        return np.maximum.accumulate(np.minimum(places, self.buffer.known - 1))
 
     def _second_best(
         self, n: int, places: np.ndarray, probabilities: np.ndarray, middle: int, radius: int
@@ -473,25 +465,28 @@ class FilterWindow(QueryWindow):
         """Return the place that is most probable now, with the probability 0."""
         place = self.filter.most_probable(NO_PLACES)[0] + first
         match = SequenceMatch(place, place, place, 1.0, -1, float('nan'))
-        length = len(self._images)
-        path = np.stack([np.arange(length), np.full(length, place)], axis=1).astype(np.int32)
-        return WindowMatch(
-            match, path, partial(self._sequences, n, first, NO_PLACES, np.empty(0)), 0.0
-        )
+        sequences = partial(self._sequences, n, first, NO_PLACES, np.empty(0))
+        return WindowMatch(match, _numbered(np.full(len(self._images), place)), sequences, 0.0)
 
-    def _path(self, state: np.ndarray, position: int) -> np.ndarray:
+    def _path(self, state: np.ndarray, numbers: np.ndarray, position: int) -> np.ndarray:
         """Return the place of each image, (l,); before the one at a position at one speed."""
-        images = self._numbers()
-        back = images[-1] - images
+        back = numbers[-1] - numbers
         lag = int(back[position])
         if self._is_resting(position):  # images before the standstill as well
-            lag = max(lag, int(min(back[0], len(images) - 1 - self._middle)))
+            lag = max(lag, int(min(back[0], len(numbers) - 1 - self._middle)))
         places = self.filter.path(state, lag)
         lag = int(np.count_nonzero(places >= 0)) - 1  # since the path has entered the map
         slope = (places[0] - places[lag]) / lag if lag else self._speeds[state[3]]
         earlier = np.maximum(back - lag, 0) * slope
         path = places[np.minimum(back, lag)].astype(np.int64) - np.rint(earlier).astype(np.int64)
         return np.maximum(path, self.layout.first_column(places[0]))
+
+
+def _numbered(places: np.ndarray) -> np.ndarray:
+    """Return the place of each image as a path: position in the window and place, (l, 2)."""
+    path = np.empty((len(places), 2), np.int32)
+    path[:, 0], path[:, 1] = np.arange(len(places)), places
+    return path
 
 
 def _moved_on(found: WindowMatch) -> WindowMatch:

@@ -9,6 +9,7 @@ places in between is learned from the map, so that the query's changes show how 
 """
 
 from collections import deque
+from collections.abc import Collection
 import math
 
 import numpy as np
@@ -23,7 +24,7 @@ UNLIT = 0.3  # probability of such places above which equal images are no stands
 SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
 NOISE = 0.15  # deviation of the change by noise, common to all
 LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
-COMPARED = np.arange(1, 4)  # images apart that the window is compared with its path at
+COMPARED = 1, 2, 3  # images apart that the window is compared with its path at
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 FLOOR = 1e-3  # least relative probability of a speed
@@ -122,25 +123,31 @@ class ImageChange:
         left = np.maximum(1 - self.curve, 0)  # of the similarity: it shrinks in one ratio further
         ratio = min(left[-1] / left[-2], 1) if left[-2] > 0 else 0.0
         beyond = np.arange(1, int(np.ceil(APART * speeds.max())) - APART + 1)
-        self._extended = np.append(self.curve, self.curve[-1] + left[-1] * (1 - ratio**beyond))
+        further = self.curve[-1] + left[-1] * (1 - ratio**beyond)
+        self._extended: list[float] = [*self.curve.tolist(), *further.tolist()]
         self._decay = float(-np.log(np.clip(left[1], LEAST_SIMILAR, 1)))
-        changes = self.expected_change(np.outer(speeds, range(1, APART + 1))) + OFFSET
+        places = np.outer(speeds, range(1, APART + 1)).tolist()
+        changes = np.array(
+            [[self.expected_change(each) + OFFSET for each in row] for row in places]
+        )
         covariances = SPREAD**2 * np.eye(APART) + SCALE**2
         covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
         # by speed, and images apart
         self._expected, self._precisions = np.log(changes), np.linalg.inv(covariances)
 
-    def expected_change(self, places: np.ndarray) -> np.ndarray:
+    def expected_change(self, places: float) -> float:
         """
         Return the change of images so many places apart, by the curve of the map.
 
         The curve is known at whole places. Below one place, the similarity decays exponentially.
 
-        :param places: at least 0, any shape.
+        :param places: at least 0.
         """
-        below = -np.expm1(-self._decay * np.minimum(places, 1))
-        beyond = np.interp(places, np.arange(len(self._extended)), self._extended)
-        return np.asarray(np.where(places < 1, below, beyond))
+        if places < 1:
+            return -float(np.expm1(-self._decay * places))
+        whole = min(int(places), len(self._extended) - 2)
+        low, high = self._extended[whole : whole + 2]
+        return (high - low) * min(places - whole, 1) + low
 
     def _find_equal(self) -> None:
         self._equal = self._from_before < self.standstill  # to the place before, up to noise
@@ -218,9 +225,8 @@ class ImageChange:
         """
         if not self._of_window:
             return 0.0
-        images = len(self._of_window)
-        changes = [min(sum(each) / images, 1) for each in zip(*self._of_window, strict=True)]
-        expected = np.minimum(self.expected_change(speed * COMPARED), 1).tolist()
+        changes = [min(change, 1) for change in _means(self._of_window)]
+        expected = [min(self.expected_change(speed * apart), 1) for apart in COMPARED]
         noise = (1 - changes[0]) / max(1 - expected[0], LEAST_SIMILAR)
         noise = min(max(noise, LEAST_LEFT), 1)
         logs = [
@@ -251,7 +257,12 @@ class ImageChange:
         before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
         self._by_apart.append([change, *(change_between(newest, image) for image in before)])
         self._of_window.append(self._by_apart[-1][: len(COMPARED)])
-        off = np.log(np.mean(self._by_apart, axis=0) + OFFSET) - self._expected
+        off = np.log(np.array(_means(self._by_apart)) + OFFSET) - self._expected
         logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
         likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))
         return np.asarray(likely)
+
+
+def _means(rows: Collection[list[float]]) -> list[float]:
+    """Return the mean of each column; of few numbers, faster than NumPy."""
+    return [sum(column) / len(rows) for column in zip(*rows, strict=True)]

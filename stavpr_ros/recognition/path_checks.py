@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from stavpr_ros.compilation import kernel
 
 EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share of its mean
 UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
@@ -61,24 +62,30 @@ class PathCandidate:
         return self.probability * self.factor
 
 
+@kernel
 def unevenness(path: np.ndarray, z: np.ndarray, part: float = 1.0) -> float:
     """
     Return by how much z varies more along a path than it may at right places, 0 if it does not.
 
     Each place counts once, with its nearest image: a map of few places has none between them.
 
-    :param path: place of each image, ascending, (l,).
-    :param z: z-normalized distance of each image to its place, (l,); infinite ones do not count.
+    :param path: place of each image, ascending, (l,), int64.
+    :param z: z-normalized distance of each image to its place, (l,), float32; infinite ones do
+        not count.
     :param part: of the limit: ``NEWEST`` for the newest images of a window alone.
     """
-    by_place: dict[int, float] = {}  # few numbers: plain Python takes a tenth of NumPy's time
-    for place, each in zip(path.tolist(), z.tolist(), strict=True):
-        by_place[place] = min(each, by_place.get(place, math.inf))
-    nearest = [each for each in by_place.values() if each < math.inf]
-    if len(nearest) < LEAST_PLACES:
+    nearest, count, place = np.empty(len(path)), 0, path[0]
+    for i in range(len(path)):
+        if z[i] < np.inf:
+            if not count or path[i] != place:
+                place, nearest[count] = path[i], np.inf
+                count += 1
+            nearest[count - 1] = min(nearest[count - 1], z[i])
+    if count < LEAST_PLACES:
         return 0.0
-    mean = sum(nearest) / len(nearest)
-    deviation = math.sqrt(sum((each - mean) ** 2 for each in nearest) / len(nearest))
+    nearest = nearest[:count]
+    mean = nearest.sum() / count
+    deviation = np.sqrt(((nearest - mean) ** 2).sum() / count)
     return max(deviation - part * max(EVEN, -EVEN_SHARE * mean), 0.0)
 
 
