@@ -117,7 +117,7 @@ def mean_offsets(
     The deviation at the oldest image is in proportion to the images that moved: the filter knows
     the path of a slow camera by the images before the window.
 
-    :param z, path, exponents, images, n: see :func:`offset_probabilities`.
+    :param z, path, exponents, images, n: those of :func:`offset_probabilities`.
     """
     moved = (images[-1] - images[0]) / max(len(images) - 1, 1)
     window = z, path, EVIDENCE * exponents, images, n
