@@ -15,17 +15,26 @@ from stavpr_ros.errors import (
     InputError,
     SettingsError,
 )
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, route_features, Status
+from stavpr_ros.recognition import (
+    Match,
+    PlaceRecognizer,
+    RecognizerSettings,
+    route_features,
+    Status,
+)
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
 from stavpr_ros.recognition.filter_paths import BAND, CLOSE
 from stavpr_ros.recognition.filter_window import LEAST_CANDIDATE
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
+    CERTAIN,
     EVICTED,
     LEAST_PLACES,
+    LONGEST_GAP,
     LoopCloser,
 )
 from stavpr_ros.recognition.robust import (
+    MIN_PROBABILITY,
     PAPER,
     ROBUST,
     unit_norm,
@@ -272,6 +281,44 @@ def test_mode_paper_and_localization_have_no_late_matches(laps, small_map):
     assert all(match.late is None for match in drive(paper, laps[:150]))
     localizer = PlaceRecognizer(small_map, RecognizerSettings(mode='robust'))
     assert {match.late for match in drive(localizer, small_map.features)} == {None}
+
+
+SURE, DOUBTFUL, NONE = (CERTAIN + 1) / 2, 0.6, 0.4  # probabilities
+FIVE = [DOUBTFUL] * SHORT.length
+
+
+@pytest.mark.parametrize(
+    ('probabilities', 'closed'),
+    [
+        (FIVE, 1),
+        ([SURE, DOUBTFUL, DOUBTFUL], 3),
+        ([DOUBTFUL, SURE, DOUBTFUL], 2),
+        ([*FIVE[:4], *[NONE] * (LONGEST_GAP - 1), DOUBTFUL], 1),
+        ([*FIVE[:4], *[NONE] * LONGEST_GAP, DOUBTFUL], 0),
+        ([SURE, *[NONE] * LONGEST_GAP, DOUBTFUL], 1),
+        ([*FIVE[:4], 'reset', DOUBTFUL], 0),
+        ([*FIVE[:4], 'rest', DOUBTFUL, DOUBTFUL, 'drive', DOUBTFUL], 1),
+        ([math.nan], 1),  # mode paper
+    ],
+)
+def test_path_is_closed_after_a_window_of_matches_or_a_certain_one(
+    laps, monkeypatch, probabilities, closed
+):
+    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings)
+    monkeypatch.setattr(type(closer._window), 'is_standstill', property(lambda _: at_rest))
+    found, at_rest = [], False
+    for each in probabilities:
+        if each == 'reset':
+            closer.reset()
+        elif isinstance(each, str):
+            at_rest = each == 'rest'
+        else:
+            status = Status.NO_MATCH if each == NONE else Status.MATCH
+            match = Match(status, probability=each, min_probability=MIN_PROBABILITY)
+            found.append(closer._confirmed(match))
+    assert sum(match.accepted for match in found) == closed
+    waiting = [match for match in found if match.probability == DOUBTFUL and not match.accepted]
+    assert all(match.reason.endswith(f'is not above {CERTAIN:.3f}') for match in waiting)
 
 
 # ------------------------------------------------ seconds

@@ -4,6 +4,7 @@
 
 from collections import deque
 from dataclasses import replace
+import math
 
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice
@@ -28,6 +29,8 @@ MODEL = FilterSettings(
     speeds=(0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5), enter=0.003, speed_weight=0
 )
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
+CERTAIN = 0.97  # probability of a match that confirms its path alone
+LONGEST_GAP = 3  # images from a match to the one that continues it, at most
 
 
 class LoopCloser(SequenceRecognizer):
@@ -78,6 +81,7 @@ class LoopCloser(SequenceRecognizer):
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
+        self._in_a_row, self._since = 0, 0  # matches that continue each other, images since
 
     def __len__(self) -> int:
         """Return the number of places that are not evicted; ``first + len`` images have come."""
@@ -101,6 +105,7 @@ class LoopCloser(SequenceRecognizer):
         """
         super().reset()
         self._young.clear()
+        self._in_a_row = 0
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -115,10 +120,33 @@ class LoopCloser(SequenceRecognizer):
         self._append(features, stamp)
         self._track.append(position)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)
-        match = self._match(position)
+        match = self._confirmed(self._match(position))
         if match.status is Status.NO_MATCH and match.sequence is None:
             return replace(match, reason='no earlier place is old enough to be matched with')
         return replace(match, late=self._late(match))
+
+    def _confirmed(self, match: Match) -> Match:
+        """
+        Return the match; mode robust: it must be certain while its path is not confirmed.
+
+        Streets in one light look alike for about a window: a path is confirmed by as many matches
+        in a row as the window has images, or by one that is certain. A camera at rest confirms
+        nothing.
+        """
+        self._since += 1
+        if not match.accepted or math.isnan(match.probability):
+            return match
+        length = self._settings.sequence.length
+        self._in_a_row *= self._since <= LONGEST_GAP
+        self._since = 0
+        if match.probability > CERTAIN:
+            self._in_a_row = length
+        elif not self._window.is_standstill:
+            self._in_a_row += 1
+        if self._in_a_row >= length:
+            return match
+        limited = replace(match, threshold=1 - CERTAIN, min_probability=CERTAIN)
+        return limited.with_probability(match.probability)
 
     def _late(self, match: Match) -> Match | None:
         """
