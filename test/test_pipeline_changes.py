@@ -33,25 +33,26 @@ from stavpr_ros.recognition.verification import (
 pytestmark = pytest.mark.usefixtures('one_thread')
 
 CERTAIN = 7  # images after which the place is probable, in loop closure, too
+CONFIRMED = 11  # images after which its path is confirmed
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_min_probability_and_candidates_change_with_a_full_window(operation, route):
     pipeline = recorded(route, operation, candidates=3)
-    match = process(pipeline, route[:CERTAIN])[-1]
+    match = process(pipeline, route[:CONFIRMED])[-1]
     assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
     assert match.candidates[0].place == match.sequence.middle
     strict = 1 - 1e-9
     pipeline.change(replace(pipeline.settings, min_probability=strict, candidates=0))
-    match = process(pipeline, route[7:8], first=7)[0]
+    match = process(pipeline, route[11:12], first=11)[0]
     assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1 - strict, ())
     pipeline.change(replace(pipeline.settings, min_probability=0.1, candidates=1))
-    match = process(pipeline, route[8:9], first=8)[0]
-    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 8, 0.9)
+    match = process(pipeline, route[12:13], first=12)[0]
+    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 12, 0.9)
     assert len(match.candidates) == 1
-    assert pipeline.process(message(route[9]), 10, list_candidates=False).candidates == ()
+    assert pipeline.process(message(route[13]), 14, list_candidates=False).candidates == ()
     pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
-    match = process(pipeline, route[9:10], first=9)[0]
+    match = process(pipeline, route[13:14], first=13)[0]
     assert match.threshold == pytest.approx(0.03)
 
 
