@@ -42,11 +42,11 @@ def z_normalized_on_device(
 
 class CudaPlaceFilter:
     """
-    See :class:`stavpr_ros.recognition.filter_window.StateFilter`, on torch's current CUDA device.
+    A :class:`stavpr_ros.recognition.place_filter.PlaceFilter` on torch's current CUDA device.
 
     Probabilities differ from those of the CPU in the last digits: sums are formed in another
     order. Only the first of :meth:`belief`, :meth:`most_probable` and :meth:`path` after an image
-    waits for the device. Parameters: see :class:`stavpr_ros.recognition.place_filter.PlaceFilter`.
+    waits for the device.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class CudaPlaceFilter:
         self.count, self._read_at = 0, -1
 
     def places_of_states(self) -> np.ndarray:
-        """See :meth:`StateFilter.places_of_states`; copied from the device."""
+        """See :meth:`PlaceFilter.places_of_states`; copied from the device."""
         found: np.ndarray = (self._by_place() * self._scale).float().cpu().numpy()
         return found
 
@@ -140,7 +140,7 @@ class CudaPlaceFilter:
         speed_likelihoods: np.ndarray | float = 1.0,
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
-        """See :meth:`StateFilter.update`."""
+        """See :meth:`PlaceFilter.update`."""
         s, (K, V), v, n = self.settings, self._shape, self._views, len(z)
         slot = self.count % len(self._origins)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
@@ -206,7 +206,7 @@ class CudaPlaceFilter:
         self._read_at = self.count
 
     def belief(self, n: int, images_ago: int) -> Belief:
-        """See :meth:`StateFilter.belief`."""
+        """See :meth:`PlaceFilter.belief`."""
         self._read()
         K, V = self._shape
         then = self._paths[images_ago]
@@ -222,13 +222,13 @@ class CudaPlaceFilter:
         return belief_of(states, self._top_states[kept].astype(np.float64))
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
-        """See :meth:`StateFilter.most_probable`."""
+        """See :meth:`PlaceFilter.most_probable`."""
         self._read()
         left = np.flatnonzero(~np.isin(self._top, excluded))
         return (int(self._top[left[0]]), float(self._top_sums[left[0]])) if len(left) else (0, 0.0)
 
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
-        """See :meth:`StateFilter.path`."""
+        """See :meth:`PlaceFilter.path`."""
         self._read()
         (K, V), (k, v, y) = self._shape, state[:3]
         column = (int(np.flatnonzero(self._top == y)[0]) * K + k) * V + v

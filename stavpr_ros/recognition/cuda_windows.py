@@ -13,7 +13,6 @@ from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter, z_normalized_on_device
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 import torch
 
@@ -65,17 +64,11 @@ def spread_on_device(row: torch.Tensor, columns: torch.Tensor | None, width: int
 class CudaFilterWindow(FilterWindow):
     """A :class:`FilterWindow` whose rows and filter are on torch's current CUDA device."""
 
+    buffer_class, filter_class = DeviceBuffer, CudaPlaceFilter
+
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._columns = device_columns(self.layout)
-
-    def _buffer(self, sequence: SequenceSettings, width: int) -> SequenceBuffer:
-        return DeviceBuffer(sequence.length, width, sequence.k, copies=1)
-
-    def _state_filter(
-        self, width: int, lag: int, settings: FilterSettings, gaps: np.ndarray
-    ) -> CudaPlaceFilter:
-        return CudaPlaceFilter(width, lag, settings, gaps)
 
     def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
         if self._normalizes:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 import sys
-from typing import Any, Protocol
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -36,6 +36,9 @@ from stavpr_ros.recognition.place_means import PlaceMeans
 from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 
+if TYPE_CHECKING:
+    from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter
+
 CALIBRATION = 2.0  # factor of the odds of being on the map, which the filter declares too low
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
@@ -62,63 +65,6 @@ class WindowImage:
     is_matched: bool = False
 
 
-class StateFilter(Protocol):
-    """
-    A place filter over n places, on the CPU or on a CUDA device.
-
-    ``count`` is the number of images since the reset.
-    """
-
-    count: int
-
-    def reset(self) -> None:
-        """Forget where the camera was."""
-
-    def update(
-        self,
-        z: Any,
-        weight: float,
-        speed_weights: np.ndarray,
-        speed_likelihoods: np.ndarray | float = 1.0,
-        not_near: np.ndarray = NO_PLACES,
-    ) -> None:
-        """
-        Advance by an image.
-
-        :param z: z-normalized distances to the first m places, (m,), float32, an array or a tensor
-            on the filter's device; +inf excludes a place.
-        :param weight: alpha; 0 = the image is no evidence.
-        :param speed_weights: relative probability of each speed, (V,).
-        :param speed_likelihoods: of each speed relative to that off the map, (V,).
-        :param not_near: places below m whose z counts as 0 at least.
-        """
-
-    def places_of_states(self) -> np.ndarray:
-        """Return the probability of each place, (room,), float32."""
-
-    def belief(self, n: int, images_ago: int) -> Belief:
-        """
-        Return where the camera was a number of images ago, by the images since then, too.
-
-        :param n: places.
-        :param images_ago: at most the lag and ``count - 1``.
-        """
-
-    def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
-        """
-        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
-
-        :param excluded: places, ascending.
-        """
-
-    def path(self, state: np.ndarray, images: int) -> np.ndarray:
-        """
-        Return the places of the most probable path to a state, newest first, (images + 1,).
-
-        :param state: level, speed, place.
-        """
-
-
 class FilterWindow(QueryWindow):
     """
     A :class:`PlaceFilter` updated image by image, and the window that its answers are of.
@@ -135,7 +81,8 @@ class FilterWindow(QueryWindow):
     ``change`` compares images, ``filter`` contains the states.
     """
 
-    filter: StateFilter
+    buffer_class: type[SequenceBuffer] = SequenceBuffer
+    filter_class: 'type[PlaceFilter | CudaPlaceFilter]' = PlaceFilter
 
     def __init__(
         self,
@@ -149,11 +96,12 @@ class FilterWindow(QueryWindow):
     ) -> None:
         layout, settings = layout or ColumnLayout(), settings or FilterSettings()
         length, width = sequence.length, layout.width(places)
-        super().__init__(self._buffer(sequence, width), layout, normalizes, around)
+        buffer = self.buffer_class(length, width, sequence.k, copies=1)
+        super().__init__(buffer, layout, normalizes, around)
         self._middle, self._to_oldest = (length - 1) // 2, to_oldest
         self._calibration = 1.0 if to_oldest else CALIBRATION  # loop closure is not too modest
         lag = length - 1 - (0 if to_oldest else self._middle)
-        self.filter = self._state_filter(width, lag, settings, layout.gaps)
+        self.filter = self.filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings, length)
         self._speeds, self._levels = settings.speeds, settings.levels
         self._weight = settings.weight
@@ -161,14 +109,6 @@ class FilterWindow(QueryWindow):
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._entered = 0  # number of the image with which the latest path came to the map
-
-    def _buffer(self, sequence: SequenceSettings, width: int) -> SequenceBuffer:
-        return SequenceBuffer(sequence.length, width, sequence.k, copies=1)
-
-    def _state_filter(
-        self, width: int, lag: int, settings: FilterSettings, gaps: np.ndarray
-    ) -> StateFilter:
-        return PlaceFilter(width, lag, settings, gaps)
 
     @property
     def changes(self) -> tuple[float, ...]:

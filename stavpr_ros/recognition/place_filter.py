@@ -64,7 +64,7 @@ NO_PLACE = np.float32(-np.inf)  # z of a gap between sessions, where likelihoods
 
 class PlaceFilter:
     """
-    See :class:`stavpr_ros.recognition.filter_window.StateFilter`, and the module; on the CPU.
+    The filter of the module, on the CPU; ``count`` is the number of images since the reset.
 
     A state takes 4 bytes, and half a byte for each image of the lag: 274 bytes a place with the
     default speeds and levels and a lag of 10.
@@ -142,7 +142,16 @@ class PlaceFilter:
         speed_likelihoods: np.ndarray | float = 1.0,
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
-        """See :meth:`StateFilter.update`."""
+        """
+        Advance by an image.
+
+        :param z: z-normalized distances to the first m places, (m,), float32, an array or a tensor
+            on the filter's device; +inf excludes a place.
+        :param weight: alpha; 0 = the image is no evidence.
+        :param speed_weights: relative probability of each speed, (V,).
+        :param speed_likelihoods: of each speed relative to that off the map, (V,).
+        :param not_near: places below m whose z counts as 0 at least.
+        """
         s, n = self.settings, len(z)
         slot = self.count % len(self._steps)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
@@ -193,7 +202,12 @@ class PlaceFilter:
         self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
 
     def belief(self, n: int, images_ago: int) -> Belief:
-        """See :meth:`StateFilter.belief`."""
+        """
+        Return where the camera was a number of images ago, by the images since then, too.
+
+        :param n: places.
+        :param images_ago: at most the lag and ``count - 1``.
+        """
         top = self._top(n)
         least = NEGLIGIBLE * self._a[top // BLOCK, :, :, top % BLOCK].max(initial=0)
         most = len(top) * len(self._levels) * len(self._speeds)
@@ -218,12 +232,20 @@ class PlaceFilter:
         return np.argpartition(self._maxima, -count)[-count:] * BLOCK
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
-        """See :meth:`StateFilter.most_probable`."""
+        """
+        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
+
+        :param excluded: places, ascending.
+        """
         place, probability = find_most_probable(self._by_place, self._maxima, excluded)
         return place, probability * self._scale
 
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
-        """See :meth:`StateFilter.path`."""
+        """
+        Return the places of the most probable path to a state, newest first, (images + 1,).
+
+        :param state: level, speed, place.
+        """
         places = np.empty(images + 1, np.int32)
         trace_back(
             *(int(i) for i in state[:3]), self._origins, self._steps,
