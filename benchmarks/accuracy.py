@@ -161,13 +161,13 @@ def evaluate_case(
 def evaluate_hallway(
     folder: Path, feature: str, making: dict[str, FeatureExtractor]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield key and numbers of the loop closures in each mode, late ones included."""
+    """Yield key and numbers of the loop closures in each mode."""
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
     for mode, extractor in making.items():
         route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), extractor)
         truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
         settings = RecognizerSettings(mode=mode)
-        evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED, late=True)
+        evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
         yield f'hallway/{feature}/{mode}/same', numbers(evaluation, mode)
 
 

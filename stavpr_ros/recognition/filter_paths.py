@@ -40,12 +40,11 @@ START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
 STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
 EVEN_STEPS = np.array([0.0, 0.01, 0.98, 0.01, 0.0])  # of a camera that advances evenly
 EVEN_DEVIATION = 1.5  # places: START_DEVIATION of it
-EVEN = 0.1  # probability of such a camera
+EVENLY = 0.1  # probability of such a camera
 EVIDENCE = 1.5  # factor of alpha between places that are near to each other
 LEAST_DEVIATION = 0.5  # places: START_DEVIATION where few images moved
 OFFSETS = np.arange(-BAND, BAND + 1)
 IMPOSSIBLE = 1e-20  # least likelihood of an image
-MOST_LOG = 700.0  # whose exponential is a float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +110,8 @@ def mean_offsets(
     """
     Return the mean offset of each image from a path, (l,), float64.
 
-    With the likelihoods p of the window if the camera advances evenly and q if not, and the means
-    by both, it is (0.1 p even + 0.9 q uneven) / (0.1 p + 0.9 q).
+    With the likelihoods P of the window if the camera advances evenly and Q if not, and the means
+    by both, it is (0.1 P even + 0.9 Q uneven) / (0.1 P + 0.9 Q); p and q are logarithms.
 
     The deviation at the oldest image is in proportion to the images that moved: the filter knows
     the path of a slow camera by the images before the window.
@@ -123,7 +122,8 @@ def mean_offsets(
     window = z, path, EVIDENCE * exponents, images, n
     even, p = _smoothed(*window, EVEN_STEPS, max(EVEN_DEVIATION * moved, LEAST_DEVIATION))
     uneven, q = _smoothed(*window, STEPS, max(START_DEVIATION * moved, LEAST_DEVIATION))
-    share = 1 / (1 + (1 - EVEN) / EVEN * np.exp(min(q - p, MOST_LOG)))
+    p, q = p + np.log(EVENLY), q + np.log(1 - EVENLY)
+    share = np.exp(p - np.logaddexp(p, q))
     mean: np.ndarray = (share * even + (1 - share) * uneven) @ OFFSETS
     return mean
 
