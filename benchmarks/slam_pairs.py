@@ -85,9 +85,9 @@ def recognize(
     for i, (lap, number) in enumerate(drive.images.tolist()):
         record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
         match = pipeline.process(record, int(drive.stamps[i]), odometry[i], camera)
-        for each in (match, match.late):
-            pair = pipeline.matched_pair(each) if each is not None else None
-            if pair is None or each is None:
+        for each in (match, *match.late):
+            pair = pipeline.matched_pair(each)
+            if pair is None:
                 continue
             query = image_of[each.window_stamps[each.position]]
             place = image_of[pair.source.place(each.place_index).stamp]

@@ -9,7 +9,7 @@ import numpy as np
 from places import features_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
+from stavpr_ros.alignment.lm_dtw import best_match, match_sequence, SequenceMatch
 from stavpr_ros.errors import (
     FeatureMismatchError,
     InputError,
@@ -34,7 +34,6 @@ from stavpr_ros.recognition.loop_closer import (
     LoopCloser,
 )
 from stavpr_ros.recognition.robust import (
-    MIN_PROBABILITY,
     PAPER,
     ROBUST,
     unit_norm,
@@ -238,30 +237,34 @@ def test_late_matches_close_what_was_not_certain_at_first():
     """
     A second lap in bad light, where evidence grows slowly.
 
-    Each late match is that of a filter which is read at the oldest image, and none of an image
-    that had one before.
+    Some waited for the others of their path. Of those of oldest images, each is that of a filter
+    which is read there. No image has two.
     """
-    length, lap, exclude = 20, 60, 20
+    length, lap, exclude = 20, 80, 20
     strips = laps_of(2 * lap, lap).strips
     rng = np.random.default_rng(1)
     strips[:, lap:] += 0.5 * rng.standard_normal(strips[:, lap:].shape).astype(np.float32)
     features = features_of(strips)
     settings = RecognizerSettings(sequence=SequenceSettings(length), nms_radius=5, mode='robust')
     closer = LoopCloser(settings, exclude, features.settings)
-    middle, closed, late = (length - 1) // 2, set(), {}
+    middle, closed, late, oldest = (length - 1) // 2, [], {}, 0
     for i in range(len(features)):
         match = closer.update(features[i : i + 1])
+        assert (match.image_index, match.is_late, match.position) == (i, False, match.position)
         if match.accepted:
-            closed.add(i - (length - 1) + middle)
-        if match.late is None:
+            closed.append(i - (length - 1) + middle)
+        assert match.accepted or not match.late
+        for found in match.late:
+            assert (found.status, found.is_late) == (Status.MATCH, True)
+            assert found.position == (0 if found.is_oldest else middle)
+            assert abs(int(found.path[found.position, 1]) - found.place_index) <= CLOSE
+            late[found.first_image_index + found.position] = found.place_index
+            closed.append(found.first_image_index + found.position)
+        newest = [each for each in (*match.late, *closer._waiting) if each.image_index == i]
+        found = newest[0] if newest else match
+        if not found.is_oldest:
             continue
-        found, oldest = match.late, i - (length - 1)
-        assert match.accepted
-        assert (found.status, found.is_late) == (Status.MATCH, True)
-        assert (match.position, found.position) == (middle, 0)
-        assert oldest not in closed
-        assert abs(int(found.path[0, 1]) - found.place_index) <= CLOSE
-        late[oldest] = found.place_index
+        oldest += 1
         window = closer._window
         belief = window.filter.belief(window.buffer.known, length - 1)
         near, probabilities = belief.probabilities(window.buffer.known)
@@ -269,56 +272,80 @@ def test_late_matches_close_what_was_not_certain_at_first():
         share = window.match_oldest(settings.nms_radius, True).shares[0]
         of_path = of_sequence(belief, best)
         assert found.probability == pytest.approx(share * of_path)
-    assert len(late) >= 5
+    assert len(closed) == len(set(closed))
+    assert len(late) > oldest >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
     closer.reset()
     again = drive(closer, features[: length - 1])  # no window is full
-    assert all(match.late is None for match in again)
+    assert not any(match.late for match in again)
 
 
 def test_mode_paper_and_localization_have_no_late_matches(laps, small_map):
     paper = LoopCloser(RecognizerSettings(10.0, sequence=SHORT), 12, laps.settings)
-    assert all(match.late is None for match in drive(paper, laps[:150]))
+    assert not any(match.late for match in drive(paper, laps[:150]))
     localizer = PlaceRecognizer(small_map, RecognizerSettings(mode='robust'))
-    assert {match.late for match in drive(localizer, small_map.features)} == {None}
+    assert {match.late for match in drive(localizer, small_map.features)} == {()}
 
 
 SURE, DOUBTFUL, NONE = (CERTAIN + 1) / 2, 0.6, 0.4  # probabilities
-FIVE = [DOUBTFUL] * SHORT.length
+PLACE = 8
 
 
 @pytest.mark.parametrize(
-    ('probabilities', 'closed'),
+    ('events', 'closed'),
     [
-        (FIVE, 1),
-        ([SURE, DOUBTFUL, DOUBTFUL], 3),
-        ([DOUBTFUL, SURE, DOUBTFUL], 2),
-        ([*FIVE[:4], *[NONE] * (LONGEST_GAP - 1), DOUBTFUL], 1),
-        ([*FIVE[:4], *[NONE] * LONGEST_GAP, DOUBTFUL], 0),
-        ([SURE, *[NONE] * LONGEST_GAP, DOUBTFUL], 1),
-        ([*FIVE[:4], 'reset', DOUBTFUL], 0),
-        ([*FIVE[:4], 'rest', DOUBTFUL, DOUBTFUL, 'drive', DOUBTFUL], 1),
-        ([math.nan], 1),  # mode paper
+        ([SURE, SURE], [1, 0]),
+        ([DOUBTFUL, SURE, DOUBTFUL, SURE, DOUBTFUL], [3, 0, 1, 2, 4]),
+        ([DOUBTFUL] * 9, []),
+        ([DOUBTFUL] * 11, [9, *range(9), 10]),
+        (['rest', *[DOUBTFUL] * 30, 'drive', SURE, SURE], [31, *range(16, 31)]),  # 15 have waited
+        ([SURE, *[NONE] * (LONGEST_GAP - 1), SURE], [LONGEST_GAP, 0]),
+        ([SURE, *[NONE] * LONGEST_GAP, SURE], []),
+        ([SURE, SURE, *[NONE] * LONGEST_GAP, DOUBTFUL], [1, 0]),
+        ([SURE, *[NONE] * LONGEST_GAP, SURE, SURE], [LONGEST_GAP + 2, LONGEST_GAP + 1]),
+        ([SURE, BAND, SURE], [1, 0]),
+        ([SURE, BAND + 1, SURE], []),
+        ([SURE, NONE, -2 * BAND, SURE], [2, 0]),
+        ([SURE, 'reset', SURE], []),
+        ([SURE, 'evict', DOUBTFUL, SURE], [2, 1]),
+        ([DOUBTFUL, SURE, 'rest', SURE, SURE, 'drive', SURE], [4, 0, 1, 2, 3]),
+        ([math.nan], [0]),  # mode paper
     ],
 )
-def test_path_is_closed_after_a_window_of_matches_or_a_certain_one(
-    laps, monkeypatch, probabilities, closed
+def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(
+    laps, monkeypatch, events, closed
 ):
+    """Those before are late; a number moves the place, and ``evict`` evicts the one before."""
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings)
     monkeypatch.setattr(type(closer._window), 'is_standstill', property(lambda _: at_rest))
-    found, at_rest = [], False
-    for each in probabilities:
-        if each == 'reset':
+    monkeypatch.setattr(LoopCloser, 'first', property(lambda _: first))
+    found, images, place, first, at_rest = [], 0, PLACE, 0, False
+    for event in events:
+        if event == 'reset':
             closer.reset()
-        elif isinstance(each, str):
-            at_rest = each == 'rest'
+        elif event == 'evict':
+            place, first = place + 1, place + 1
+        elif isinstance(event, str):
+            at_rest = event == 'rest'
+        elif isinstance(event, int):
+            place += event
         else:
-            status = Status.NO_MATCH if each == NONE else Status.MATCH
-            match = Match(status, probability=each, min_probability=MIN_PROBABILITY)
-            found.append(closer._confirmed(match))
-    assert sum(match.accepted for match in found) == closed
-    waiting = [match for match in found if match.probability == DOUBTFUL and not match.accepted]
-    assert all(match.reason.endswith(f'is not above {CERTAIN:.3f}') for match in waiting)
+            match = Match(
+                Status.NO_MATCH if event == NONE else Status.MATCH,
+                sequence=SequenceMatch(place, place, place, 0.0, -1, math.nan),
+                path=np.array([[0, place]]),
+                probability=event,
+                min_probability=0.5,
+                image_index=images,
+            )
+            match = closer._confirmed(match, [])
+            waits = not match.accepted and event != NONE
+            assert match.reason == 'its path is not confirmed yet' * waits
+            assert not waits or not match.with_probability(1.0).accepted
+            assert all(each.is_late for each in match.late)
+            found += [match, *match.late] if match.accepted else []
+            images += 1
+    assert [match.image_index for match in found] == closed
 
 
 # ------------------------------------------------ seconds
@@ -374,8 +401,8 @@ def test_reset_after_clock_jump_keeps_route(laps):
         if i < 104:
             assert answer.status is Status.WARMING_UP
         else:
-            assert answer.status is Status.MATCH
-            assert (i - answer.newest_index) % 60 == 0
+            assert answer.accepted == (i > 104)  # the path is confirmed by two
+            assert not answer.accepted or (i - answer.newest_index) % 60 == 0
 
 
 def test_reset_keeps_znorm_of_places_and_forgets_place(laps):

@@ -217,15 +217,16 @@ def test_candidates_message_lists_places(places, probabilities):
 
 
 @pytest.mark.parametrize(
-    ('first_image', 'has_poses', 'is_late'),
+    ('first_image', 'has_poses', 'is_oldest'),
     [(55, True, False), (39, False, False), (55, True, True)],
 )
-def test_loop_closure_message_of_a_match(places, first_image, has_poses, is_late):
-    """Of the middle image of the window, or (late) the oldest; image 41 has no pose."""
+@pytest.mark.parametrize('is_late', [False, True])
+def test_loop_closure_message_of_a_match(places, first_image, has_poses, is_oldest, is_late):
+    """Of the middle image of the window, or the oldest; image 41 has no pose."""
     changes = (1.0, 0.25, 0.5, 0.125, 0.75)
     match = accepted(
-        image_index=first_image + 4, inliers=9, probability=0.75, is_late=is_late,
-        window_changes=changes,
+        image_index=first_image + 4, inliers=9, probability=0.75, is_oldest=is_oldest,
+        is_late=is_late, window_changes=changes,
     )  # fmt: skip
     message = loop_closure_message(HEADER, match, places, 'r2', PoseFrames('odom', 'base'))
     assert [pair.query_change for pair in message.pairs] == [changes[q] for q in PATH[:, 0]]
@@ -233,7 +234,7 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses, is_late
     assert [(pair.query_index, pair.place_index) for pair in message.pairs] == pairs
     stamps = [(pair.query_stamp, pair.place_stamp) for pair in message.pairs]
     assert stamps == [(Time(sec=q + 1), Time(sec=m + 1)) for q, m in pairs]
-    query = first_image + (0 if is_late else 2)
+    query = first_image + (0 if is_oldest else 2)
     expected = LoopClosure(
         header=HEADER, query_index=query, query_stamp=Time(sec=query + 1), place_index=32,
         place_stamp=Time(sec=33), has_poses=has_poses, distance=0.25, threshold=message.threshold,

@@ -171,21 +171,29 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
 def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkeypatch):
     """They are those of the whole window, bit for bit, of late matches as well."""
     pipeline = recorded(route, operation)
-    matches, rows = [], []
+    matches, rows, earlier = [], [], 0
     for i, image in enumerate(route[:30]):
         (match,) = process(pipeline, [image], first=i, poses=True)
         row = pipeline.newest_distances()
-        rows = [*rows, np.pad(row, (0, 60 - len(row)), constant_values=np.inf)][-LENGTH:]
+        rows.append(np.pad(row, (0, 60 - len(row)), constant_values=np.inf))
         if len(rows) < LENGTH:
             continue
         with monkeypatch.context() as patch:
             patch.setattr(SequenceBuffer, 'rows', lambda buffer: pytest.fail('the whole window'))
-            pairs = [pipeline.matched_pair(one) for one in (match, match.late) if one is not None]
-        for pair in filter(None, pairs):
-            columns = np.array(rows)[:, pair.first :][:, : len(pair.poses)]
+            pairs = {one: pipeline.matched_pair(one) for one in (match, *match.late)}
+        for one, pair in pairs.items():
+            if pair is None:
+                continue
+            end = i + 1
+            if operation == 'loop_closure':
+                assert pair.query_pose[0] == (one.first_image_index + one.position) % 30
+                end = one.image_index + 1 - 30
+            earlier += end <= i
+            columns = np.array(rows)[end - LENGTH : end, pair.first :][:, : len(pair.poses)]
             np.testing.assert_array_equal(pair.distances, columns)
             matches.append(pair.query_pose[0] - pair.pose(pair.place)[0])
     assert matches.count(0) > 20
+    assert bool(earlier) == (operation == 'loop_closure')
     assert len(set(np.abs(matches))) < 4
 
 

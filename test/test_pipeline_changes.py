@@ -28,6 +28,7 @@ from stavpr_ros.recognition.verification import (
     GeometricEvidence,
     GeometricSettings,
     GeometricVerifier,
+    PlaceVerifier,
 )
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -117,6 +118,29 @@ def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route,
     assert match.sequence.middle == plain.sequence.middle == match.candidates[0].place
 
 
+def test_geometric_check_decides_each_late_match(route, monkeypatch):
+    """Where it rejects the match that they come with, too."""
+    check = GeometricSettings(min_inliers=8)
+
+    def closing(**changes):
+        pipeline = recorded(route, 'loop_closure', **changes)
+        (match,) = (each for each in process(pipeline, route[:12], first=30) if each.late)
+        return pipeline.places, match
+
+    places, match = closing(geometric=check)
+    assert match.accepted
+    for each in match.late:
+        query = places.thumbnail(each.first_image_index + each.position)
+        place = places.thumbnail(each.place_index)
+        assert each.inliers == GeometricVerifier(check).inliers(query, place) >= 8
+    rejected = {match.place_index, match.late[0].place_index}
+    monkeypatch.setattr(PlaceVerifier, 'inliers', lambda *given: 8 * (given[3] not in rejected))
+    _, other = closing(geometric=check)
+    assert not other.accepted
+    left = [each.place_index for each in match.late if each.place_index not in rejected]
+    assert [each.place_index for each in other.late] == left != []
+
+
 def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path):
     save_map(replace(small_map, thumbnails=()), tmp_path / 'blind.stavpr')
     pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings())
@@ -187,13 +211,14 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     assert (pipeline.window_fill, len(pipeline.places)) == (0, places)
     # the first equals the last keyframe
     matches = process(pipeline, route[4 : 4 + LENGTH], first=100)
-    waiting = statuses(matches).index(Status.MATCH)
-    assert statuses(matches) == [Status.WARMING_UP] * waiting + [Status.MATCH] * (5 - waiting)
+    waiting = statuses(matches).count(Status.WARMING_UP)
+    found = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
+    assert statuses(matches) == [Status.WARMING_UP] * waiting + [found] * (5 - waiting)
     assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 3
     assert matches[-1].window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
         assert matches[-1].first_image_index == places
-    assert matches[-1].newest_index == 8
+    assert matches[-1].path[-1].tolist() == [4, 8]
 
 
 def test_relocalize_returns_the_match_of_the_window(map_file, route):

@@ -34,7 +34,7 @@ class GeometricCheck:
         is_weighed: bool,
     ) -> Match:
         """
-        Return a match, and its late match, after the check; without thumbnails, as they are.
+        Return a match, and its late ones, after the check; without thumbnails, as they are.
 
         Matches with too few inliers are rejected.
 
@@ -43,11 +43,11 @@ class GeometricCheck:
         :param is_weighed: the result changes the probability instead (:class:`GeometricEvidence`),
             where the match is doubtful.
         """
-        match = self._checked(match, places, query, is_weighed)
-        if match.late is None or not match.accepted:
-            return match
-        query = places.thumbnail(match.late.first_image_index)
-        return replace(match, late=self._checked(match.late, places, query, is_weighed))
+        late = []
+        for each in match.late:
+            of_late = places.thumbnail(each.first_image_index + each.position)
+            late.append(self._checked(each, places, of_late, is_weighed))
+        return replace(self._checked(match, places, query, is_weighed), late=tuple(late))
 
     def _checked(
         self,

@@ -238,7 +238,7 @@ class Pipeline:
 
     def matched_pair(self, match: Match, relative_pose: str = 'auto') -> MatchedPair | None:
         """
-        Return the pair of the newest match, or its late one, for its edge.
+        Return the pair of the newest match, or of one of its late ones, for its edge.
 
         :param relative_pose: the parameter of this name.
         :returns: None without a match, or where the place of a map can have no edge.
@@ -254,8 +254,11 @@ class Pipeline:
         unknown = np.full(7, np.nan)
         poses = np.array([unknown if pose is None else pose for _, pose in self._window])
         query = self._window[match.position][0]
-        if match.is_late:
-            query = places.thumbnail(match.first_image_index)
+        if match.is_late and isinstance(places, GrowingMap):
+            query = places.thumbnail(match.first_image_index + match.position)
+            window = match.first_image_index - places.first + np.arange(len(poses))
+            poses = places.poses[window]
+            distances = distances and match.columns_of
         return matched_pair(match, places, query, poses, distances)
 
     def newest_distances(self) -> np.ndarray:
@@ -347,8 +350,7 @@ class Pipeline:
                 middle, _ = self._window[(len(self._window) - 1) // 2]
                 is_weighed = not math.isnan(match.probability) and self.operation == 'localization'
                 match = self._check.checked(match, operation.places, middle, is_weighed)
-            if match.late and not (match.accepted and match.late.accepted):
-                match = replace(match, late=None)
+            match = replace(match, late=tuple(each for each in match.late if each.accepted))
         self._last = replace(match, image=image)
         return self._last
 
@@ -429,8 +431,7 @@ def _update(
     if isinstance(recognizer, LoopCloser):  # it evicts the oldest places
         places.forget(recognizer.first - places.first)
     index = places.add(features, stamp, pose=pose, thumbnail=jpeg)
-    late = match.late and replace(match.late, image_index=index)
-    return replace(match, image_index=index, late=late)
+    return replace(match, image_index=index)
 
 
 def _needed_size(operation: Operation, thumbnail_width: int) -> tuple[int, int] | None:

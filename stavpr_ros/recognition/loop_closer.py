@@ -11,6 +11,7 @@ from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
+from stavpr_ros.recognition.filter_paths import BAND
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import Match, Status
@@ -29,8 +30,9 @@ MODEL = FilterSettings(
     speeds=(0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5), enter=0.003, speed_weight=0
 )
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
-CERTAIN = 0.97  # probability of a match that confirms its path alone
+CERTAIN = 0.95  # probability above which half a window of matches confirms their path
 LONGEST_GAP = 3  # images from a match to the one that continues it, at most
+LONGEST_WAIT = 3  # windows; so many matches of a path wait for its confirmation, at most
 
 
 class LoopCloser(SequenceRecognizer):
@@ -81,7 +83,11 @@ class LoopCloser(SequenceRecognizer):
         # stamps of the latest places, not yet old enough in seconds
         self._young: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
-        self._in_a_row, self._since = 0, 0  # matches that continue each other, images since
+        length = settings.sequence.length
+        # of the latest path: its last match, probabilities, matches that wait for its confirmation
+        self._last: Match | None = None
+        self._path: deque[float] = deque(maxlen=2 * length)
+        self._waiting: deque[Match] = deque(maxlen=LONGEST_WAIT * length)
 
     def __len__(self) -> int:
         """Return the number of places that are not evicted; ``first + len`` images have come."""
@@ -105,7 +111,7 @@ class LoopCloser(SequenceRecognizer):
         """
         super().reset()
         self._young.clear()
-        self._in_a_row = 0
+        self._last = None
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -120,45 +126,68 @@ class LoopCloser(SequenceRecognizer):
         self._append(features, stamp)
         self._track.append(position)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)
-        match = self._confirmed(self._match(position))
+        match = replace(self._match(position), image_index=self.first + len(self) - 1)
         if match.status is Status.NO_MATCH and match.sequence is None:
-            return replace(match, reason='no earlier place is old enough to be matched with')
-        return replace(match, late=self._late(match))
+            match = replace(match, reason='no earlier place is old enough to be matched with')
+        return self._confirmed(match, self._oldest(match))
 
-    def _confirmed(self, match: Match) -> Match:
+    def _confirmed(self, match: Match, oldest: list[Match]) -> Match:
         """
-        Return the match; mode robust: it must be certain while its path is not confirmed.
+        Return the match; mode robust: as no match while its path is not confirmed.
 
-        Streets in one light look alike for about a window: a path is confirmed by as many matches
-        in a row as the window has images, or by one that is certain. A camera at rest confirms
-        nothing.
+        Streets in one light look alike for about a window: a path is confirmed by half a window
+        of matches that are certain, or by two windows of any. Those that waited are late ones of
+        the match that confirms it. A camera at rest confirms nothing.
+
+        :param oldest: the match of the oldest image, or none.
         """
-        self._since += 1
         if not match.accepted or math.isnan(match.probability):
             return match
+        if not self._continues(match):
+            self._path.clear()
+            self._waiting.clear()
+        self._last = match
+        self._waiting += [self._late(each) for each in oldest]
+        if not self._window.is_standstill:
+            self._path.append(match.probability)
+        certain = sum(probability > CERTAIN for probability in self._path)
         length = self._settings.sequence.length
-        self._in_a_row *= self._since <= LONGEST_GAP
-        self._since = 0
-        if match.probability > CERTAIN:
-            self._in_a_row = length
-        elif not self._window.is_standstill:
-            self._in_a_row += 1
-        if self._in_a_row >= length:
-            return match
-        limited = replace(match, threshold=1 - CERTAIN, min_probability=CERTAIN)
-        return limited.with_probability(match.probability)
+        if certain < length // 2 and len(self._path) < 2 * length:
+            self._waiting.append(self._late(match))
+            match = replace(match, threshold=0.0, min_probability=1.0)
+            return replace(match, status=Status.NO_MATCH, reason='its path is not confirmed yet')
+        # places of the others have been evicted
+        late = [each for each in self._waiting if each.path[:, 1].min() >= self.first]
+        self._waiting.clear()
+        return replace(match, late=tuple(late))
 
-    def _late(self, match: Match) -> Match | None:
+    def _late(self, match: Match) -> Match:
+        """Return a match of the present window with all that is needed of it later."""
+        path = match.path[:, 1]
+        first = max(int(path.min()) - BAND, self.first)
+        end = min(int(path.max()) + BAND + 1, self.first + len(self))
+        columns = super().window_columns(np.arange(first, end))
+        return replace(match, is_late=True, first_column=first, columns=columns)
+
+    def _continues(self, match: Match) -> bool:
+        """Return whether a match continues the path of the last one."""
+        if self._last is None:
+            return False
+        images = match.image_index - self._last.image_index
+        apart = abs(match.place_index - self._last.place_index)
+        return images <= LONGEST_GAP and apart <= BAND * images
+
+    def _oldest(self, match: Match) -> list[Match]:
         """
         Return the match of the oldest image, if it had none as the middle one and is certain now.
 
-        It is a backward pass over the window. Windows without a match have no late one either.
+        It is a backward pass over the window. Windows without a match have none of it either.
         """
         if not self._window.buffer.full:
-            return None
+            return []
         found = self._window.match_oldest(self._settings.nms_radius, match.accepted)
-        late = match.of_window(found, 0)
-        return replace(late, is_late=True) if late.accepted else None
+        oldest = replace(match.of_window(found, 0), is_oldest=True)
+        return [oldest] if oldest.accepted else []
 
     def newest_row(self) -> np.ndarray:
         """

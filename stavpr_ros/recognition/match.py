@@ -13,7 +13,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.path import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
 
-NO_SHARES = np.empty(0)
+NO_SHARES, NO_COLUMNS = np.empty(0), np.empty((0, 0), np.float32)
 LEAST_SHARE = 1e-9  # of a place of the path; ratios to it are finite
 
 
@@ -97,8 +97,8 @@ class Match:
     """
     The result for one image; indices are 0-based places of the map.
 
-    The recognizer fills the fields from ``threshold`` to ``window_changes``, the pipeline the
-    others.
+    The recognizer fills the fields from ``threshold`` to ``window_changes`` and those of late
+    matches, the pipeline the others.
 
     :param status: only ``MATCH`` names a place.
     :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.
@@ -114,9 +114,8 @@ class Match:
     :param min_probability: mode robust: a window is matched above this probability.
     :param path_ratios: probability of each place of the path over that of the matched place, (m,);
         empty in mode paper.
-    :param is_late: the place is that of the oldest image of the window instead of the middle one.
-    :param late: the match of the oldest image, if that image had none as the middle one; None = it
-        had one, or is still uncertain.
+    :param is_late: it is one of the late matches of another.
+    :param late: loop closure: matches of earlier images that had none until now.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param window_changes: difference of each of them from the image before it, 0 = equal; empty in
         mode paper.
@@ -127,6 +126,9 @@ class Match:
         one.
     :param stages: duration of each stage, seconds.
     :param image: the decoded image, RGB; None = not decoded.
+    :param is_oldest: the place is that of the oldest image of the window, not of the middle one.
+    :param columns: of a late match: image distances of its window to places from ``first_column``
+        on, (l, k), float32.
     """
 
     status: Status
@@ -139,7 +141,7 @@ class Match:
     min_probability: float = math.nan
     path_ratios: np.ndarray = field(default_factory=lambda: NO_SHARES)
     is_late: bool = False
-    late: 'Match | None' = None
+    late: 'tuple[Match, ...]' = ()
     window_stamps: tuple[int, ...] = ()
     window_changes: tuple[float, ...] = ()
     image_index: int = -1
@@ -148,6 +150,9 @@ class Match:
     cause: str = ''
     stages: Mapping[str, float] = field(default_factory=dict)
     image: np.ndarray | None = None
+    is_oldest: bool = False
+    first_column: int = 0
+    columns: np.ndarray = field(default_factory=lambda: NO_COLUMNS)
 
     def __repr__(self) -> str:
         fields = [self.status.name]
@@ -171,7 +176,7 @@ class Match:
     @property
     def position(self) -> int:
         """Position in the window of the image that the place is of."""
-        return 0 if self.is_late else (len(self.window_stamps) - 1) // 2
+        return 0 if self.is_oldest else (len(self.window_stamps) - 1) // 2
 
     @property
     def newest_index(self) -> int:
@@ -182,6 +187,19 @@ class Match:
     def path_probabilities(self) -> np.ndarray:
         """Return the probability of each place of the path, (m,); empty in mode paper."""
         return np.minimum(self.probability * self.path_ratios, 1)
+
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """
+        Return the image distances of the window of a late match, (l, k).
+
+        :param places: shape (k,), int64, successive ones.
+        :returns: +inf where they are not known.
+        """
+        columns = places - self.first_column
+        known = (columns >= 0) & (columns < self.columns.shape[1])
+        rows: np.ndarray = np.full((len(self.columns), len(places)), np.inf, np.float32)
+        rows[:, known] = self.columns[:, columns[known]]
+        return rows
 
     def at(self, position: int) -> 'Match':
         """Return this as the match of another image of the window, with its probability."""

@@ -22,12 +22,17 @@ from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator, needed_by_pnp
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair
-from stavpr_ros.ros.messages import loop_closure_message, PoseFrames, relative_pose_message
+from stavpr_ros.ros.messages import (
+    loop_closure_message,
+    PoseFrames,
+    relative_pose_message,
+    time_message,
+)
 from stavpr_ros.ros.worker import Worker
 from stavpr_ros.signals import time_left
 from std_msgs.msg import Header
 
-MOST_WAITING = 16  # closures; while there are more, the oldest goes without a relative pose
+MOST_WAITING = 40  # closures; while there are more, the oldest goes without a relative pose
 UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
 NO_POSE = 'the place has no pose: record maps and routes with odometry'
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
@@ -80,18 +85,22 @@ class EdgePublisher:
         :param frames: of the poses of the places and of the odometry.
         :param camera: of the image; None = unknown.
         :returns: the edge for the message of the match, None without a match; the closures of the
-            match and of its late match.
+            match and of its late ones.
         """
         places, edge, closures = pipeline.places, None, []
         # a route has the camera of the query
         place_camera = places.camera if isinstance(places, PlaceMap) else camera
-        for each in filter(None, (match, match.late)):
+        for each in (match, *match.late):
             pair = pipeline.matched_pair(each, self._estimator.method)
             if each is match and match.accepted:
                 edge = self._immediate(pair, camera, place_camera)
             if pair is None:
                 continue
             pose = None if np.isnan(pair.query_pose).any() else pair.query_pose
+            if each.is_late:  # its window may be an earlier one
+                header = Header(
+                    frame_id=header.frame_id, stamp=time_message(each.window_stamps[-1])
+                )
             message = loop_closure_message(header, each, pair.source, self._robot_id, frames, pose)
             if message is not None:
                 closures.append(WaitingClosure(message, pair, camera, place_camera))

@@ -10,6 +10,7 @@ is in the map is a false negative. Average precision is scikit-learn's, which co
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, Self
 
 import numpy as np
@@ -240,7 +241,7 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
 
     :param matches: one an image, in order: that of the window that ends with the image.
     :param length: images in a window, l.
-    :param late: images whose window was not matched take their late match, where they have one.
+    :param late: images without a match of their own take their late one, where they have it.
     """
     found = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
@@ -261,11 +262,10 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
             assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
         for position in range(middle + 1, length):
             assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
-    for end, match in enumerate(matches if late else ()):
-        if match.late is not None and match.late.sequence is not None:
-            image = end - (length - 1)
-            found.places[image], found.distances[image] = match.late.place_index, match.late.score
-            found.accepted[image], found.probabilities[image] = True, match.late.probability
+    for each in chain.from_iterable(match.late for match in matches if late):
+        image = each.first_image_index + each.position
+        found.places[image], found.distances[image] = each.place_index, each.score
+        found.accepted[image], found.probabilities[image] = True, each.probability
     return found
 
 
