@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Removes the places of a map at which the camera was at rest."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.mapping import PlaceMap, select_places
-from stavpr_ros.recognition.blocks import blocks
+from stavpr_ros.recognition.blocks import blocks, PlaceChanges
 from stavpr_ros.recognition.robust import FilterSettings, MeanCentering
 from tqdm import tqdm
 
@@ -24,67 +25,37 @@ def without_duplicates(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
 
     :param progress: show it on standard error.
     """
-    n = len(place_map)
-    least = FilterSettings().standstill * _mean_change(place_map, progress)
-    step = _median_step(place_map)
-    keeper, last = np.arange(n), np.empty((0, 0))
-    for place, strips in _centered(place_map, 'drop duplicates', progress):
-        kept = keeper[place - 1] if place else 0
-        if (
-            _is_first(place_map, place)
-            or change_between(strips, last) >= least
-            or _distance(place_map, kept, place) > MIN_MOTION * step
-        ):
-            last = strips
-        else:
+    n, index = len(place_map), place_map.session_index
+    centering, changes = MeanCentering(place_map.features), PlaceChanges(n, 1)
+    for _, strips in _centered(place_map, centering, 'compare neighbors', progress):
+        changes.add(strips)
+    is_first = np.diff(np.zeros(n) if index is None else index, prepend=-1) != 0
+    neighbors = changes.changes[0, ~is_first]
+    least = FilterSettings().standstill * (neighbors.mean(dtype=float) if len(neighbors) else 1)
+    positions = np.full((n, 3), np.nan) if place_map.poses is None else place_map.poses[:, :3]
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    moved = MIN_MOTION * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    keeper, kept, last = np.arange(n), 0, np.empty((0, 0))
+    for places, block in _centered(place_map, centering, 'drop duplicates', progress):
+        for place, strips in zip(range(n)[places], block.swapaxes(0, 1), strict=True):
+            distance = np.linalg.norm(positions[place] - positions[kept])  # NaN = unknown
+            if is_first[place] or change_between(strips, last) >= least or distance > moved:
+                kept, last = place, strips
             keeper[place] = kept
     if place_map.same_as is not None:
         place_map = replace(place_map, same_as=_related(place_map.same_as, keeper))
     return select_places(place_map, np.flatnonzero(keeper == np.arange(n)))
 
 
-def _centered(place_map, text, progress):  # type: ignore[no-untyped-def]
-    """Yield number and features (W, d) of each place, centered."""
-    centering = MeanCentering(place_map.features)
+def _centered(
+    place_map: PlaceMap, centering: MeanCentering, text: str, progress: bool
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield the centered features of each block, (W, m, d), and show the progress."""
     bar = tqdm(total=len(place_map), desc=text, unit='place', disable=None if progress else True)
     with bar:
         for places, block in blocks(place_map.features):
-            strips = centering.places(block).strips
-            yield from zip(range(places.start, places.stop), strips.swapaxes(0, 1), strict=True)
+            yield places, centering.places(block).strips
             bar.update(places.stop - places.start)
-
-
-def _is_first(place_map: PlaceMap, place: int) -> bool:
-    """Whether a place is the first one of a session."""
-    index = place_map.session_index
-    return place == 0 or (index is not None and index[place] != index[place - 1])
-
-
-def _mean_change(place_map: PlaceMap, progress: bool) -> float:
-    """Return the mean change of neighbors in one session."""
-    changes, before = [], np.empty((0, 0))
-    for place, strips in _centered(place_map, 'compare neighbors', progress):
-        if not _is_first(place_map, place):
-            changes.append(change_between(strips, before))
-        before = strips
-    return float(np.mean(changes)) if changes else 1.0
-
-
-def _distance(place_map: PlaceMap, one: int, other: int) -> float:
-    """Return the distance between two places in meters, 0 where it is unknown."""
-    first, second = place_map.pose(one), place_map.pose(other)
-    if first is None or second is None:
-        return 0.0
-    return float(np.linalg.norm(second[:3] - first[:3]))
-
-
-def _median_step(place_map: PlaceMap) -> float:
-    """Return the median distance of neighbors in meters, 0 if unknown."""
-    if place_map.poses is None:
-        return 0.0
-    steps = np.linalg.norm(np.diff(place_map.poses[:, :3], axis=0), axis=1)
-    steps = steps[steps > 0]  # NaN is not
-    return float(np.median(steps)) if len(steps) else 0.0
 
 
 def _related(same_as: np.ndarray, keeper: np.ndarray) -> np.ndarray:
