@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search of mode robust: matches of a drive at any speed, off the map and standing."""
 
+from dataclasses import replace
 from itertools import pairwise, product
 
 from hypothesis import given, settings
@@ -18,6 +19,7 @@ from stavpr_ros.recognition.filter_paths import (
     offset_probabilities,
     OFFSETS,
     smooth,
+    straight_offsets,
 )
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.map_change import APART
@@ -143,8 +145,12 @@ def test_smoothed_offsets_without_any_likely_one_are_equal():
     np.testing.assert_allclose(masses, 0.25)
 
 
-def offset_errors(true_offsets, images=20, seeds=200):
-    """Return the mean errors of places by both models and by the filter's, in faint light."""
+def offset_errors(true_offsets, gaps=None, images=20, seeds=200):
+    """
+    Return the mean errors of places by mean_offsets and by the filter's model, in faint light.
+
+    :param gaps: function of the offsets: intervals from image to image, one less than images.
+    """
     errors = np.zeros(2)
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
@@ -153,7 +159,9 @@ def offset_errors(true_offsets, images=20, seeds=200):
         z = rng.normal(size=(images, len(OFFSETS)))
         z[numbers, offsets + BAND] -= 1.4
         window = z, path, np.full(images, 0.28 * -1.4), numbers, 200
-        found = mean_offsets(*window), offset_probabilities(*window) @ OFFSETS
+        steps = np.ones(images - 1) if gaps is None else gaps(offsets)
+        times = np.append(0.0, steps.cumsum()), np.arange(200.0)
+        found = mean_offsets(*window, *times), offset_probabilities(*window) @ OFFSETS
         errors += [np.abs(np.rint(each) - offsets).mean() / seeds for each in found]
     return errors
 
@@ -163,12 +171,62 @@ def test_places_of_a_camera_that_advances_evenly_are_nearer():
     assert error < 0.8 * by_filter
 
 
-def test_places_of_a_camera_that_loses_images_are_nearer_too():
-    steps = np.array([-1, 0, 1])
-    error, by_filter = offset_errors(
-        lambda rng, images: rng.choice(steps, images, p=[0.25, 0.5, 0.25]).cumsum()
-    )
-    assert error < by_filter
+def of_lost_images(rng, images):
+    return rng.choice([-1, 0, 1], images, p=[0.25, 0.5, 0.25]).cumsum()
+
+
+def test_places_of_a_camera_that_loses_images_are_nearer_by_their_times():
+    error, by_filter = offset_errors(of_lost_images)
+    assert error < 1.01 * by_filter
+    error, by_filter = offset_errors(of_lost_images, lambda offsets: 1 + np.diff(offsets))
+    assert error < 0.75 * by_filter
+
+
+@pytest.mark.parametrize('first', [0, 20])
+def test_straight_paths_are_those_of_a_loop_over_their_ends(first):
+    rng = np.random.default_rng(first)
+    images, n, deviation = 5, 26, 1.25
+    path = first + np.array([0, 1, 2, 4, 5])
+    likelihoods = rng.random((images, len(OFFSETS)))
+    times, place_times = rng.random(images).cumsum(), rng.random(n).cumsum()
+    places, sums, total, prior = np.arange(n), np.zeros(images), 0.0, 0.0
+    for ends in product(np.linspace(-3, 3, 13), repeat=2):
+        weight = np.exp(-0.5 * np.sum(np.square(ends)) / deviation**2)
+        prior += weight
+        begin, end = np.interp(path[[0, -1]] + ends, places, place_times)
+        of_images = np.interp(times, times[[0, -1]], [begin, max(begin, end)])
+        line = np.interp(of_images, place_times, places)
+        for i, offset in enumerate(np.rint(line).astype(int) - path):
+            weight *= likelihoods[i, offset + BAND] if abs(offset) <= BAND else 0
+        total += weight
+        sums += weight * (line - path)
+    means = np.zeros(images)
+    found = straight_offsets(likelihoods, path, times, place_times, deviation, means)
+    assert found == pytest.approx(total / prior)
+    np.testing.assert_allclose(means, sums / total, atol=1e-9)
+
+
+def test_stamps_show_where_images_were_lost():
+    n, length, width = 800, 20, 8
+    rng = np.random.default_rng(7)
+    strips = rng.standard_normal((7, n + width, 24))
+    route = sum(strips[:, i : i + n] for i in range(width)) / 2  # places like many neighbors
+    kept, images = (np.flatnonzero(rng.random(n) < 0.6) for _ in range(2))
+    query = features_of(route[:, images], noise=3.0)
+
+    def mean_error(second):
+        stamps = (kept + 1) * second
+        place_map = replace(map_of(features_of(route[:, kept])), stamps=stamps)
+        settings = RecognizerSettings(sequence=SequenceSettings(length), mode='robust')
+        recognizer, errors = PlaceRecognizer(place_map, settings), []
+        for i, image in enumerate(images):
+            match = recognizer.update(query[i : i + 1], int(image + 1) * second)
+            if match.accepted and i >= length:
+                errors.append(abs(kept[match.place_index] - images[i - length // 2]))
+        assert len(errors) > 0.6 * len(images)
+        return np.mean(errors)
+
+    assert mean_error(10**9) < 0.95 * mean_error(0)
 
 
 def test_path_follows_images_whose_speed_changes(recognizer, route):

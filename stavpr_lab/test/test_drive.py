@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from scores import truth_matrix
-from stavpr_lab.evaluation.drive import cropped, DriveChanges
+from stavpr_lab.evaluation.drive import cropped, DriveChanges, INTERVAL
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.sources.frame import Frame
@@ -72,6 +72,15 @@ def test_images_are_dropped_with_the_probability_and_by_the_seed():
     assert images.tolist() != DriveChanges(drop=0.3, seed=6).images(4000).tolist()
     assert (np.diff(images) > 0).all()
     assert 0.67 < len(images) / 4000 < 0.73
+
+
+def test_stamps_have_gaps_where_images_are_dropped():
+    """Not where the drive is slower: each image is an interval after the one before."""
+    truth = GroundTruth.identity(40, 40, 0)
+    slow = DriveChanges(speed=0.5).apply(truth)
+    np.testing.assert_array_equal(slow.stamps, (np.arange(80) + 1) * INTERVAL)
+    dropped = DriveChanges(drop=0.3, seed=5).apply(truth)
+    np.testing.assert_array_equal(dropped.stamps, (dropped.images + 1) * INTERVAL)
 
 
 def test_apply_moves_the_ground_truth_with_images_and_places():

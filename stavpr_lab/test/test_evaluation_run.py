@@ -24,10 +24,11 @@ class Scripted:
 
     def __init__(self, rows, paths, candidates):
         self.rows, self.paths, self.listed, self.at = rows, paths, candidates, -1
-        self.buffer = np.empty(6, np.float32)
+        self.buffer, self.stamps = np.empty(6, np.float32), []
 
-    def update(self, features, pose=None):
+    def update(self, features, stamp=0, pose=None):
         assert len(features) == 1
+        self.stamps.append(stamp)
         self.at += 1
         if self.paths[self.at] is None:
             return Match(Status.WARMING_UP)
@@ -55,7 +56,9 @@ def test_recognize_traverse_of_four_images_by_hand(small_map):
         candidates=[None, None, [1, 5, 0], [3, 4]],
     )
     settings = RecognizerSettings(1.0, sequence=SequenceSettings(length=3))
-    found = recognize_traverse(online, small_map.features[:4], 6, settings)
+    stamps = np.array([7, 8, 10, 11]) * 10**9
+    found = recognize_traverse(online, small_map.features[:4], 6, settings, stamps=stamps)
+    assert online.stamps == stamps.tolist()
     assert found.sequence.places[1:3, :4].tolist() == [[1, 5, 0, -1], [4, 3, -1, -1]]
     assert found.sequence.best.tolist() == [0, 1, 4, 5]
     assert found.sequence.scores.tolist() == [0.25] * 4

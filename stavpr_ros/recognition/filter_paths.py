@@ -17,12 +17,12 @@ few, and before the middle of the window the path is a straight line. The offset
 place from it is a hidden Markov model: it changes little from image to image, and the evidence is
 the filter's, at the path's level. The forward-backward algorithm gives its probabilities.
 
-The place of an image is the mean of two such models (:func:`mean_offsets`): in one the camera
-advances evenly, in the other it does not, as where images are lost. Each counts by the likelihood
-of the window.
+The place of an image is the mean by such a model and by straight paths, of a camera that advances
+evenly in time (:func:`mean_offsets`). Each counts by the likelihood of the window.
 """
 
 from dataclasses import dataclass
+import sys
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import prefetch
@@ -38,11 +38,11 @@ CLOSE = 2  # places: the probability of a place is that of its neighbors within 
 BAND = 5  # places to either side of the filter's path
 START_DEVIATION = 3.0  # places, of the path at the oldest image of the window
 STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less than the path, ...
-EVEN_STEPS = np.array([0.0, 0.01, 0.98, 0.01, 0.0])  # of a camera that advances evenly
-EVEN_DEVIATION = 1.5  # places: START_DEVIATION of it
-EVENLY = 0.1  # probability of such a camera
+EVENLY = 0.03  # probability of a camera that advances evenly
+ENDS = np.arange(-3, 3.1, 0.5)  # places, from the path to the ends of its straight path
+END_DEVIATION = 1.25  # places, of these ends
 EVIDENCE = 1.5  # factor of alpha between places that are near to each other
-LEAST_DEVIATION = 0.5  # places: START_DEVIATION where few images moved
+LEAST_DEVIATION = 0.5  # places: of both where few images moved
 OFFSETS = np.arange(-BAND, BAND + 1)
 IMPOSSIBLE = 1e-20  # least likelihood of an image
 
@@ -101,41 +101,52 @@ def offset_probabilities(
     :param n: places.
     :returns: shape (l, S); each row sums to 1.
     """
-    return _smoothed(z, path, exponents, images, n, STEPS, START_DEVIATION)[0]
+    likelihoods, moves = _evidence(z, path, exponents, images, n)
+    return _smoothed(likelihoods, moves, START_DEVIATION)[0]
 
 
 def mean_offsets(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
-) -> np.ndarray:
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
+    times: np.ndarray, place_times: np.ndarray,
+) -> np.ndarray:  # fmt: skip
     """
     Return the mean offset of each image from a path, (l,), float64.
 
     With the likelihoods P of the window if the camera advances evenly and Q if not, and the means
-    by both, it is (0.1 P even + 0.9 Q uneven) / (0.1 P + 0.9 Q); p and q are logarithms.
+    by both, it is (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q).
 
-    The deviation at the oldest image is in proportion to the images that moved: the filter knows
-    the path of a slow camera by the images before the window.
+    Deviations are in proportion to the images that moved: the filter knows the path of a slow
+    camera by the images before the window.
 
     :param z, path, exponents, images, n: those of :func:`offset_probabilities`.
+    :param times: of the images, ascending, (l,), float64, of any unit.
+    :param place_times: of the n places, ascending, (n,), float64, of any unit.
     """
     moved = (images[-1] - images[0]) / max(len(images) - 1, 1)
-    window = z, path, EVIDENCE * exponents, images, n
-    even, p = _smoothed(*window, EVEN_STEPS, max(EVEN_DEVIATION * moved, LEAST_DEVIATION))
-    uneven, q = _smoothed(*window, STEPS, max(START_DEVIATION * moved, LEAST_DEVIATION))
-    p, q = p + np.log(EVENLY), q + np.log(1 - EVENLY)
-    share = np.exp(p - np.logaddexp(p, q))
-    mean: np.ndarray = (share * even + (1 - share) * uneven) @ OFFSETS
+    likelihoods, moves = _evidence(z, path, EVIDENCE * exponents, images, n)
+    uneven, q = _smoothed(likelihoods, moves, max(START_DEVIATION * moved, LEAST_DEVIATION))
+    even = np.zeros(len(path))
+    deviation = max(END_DEVIATION * moved, LEAST_DEVIATION)
+    p = EVENLY * straight_offsets(likelihoods, path, times, place_times, deviation, even)
+    share = p / max(p + (1 - EVENLY) * np.exp(q), sys.float_info.min)
+    mean: np.ndarray = share * even + (1 - share) * (uneven @ OFFSETS)
     return mean
 
 
+def _evidence(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return likelihoods and moves of :func:`smooth`."""
+    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(STEPS)))
+    _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
+    return likelihoods, moves
+
+
 def _smoothed(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
-    steps: np.ndarray, deviation: float,
-) -> tuple[np.ndarray, float]:  # fmt: skip
+    likelihoods: np.ndarray, moves: np.ndarray, deviation: float
+) -> tuple[np.ndarray, float]:
     """Return the probability of each offset, (l, S), and the log-likelihood of the window."""
-    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(steps)))
-    _window_likelihoods(z, path, exponents, images, n, steps, likelihoods, moves)
-    masses = np.empty(z.shape)
+    masses = np.empty(likelihoods.shape)
     masses[0] = np.exp(-0.5 * (OFFSETS / deviation) ** 2)
     masses[0] /= masses[0].sum()
     return masses, smooth(likelihoods, moves, masses)
@@ -294,17 +305,20 @@ def find_most_probable(by_place, maxima, excluded):
 @kernel
 def _window_likelihoods(
     z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
-    steps: np.ndarray, likelihoods: np.ndarray, moves: np.ndarray,
+    likelihoods: np.ndarray, moves: np.ndarray,
 ) -> None:  # fmt: skip
     """Write the input of :func:`smooth`; parameters: see :func:`offset_probabilities`."""
     for i in range(len(path)):
         for s in range(z.shape[1]):
             inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
             likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
+        largest = likelihoods[i].max()
+        for s in range(z.shape[1]):
+            likelihoods[i, s] = likelihoods[i, s] / largest if largest > 0 else 1
         step = path[i] - path[i - 1] if i else 0
         same = i > 0 and images[i] == images[i - 1]
         for d in range(-2, 3):
-            moved = steps[d + 2] if step + d >= 0 else 0
+            moved = STEPS[d + 2] if step + d >= 0 else 0
             moves[i, d + 2] = (1 if d == 0 else 0) if same else moved
 
 
@@ -313,9 +327,8 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> fl
     """
     Write the probability of each offset at each image, by the forward-backward algorithm.
 
-    Images that no offset explains give no evidence.
-
-    :param likelihoods: of each image at each offset, (l, S).
+    :param likelihoods: of each image at each offset, relative to the largest, (l, S); equal for
+        an image that no offset explains.
     :param moves: probability that the offset becomes 2 less, ..., 2 more before an image, (l, 5).
     :param masses: (l, S), written; its first row contains the probabilities before all images.
     :returns: logarithm of the likelihood of all images.
@@ -355,3 +368,60 @@ def _normalize(masses: np.ndarray) -> float:
     for s in range(len(masses)):
         masses[s] = masses[s] / total if total > 0 else 1 / len(masses)
     return total
+
+
+@kernel
+def straight_offsets(
+    likelihoods: np.ndarray, path: np.ndarray, times: np.ndarray, place_times: np.ndarray,
+    deviation: float, means: np.ndarray,
+) -> float:  # fmt: skip
+    """
+    Add up the offsets of straight paths, each by the likelihood of the images.
+
+    They lead from a place near that of the oldest image to one near that of the newest, and pass
+    all places at one ratio of the time on the map to that of the query.
+
+    :param likelihoods: those of :func:`smooth`; offsets beyond are excluded.
+    :param path: place of each image, ascending, (l,), int64.
+    :param times: of the images, (l,), and place_times: of the places, (n,); ascending.
+    :param deviation: of the ends of a path, places.
+    :param means: zeros, (l,); written: the mean offset of each image.
+    :returns: likelihood of all images.
+    """
+    last, offsets, sum_of_weights, prior = len(path) - 1, np.zeros(len(path)), 0.0, 0.0
+    duration = times[last] - times[0]
+    for from_first in ENDS:
+        for from_last in ENDS:
+            weight = np.exp(-0.5 * (from_first**2 + from_last**2) / deviation**2)
+            prior += weight
+            begin = _time_at(place_times, path[0] + from_first)
+            end = max(_time_at(place_times, path[last] + from_last), begin)
+            y = max(path[0] + int(np.floor(ENDS[0])), 0)
+            for i in range(last + 1):
+                passed = (times[i] - times[0]) / duration if duration > 0 else 1.0
+                time = begin + (end - begin) * passed
+                while y < len(place_times) - 1 and place_times[y + 1] <= time:
+                    y += 1
+                part = 0.0  # of the way to the next place
+                if y < len(place_times) - 1:
+                    part = (time - place_times[y]) / (place_times[y + 1] - place_times[y])
+                offsets[i] = y + part - path[i]
+                s = int(np.rint(y + part)) - path[i] + BAND
+                weight *= likelihoods[i, s] if 0 <= s < likelihoods.shape[1] else 0
+                if weight == 0:
+                    break
+            sum_of_weights += weight
+            for i in range(last + 1):
+                means[i] += weight * offsets[i]
+    if sum_of_weights > 0:
+        means /= sum_of_weights
+    return sum_of_weights / prior
+
+
+@kernel
+def _time_at(place_times: np.ndarray, place: float) -> float:
+    """Return the time at a place, also between two; the places beyond the ends are the ends."""
+    place = min(max(place, 0.0), len(place_times) - 1.0)
+    y = min(int(place), max(len(place_times) - 2, 0))
+    later = min(y + 1, len(place_times) - 1)
+    return place_times[y] + (place_times[later] - place_times[y]) * (place - y)

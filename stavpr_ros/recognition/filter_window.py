@@ -22,6 +22,7 @@ from stavpr_ros.recognition.filter_paths import (
     offset_probabilities,
     OFFSETS,
 )
+from stavpr_ros.recognition.image_times import image_times
 from stavpr_ros.recognition.map_change import ImageChange
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.path_checks import (
@@ -109,6 +110,7 @@ class FilterWindow(QueryWindow):
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._entered = 0  # number of the image with which the latest path came to the map
+        self._place_times = np.arange(width, dtype=np.float64)  # by column, for mean_offsets()
 
     @property
     def changes(self) -> tuple[float, ...]:
@@ -119,6 +121,17 @@ class FilterWindow(QueryWindow):
     def is_standstill(self) -> bool:
         """Whether the newest image equals the one before, up to noise."""
         return self.change.is_standstill(self._images[-1].change)
+
+    def learn_times(self, stamps: np.ndarray) -> None:
+        """
+        Learn at what times the camera passed the places of the map.
+
+        :param stamps: ns, (n,), int64; 0 = unknown.
+        """
+        columns = self.layout.columns_of(np.arange(len(stamps)))
+        steps = np.ones(len(self._place_times))
+        steps[columns[1:]] = np.diff(image_times(stamps, columns))
+        self._place_times = steps.cumsum()
 
     def reset(self) -> None:
         """Drop all images."""
@@ -131,6 +144,7 @@ class FilterWindow(QueryWindow):
     def grow(self, places: int) -> None:
         """Make room for more places."""
         super().grow(places)
+        self._place_times = np.arange(places, dtype=np.float64)
         assert isinstance(self.filter, PlaceFilter)
         self.filter.grow(places)
         self.change.grow(places)
@@ -361,7 +375,9 @@ class FilterWindow(QueryWindow):
         window = z, path, exponents, numbers, n
         masses = offset_probabilities(*window)
         checked = self._ascending(path, masses @ OFFSETS)
-        placed = self._ascending(path, mean_offsets(*window))
+        stamps = np.array(self.buffer.stamps[-len(path) :])
+        times = image_times(stamps, numbers), self._place_times[:n]
+        placed = self._ascending(path, mean_offsets(*window, *times))
         close = np.abs(places - placed[:, None]) <= CLOSE
         first, last = self.layout.positions_of(inside[[0, -1], [0, -1]]).tolist()
         stretches = self.change.stretches(first, last + 1)

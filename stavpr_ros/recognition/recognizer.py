@@ -283,6 +283,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
         if isinstance(self._window, FilterWindow):
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
+            self._window.learn_times(place_map.stamps)
         # where a first stage compares vectors of whole images: it, and their centering
         self._vectors: tuple[FirstStage, MeanCentering] | None = None
         # of the start, for the log: statistics that were learned again, an error rate that is not

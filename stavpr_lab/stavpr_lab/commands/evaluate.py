@@ -244,6 +244,7 @@ def _evaluate(
         'precision': arguments.precision,
         'progress': True,
         'odometry': sequences.odometry,
+        'stamps': sequences.query.stamps,
     }
     if sequences.reference is None:
         exclude, late = arguments.exclude_places, arguments.late_closures

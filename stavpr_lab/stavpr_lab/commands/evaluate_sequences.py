@@ -318,7 +318,8 @@ def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     if reference is not None and changes.removed:
         reference = select_places(reference, drive.places)
     title = f'{sequences.title}, {_description(arguments)}'
-    query = select_places(query, drive.images)
+    if replace(changes, removed=()) != DriveChanges(seed=changes.seed):
+        query = replace(select_places(query, drive.images), stamps=drive.stamps)
     odometry = None if sequences.odometry is None else sequences.odometry[drive.images]
     return replace(
         sequences, reference=reference, query=query, drive=drive, title=title, odometry=odometry

@@ -23,6 +23,7 @@ VARYING = 'varying'
 STOP = 30  # images that a stop adds, where no number is given
 KINDS = ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')  # the drives of the accuracy table
 SPEEDS = 0.01, 100.0  # slowest and fastest, places per image
+INTERVAL = 100_000_000  # ns between two images, before any are left out
 PERIOD = 60  # images of one period of the varying speed: 1, 2, 1, 1/2, 1
 UNSEEN_DISTANCE = 5  # places from the map within which a removed place may look like a mapped one
 
@@ -109,6 +110,10 @@ class DriveChanges:
 
         :raises SettingsError: a stop at an image that there is not, or no image is left.
         """
+        return self._numbered_images(n)[0]
+
+    def _numbered_images(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the images that are shown, and their numbers before any are left out, (N,)."""
         images = _images_at(n, self.speed)
         for at, count in self.stops:
             if not 0 <= at < n:
@@ -117,11 +122,13 @@ class DriveChanges:
             images = np.insert(images, position, np.full(count, images[position]))
         if self.reverse:
             images = images[::-1]
+        numbers = np.arange(len(images))
         if self.drop:
-            images = images[np.random.default_rng(self.seed).random(len(images)) >= self.drop]
+            left = np.random.default_rng(self.seed).random(len(images)) >= self.drop
+            images, numbers = images[left], numbers[left]
         if not len(images):
             raise SettingsError(f'drop = {self.drop} leaves none of {n} images')
-        return images
+        return images, numbers
 
     def places(self, n: int) -> np.ndarray:
         """
@@ -150,9 +157,10 @@ class DriveChanges:
         :param ground_truth: of the query and the map as they were recorded, of any origin.
         :raises SettingsError: a change that does not fit the query or the map.
         """
-        images, places = self.images(ground_truth.N), self.places(ground_truth.n)
-        recorded = ground_truth.select(images)
-        return Drive(images, places, recorded.on_places(places), recorded, self.removed)
+        images, numbers = self._numbered_images(ground_truth.N)
+        places, recorded = self.places(ground_truth.n), ground_truth.select(images)
+        stamps = (numbers + 1) * INTERVAL
+        return Drive(images, places, recorded.on_places(places), recorded, stamps, self.removed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +172,8 @@ class Drive:
     :param places: the recorded place that each place of the map is, ascending, shape (n,), int64.
     :param truth: of the images, in places of this map (which are numbered without gaps).
     :param recorded: of the images, in places of the recorded map.
+    :param stamps: of the images, ns, (N,), int64: at one interval, with gaps where images are left
+        out.
     :param removed: stretches (first, last) of the recorded map that this one lacks.
     """
 
@@ -171,6 +181,7 @@ class Drive:
     places: np.ndarray
     truth: GroundTruth
     recorded: GroundTruth
+    stamps: np.ndarray
     removed: tuple[tuple[int, int], ...] = ()
 
     def unseen(self) -> list[np.ndarray]:

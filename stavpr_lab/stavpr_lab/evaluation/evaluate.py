@@ -193,6 +193,7 @@ def recognize_traverse(
     progress: str = '',
     odometry: np.ndarray | None = None,
     late: bool = False,
+    stamps: np.ndarray | None = None,
 ) -> TraverseResults:
     """
     Match every image of a traverse.
@@ -205,6 +206,7 @@ def recognize_traverse(
     :param progress: label of the progress bar; none without.
     :param odometry: poses of the images, (N, 7), NaN = unknown; None = of all.
     :param late: late matches count for the images that had none.
+    :param stamps: of the images, ns, (N,), int64, 0 = unknown; None = of all.
     """
     count, ranks = len(features), max(RANKS)
     length = settings.sequence.length
@@ -220,7 +222,8 @@ def recognize_traverse(
     for i in tqdm(range(count), desc=progress, unit='image', disable=None if progress else True):
         began = time.perf_counter()
         pose = None if odometry is None or np.isnan(odometry[i]).any() else odometry[i]
-        match = online.update(features[i : i + 1], pose=pose)
+        stamp = 0 if stamps is None else int(stamps[i])
+        match = online.update(features[i : i + 1], stamp, pose)
         seconds[i] = time.perf_counter() - began
         matches.append(match)
         row = np.array(online.newest_row())  # a copy: the recognizer overwrites it
@@ -254,6 +257,7 @@ def evaluate_on_map(
     precision: str = 'float32',
     progress: bool = False,
     odometry: np.ndarray | None = None,
+    stamps: np.ndarray | None = None,
 ) -> Evaluation:
     """
     Recognize a traverse on a map and compute its metrics.
@@ -265,19 +269,25 @@ def evaluate_on_map(
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
     :param odometry: poses of the query's images, (N, 7), compared with those of the places.
+    :param stamps: of the query's images, ns, (N,), int64, 0 = unknown; None = of all.
     :raises InputError: fewer images than one window, or ground truth of another length.
     """
 
     def results(
-        features: LocalFeatures, label: str, poses: np.ndarray | None = None
+        features: LocalFeatures,
+        label: str,
+        poses: np.ndarray | None = None,
+        stamps: np.ndarray | None = None,
     ) -> TraverseResults:
         # a new recognizer for each: mode robust keeps statistics of the images so far
         one = PlaceRecognizer(place_map, settings, backend, precision)
         bar = label if progress else ''
-        return recognize_traverse(one, features, len(place_map), settings, shown, bar, poses)
+        return recognize_traverse(
+            one, features, len(place_map), settings, shown, bar, poses, stamps=stamps
+        )
 
     centered_images(len(query), settings.sequence.length)
-    known = results(query, 'recognizing', odometry)
+    known = results(query, 'recognizing', odometry, stamps)
     elsewhere = None if unknown is None else results(unknown, 'false alarms')
     return evaluate_traverse(known, ground_truth, settings.sequence.length, elsewhere)
 
@@ -292,6 +302,7 @@ def evaluate_loop_closures(
     odometry: np.ndarray | None = None,
     late: bool = False,
     precision: str = 'float32',
+    stamps: np.ndarray | None = None,
 ) -> Evaluation:
     """
     Recognize a traverse on its own past and compute its metrics.
@@ -306,7 +317,9 @@ def evaluate_loop_closures(
     centered_images(len(query), settings.sequence.length)
     closer = LoopCloser(settings, exclude_places, query.settings, precision=precision)
     label = 'closing loops' if progress else ''
-    results = recognize_traverse(closer, query, len(query), settings, shown, label, odometry, late)
+    results = recognize_traverse(
+        closer, query, len(query), settings, shown, label, odometry, late, stamps
+    )
     return evaluate_traverse(results, ground_truth, settings.sequence.length)
 
 
