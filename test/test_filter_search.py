@@ -15,9 +15,8 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.filter_paths import (
     BAND,
-    mean_offsets,
-    offset_probabilities,
     OFFSETS,
+    refine,
     smooth,
     straight_offsets,
 )
@@ -147,7 +146,7 @@ def test_smoothed_offsets_without_any_likely_one_are_equal():
 
 def offset_errors(true_offsets, gaps=None, images=20, seeds=200):
     """
-    Return the mean errors of places by mean_offsets and by the filter's model, in faint light.
+    Return the mean errors of places by both models and by the filter's alone, in faint light.
 
     :param gaps: function of the offsets: intervals from image to image, one less than images.
     """
@@ -158,10 +157,11 @@ def offset_errors(true_offsets, gaps=None, images=20, seeds=200):
         path, numbers = np.arange(100, 100 + images), np.arange(images)
         z = rng.normal(size=(images, len(OFFSETS)))
         z[numbers, offsets + BAND] -= 1.4
-        window = z, path, np.full(images, 0.28 * -1.4), numbers, 200
+        window = z, path, np.full(images, 0.28 * -1.4), numbers
         steps = np.ones(images - 1) if gaps is None else gaps(offsets)
         times = np.append(0.0, steps.cumsum()), np.arange(200.0)
-        found = mean_offsets(*window, *times), offset_probabilities(*window) @ OFFSETS
+        masses, means = refine(*window, *times)
+        found = means, masses @ OFFSETS
         errors += [np.abs(np.rint(each) - offsets).mean() / seeds for each in found]
     return errors
 
@@ -196,7 +196,7 @@ def test_straight_paths_are_those_of_a_loop_over_their_ends(first):
         begin, end = np.interp(path[[0, -1]] + ends, places, place_times)
         of_images = np.interp(times, times[[0, -1]], [begin, max(begin, end)])
         line = np.interp(of_images, place_times, places)
-        for i, offset in enumerate(np.rint(line).astype(int) - path):
+        for i, offset in enumerate(np.rint(line - path).astype(int)):
             weight *= likelihoods[i, offset + BAND] if abs(offset) <= BAND else 0
         total += weight
         sums += weight * (line - path)

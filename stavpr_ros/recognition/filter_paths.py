@@ -12,17 +12,16 @@ in the lower half and that of the next speed in the upper one::
 
     ring of the latest images    (lag, blocks, K, (V + 1) // 2, BLOCK), uint8
 
-The path of a state is then refined (:func:`offset_probabilities`): the speeds of the filter are
+The path of a state is then refined (:func:`refine`): the speeds of the filter are
 few, and before the middle of the window the path is a straight line. The offset of each image's
 place from it is a hidden Markov model: it changes little from image to image, and the evidence is
 the filter's, at the path's level. The forward-backward algorithm gives its probabilities.
 
 The place of an image is the mean by such a model and by straight paths, of a camera that advances
-evenly in time (:func:`mean_offsets`). Each counts by the likelihood of the window.
+evenly in time. Each counts by the likelihood of the window.
 """
 
 from dataclasses import dataclass
-import sys
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import prefetch
@@ -88,68 +87,32 @@ def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
     return Belief(found[:, 0], weights[:count], found[:, 1:])
 
 
-def offset_probabilities(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
-) -> np.ndarray:
+def refine(
+    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray,
+    times: np.ndarray, place_times: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """
-    Return the probability of each offset from a path, by all images of the window.
+    Return where the camera was beside a path, by all images of the window.
 
-    :param z: z-normalized distances of each image to the places near the path, (l, S).
-    :param path: place of each image, (l,).
+    The mean offset is by more evidence, and by two models. With the likelihoods P of the window if
+    the camera advances evenly in time and Q if not, and the means by both, it is
+
+        (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q)
+
+    Their deviations are in proportion to the images that moved: the filter knows the path of a
+    slow camera by the images before the window.
+
+    :param z: z-normalized distances of each image to the places near the path, (l, S), float32.
+    :param path: place of each image, ascending, (l,), int64.
     :param exponents: of their likelihoods: alpha times the mean of right places, (l,).
     :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
-    :param n: places.
-    :returns: shape (l, S); each row sums to 1.
-    """
-    likelihoods, moves = _evidence(z, path, exponents, images, n)
-    return _smoothed(likelihoods, moves, START_DEVIATION)[0]
-
-
-def mean_offsets(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
-    times: np.ndarray, place_times: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """
-    Return the mean offset of each image from a path, (l,), float64.
-
-    With the likelihoods P of the window if the camera advances evenly and Q if not, and the means
-    by both, it is (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q).
-
-    Deviations are in proportion to the images that moved: the filter knows the path of a slow
-    camera by the images before the window.
-
-    :param z, path, exponents, images, n: those of :func:`offset_probabilities`.
     :param times: of the images, ascending, (l,), float64, of any unit.
     :param place_times: of the n places, ascending, (n,), float64, of any unit.
+    :returns: probability of each offset for each image, (l, S), and its mean offset, (l,).
     """
-    moved = (images[-1] - images[0]) / max(len(images) - 1, 1)
-    likelihoods, moves = _evidence(z, path, EVIDENCE * exponents, images, n)
-    uneven, q = _smoothed(likelihoods, moves, max(START_DEVIATION * moved, LEAST_DEVIATION))
-    even = np.zeros(len(path))
-    deviation = max(END_DEVIATION * moved, LEAST_DEVIATION)
-    p = EVENLY * straight_offsets(likelihoods, path, times, place_times, deviation, even)
-    share = p / max(p + (1 - EVENLY) * np.exp(q), sys.float_info.min)
-    mean: np.ndarray = share * even + (1 - share) * (uneven @ OFFSETS)
-    return mean
-
-
-def _evidence(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return likelihoods and moves of :func:`smooth`."""
-    likelihoods, moves = np.empty(z.shape), np.empty((len(path), len(STEPS)))
-    _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
-    return likelihoods, moves
-
-
-def _smoothed(
-    likelihoods: np.ndarray, moves: np.ndarray, deviation: float
-) -> tuple[np.ndarray, float]:
-    """Return the probability of each offset, (l, S), and the log-likelihood of the window."""
-    masses = np.empty(likelihoods.shape)
-    masses[0] = np.exp(-0.5 * (OFFSETS / deviation) ** 2)
-    masses[0] /= masses[0].sum()
-    return masses, smooth(likelihoods, moves, masses)
+    masses, means = np.empty(z.shape), np.empty(len(path))
+    _refine(z, path, exponents, images, times, place_times, masses, means)
+    return masses, means
 
 
 # ------------------------------------------------ kernels
@@ -303,15 +266,48 @@ def find_most_probable(by_place, maxima, excluded):
 
 
 @kernel
-def _window_likelihoods(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray, n: int,
-    likelihoods: np.ndarray, moves: np.ndarray,
-) -> None:  # fmt: skip
-    """Write the input of :func:`smooth`; parameters: see :func:`offset_probabilities`."""
+def _refine(z, path, exponents, images, times, place_times, masses, means):
+    """Write the results of :func:`refine`."""
+    l, n = len(path), len(place_times)
+    likelihoods, moves = np.empty(z.shape), np.empty((l, len(STEPS)))
+    _window_likelihoods(z, path, exponents, 1.0, images, n, likelihoods, moves)
+    _start(START_DEVIATION, masses[0])
+    smooth(likelihoods, moves, masses)
+    moved = (images[-1] - images[0]) / max(l - 1, 1)
+    _window_likelihoods(z, path, exponents, EVIDENCE, images, n, likelihoods, moves)
+    uneven = np.empty(z.shape)
+    _start(max(START_DEVIATION * moved, LEAST_DEVIATION), uneven[0])
+    q = (1 - EVENLY) * np.exp(smooth(likelihoods, moves, uneven))
+    means[:] = 0
+    deviation = max(END_DEVIATION * moved, LEAST_DEVIATION)
+    p = EVENLY * straight_offsets(likelihoods, path, times, place_times, deviation, means)
+    share = p / (p + q) if p > 0 else 0.0
+    for i in range(l):
+        mean = 0.0
+        for s in range(len(OFFSETS)):
+            mean += uneven[i, s] * OFFSETS[s]
+        means[i] = share * means[i] + (1 - share) * mean
+
+
+@kernel
+def _start(deviation, masses):
+    """Write the probability of each offset before the first image, (S,)."""
+    for s in range(len(OFFSETS)):
+        masses[s] = np.exp(-0.5 * (OFFSETS[s] / deviation) ** 2)
+    _normalize(masses)
+
+
+@kernel
+def _window_likelihoods(z, path, exponents, evidence, images, n, likelihoods, moves):
+    """
+    Write the input of :func:`smooth`.
+
+    :param evidence: factor of the exponents; n: places; others: see :func:`refine`.
+    """
     for i in range(len(path)):
         for s in range(z.shape[1]):
             inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
-            likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
+            likelihoods[i, s] = np.exp(evidence * exponents[i] * z[i, s]) if inside else 0
         largest = likelihoods[i].max()
         for s in range(z.shape[1]):
             likelihoods[i, s] = likelihoods[i, s] / largest if largest > 0 else 1
@@ -388,25 +384,27 @@ def straight_offsets(
     :param means: zeros, (l,); written: the mean offset of each image.
     :returns: likelihood of all images.
     """
-    last, offsets, sum_of_weights, prior = len(path) - 1, np.zeros(len(path)), 0.0, 0.0
-    duration = times[last] - times[0]
+    last, end_of_map = len(path) - 1, len(place_times) - 1
+    offsets, passed = np.zeros(len(path)), np.ones(len(path))  # passed: share of the time
+    if times[last] > times[0]:
+        passed[:] = (times - times[0]) / (times[last] - times[0])
+    sum_of_weights, prior = 0.0, 0.0
     for from_first in ENDS:
         for from_last in ENDS:
             weight = np.exp(-0.5 * (from_first**2 + from_last**2) / deviation**2)
             prior += weight
             begin = _time_at(place_times, path[0] + from_first)
             end = max(_time_at(place_times, path[last] + from_last), begin)
-            y = max(path[0] + int(np.floor(ENDS[0])), 0)
+            y = max(path[0] + int(ENDS[0]), 0)
             for i in range(last + 1):
-                passed = (times[i] - times[0]) / duration if duration > 0 else 1.0
-                time = begin + (end - begin) * passed
-                while y < len(place_times) - 1 and place_times[y + 1] <= time:
+                time = begin + (end - begin) * passed[i]
+                while y < end_of_map and place_times[y + 1] <= time:
                     y += 1
-                part = 0.0  # of the way to the next place
-                if y < len(place_times) - 1:
-                    part = (time - place_times[y]) / (place_times[y + 1] - place_times[y])
-                offsets[i] = y + part - path[i]
-                s = int(np.rint(y + part)) - path[i] + BAND
+                place = float(y)
+                if y < end_of_map:
+                    place += (time - place_times[y]) / (place_times[y + 1] - place_times[y])
+                offsets[i] = place - path[i]
+                s = int(np.rint(offsets[i])) + BAND
                 weight *= likelihoods[i, s] if 0 <= s < likelihoods.shape[1] else 0
                 if weight == 0:
                     break

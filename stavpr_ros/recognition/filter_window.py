@@ -16,11 +16,10 @@ from stavpr_ros.recognition.filter_paths import (
     BAND,
     Belief,
     CLOSE,
-    mean_offsets,
     NEGLIGIBLE,
     NO_PLACES,
-    offset_probabilities,
     OFFSETS,
+    refine,
 )
 from stavpr_ros.recognition.image_times import image_times
 from stavpr_ros.recognition.map_change import ImageChange
@@ -110,7 +109,7 @@ class FilterWindow(QueryWindow):
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._entered = 0  # number of the image with which the latest path came to the map
-        self._place_times = np.arange(width, dtype=np.float64)  # by column, for mean_offsets()
+        self._place_times = np.arange(width, dtype=np.float64)  # by column, of the camera
 
     @property
     def changes(self) -> tuple[float, ...]:
@@ -358,7 +357,7 @@ class FilterWindow(QueryWindow):
         Return the places near a path that explain the images of the window best.
 
         The path is checked where the evidence of the filter has its mean; places are estimated
-        with more (:func:`stavpr_ros.recognition.filter_paths.mean_offsets`), which would make
+        with more (:func:`stavpr_ros.recognition.filter_paths.refine`), which would make
         paths through look-alike places more even as well.
 
         :param path: place of each image, ascending, (l,).
@@ -372,12 +371,10 @@ class FilterWindow(QueryWindow):
         inside = np.minimum(np.maximum(places, 0), n - 1)
         exponents = np.array([image.weight for image in self._images]) * self._levels[level]
         z = self.buffer.at(inside, len(inside))
-        window = z, path, exponents, numbers, n
-        masses = offset_probabilities(*window)
+        times = image_times(np.array(self.buffer.stamps[-len(path) :]), numbers)
+        masses, means = refine(z, path, exponents, numbers, times, self._place_times[:n])
         checked = self._ascending(path, masses @ OFFSETS)
-        stamps = np.array(self.buffer.stamps[-len(path) :])
-        times = image_times(stamps, numbers), self._place_times[:n]
-        placed = self._ascending(path, mean_offsets(*window, *times))
+        placed = self._ascending(path, means)
         close = np.abs(places - placed[:, None]) <= CLOSE
         first, last = self.layout.positions_of(inside[[0, -1], [0, -1]]).tolist()
         stretches = self.change.stretches(first, last + 1)
