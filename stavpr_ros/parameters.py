@@ -226,6 +226,13 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'Align the cells of two strips vertically first, for cameras that change their '
             'height; slow.',
         ),
+        NodeParameter(
+            'other_views',
+            False,
+            'Localization in mode robust: compare images rotated by 8 degrees and moved by a '
+            'tenth of their height as well, until one of these views is matched; for a camera '
+            'that is mounted otherwise than that of the map. On the CPU.',
+        ),
     ),
     'Recognition': (
         NodeParameter(

@@ -289,7 +289,7 @@ def test_values_of_recognition_are_complete():
     assert ' '.join(found) == (
         'operation=localization mode=robust min_probability=0.500 window=20 length=20 '
         'last_status=match last_reason=none last_place=17 last_distance=0.422 '
-        'last_answer_age_s=0.030 camera=not needed edges_pnp=3 edges_dropped=2 '
+        'last_answer_age_s=0.030 camera=not needed view=none edges_pnp=3 edges_dropped=2 '
         'edges_dropped_10s=2 last_edge_reason=none '
         'statuses_no_match=990 statuses_match=2000'
     )

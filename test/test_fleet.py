@@ -319,8 +319,9 @@ def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, ca
         pipeline.snapshot()
     with pytest.raises(SettingsError, match='mapping'):
         pipeline.change(operation='mapping')
-    with pytest.raises(SettingsError, match='precision int8'):
-        pipeline.change(settings_of(precision='int8'), loaded=read_map(address, settings_of()))
+    for name, value in (('precision', 'int8'), ('other_views', True)):
+        with pytest.raises(SettingsError, match=f'{name} {value}'):
+            pipeline.change(settings_of(**{name: value}), loaded=read_map(address, settings_of()))
 
 
 def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route, small_map):

@@ -80,6 +80,7 @@ def test_default_values_give_default_settings():
         ({'sigma': 2.0}, 'spatial.sigma', 2.0),
         ({'strategy': 'vanilla'}, 'spatial.strategy', 'vanilla'),
         ({'vertical': True}, 'spatial.vertical', True),
+        ({'other_views': True}, 'other_views', True),
         ({'sequence_length': 7}, 'sequence.length', 7),
         ({'beta': 3.0}, 'sequence.beta', 3.0),
         ({'min_probability': 0.25}, 'applied_threshold', 0.75),
@@ -117,6 +118,10 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
         ({'operation': 'loop_closure', 'strategy': 'none'}, 'take strategy adaptive or vanilla'),
         ({'operation': 'loop_closure', 'vertical': True}, 'without vertical alignment'),
         ({'operation': 'loop_closure', 'max_places': 100}, 'take at least 103'),
+        ({'operation': 'loop_closure', 'other_views': True}, 'other_views with operation loop_cl'),
+        ({'operation': 'mapping', 'other_views': True}, 'take operation localization'),
+        ({'mode': 'paper', 'other_views': True}, 'other_views .* mode paper'),
+        ({'time_budget_ms': 9.0, 'other_views': True}, 'time_budget_ms = 9: .* budget 0'),
         (
             {'operation': 'mapping', 'geometric_check': 'orb', 'thumbnail_width': 0},
             'geometric_check = orb with thumbnail_width = 0',

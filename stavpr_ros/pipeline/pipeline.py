@@ -24,6 +24,7 @@ from stavpr_ros.pipeline.geometric_check import GeometricCheck
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, Operation, start_operation
+from stavpr_ros.pipeline.view_bank import ViewBank
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
@@ -98,8 +99,20 @@ class Pipeline:
 
     @property
     def _recognizer(self) -> SequenceRecognizer | None:
+        updated = self._updated
+        return updated.recognizer if isinstance(updated, ViewBank) else updated
+
+    @property
+    def _updated(self) -> SequenceRecognizer | ViewBank | None:
+        """Return what the features of an image are given to."""
         operation = self._operation
-        return operation.recognizer if operation else None
+        return (operation.views or operation.recognizer) if operation else None
+
+    @property
+    def view(self) -> str:
+        """Return how images are compared, one of ``VIEWS``; empty without other views."""
+        updated = self._updated
+        return updated.view if isinstance(updated, ViewBank) else ''
 
     @property
     def map_state(self) -> str:
@@ -169,8 +182,8 @@ class Pipeline:
         if loaded is not None or name != self.operation:
             self._require_no_loss(name, loaded)
             self._start(name, settings, loaded)
-        elif (recognizer := self._recognizer) is not None:
-            recognizer.set_limits(settings.threshold, settings.min_probability, settings.max_error)
+        elif (updated := self._updated) is not None:
+            updated.set_limits(settings.threshold, settings.min_probability, settings.max_error)
         self.settings = settings
         if before is None and self.threshold is not None:
             self.reset()  # images since then are not in the window
@@ -214,8 +227,8 @@ class Pipeline:
         self._window.clear()
         if self._check is not None:
             self._check.reset()
-        if (recognizer := self._recognizer) is not None:
-            recognizer.reset()
+        if (updated := self._updated) is not None:
+            updated.reset()
 
     def relocalize(self, count: int) -> Match:
         """
@@ -334,7 +347,8 @@ class Pipeline:
             reason = f'the map is full: parameter max_places = {self.settings.max_places}'
             return Match(Status.NOT_READY, reason, image=image, cause='map full')
         with _timed(stages, 'extraction'):
-            features = operation.extractor.extract([image])
+            images = operation.views.warped(image) if operation.views else [image]
+            features = operation.extractor.extract(images)
         with _timed(stages, 'matching'):
             thumbnail = thumbnail_of(image, width) if width else None
             match = _update(operation, features, thumbnail, stamp, pose)
@@ -425,7 +439,7 @@ def _update(
         jpeg = encode_thumbnail(thumbnail)
     match = Match(Status.MAPPED)
     if recognizer is not None:
-        match = recognizer.update(features, stamp, pose)
+        match = (operation.views or recognizer).update(features, stamp, pose)
     if not isinstance(places, GrowingMap):
         return match
     if isinstance(recognizer, LoopCloser):  # it evicts the oldest places

@@ -67,6 +67,7 @@ class PipelineSettings:
     candidates: int = default('candidates')
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     geometric: GeometricSettings | None = None
+    other_views: bool = default('other_views')
 
     def __post_init__(self) -> None:
         if self.threshold is not None and options_of(self.mode).place_filter:
@@ -120,6 +121,12 @@ class PipelineSettings:
                 f'geometric_check = {self.geometric.method} with thumbnail_width = 0 and '
                 f'operation {operation}: the check compares images with thumbnails'
             )
+        robust = operation == 'localization' and options_of(self.mode).place_filter
+        if self.other_views and (self.time_budget_ms or not robust):
+            raise SettingsError(
+                f'other_views with operation {operation}, mode {self.mode}, time_budget_ms = '
+                f'{self.time_budget_ms:g}: take operation localization, mode robust, budget 0'
+            )
         if operation == 'loop_closure':
             self._require_loop_closure()
 
@@ -140,12 +147,12 @@ class PipelineSettings:
 
     def matching_backend(self, operation: str) -> str:
         """
-        Return the backend of the image distances, ``cpu`` or ``cuda``; loop closure has the first.
+        Return the backend of the image distances: ``cuda``, or ``cpu``, that of loop closure, too.
 
         :raises UnavailableError: ``cuda`` is set and not available.
         """
         backend = choose_backend(self.backend)
-        return 'cpu' if operation == 'loop_closure' else backend
+        return 'cpu' if operation == 'loop_closure' or self.other_views else backend
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""

@@ -13,6 +13,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap, verify_map
 from stavpr_ros.mapping.stores import is_address, store_of
 from stavpr_ros.pipeline.settings import PipelineSettings
+from stavpr_ros.pipeline.view_bank import ViewBank
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
@@ -36,11 +37,13 @@ class Operation:
 
     :param places: a fixed map in localization, otherwise a growing one.
     :param recognizer: of these places; None in mapping.
+    :param views: of this recognizer and others; None without ``other_views``.
     """
 
     extractor: FeatureExtractor
     places: PlaceMap | GrowingMap
     recognizer: SequenceRecognizer | None = None
+    views: ViewBank | None = None
 
 
 @runtime_checkable
@@ -86,7 +89,10 @@ def start_operation(
             return None
         recognizer = _recognizer(settings, place_map)
         _warm_up(recognizer, extractor, settings.sequence.length)
-        return Operation(extractor, place_map, recognizer)
+        views = None
+        if settings.other_views and isinstance(recognizer, PlaceRecognizer):
+            views = ViewBank(recognizer, place_map)
+        return Operation(extractor, place_map, recognizer, views)
     extractor = extractor or settings.extractor()
     if name == 'mapping':
         extractor.extract([BLANK_IMAGE])
@@ -119,10 +125,11 @@ def _recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceReco
     if not place_map.partial:
         backend = settings.matching_backend('localization')
         return PlaceRecognizer(place_map, settings.recognition(), backend, settings.precision)
-    if settings.backend == 'cuda' or settings.precision != 'float32':
+    if settings.backend == 'cuda' or settings.precision != 'float32' or settings.other_views:
         raise SettingsError(
-            f'backend {settings.backend}, precision {settings.precision}: the map of a fleet is '
-            'matched on the CPU in float32; take backend auto or cpu, and precision float32'
+            f'backend {settings.backend}, precision {settings.precision}, other_views '
+            f'{settings.other_views}: the map of a fleet is matched on the CPU in float32; take '
+            'backend auto or cpu, precision float32, and other_views false'
         )
     assert isinstance(place_map, PartialMap)
     return place_map.recognizer(settings.recognition())

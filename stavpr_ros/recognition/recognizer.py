@@ -3,6 +3,7 @@
 """Image by image: distances of the newest image, nearest sequence of the window, status."""
 
 from abc import ABC, abstractmethod
+import copy
 from dataclasses import replace
 import math
 import time
@@ -307,6 +308,25 @@ class PlaceRecognizer(SequenceRecognizer):
         """
         threshold = self._suggested if threshold is None else threshold
         super().set_limits(threshold, min_probability, max_error)
+
+    def another(self, place_map: PlaceMap) -> 'PlaceRecognizer':
+        """
+        Return a recognizer with a window of its own, of the same features in memory.
+
+        :param place_map: that of this recognizer: of mode robust, on the CPU, without time budget.
+        """
+        other, window = copy.copy(self), _window_of(place_map, self._settings, 'cpu')
+        assert isinstance(window, FilterWindow)
+        window.change = copy.deepcopy(self._window.change)  # type: ignore[attr-defined]
+        other._window, other._motion = window, copy.deepcopy(self._motion)
+        other._centering = copy.copy(self._centering)
+        other.reset()
+        return other
+
+    @property
+    def is_standstill(self) -> bool:
+        """Whether the newest image equals the one before, up to noise."""
+        return self._window.is_standstill
 
     def _keep_time_budget(
         self, prepared: LocalFeatures | Int8Features, features: LocalFeatures

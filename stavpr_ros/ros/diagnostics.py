@@ -135,6 +135,7 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             'last_distance': counts.distance,
             'last_answer_age_s': counts.answered.age,
             'camera': health.camera,
+            'view': health.view or None,
             **{_key('edges', source): count for source, count in counts.edges.total.items()},
             f'edges_dropped_{RECENT}s': counts.edges.recent['dropped'],
             'last_edge_reason': counts.edge_reason or None,

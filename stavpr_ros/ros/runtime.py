@@ -302,6 +302,7 @@ class Runtime:
             window=pipeline.window_fill,
             missing=pipeline.missing,
             camera='not needed' if camera is None else camera.state,
+            view=pipeline.view,
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.contrast,
             applied_threshold=pipeline.threshold,
@@ -340,7 +341,10 @@ class Runtime:
         pose, frames = self._pose_at(nanoseconds(header.stamp))
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
+        view = self.pipeline.view
         match = self._match(item.message, pose, camera)
+        if self.pipeline.view != view:
+            self._node.get_logger().info(f'images are compared {self.pipeline.view}')
         began = time.monotonic()
         message = self._publish(header, match, pose, frames, camera)
         stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
