@@ -284,7 +284,6 @@ class PlaceRecognizer(SequenceRecognizer):
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
         if isinstance(self._window, FilterWindow):
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
-            self._window.learn_times(place_map.stamps)
         # where a first stage compares vectors of whole images: it, and their centering
         self._vectors: tuple[FirstStage, MeanCentering] | None = None
         # of the start, for the log: statistics that were learned again, an error rate that is not
@@ -441,20 +440,25 @@ def _window_of(place_map: PlaceMap, settings: RecognizerSettings, backend: str) 
     """Return an empty window for a map."""
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
     layout = layout_of(place_map, settings.nms_radius)
-    if backend == 'cuda':
-        from stavpr_ros.recognition.cuda_windows import CudaFilterWindow, CudaLmDtwWindow
-
-        if options.place_filter:
-            return CudaFilterWindow(sequence, n, None, layout, options.query_znorm)
-        if options.any:
-            raise SettingsError(
-                f"options {options} with backend 'cuda': without the place filter, it runs mode "
-                "paper only; take 'cpu'"
-            )
-        return CudaLmDtwWindow(sequence, n, layout)
     if options.place_filter:
-        return FilterWindow(sequence, n, None, layout, options.query_znorm)
-    return LmDtwWindow(sequence, n, layout, options.query_znorm)
+        window_class = FilterWindow
+        if backend == 'cuda':
+            from stavpr_ros.recognition.cuda_windows import CudaFilterWindow
+
+            window_class = CudaFilterWindow
+        window = window_class(sequence, n, None, layout, options.query_znorm)
+        window.learn_times(place_map.stamps)
+        return window
+    if backend == 'cpu':
+        return LmDtwWindow(sequence, n, layout, options.query_znorm)
+    if options.any:
+        raise SettingsError(
+            f"options {options} with backend 'cuda': without the place filter, it runs mode paper "
+            "only; take 'cpu'"
+        )
+    from stavpr_ros.recognition.cuda_windows import CudaLmDtwWindow
+
+    return CudaLmDtwWindow(sequence, n, layout)
 
 
 def position_of(pose: np.ndarray | None) -> np.ndarray:
