@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the kernel chose, in one small buffer: written on the device, copied to the host once."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.alignment.cuda.compilation import Runtime
@@ -12,24 +11,22 @@ import torch
 WORDS = 6  # four places and two distances, in front of the window's cells
 
 
-@dataclass(frozen=True)
-class Selection:
+class Selection(NamedTuple):
     """
     The nearest start and its second best.
 
     :param start, length: the nearest start s and its m; -1 and undefined where no path is finite.
-    :param distance: its q_m.
-    :param second_best_start, second_best_length, second_best_distance: the same of the second
-        best; -1 for none.
+    :param second_best_start, second_best_length: the same of the second best; -1 for none.
+    :param distance, second_best_distance: q_m of both.
     :param cells: the cells of the nearest start, shape (l, k), float32, +inf past the
         map's end; valid until the next fetch.
     """
 
     start: int
     length: int
-    distance: float
     second_best_start: int
     second_best_length: int
+    distance: float
     second_best_distance: float
     cells: np.ndarray
 
@@ -55,15 +52,5 @@ class SelectionBuffer:
     def fetch(self) -> Selection:
         """Copy the answer to the host and wait for it."""
         self._runtime.fetch(self._device, self._host)
-        start, length, second_best_start, second_best_length = self._places.tolist()
-        distance, second_best_distance = self._answer[:2].tolist()
         cells = self._answer[2:].reshape(self._shape)
-        return Selection(
-            start,
-            length,
-            distance,
-            second_best_start,
-            second_best_length,
-            second_best_distance,
-            cells,
-        )
+        return Selection._make([*self._places.tolist(), *self._answer[:2].tolist(), cells])
