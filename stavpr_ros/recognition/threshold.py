@@ -10,6 +10,8 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from tqdm import tqdm
 
+WINDOWS = 24  # that are tried
+
 
 def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
     """
@@ -34,13 +36,7 @@ def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
     return (np.clip(value, 0, 1) * 255).astype(np.uint8)
 
 
-def suggest_threshold(
-    place_map: PlaceMap,
-    settings: RecognizerSettings | None = None,
-    windows: int = 24,
-    progress: bool = False,
-    model: str = '',
-) -> float:
+def suggest_threshold(place_map: PlaceMap, progress: bool = False, model: str = '') -> float:
     """
     Ask how near the map's places come to *other* places of it when they look different.
 
@@ -49,12 +45,10 @@ def suggest_threshold(
     median of their distances. It is a start: where precision matters, evaluate with a second real
     drive.
 
-    :param settings: of the recognizer; its threshold is not used.
-    :param windows: how many windows are tried.
     :param model: file of the network, see :meth:`PlaceMap.extractor`.
     :raises InputError: the map has no thumbnails, or is too short to have an elsewhere.
     """
-    settings = settings or RecognizerSettings(threshold=1.0)
+    settings = RecognizerSettings()
     sequence = settings.sequence
     n, l = len(place_map), sequence.length
     if n < 4 * l:
@@ -67,7 +61,7 @@ def suggest_threshold(
     extractor = place_map.extractor(model=model)
     rng = np.random.default_rng(0)
     elsewhere = []
-    starts = np.unique(np.linspace(0, n - l, min(windows, n - l + 1)).astype(int))
+    starts = np.unique(np.linspace(0, n - l, min(WINDOWS, n - l + 1)).astype(int))
     for variant, start in enumerate(
         tqdm(starts, desc='threshold', unit='window', disable=None if progress else True)
     ):
