@@ -1,8 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Features that are one vector an image (W = 1), tokens, several outputs, pooled strips."""
-
-from collections import OrderedDict
+"""Features that are one vector an image (W = 1), tokens, pooled strips."""
 
 import numpy as np
 from pipelines import localizing, process
@@ -11,7 +9,7 @@ from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.extractor import cut_strips
-from stavpr_ros.features.outputs import as_maps, one_of
+from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, load_map, save_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
@@ -48,15 +46,6 @@ def test_as_maps_leaves_maps_and_vectors():
 def test_as_maps_of_other_outputs_is_rejected(output, named):
     with pytest.raises(SettingsError, match=named):
         as_maps(output, 2, 1, 'net')
-
-
-def test_one_of_several_outputs_by_number_and_key():
-    a, b = np.zeros(1, np.float32), np.ones(1, np.float32)
-    assert one_of(a, '0', 'net') is a
-    assert one_of((a, b), '1', 'net') is b
-    assert one_of(OrderedDict(x_norm=a, tokens=b), 'tokens', 'net') is b
-    with pytest.raises(SettingsError, match=r"no output '2': its outputs are 0, 1"):
-        one_of([a, b], '2', 'net')
 
 
 @pytest.mark.parametrize('pooling', ['mean', 'gem'])

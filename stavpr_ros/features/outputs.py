@@ -1,32 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Outputs of a network to feature maps or vectors: one of several, tokens to maps."""
+"""Outputs of a network to feature maps or vectors: tokens to maps."""
 
-from collections.abc import Mapping, Sequence
 import math
 from typing import Any
 
 from stavpr_ros.errors import SettingsError
-
-
-def one_of(output: Any, which: str, name: str) -> Any:
-    """
-    Return one output of a network that returns a tuple, a list or a dictionary.
-
-    :param which: its number from 0, or its key; a single output has the number 0.
-    :param name: of the network.
-    :raises SettingsError: there is none of this number or key.
-    """
-    outputs: dict[str, Any] = {'0': output}
-    if isinstance(output, Mapping):
-        outputs = {str(key): value for key, value in output.items()}
-    elif isinstance(output, Sequence):
-        outputs = {str(i): value for i, value in enumerate(output)}
-    if which not in outputs:
-        raise SettingsError(
-            f'{name} has no output {which!r}: its outputs are {", ".join(outputs)}'
-        )
-    return outputs[which]
 
 
 def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:

@@ -7,7 +7,7 @@ A network in Python is a program of somebody else. It runs here, once, to be rec
 maps only read the ONNX file, which is data. Requires the extra ``onnx``.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 import io
@@ -20,7 +20,7 @@ import numpy as np
 from stavpr_lab.features.weights import last_line
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.onnx import BATCH, import_onnx, ON_CPU, TOLERANCE
-from stavpr_ros.features.outputs import as_maps, one_of
+from stavpr_ros.features.outputs import as_maps
 import torch
 from torch import nn
 
@@ -148,6 +148,26 @@ class Chosen(nn.Module):
                 raise SettingsError(f'{name} returns vectors {tuple(maps.shape)}: expected a map')
             found.append(maps)
         return tuple(found)
+
+
+def one_of(output: Any, which: str, name: str) -> Any:
+    """
+    Return one output of a network that returns a tuple, a list or a dictionary.
+
+    :param which: its number from 0, or its key; a single output has the number 0.
+    :param name: of the network.
+    :raises SettingsError: there is none of this number or key.
+    """
+    outputs: dict[str, Any] = {'0': output}
+    if isinstance(output, Mapping):
+        outputs = {str(key): value for key, value in output.items()}
+    elif isinstance(output, Sequence):
+        outputs = {str(i): value for i, value in enumerate(output)}
+    if which not in outputs:
+        raise SettingsError(
+            f'{name} has no output {which!r}: its outputs are {", ".join(outputs)}'
+        )
+    return outputs[which]
 
 
 def export_network(chosen: Chosen, size: int) -> Exported:
