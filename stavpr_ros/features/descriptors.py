@@ -18,7 +18,6 @@ import numpy as np
 from stavpr_ros.errors import SourceError, UnavailableError
 from stavpr_ros.features.extractor import FeatureSettings, LocalFeatures, normalize
 from stavpr_ros.features.registry import DescriptorSettings
-from stavpr_ros.output_file import atomic_output, Force, NPY
 from stavpr_ros.regular_file import require_regular
 
 _PATH = re.compile(r'(?P<file>.*\.(npy|npz|csv|mat))(:(?P<name>.+))?', re.IGNORECASE)
@@ -111,19 +110,6 @@ def _float32(rows: np.ndarray, path: str, first: int) -> np.ndarray:
         raise SourceError(f'descriptors {path}: row {row} has NaN or infinite numbers')
     _, exponents = np.frexp(abs(rows).max(axis=(1, 2), keepdims=True))
     return np.ldexp(rows, -exponents).astype(np.float32)
-
-
-def write_descriptors(features: LocalFeatures, path: Path, force: Force = False) -> None:
-    """
-    Write features as a .npy array that :func:`read_descriptors` reads.
-
-    :param features: strips (W, n, d); written as (n, d) if W = 1, else (n, W, d), float32, each
-        strip with its share of the norm of its image.
-    """
-    strips = (features.strips * features.weights[:, :, None]).transpose(1, 0, 2)
-    array = np.ascontiguousarray(strips[:, 0] if strips.shape[1] == 1 else strips)
-    with atomic_output(path, NPY, force) as file:
-        np.save(file, array)
 
 
 def require_comparable(features: LocalFeatures, settings: FeatureSettings, dimension: int) -> None:

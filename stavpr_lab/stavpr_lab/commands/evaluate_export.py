@@ -39,8 +39,6 @@ def export(
     arguments: argparse.Namespace, report: 'Report', settings: 'RecognizerSettings'
 ) -> None:
     """Write the files of a format; ``settings`` are those of the recognizer."""
-    from stavpr_ros.features.descriptors import write_descriptors
-
     folder, force = Path(arguments.export), arguments.force
     if arguments.export_format == 'vpr_tutorial':
         _write_matrices(report, settings, folder, force)
@@ -53,16 +51,25 @@ def export(
             _write_npy(folder / f'{name}_descriptors.npy', rows, force)
             _link_images(files[i], positions[i], folder / name)
     else:
-        write_descriptors(report.query.features, folder / 'query.npy', force)
+        _write_npy(folder / 'query.npy', image_strips(report.query.features), force)
         if report.reference is not report.query:
-            write_descriptors(report.reference.features, folder / 'map.npy', force)
+            _write_npy(folder / 'map.npy', image_strips(report.reference.features), force)
     print(f'{arguments.export_format}: {folder}')
+
+
+def image_strips(features: 'LocalFeatures') -> np.ndarray:
+    """
+    Return the strips of each image, each with its share of the norm, as descriptors are read.
+
+    :returns: shape (n, W, d), float32; (n, d) if W = 1.
+    """
+    strips = (features.strips * features.weights[:, :, None]).transpose(1, 0, 2)
+    return strips[:, 0] if strips.shape[1] == 1 else strips
 
 
 def image_vectors(features: 'LocalFeatures') -> np.ndarray:
     """Return a unit-norm vector of each image, its strips side by side, shape (n, W d)."""
-    strips = (features.strips * features.weights[:, :, None]).transpose(1, 0, 2)
-    return np.ascontiguousarray(strips.reshape(len(features), -1), np.float32)
+    return image_strips(features).reshape(len(features), -1)
 
 
 def _image_files(arguments: argparse.Namespace, report: 'Report') -> list[list[Path]]:
