@@ -27,7 +27,6 @@ from stavpr_ros.recognition import Status
 from stavpr_ros.recognition.verification import (
     GeometricEvidence,
     GeometricSettings,
-    GeometricVerifier,
     PlaceVerifier,
 )
 
@@ -83,8 +82,7 @@ def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
     process(pipeline, route[7:9], first=7)
     accepted = process(pipeline, route[9:10], first=9)[0]
     assert (accepted.status, accepted.reason, accepted.place_index) == (Status.MATCH, '', 7)
-    thumbnail = pipeline.places.thumbnail(7)
-    found = GeometricVerifier(check).inliers(thumbnail_of(route[7]), thumbnail)
+    found = PlaceVerifier(check).inliers(thumbnail_of(route[7]), pipeline.places, 7)
     assert accepted.inliers == found >= 100
     pipeline.reset()
     process(pipeline, route[: CERTAIN + 2])  # the same images again
@@ -131,8 +129,8 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
     assert match.accepted
     for each in match.late:
         query = places.thumbnail(each.first_image_index + each.position)
-        place = places.thumbnail(each.place_index)
-        assert each.inliers == GeometricVerifier(check).inliers(query, place) >= 8
+        found = PlaceVerifier(check).inliers(query, places, each.place_index)
+        assert each.inliers == found >= 8
     rejected = {match.place_index, match.late[0].place_index}
     monkeypatch.setattr(PlaceVerifier, 'inliers', lambda *given: 8 * (given[3] not in rejected))
     _, other = closing(geometric=check)

@@ -9,7 +9,6 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.recognition.verification import (
     GeometricEvidence,
     GeometricSettings,
-    GeometricVerifier,
     PlaceVerifier,
 )
 from stavpr_ros.sources import open_source
@@ -42,18 +41,39 @@ VIEWS = {
 }
 
 
+class Thumbnails:
+    """Places of which thumbnails are known, and how often each was read."""
+
+    def __init__(self, images):
+        self.images, self.read = images, []
+
+    def thumbnail(self, place):
+        self.read.append(place)
+        return self.images.get(place)
+
+
+class Pairs:
+    """Checks pairs of images."""
+
+    def __init__(self, settings=None):
+        self._verifier = PlaceVerifier(settings or GeometricSettings())
+
+    def inliers(self, query, place):
+        return self._verifier.inliers(query, Thumbnails({0: place}), 0)
+
+
 @pytest.mark.parametrize(
     ('method', 'view'), [*(('orb', view) for view in VIEWS), ('sift', 'slanted')]
 )
 def test_inliers_of_flat_scene_from_other_viewpoint_are_many(method, view):
-    check = GeometricVerifier(GeometricSettings(method))
+    check = Pairs(GeometricSettings(method))
     one = texture(0)
     assert check.inliers(one, moved(one, VIEWS[view])) > 100
 
 
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_other_scene_are_few(method):
-    check = GeometricVerifier(GeometricSettings(method))
+    check = Pairs(GeometricSettings(method))
     found = [check.inliers(texture(seed), texture(seed + 100)) for seed in range(2)]
     assert max(found) < 30
 
@@ -61,7 +81,7 @@ def test_inliers_of_other_scene_are_few(method):
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_two_depths_count_both(method):
     """Parallax, which no homography explains."""
-    check = GeometricVerifier(GeometricSettings(method))
+    check = Pairs(GeometricSettings(method))
     near, far = texture(1), texture(2)
     one, other = far.copy(), moved(far, [[1, 0, 10], [0, 1, 0], [0, 0, 1]])
     one[240:], other[240:] = near[240:], moved(near, [[1, 0, 50], [0, 1, 0], [0, 0, 1]])[240:]
@@ -80,8 +100,8 @@ def test_inliers_without_common_geometry_are_few():
         for image, (y, x) in ((one, cell), (other, cells[place])):
             image[y + 10 : y + 70, x + 10 : x + 70] = patch
     settings = GeometricSettings(features=2000, width=640)
-    assert GeometricVerifier(settings).inliers(one, one) > 800
-    assert GeometricVerifier(settings).inliers(one, other) < 150
+    assert Pairs(settings).inliers(one, one) > 800
+    assert Pairs(settings).inliers(one, other) < 150
 
 
 def test_inliers_of_one_patch_repeated_in_query_are_few():
@@ -89,13 +109,13 @@ def test_inliers_of_one_patch_repeated_in_query_are_few():
     patch = texture(0, (120, 160))
     place = np.pad(patch, ((0, 360), (0, 480), (0, 0)))
     least = GeometricSettings().min_inliers
-    assert GeometricVerifier().inliers(place, place) >= least
-    assert GeometricVerifier().inliers(np.tile(patch, (4, 4, 1)), place) < least
+    assert Pairs().inliers(place, place) >= least
+    assert Pairs().inliers(np.tile(patch, (4, 4, 1)), place) < least
 
 
 @pytest.mark.parametrize('method', METHODS)
 def test_inliers_of_blank_image_are_zero(method):
-    check, scene = GeometricVerifier(GeometricSettings(method)), texture(0)
+    check, scene = Pairs(GeometricSettings(method)), texture(0)
     dot = np.zeros((480, 640, 3), np.uint8)
     dot[200:230, 300:330] = 255
     tiny = (np.ascontiguousarray(part) for part in (scene[:1, :1], scene[:1], scene[:, :1]))
@@ -105,7 +125,7 @@ def test_inliers_of_blank_image_are_zero(method):
 
 
 def test_inliers_after_query_memory_is_reused_are_of_new_query():
-    check, buffer = GeometricVerifier(), texture(0)
+    check, buffer = Pairs(), texture(0)
     place = moved(texture(7), VIEWS['shifted'])
     before = check.inliers(buffer, place)
     buffer[:] = texture(7)
@@ -136,7 +156,7 @@ def test_inliers_of_other_arrays_are_rejected(name):
     good = texture(0)
     for bad in (good[:, :, 0], good.astype(np.float32), good[:0], np.dstack([good, good])):
         with pytest.raises(InputError, match=name):
-            GeometricVerifier().inliers(*((bad, good) if name == 'query' else (good, bad)))
+            Pairs().inliers(*((bad, good) if name == 'query' else (good, bad)))
 
 
 # ------------------------------------------------ real places
@@ -158,7 +178,7 @@ def test_inliers_separate_real_places(data_folder, name, recall):
     query, reference = (images(data_folder / name / folder) for folder in folders)
     right = [(i, i) for i in range(0, len(query), 8)]
     wrong = [(i, (i + 37) % len(query)) for i in range(0, len(query), 8)]
-    check, least = GeometricVerifier(), GeometricSettings().min_inliers
+    check, least = Pairs(), GeometricSettings().min_inliers
     verified = [
         np.mean([check.inliers(query[i], thumbnail(reference[j])) >= least for i, j in pairs])
         for pairs in (right, wrong)
@@ -167,24 +187,13 @@ def test_inliers_separate_real_places(data_folder, name, recall):
     assert verified[1] <= 0.03
 
 
-class Thumbnails:
-    """Places of which thumbnails are known, and how often each was read."""
-
-    def __init__(self, images):
-        self.images, self.read = images, []
-
-    def thumbnail(self, place):
-        self.read.append(place)
-        return self.images.get(place)
-
-
 def test_place_verifier_keeps_keypoints_of_places_until_map_changes():
     check = GeometricSettings()
     verifier, one, other = PlaceVerifier(check), texture(0), texture(100)
     places = Thumbnails({3: moved(one, VIEWS['shifted']), 4: other})
     counts = [verifier.inliers(one, places, place) for place in (3, 4, 3)]
-    assert counts[0] == GeometricVerifier(check).inliers(one, places.images[3]) > 100
-    assert counts == [counts[0], GeometricVerifier(check).inliers(one, other), counts[0]]
+    assert counts[0] == Pairs(check).inliers(one, places.images[3]) > 100
+    assert counts == [counts[0], Pairs(check).inliers(one, other), counts[0]]
     assert places.read == [3, 4]
     another = Thumbnails({3: other})
     assert verifier.inliers(one, another, 3) == counts[1]

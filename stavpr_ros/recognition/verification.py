@@ -73,44 +73,53 @@ class Keypoints:
     descriptors: np.ndarray
 
 
-class GeometricVerifier:
+class PlaceVerifier:
     """
-    Counts the matches of two images that one geometry explains. Belongs to one thread.
+    Checks images against places of a map. Belongs to one thread.
 
-    The same images give the same count. The keypoints of the last query are kept, so that one
-    image is checked against several places at little more than the places' cost.
+    The same images give the same count. The keypoints of the last image and of the latest places
+    are kept: another image against one of these costs the half.
 
     :param settings: see :class:`GeometricSettings`.
     """
 
-    def __init__(self, settings: GeometricSettings | None = None) -> None:
-        self.settings = settings or GeometricSettings()
-        self._detector = _detector(self.settings)
+    def __init__(self, settings: GeometricSettings) -> None:
+        self.settings = settings
+        self._detector = _detector(settings)
         self._query: tuple[np.ndarray, Keypoints] | None = None  # small and gray; its keypoints
+        self._places: PlaceMap | GrowingMap | None = None
+        self._known: OrderedDict[int, Keypoints] = OrderedDict()
 
-    def inliers(self, query: np.ndarray, place: np.ndarray) -> int:
+    def inliers(self, query: np.ndarray, places: PlaceMap | GrowingMap, place: int) -> int | None:
         """
-        Count the matches that one geometry explains; 0 for images that have too few.
+        Count the matches of an image and a place that one geometry explains.
 
-        :param query, place: RGB, each (h, w, 3) uint8, of any size.
-        :raises InputError: no such images.
+        :param query: RGB (h, w, 3) uint8; a thumbnail of the width that maps keep is sufficient.
+        :param places: the map, or the route, that the place is of.
+        :returns: 0 for images that have too few; None where the place has no thumbnail.
+        :raises InputError: another array than such an image.
         """
-        return self.common(self.query_keypoints(query), self.keypoints(place, 'place'))
+        if places is not self._places:
+            self._places = places
+            self._known.clear()
+        if place not in self._known:
+            thumbnail = places.thumbnail(place)
+            if thumbnail is None:
+                return None
+            self._known[place] = self._detected(self._small_gray(thumbnail, f'place {place}'))
+            if len(self._known) > CACHED:
+                self._known.popitem(last=False)
+        self._known.move_to_end(place)
+        return self._common(self._query_keypoints(query), self._known[place])
 
-    def query_keypoints(self, query: np.ndarray) -> Keypoints:
-        """Return the keypoints of an image, RGB (h, w, 3) uint8; those of the last are kept."""
+    def _query_keypoints(self, query: np.ndarray) -> Keypoints:
         gray = self._small_gray(query, 'query')
         # compared by content: a caller may use the memory of an image again for the next
         if self._query is None or not np.array_equal(self._query[0], gray):
             self._query = gray, self._detected(gray)
         return self._query[1]
 
-    def keypoints(self, image: np.ndarray, name: str) -> Keypoints:
-        """Return the keypoints of an image, RGB (h, w, 3) uint8, which errors call ``name``."""
-        return self._detected(self._small_gray(image, name))
-
-    def common(self, query: Keypoints, place: Keypoints) -> int:
-        """Count the matches that one geometry explains; 0 for too few keypoints."""
+    def _common(self, query: Keypoints, place: Keypoints) -> int:
         if min(len(query.points), len(place.points)) < LEAST_MATCHES:
             return 0
         mine, theirs = mutual_matches(query.descriptors, place.descriptors, self.settings.ratio)
@@ -178,43 +187,6 @@ def mutual_matches(
     squares[rows, nearest] = np.inf
     clear = (least < ratio**2 * squares.min(axis=1)) & (back[nearest] == rows)
     return np.flatnonzero(clear), nearest[clear]
-
-
-class PlaceVerifier:
-    """
-    Checks images against places of a map. Belongs to one thread.
-
-    The keypoints of the latest places are kept: another image against one of them costs the half.
-
-    :param settings: see :class:`GeometricSettings`.
-    """
-
-    def __init__(self, settings: GeometricSettings) -> None:
-        self.settings = settings
-        self._verifier = GeometricVerifier(settings)
-        self._places: PlaceMap | GrowingMap | None = None
-        self._known: OrderedDict[int, Keypoints] = OrderedDict()
-
-    def inliers(self, query: np.ndarray, places: PlaceMap | GrowingMap, place: int) -> int | None:
-        """
-        Count the matches of an image and a place that one geometry explains.
-
-        :param query: RGB (h, w, 3) uint8; a thumbnail of the width that maps keep is sufficient.
-        :param places: the map, or the route, that the place is of.
-        :returns: None where the place has no thumbnail.
-        """
-        if places is not self._places:
-            self._places = places
-            self._known.clear()
-        if place not in self._known:
-            thumbnail = places.thumbnail(place)
-            if thumbnail is None:
-                return None
-            self._known[place] = self._verifier.keypoints(thumbnail, f'place {place}')
-            if len(self._known) > CACHED:
-                self._known.popitem(last=False)
-        self._known.move_to_end(place)
-        return self._verifier.common(self._verifier.query_keypoints(query), self._known[place])
 
 
 class GeometricEvidence:
