@@ -278,13 +278,15 @@ class FleetRecognizer(SequenceRecognizer):
         if lookup.fetched is None:
             return False
         self._city.remember(lookup.places, lookup.fetched)
-        centered = self._centering.places(lookup.fetched.features)
+        changes = PlaceChanges(len(lookup.places), 1)
+        centered = self._centering.places(lookup.fetched.features, changes.add)
+        from_before = changes.changes[0]
+        from_before[:1] = 1  # of the first place it is unknown
         images = list(self._images)
         distances = CpuMatcher(centered, self._settings.spatial).distance_matrix(
             np.stack([image.strips for image in images], axis=1),
             np.stack([image.weights for image in images], axis=1),
         )
-        changes = _changes_from_before(centered.strips)
         chunk_of = lookup.places // CHUNK
         free = np.lexsort((self._wanted, self._chunks >= 0)).tolist()
         for slot, chunk in zip(free, np.unique(chunk_of).tolist(), strict=False):
@@ -296,7 +298,7 @@ class FleetRecognizer(SequenceRecognizer):
             self._places[target] = lookup.places[here]
             self._same_as[target] = lookup.same_as[here]
             # of the chunk's first place it is unknown
-            self._from_before[target] = changes[np.maximum(here, here[:2].max())]
+            self._from_before[target] = from_before[np.maximum(here, here[:2].max())]
             rows = slice(self._sampled + target.start, self._sampled + target.stop)
             self._strips[:, rows] = centered.strips[:, here]
             self._weights[:, rows] = centered.weights[:, here]
@@ -333,13 +335,6 @@ def _firsts(places: np.ndarray, runs: np.ndarray) -> np.ndarray:
     """Return the positions where runs of neighboring places of one session begin."""
     apart = np.diff(places, prepend=-2) != 1
     return np.flatnonzero(apart | (np.diff(runs, prepend=-1) != 0))
-
-
-def _changes_from_before(strips: np.ndarray) -> np.ndarray:
-    """Return the change of each place of (W, n, d) from the one before, (n,); 1 of the first."""
-    similarity = np.einsum('wnd,wnd->wn', strips[:, 1:], strips[:, :-1])
-    similarity[~(strips[:, 1:].any(axis=2) | strips[:, :-1].any(axis=2))] = 1
-    return np.append(np.float32(1), 1 - similarity.mean(axis=0)).astype(np.float32)
 
 
 class FleetMap(CityMap):
