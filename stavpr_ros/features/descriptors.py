@@ -102,8 +102,7 @@ def _float32(rows: np.ndarray, path: str, first: int) -> np.ndarray:
 
     :param first: number of the first row, for the error.
     """
-    exact = np.float32 if rows.dtype == np.float16 else np.promote_types(rows.dtype, np.float32)
-    rows = rows.astype(exact)
+    rows = rows.astype(np.promote_types(rows.dtype, np.float32))
     finite = np.isfinite(rows).all(axis=(1, 2))
     if not finite.all():
         row = first + int(np.flatnonzero(~finite)[0])
