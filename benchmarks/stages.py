@@ -237,7 +237,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     query = make_features(1, d, STRIPS, seed)
     weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
     places = Int8Features(rounded, weights, query.settings)
-    exact = CpuMatcher(places, SPATIAL, 'int8')
+    exact = CpuMatcher(places, SPATIAL)
     probable = np.linspace(0, n - BLOCK, TOP).astype(np.int64)
     stage = FirstStage(exact, places, lambda: probable)
     arguments = np.ascontiguousarray(query.strips[:, 0]), query.weights[:, 0]

@@ -24,15 +24,17 @@ TOLERANCE = 1e-5
 
 
 @pytest.fixture(scope='module')
-def matcher_class(cuda_runtime):
-    """Return the class, with small blocks."""
+def matcher_of(cuda_runtime):
+    """Return the function that makes a matcher, with small blocks."""
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
-    from stavpr_ros.recognition.cuda_matcher import CudaMatcher
+    from stavpr_ros.recognition.matcher import make_matcher
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dtw, 'BLOCK', 4)
         patch.setattr(lm_dtw, 'BLOCK', 8)
-        yield CudaMatcher
+        yield lambda map_, spatial, precision='float32': make_matcher(
+            map_, spatial, 'cuda', precision
+        )
 
 
 def features(n, seed=0, strips=W, zero=()):
@@ -75,10 +77,10 @@ def expected_row(reference, query, i, settings, precision='float32'):
         ('none', None, 'int8'),
     ],
 )
-def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, precision):
+def test_distances_of_every_strategy_equal_oracle(matcher_of, strategy, xi, precision):
     reference, query = features(7, zero=[(1, 2)]), features(3, seed=1, zero=[(0, 0)])
     settings = SpatialSettings(strategy, 0.7, xi)
-    matcher = matcher_class(reference, settings, precision)
+    matcher = matcher_of(reference, settings, precision)
     assert matcher.places == 7
     matrix = matcher.distance_matrix(query.strips, query.weights)
     assert matrix.dtype == np.float32
@@ -90,19 +92,19 @@ def test_distances_of_every_strategy_equal_oracle(matcher_class, strategy, xi, p
 
 
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
-def test_distances_in_pieces_are_equal(matcher_class, monkeypatch, precision):
+def test_distances_in_pieces_are_equal(matcher_of, monkeypatch, precision):
     from stavpr_ros.recognition import cuda_matcher
 
     reference, query = features(11), features(5, seed=1)
-    whole = matcher_class(reference, SpatialSettings(), precision)
+    whole = matcher_of(reference, SpatialSettings(), precision)
     expected = whole.distance_matrix(query.strips, query.weights)
     monkeypatch.setattr(cuda_matcher, 'BLOCK_WORDS', 4 * W * W * 2)
     monkeypatch.setattr(cuda_matcher, 'QUERIES', 2)
     monkeypatch.setattr(cuda_matcher, 'PLACES_IN_PIECES', 3)
-    pieces = matcher_class(reference, SpatialSettings(), precision)
+    pieces = matcher_of(reference, SpatialSettings(), precision)
     got = pieces.distance_matrix(query.strips, query.weights)
     np.testing.assert_allclose(got, expected, rtol=0, atol=TOLERANCE)
-    holistic = matcher_class(reference, SpatialSettings('none'), precision)
+    holistic = matcher_of(reference, SpatialSettings('none'), precision)
     row = holistic.distances(query.strips[:, 0], query.weights[:, 0]).cpu().numpy()
     expected = expected_row(reference, query, 0, SpatialSettings('none'), precision)
     np.testing.assert_allclose(row, expected, rtol=0, atol=TOLERANCE)
@@ -122,7 +124,7 @@ def same(a, b):
 @pytest.mark.parametrize(
     ('n', 'length', 'beta', 'nms_radius'), [(11, 3, 2.0, 3), (1, 2, 1.5, 0), (4, 3, 3.0, 0)]
 )
-def test_window_equals_that_of_cpu(matcher_class, n, length, beta, nms_radius):
+def test_window_equals_that_of_cpu(matcher_of, n, length, beta, nms_radius):
     sequence = SequenceSettings(length=length, beta=beta)
     window, twin = windows(n, sequence)
     rng = np.random.default_rng(n)
@@ -156,18 +158,18 @@ def first_image(x):
     return x.strips[:, 0], x.weights[:, 0]
 
 
-def test_distances_returned_before_stay_unchanged(matcher_class):
+def test_distances_returned_before_stay_unchanged(matcher_of):
     reference = features(6)
-    matcher = matcher_class(reference, SpatialSettings())
+    matcher = matcher_of(reference, SpatialSettings())
     first = matcher.distances(*first_image(reference))
     kept = first.clone()
     matcher.distances(reference.strips[:, 3], reference.weights[:, 3])
     assert torch.equal(first, kept)
 
 
-def test_window_of_empty_map_has_no_match(matcher_class):
+def test_window_of_empty_map_has_no_match(matcher_of):
     query = features(1)
-    matcher = matcher_class(features(3)[0:0], SpatialSettings())
+    matcher = matcher_of(features(3)[0:0], SpatialSettings())
     assert matcher.places == 0
     window, _ = windows(0)
     for _ in range(3):
@@ -179,25 +181,25 @@ def test_window_of_empty_map_has_no_match(matcher_class):
     assert found.path.shape == (0, 2)
 
 
-def test_cuda_matcher_with_invalid_settings_is_rejected(matcher_class):
+def test_cuda_matcher_with_invalid_settings_is_rejected(matcher_of):
     with pytest.raises(SettingsError, match='xi = 5'):
-        matcher_class(features(3), SpatialSettings(xi=5))
+        matcher_of(features(3), SpatialSettings(xi=5))
     with pytest.raises(InputError, match='at least 4'):
-        matcher_class(features(3, strips=3), SpatialSettings('sliding_window'))
+        matcher_of(features(3, strips=3), SpatialSettings('sliding_window'))
 
 
 @pytest.mark.skipif(SIMULATOR, reason='sizes of a real map take a real device')
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
-def test_distances_of_large_map_on_device_equal_cpu(matcher_class, monkeypatch, precision):
+def test_distances_of_large_map_on_device_equal_cpu(matcher_of, monkeypatch, precision):
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
-    from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+    from stavpr_ros.recognition.matcher import make_matcher
 
     monkeypatch.setattr(dtw, 'BLOCK', 128)
     monkeypatch.setattr(lm_dtw, 'BLOCK', 128)
     reference, query = features(30_000, strips=7), features(25, seed=1, strips=7)
     settings, sequence = SpatialSettings(xi=3), SequenceSettings()
-    matcher = matcher_class(reference, settings, precision)
-    twin = CpuMatcher(reference, settings, precision)
+    matcher = matcher_of(reference, settings, precision)
+    twin = make_matcher(reference, settings, 'cpu', precision)
     window, twin_window = windows(len(reference), sequence)
     matrix = matcher.distance_matrix(query.strips, query.weights)
     expected = twin.distance_matrix(query.strips, query.weights)

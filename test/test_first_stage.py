@@ -13,6 +13,7 @@ from stavpr_ros.mapping import Session
 from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.first_stage import CHUNK, FirstStage
+from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import unit_norm
 
 W, d = 7, 40
@@ -31,7 +32,7 @@ def noisy(features, share=0.4, seed=1):
 
 
 def stage_of(features, probable=(), precision='float32', spatial=None):
-    matcher = CpuMatcher(features, spatial or SpatialSettings(), precision)
+    matcher = make_matcher(features, spatial or SpatialSettings(), 'cpu', precision)
     return matcher, FirstStage(matcher, features, lambda: np.array(probable, np.int64))
 
 

@@ -18,7 +18,6 @@ from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.int8_features import rounded
 from stavpr_ros.recognition.matcher import make_matcher
 
@@ -127,7 +126,7 @@ def test_matcher_in_int8_equals_functions_of_its_strip_distances(strategy):
     reference, queries = features_of(random_strips(7, 300, 20)), random_strips(7, 3, 20, seed=1)
     spatial = SpatialSettings(strategy)
     weights = np.full((7, 3), 7**-0.5, np.float32)
-    matrix = CpuMatcher(reference, spatial, 'int8').distance_matrix(queries, weights)
+    matrix = make_matcher(reference, spatial, 'cpu', 'int8').distance_matrix(queries, weights)
     assert matrix.shape == (3, 300)
     for x in range(3):
         d, _ = kernel_distances(reference.strips, queries, x)

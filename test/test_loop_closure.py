@@ -33,6 +33,7 @@ from stavpr_ros.recognition.loop_closer import (
     LONGEST_GAP,
     LoopCloser,
 )
+from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.recognition.robust import (
     PAPER,
     ROBUST,
@@ -534,7 +535,7 @@ def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkey
     held = laps[evicted:200]
     newest = route.newest
     found = matcher.to_oldest(route.strips, newest, route.count - 3)
-    expected = CpuMatcher(held, SpatialSettings(), 'int8').distances(
+    expected = make_matcher(held, SpatialSettings(), 'cpu', 'int8').distances(
         newest[:, 0], np.ones(7, np.float32)
     )
     np.testing.assert_allclose(found, expected[:-3], atol=1e-6, rtol=0)

@@ -8,11 +8,11 @@ import numpy as np
 from stavpr_ros.alignment.cpu import dot, int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.settings import SpatialSettings
-from stavpr_ros.alignment.spatial import adaptive_weights, image_distances, WINDOW
+from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty, is_aligned
-from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.robust import normalize
 from stavpr_ros.recognition.route_strips import RouteStrips
 
@@ -35,8 +35,8 @@ class CpuMatcher:
     """
     See :class:`stavpr_ros.recognition.matcher.Matcher`.
 
-    :param features: those of the map, for int8 rounded or not. Contiguous float32 ones whose
-        memory begins with a cache line are shared, not copied.
+    :param features: those of the map; contiguous float32 ones whose memory begins with a cache
+        line are shared, not copied.
     """
 
     _map: np.ndarray | tuple[np.ndarray, np.ndarray]
@@ -46,17 +46,11 @@ class CpuMatcher:
         self,
         features: LocalFeatures | Int8Features,
         spatial: SpatialSettings,
-        precision: str = 'float32',
     ) -> None:
-        W = len(features.strips)
-        if spatial.strategy == 'sliding_window' and W < WINDOW:
-            raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
-        self._prepare(W, spatial)
+        self._prepare(len(features.strips), spatial)
         self._cells = features.cells if spatial.vertical else None
         self._weights = features.weights
         self._places = self._weights.shape[1]
-        if precision == 'int8' and isinstance(features, LocalFeatures):
-            features = rounded(features, lambda block: block)
         if isinstance(features, Int8Features):
             self._map = features.strips.kernel_arguments()
             return

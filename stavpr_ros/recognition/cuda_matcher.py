@@ -9,9 +9,8 @@ from stavpr_ros.alignment.cpu.int8 import rounded_queries
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import WINDOW
-from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.recognition.int8_features import Int8Features
 import torch
 
 BLOCK_WORDS = 2**26  # most words of products in memory at a time: 256 MiB
@@ -26,25 +25,20 @@ class CudaMatcher:
     Products by torch, alignment by the kernel of the strategy. Calls are queued on torch's current
     stream.
 
-    :param features: those of the map; unit norm, strips (W, n, d), weights (W, n).
+    :param features: those of the map; unit norm, strips (W, n, d), weights (W, n). If they are
+        int8, queries are rounded as well; strip distances are those of the CPU, bit for bit.
     :param spatial: how two images are compared.
-    :param precision: ``float32``, or ``int8``: map and query are rounded to it; strip distances
-        are those of the CPU, bit for bit.
     :raises UnavailableError: no CUDA device here, or the package numba-cuda is missing.
     :raises SettingsError: xi > W.
-    :raises InputError: fewer strips than the sliding window has.
     """
 
     def __init__(
         self,
         features: LocalFeatures | Int8Features,
         spatial: SpatialSettings,
-        precision: str = 'float32',
     ) -> None:
         self._runtime = runtime()
         device = self._runtime.torch_device
-        if precision == 'int8' and isinstance(features, LocalFeatures):
-            features = rounded(features, lambda block: block)
         if isinstance(features, Int8Features):
             lengths = features.strips.reciprocals[:, : len(features)]
             self._strips = torch.from_numpy(features.strips.rounded()).to(device)
@@ -67,8 +61,6 @@ class CudaMatcher:
         self._block, self._kernel = dtw.BLOCK, None
         self._sigma = np.float32(spatial.sigma if spatial.strategy == 'adaptive' else 0)
         if spatial.strategy == 'sliding_window':
-            if W < WINDOW:
-                raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
             self._kernel = dtw.sliding_window(W, WINDOW, band)
         elif spatial.strategy != 'none':
             self._kernel = dtw.spatial_dtw(W, band)

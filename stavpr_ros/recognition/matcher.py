@@ -6,10 +6,11 @@ from typing import Any, Protocol
 
 import numpy as np
 from stavpr_ros.alignment.settings import SpatialSettings
+from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.checks import require_choice
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.int8_features import Int8Features
+from stavpr_ros.recognition.int8_features import Int8Features, rounded
 
 PRECISIONS = ('float32', 'int8')
 
@@ -58,19 +59,25 @@ def make_matcher(
         (:mod:`stavpr_ros.alignment.cpu.int8`); strip distances of the backends are equal.
     :raises SettingsError: no such precision, or settings that do not fit the map (xi > W), the
         backend or the precision.
-    :raises InputError: vertical alignment of features whose cells are not known.
+    :raises InputError: vertical alignment of features whose cells are not known, or fewer strips
+        than the sliding window has.
     :raises UnavailableError: the backend is not available.
     """
     require_choice('precision', precision, PRECISIONS)
-    spatial.band(features.settings.strips)
+    W = features.settings.strips
+    spatial.band(W)
+    if spatial.strategy == 'sliding_window' and W < WINDOW:
+        raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
     if backend == 'cuda' and spatial.vertical:
         raise SettingsError("backend 'cuda' has no vertical alignment: take 'cpu'")
     if precision == 'int8' and spatial.vertical:
         raise SettingsError("precision 'int8' has no vertical alignment: take float32")
+    if precision == 'int8' and isinstance(features, LocalFeatures):
+        features = rounded(features, lambda block: block)
     if backend == 'cuda':
         from stavpr_ros.recognition.cuda_matcher import CudaMatcher
 
-        return CudaMatcher(features, spatial, precision)
+        return CudaMatcher(features, spatial)
     from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 
-    return CpuMatcher(features, spatial, precision)
+    return CpuMatcher(features, spatial)
