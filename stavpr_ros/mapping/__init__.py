@@ -56,26 +56,13 @@ __all__ = [
     'thumbnail_of',
     'verify_map',
 ]
-_NAMES = {
-    'builder': ('build_map', 'extract_features'),
-    'growing_map': ('GrowingMap',),
-    'keyframes': ('image_change', 'KeyframeSelector', 'KeyframeSettings', 'small_gray'),
-    'map_file': ('is_map', 'load_map', 'open_map', 'save_map', 'verify_map'),
-    'merging': ('merge_maps', 'select_places', 'select_session'),
-    'place_map': (
-        'descriptor_map',
-        'encode_thumbnail',
-        'Place',
-        'PlaceMap',
-        'Session',
-        'thumbnail_of',
-    ),
-    'trajectory': ('distance', 'rotation', 'Trajectory'),
-}
+# light ones first; none imports one behind it
+_MODULES = 'trajectory', 'keyframes', 'place_map', 'merging', 'growing_map', 'map_file', 'builder'
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _NAMES.items():
-        if name in names:
-            return getattr(import_module(f'{__name__}.{module}'), name)
+    for module in _MODULES if name in __all__ else ():
+        found = import_module(f'{__name__}.{module}')
+        if hasattr(found, name):
+            return getattr(found, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
