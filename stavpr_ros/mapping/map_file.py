@@ -72,13 +72,7 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
-        'settings': {
-            'kind': settings.kind,
-            'backbone': backbone,
-            'strips': settings.strips,
-            'projection': settings.projection,
-            'feature_version': settings.feature_version,
-        },
+        'settings': vars(settings) | {'backbone': backbone},
         'cells': place_map.features.cells,
         'projection': projection.name if projection else None,
         'sessions': [asdict(session) for session in place_map.sessions],
