@@ -231,16 +231,6 @@ class NodeSettings:
         return used or self.operation != 'localization'
 
 
-def absolute_path(path: str) -> str:
-    """
-    Return the absolute path of a file, '' of none; launch files leave ``~`` as it is.
-
-    :param path: may begin with ``~``; a relative one is relative to the working directory. The
-        address of a fleet's map is returned unchanged.
-    """
-    return path if not path or is_address(path) else os.path.abspath(os.path.expanduser(path))
-
-
 def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     """
     Build the settings from the values of all parameters.
@@ -253,7 +243,9 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         if allowed:
             require_choice(name, value, allowed)
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
-    values |= {name: absolute_path(values[name]) for name in ('map_path', 'save_path')}
+    for name in ('map_path', 'save_path'):  # a file, '' = none, or the address of a fleet's map
+        if (path := values[name]) and not is_address(path):
+            values[name] = os.path.abspath(os.path.expanduser(path))
     values['model_path'] = os.path.expanduser(values['model_path'])  # or a word: cached, download
     method = values['geometric_check']
     pipeline = PipelineSettings(
