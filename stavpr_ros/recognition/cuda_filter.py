@@ -88,16 +88,17 @@ class CudaPlaceFilter:
         # one buffer for the copy to the host: scale; places; their sums; states and their paths
         parts = (8, 8 * top, 4 * top, 4 * tops * K * V, 4 * (lag + 1) * tops * K * V)
         ends = np.cumsum([-(-size // 8) * 8 for size in parts]).tolist()
-        self._parts = [
-            slice(end - -(-size // 8) * 8, end - -(-size // 8) * 8 + size)
-            for size, end in zip(parts, ends, strict=True)
-        ]
+        types = (torch.float64, torch.int64, torch.float32, torch.float32, torch.int32)
         self._buffer = zeros(ends[-1], dtype=torch.uint8)
         self._host = self._runtime.host_buffer(ends[-1])
-        types = (torch.float64, torch.int64, torch.float32, torch.float32, torch.int32)
-        self._out = [
-            self._buffer[part].view(dtype) for part, dtype in zip(self._parts, types, strict=True)
-        ]
+        self._out, on_host = (
+            [
+                buffer[start : start + size].view(dtype)
+                for start, size, dtype in zip([0, *ends], parts, types, strict=False)
+            ]
+            for buffer in (self._buffer, self._host)
+        )
+        self._on_host = [part.numpy() for part in on_host]
         self._out[4] = self._out[4].view(lag + 1, -1)
         self._views = {
             name: self._runtime.array(getattr(self, name))
@@ -195,12 +196,7 @@ class CudaPlaceFilter:
             self._copied[3], self._copied[4],
         )  # fmt: skip
         self._runtime.fetch(self._buffer, self._host)
-        scale, self._top, top_sums, states, paths = (
-            self._host[part].numpy().view(dtype)
-            for part, dtype in zip(
-                self._parts, (np.float64, np.int64, np.float32, np.float32, np.int32), strict=True
-            )
-        )
+        scale, self._top, top_sums, states, paths = self._on_host
         self._top_sums, self._top_states = top_sums * scale[0], states * scale[0]
         self._paths = paths.reshape(len(self._origins) + 1, -1)
         self._read_at = self.count
