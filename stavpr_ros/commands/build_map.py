@@ -293,7 +293,7 @@ def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float |
         return None  # it would take the whole map into memory
     model = getattr(arguments, f'{place_map.settings.kind}_model', None) or ''
     try:
-        return suggest_threshold(place_map, progress=True, model=model)
+        return suggest_threshold(place_map, model)
     except InputError as error:
         print(f'no threshold is suggested for mode paper: {error}')
         return None

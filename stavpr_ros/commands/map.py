@@ -263,7 +263,7 @@ def _compact(arguments: argparse.Namespace) -> None:
     assert isinstance(place_map.features, StoredFeatures)
     stored, n = place_map.features.storage, len(place_map)
     if arguments.drop_duplicates:
-        place_map = without_duplicates(place_map, progress=True)
+        place_map = without_duplicates(place_map)
         print(f'{n - len(place_map)} of {n} places dropped: they show what the one before shows')
     if arguments.pca is not None:
         print(f'strips of {place_map.dimension} dimensions become {arguments.pca}')
@@ -287,7 +287,7 @@ def _merge(arguments: argparse.Namespace) -> None:
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
     merged = merge_maps(maps, [Path(path).stem for path in arguments.maps])
     if not arguments.different_routes:
-        merged = with_same_places(merged, progress=True)
+        merged = with_same_places(merged)
     _write(merged, arguments)
 
 

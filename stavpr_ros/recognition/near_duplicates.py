@@ -15,19 +15,17 @@ from tqdm import tqdm
 MIN_MOTION = 0.1  # share of the median step; a camera that moved farther was not at rest
 
 
-def without_duplicates(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
+def without_duplicates(place_map: PlaceMap) -> PlaceMap:
     """
     Return a map with the first place of each stop of the camera only.
 
     The camera was at rest where a place hardly differs from the last kept one of its session, in
     relation to the mean change of neighbors, as the place filter decides it; and, where both have
     poses, hardly moved. Without poses, a drive through the dark is not distinguished from a stop.
-
-    :param progress: show it on standard error.
     """
     n, index = len(place_map), place_map.session_index
     centering, changes = MeanCentering(place_map.features), PlaceChanges(n, 1)
-    for _, strips in _centered(place_map, centering, 'compare neighbors', progress):
+    for _, strips in _centered(place_map, centering, 'compare neighbors'):
         changes.add(strips)
     is_first = np.diff(np.zeros(n) if index is None else index, prepend=-1) != 0
     neighbors = changes.changes[0, ~is_first]
@@ -36,7 +34,7 @@ def without_duplicates(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moved = MIN_MOTION * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     keeper, kept, last = np.arange(n), 0, np.empty((0, 0))
-    for places, block in _centered(place_map, centering, 'drop duplicates', progress):
+    for places, block in _centered(place_map, centering, 'drop duplicates'):
         for place, strips in zip(range(n)[places], block.swapaxes(0, 1), strict=True):
             distance = np.linalg.norm(positions[place] - positions[kept])  # NaN = unknown
             if is_first[place] or change_between(strips, last) >= least or distance > moved:
@@ -48,11 +46,10 @@ def without_duplicates(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
 
 
 def _centered(
-    place_map: PlaceMap, centering: MeanCentering, text: str, progress: bool
+    place_map: PlaceMap, centering: MeanCentering, text: str
 ) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield the centered features of each block, (W, m, d), and show the progress."""
-    bar = tqdm(total=len(place_map), desc=text, unit='place', disable=None if progress else True)
-    with bar:
+    """Yield the centered features of each block, (W, m, d); a terminal shows the progress."""
+    with tqdm(total=len(place_map), desc=text, unit='place', disable=None) as bar:
         for places, block in blocks(place_map.features):
             yield places, centering.places(block).strips
             bar.update(places.stop - places.start)

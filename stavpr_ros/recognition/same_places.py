@@ -13,25 +13,20 @@ from tqdm import tqdm
 SURE = 0.9  # probability above which two places are taken to be the same
 
 
-def with_same_places(place_map: PlaceMap, progress: bool = False) -> PlaceMap:
+def with_same_places(place_map: PlaceMap) -> PlaceMap:
     """
     Return the map with the places of its sessions related (:attr:`PlaceMap.same_as`).
 
     Each session is driven, as a query of mode robust, on a map of the sessions before it. Where it
-    is matched, its place is the matched one. The time grows with the square of the places.
-
-    :param progress: show it on standard error.
+    is matched, its place is the matched one. The time grows with the square of the places, and a
+    terminal shows the progress.
     """
     index, n = place_map.session_index, len(place_map)
     if index is None:
         return place_map
     same_as = np.arange(n)
-    for session in tqdm(
-        range(1, len(place_map.sessions)),
-        desc='same places',
-        unit='session',
-        disable=None if progress else True,
-    ):
+    numbers = range(1, len(place_map.sessions))
+    for session in tqdm(numbers, desc='same places', unit='session', disable=None):
         earlier, places = np.flatnonzero(index < session), np.flatnonzero(index == session)
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
         found = _recognized(reference, place_map, places)

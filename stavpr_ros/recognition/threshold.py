@@ -36,7 +36,7 @@ def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
     return (np.clip(value, 0, 1) * 255).astype(np.uint8)
 
 
-def suggest_threshold(place_map: PlaceMap, progress: bool = False, model: str = '') -> float:
+def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
     """
     Ask how near the map's places come to *other* places of it when they look different.
 
@@ -62,9 +62,7 @@ def suggest_threshold(place_map: PlaceMap, progress: bool = False, model: str = 
     rng = np.random.default_rng(0)
     elsewhere = []
     starts = np.unique(np.linspace(0, n - l, min(WINDOWS, n - l + 1)).astype(int))
-    for variant, start in enumerate(
-        tqdm(starts, desc='threshold', unit='window', disable=None if progress else True)
-    ):
+    for variant, start in enumerate(tqdm(starts, desc='threshold', unit='window', disable=None)):
         images = [place_map.thumbnail(place) for place in range(start, start + l)]
         altered = [harder_look(image, variant, rng) for image in images if image is not None]
         features = extractor.extract(altered)

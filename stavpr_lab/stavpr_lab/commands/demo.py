@@ -233,7 +233,7 @@ def _threshold(place_map: 'PlaceMap', arguments: argparse.Namespace) -> float:
     if arguments.threshold is not None:
         return arguments.threshold
     try:
-        threshold = suggest_threshold(place_map, progress=True)
+        threshold = suggest_threshold(place_map)
     except InputError as error:
         raise SettingsError(f'{error}; give --threshold') from error
     _print(f'   threshold {threshold:.3f}, estimated from the first traverse')
