@@ -89,16 +89,10 @@ def test_z_normalized_on_device_equals_that_of_the_cpu(cuda_filter):
     row[[7, 149]] = np.inf
     flat, banned = np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)
     for values in (row, row[:5], flat, banned, row[:0]):
-        given = torch.from_numpy(values)
-        counted = np.arange(len(values)) % 3 > 0
-        for found, expected in (
-            (cuda_filter.z_normalized_on_device(given), z_normalized(values)),
-            (cuda_filter.z_normalized_on_device(given, 30), z_normalized(values, 30)),
-            (
-                cuda_filter.z_normalized_on_device(given, counted=torch.from_numpy(counted)),
-                z_normalized(values, counted=counted),
-            ),
-        ):
+        for counted in (np.ones(len(values), bool), np.arange(len(values)) % 3 > 0):
+            given = torch.from_numpy(values), torch.from_numpy(counted)
+            found = cuda_filter.z_normalized_on_device(*given)
+            expected = z_normalized(values, counted=counted)
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 

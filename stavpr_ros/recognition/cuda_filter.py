@@ -14,30 +14,20 @@ from stavpr_ros.recognition.filter_paths import (
 )
 from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
 import torch
-from torch.nn import functional
 
 MOST = 512  # most probable places that are copied to the host: more than are ever excluded
 
 
-def z_normalized_on_device(
-    row: torch.Tensor, around: int = 0, counted: torch.Tensor | None = None
-) -> torch.Tensor:
+def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
     """Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting."""
     if not len(row):
         return row
-    known = torch.isfinite(row)
-    if counted is not None:
-        known &= counted
+    known = torch.isfinite(row) & counted
     count = known.sum().clamp(min=1)
     values = torch.where(known, row, 0)
     mean = values.sum() / count
     off = torch.where(known, row - mean, 0)
-    z = (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
-    if not around:
-        return z
-    clipped = torch.where(torch.isfinite(z), z.clamp(min=-1), 0)[None]
-    padded = functional.pad(clipped, (around, around), mode='replicate')
-    return z - functional.avg_pool1d(padded, 2 * around + 1, stride=1)[0]
+    return (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
 
 
 class CudaPlaceFilter:

@@ -73,10 +73,7 @@ class CudaFilterWindow(FilterWindow):
     def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
         if self._normalizes:
             counted = torch.from_numpy(self._counted(len(row))).to(row.device)
-            parts = [
-                z_normalized_on_device(row[run], self._around, counted[run])
-                for run in self.layout.runs
-            ]
+            parts = [z_normalized_on_device(row[run], counted[run]) for run in self.layout.runs]
             row = parts[0] if len(parts) == 1 else torch.cat(parts)
         return spread_on_device(row, self._columns, self.buffer.places)
 
