@@ -13,11 +13,17 @@ from typing import Any
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_above, require_at_least, require_between, require_choice
+from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 
 METHODS = ('orb', 'sift')
+# These belong together: more keypoints, a ratio nearer to 1 and more pixels let more matches of
+# wrong places through, and min_inliers has to rise with them.
+FEATURES = 1000  # most keypoints of an image
+RATIO = 0.9  # of the distances to the nearest and the second nearest descriptor
+WIDTH = 320  # pixels, which images are brought to before
+PIXELS = 2.0  # how far a match may lie off the geometry, at that width
 LEAST_MATCHES = 8  # a fundamental matrix fits any seven
 ITERATIONS = 2000
 CONFIDENCE = 0.999
@@ -36,33 +42,16 @@ class GeometricSettings:
     """
     How two images are checked against each other.
 
-    The defaults belong together: more features, a ratio nearer to 1 and more pixels let more
-    matches of wrong places through, and ``min_inliers`` has to rise with them. For ``sift``, 20
-    do.
-
     :param method: keypoints: ``orb`` (fast) or ``sift`` (slower, fewer matches).
-    :param min_inliers: matches that one geometry must explain; at least 8.
-    :param features: most keypoints an image; at least 8.
-    :param ratio: a match is this much nearer than the second nearest, in (0, 1].
-    :param pixels: how far a match may lie off the geometry, in pixels at ``width``.
-    :param width: images are brought to this width before, in pixels; at least 32.
+    :param min_inliers: matches that one geometry must explain; at least 8. For ``sift``, 20 do.
     """
 
     method: str = 'orb'
     min_inliers: int = 30
-    features: int = 1000
-    ratio: float = 0.9
-    pixels: float = 2.0
-    width: int = 320
 
     def __post_init__(self) -> None:
         require_choice('method', self.method, METHODS)
         require_at_least('min_inliers', self.min_inliers, LEAST_MATCHES)
-        require_at_least('features', self.features, LEAST_MATCHES)
-        require_above('ratio', self.ratio, 0)
-        require_between('ratio', self.ratio, 0, 1)
-        require_above('pixels', self.pixels, 0)
-        require_at_least('width', self.width, 32, 'pixels')
 
 
 @dataclass(frozen=True)
@@ -84,8 +73,7 @@ class PlaceVerifier:
     """
 
     def __init__(self, settings: GeometricSettings) -> None:
-        self.settings = settings
-        self._detector = _detector(settings)
+        self._detector = _detector(settings.method)
         self._query: tuple[np.ndarray, Keypoints] | None = None  # small and gray; its keypoints
         self._places: PlaceMap | GrowingMap | None = None
         self._known: OrderedDict[int, Keypoints] = OrderedDict()
@@ -122,10 +110,10 @@ class PlaceVerifier:
     def _common(self, query: Keypoints, place: Keypoints) -> int:
         if min(len(query.points), len(place.points)) < LEAST_MATCHES:
             return 0
-        mine, theirs = mutual_matches(query.descriptors, place.descriptors, self.settings.ratio)
+        mine, theirs = mutual_matches(query.descriptors, place.descriptors, RATIO)
         if len(mine) < LEAST_MATCHES:
             return 0
-        return _explained(query.points[mine], place.points[theirs], self.settings.pixels)
+        return _explained(query.points[mine], place.points[theirs])
 
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return an image at the common width, (h, w) uint8."""
@@ -133,11 +121,11 @@ class PlaceVerifier:
             raise InputError(
                 f'{name} is {image.dtype} {image.shape}: expected RGB (h, w, 3) uint8'
             )
-        (height, width), to = image.shape[:2], self.settings.width
-        size = to, min(max(1, round(height * to / width)), TALLEST * to)
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        height, width = image.shape[:2]
+        size = WIDTH, min(max(1, round(height * WIDTH / width)), TALLEST * WIDTH)
+        interpolation = cv2.INTER_AREA if width > WIDTH else cv2.INTER_LINEAR
         return cv2.resize(
-            gray, size, interpolation=cv2.INTER_AREA if width > to else cv2.INTER_LINEAR
+            cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=interpolation
         )
 
     def _detected(self, gray: np.ndarray) -> Keypoints:
@@ -225,18 +213,18 @@ class GeometricEvidence:
         return odds / (1 + odds)
 
 
-def _detector(settings: GeometricSettings) -> Any:
+def _detector(method: str) -> Any:
     library: Any = cv2  # its types leave these out
-    if settings.method == 'sift':
-        return library.SIFT_create(settings.features)
-    return library.ORB_create(settings.features, fastThreshold=7)
+    if method == 'sift':
+        return library.SIFT_create(FEATURES)
+    return library.ORB_create(FEATURES, fastThreshold=7)
 
 
-def _explained(points: np.ndarray, others: np.ndarray, pixels: float) -> int:
+def _explained(points: np.ndarray, others: np.ndarray) -> int:
     """Count matches that the best fundamental matrix explains; also those of a flat scene."""
     try:
         _, mask = cv2.findFundamentalMat(
-            points, others, cv2.USAC_MAGSAC, pixels, CONFIDENCE, ITERATIONS
+            points, others, cv2.USAC_MAGSAC, PIXELS, CONFIDENCE, ITERATIONS
         )
     except cv2.error:  # no matrix fits: many of the matches in one point
         return 0
