@@ -20,17 +20,16 @@ class Command:
     needs_ros: bool = False
 
 
+TEXTS = {
+    'build_map': 'build a reference map from images, a video or a bag',
+    'map': 'show, check, compact, merge and recover maps',
+    'node': 'run the place-recognition node',
+    'replay': 'publish a bag, a video or images to the node',
+    'record': 'write matches or loop closures to a JSON Lines file',
+    'warm': 'compile the kernels into their cache, once',
+}
+WITH_ROS = {'node', 'replay', 'record'}
 COMMANDS = {
-    'build_map': Command(
-        'stavpr_ros.commands.build_map', 'build a reference map from images, a video or a bag'
-    ),
-    'map': Command('stavpr_ros.commands.map', 'show, check, compact, merge and recover maps'),
-    'node': Command('stavpr_ros.commands.node', 'run the place-recognition node', True),
-    'replay': Command(
-        'stavpr_ros.commands.replay', 'publish a bag, a video or images to the node', True
-    ),
-    'record': Command(
-        'stavpr_ros.commands.record', 'write matches or loop closures to a JSON Lines file', True
-    ),
-    'warm': Command('stavpr_ros.commands.warm', 'compile the kernels into their cache, once'),
+    name: Command(f'stavpr_ros.commands.{name}', text, name in WITH_ROS)
+    for name, text in TEXTS.items()
 }
