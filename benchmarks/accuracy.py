@@ -161,14 +161,15 @@ def evaluate_case(
 def evaluate_hallway(
     folder: Path, feature: str, making: dict[str, FeatureExtractor]
 ) -> Iterator[tuple[str, Any]]:
-    """Yield key and numbers of the loop closures in each mode."""
+    """Yield key and numbers of the loop closures in each mode, with late ones and without."""
     file = folder / 'rtabmap_hallway_loop/samples_GT.bmp'
     for mode, extractor in making.items():
         route = _map(open_source(folder / 'rtabmap_hallway_loop/samples'), extractor)
         truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
         settings = RecognizerSettings(mode=mode)
-        evaluation = evaluate_loop_closures(route.features, truth, settings, EXCLUDED)
-        yield f'hallway/{feature}/{mode}/same', numbers(evaluation, mode)
+        for row, late in ('same', True), ('on time', False):
+            found = evaluate_loop_closures(route.features, truth, settings, EXCLUDED, late=late)
+            yield f'hallway/{feature}/{mode}/{row}', numbers(found, mode)
 
 
 def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict[str, Any]:

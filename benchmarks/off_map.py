@@ -126,9 +126,11 @@ class Outcome:
         return document | {'bins': [row for row in document['bins'] if row['images']]}
 
 
-def matches_of(place_map: PlaceMap, features: LocalFeatures) -> list[Match]:
+def matches_of(
+    place_map: PlaceMap, features: LocalFeatures, stamps: np.ndarray | None = None
+) -> list[Match]:
     """Return the matches of a drive, one an image, by a recognizer of its own."""
-    return recognize_all(PlaceRecognizer(place_map, SETTINGS), features)
+    return recognize_all(PlaceRecognizer(place_map, SETTINGS), features, stamps)
 
 
 def outcome(
@@ -136,6 +138,7 @@ def outcome(
     features: LocalFeatures,
     truth: GroundTruth,
     unseen: np.ndarray | None = None,
+    stamps: np.ndarray | None = None,
 ) -> Outcome:
     """
     Drive a query on a map.
@@ -143,8 +146,9 @@ def outcome(
     :param features: of N images.
     :param truth: of the same images.
     :param unseen: images whose place was removed; None = none was.
+    :param stamps: of the images, ns; None = unknown.
     """
-    found = image_matches(matches_of(place_map, features), SETTINGS.sequence.length)
+    found = image_matches(matches_of(place_map, features, stamps), SETTINGS.sequence.length)
     return Outcome(
         found.accepted,
         found.probabilities,
@@ -168,6 +172,7 @@ def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> O
         pair.query.features[drive.images[shown]],
         drive.truth.select(shown),
         unseen[shown],
+        drive.stamps[shown],
     )
 
 

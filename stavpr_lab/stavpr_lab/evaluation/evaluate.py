@@ -173,15 +173,19 @@ def centered_images(count: int, length: int) -> slice:
     return slice(middle, count - (length - 1 - middle))
 
 
-def recognize_all(recognizer: PlaceRecognizer, features: LocalFeatures) -> list[Match]:
+def recognize_all(
+    recognizer: PlaceRecognizer, features: LocalFeatures, stamps: np.ndarray | None = None
+) -> list[Match]:
     """
     Recognize every image of a sequence, starting with an empty window.
 
     :param features: of N images.
+    :param stamps: of the images, ns, (N,), int64, 0 = unknown; None = of all.
     :returns: N matches, one an image.
     """
     recognizer.reset()
-    return [recognizer.update(features[i : i + 1]) for i in range(len(features))]
+    times = [0] * len(features) if stamps is None else stamps.tolist()
+    return [recognizer.update(features[i : i + 1], time) for i, time in enumerate(times)]
 
 
 def recognize_traverse(
