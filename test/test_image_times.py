@@ -9,7 +9,7 @@ from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.image_times import image_times, LONGEST
+from stavpr_ros.recognition.window import image_times, LONGEST
 
 SECOND = 10**9
 

@@ -3,6 +3,7 @@
 """Ground truth: accepted places by hand, and every kind of file."""
 
 import pickle
+import zipfile
 
 import cv2
 import numpy as np
@@ -179,6 +180,13 @@ def test_from_file_of_pickled_objects_raises(tmp_path):
     for name in ('objects.npy', 'objects.npz', 'pickle.npy'):
         with pytest.raises(SourceError, match=rf'{name} contains Python objects.*runs whatever'):
             GroundTruth.from_file(tmp_path / name, 3, 5)
+
+
+def test_from_file_of_an_archive_without_arrays_raises(tmp_path):
+    with zipfile.ZipFile(tmp_path / 'text.npz', 'w') as archive:
+        archive.writestr('truth', 'no array')
+    with pytest.raises(SourceError, match=r'text.npz has truth: expected one array'):
+        GroundTruth.from_file(tmp_path / 'text.npz', 3, 5)
 
 
 def test_from_file_reads_black_and_white_images(tmp_path):

@@ -21,7 +21,6 @@ from stavpr_ros.recognition.filter_paths import (
     OFFSETS,
     refine,
 )
-from stavpr_ros.recognition.image_times import image_times
 from stavpr_ros.recognition.map_change import ImageChange
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.path_checks import (
@@ -34,7 +33,12 @@ from stavpr_ros.recognition.path_checks import (
 from stavpr_ros.recognition.place_filter import PlaceFilter
 from stavpr_ros.recognition.place_means import PlaceMeans
 from stavpr_ros.recognition.robust import FilterSettings
-from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
+from stavpr_ros.recognition.window import (
+    ColumnLayout,
+    image_times,
+    QueryWindow,
+    SequenceBuffer,
+)
 
 if TYPE_CHECKING:
     from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter

@@ -17,10 +17,13 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
+from stavpr_ros.compilation import kernel
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.recognition.filter_paths import Belief, NO_PLACES
 from stavpr_ros.recognition.match import WindowMatch
 from stavpr_ros.recognition.robust import z_normalized
+
+LONGEST = 4.0  # intervals between images: beyond, the camera stopped, or its speed is unknown
 
 
 class ColumnLayout:
@@ -313,3 +316,25 @@ class QueryWindow(ABC):
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         self.buffer.evict(count)
+
+
+@kernel
+def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """
+    Return the times of images, (m,), float64, ascending, in intervals of most of them.
+
+    A camera that loses images still advances evenly in time: the stamps of a window show where
+    images are missing, and those of a map where places are. An interval is 1 where a stamp is
+    unknown or not above the one before.
+
+    :param stamps: ns, (m,), int64; 0 = unknown.
+    :param numbers: (m,), int64; equal ones are of a camera at rest, for which no time passes.
+    """
+    steps = np.diff(stamps).astype(np.float64)
+    is_known = (steps > 0) & (stamps[:-1] > 0)
+    usual = np.median(steps[is_known]) if is_known.any() else 1.0
+    times = np.zeros(len(stamps))
+    for i in range(len(steps)):
+        step = min(steps[i] / usual, LONGEST) if is_known[i] else 1.0
+        times[i + 1] = times[i] + (step if numbers[i + 1] > numbers[i] else 0.0)
+    return times

@@ -145,7 +145,9 @@ def _load(path: Path) -> np.ndarray:
             if TRANSPOSED in names:
                 return loaded[TRANSPOSED].T
             if len(names) == 1 or NAME in names:
-                return loaded[names[0] if len(names) == 1 else NAME]
+                found = loaded[names[0] if len(names) == 1 else NAME]
+                if isinstance(found, np.ndarray):  # other files are returned as bytes
+                    return found
     except Exception as error:  # damage raises errors of any type, of NumPy, zipfile and tokenize
         if 'pickle' in str(error):
             raise SourceError(
