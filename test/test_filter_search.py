@@ -11,7 +11,7 @@ import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition import filter_window, PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.blocks import PlaceChanges
 from stavpr_ros.recognition.filter_paths import (
     BAND,
@@ -160,7 +160,7 @@ def offset_errors(true_offsets, gaps=None, images=20, seeds=200):
         window = z, path, np.full(images, 0.28 * -1.4), numbers
         steps = np.ones(images - 1) if gaps is None else gaps(offsets)
         times = np.append(0.0, steps.cumsum()), np.arange(200.0)
-        masses, means = refine(*window, *times)
+        masses, means = refine(*window, *times, 1.5)
         found = means, masses @ OFFSETS
         errors += [np.abs(np.rint(each) - offsets).mean() / seeds for each in found]
     return errors
@@ -227,6 +227,22 @@ def test_stamps_show_where_images_were_lost():
         return np.mean(errors)
 
     assert mean_error(10**9) < 0.95 * mean_error(0)
+
+
+def test_faint_light_leaves_the_evidence_between_near_places(recognizer, route, monkeypatch):
+    evidence = []
+
+    def spied(*arguments):
+        evidence.append(arguments[-1])
+        return refine(*arguments)
+
+    drive(recognizer, route[:, 20:60])
+    window = recognizer._window
+    numbers = np.array([image.number for image in window._images])
+    monkeypatch.setattr(filter_window, 'refine', spied)
+    for level in range(3):
+        window._refined(np.arange(60 - LENGTH, 60), numbers, level)
+    assert evidence == [pytest.approx(2.3 / 1.4), 1.0, 1.0]
 
 
 def test_path_follows_images_whose_speed_changes(recognizer, route):

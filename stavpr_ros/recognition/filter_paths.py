@@ -40,7 +40,6 @@ STEPS = np.array([0.03, 0.12, 0.7, 0.12, 0.03])  # probability of 2 places less 
 EVENLY = 0.03  # probability of a camera that advances evenly
 ENDS = np.arange(-3, 3.1, 0.5)  # places, from the path to the ends of its straight path
 END_DEVIATION = 1.25  # places, of these ends
-EVIDENCE = 1.5  # factor of alpha between places that are near to each other
 LEAST_DEVIATION = 0.5  # places: of both where few images moved
 OFFSETS = np.arange(-BAND, BAND + 1)
 IMPOSSIBLE = 1e-20  # least likelihood of an image
@@ -89,13 +88,13 @@ def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
 
 def refine(
     z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray,
-    times: np.ndarray, place_times: np.ndarray,
+    times: np.ndarray, place_times: np.ndarray, evidence: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """
     Return where the camera was beside a path, by all images of the window.
 
-    The mean offset is by more evidence, and by two models. With the likelihoods P of the window if
-    the camera advances evenly in time and Q if not, and the means by both, it is
+    The mean offset is by other evidence, and by two models. With the likelihoods P of the window
+    if the camera advances evenly in time and Q if not, and the means by both, it is
 
         (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q)
 
@@ -108,10 +107,11 @@ def refine(
     :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
     :param times: of the images, ascending, (l,), float64, of any unit.
     :param place_times: of the n places, ascending, (n,), float64, of any unit.
+    :param evidence: factor of the exponents for the mean offset.
     :returns: probability of each offset for each image, (l, S), and its mean offset, (l,).
     """
     masses, means = np.empty(z.shape), np.empty(len(path))
-    _refine(z, path, exponents, images, times, place_times, masses, means)
+    _refine(z, path, exponents, images, times, place_times, evidence, masses, means)
     return masses, means
 
 
@@ -266,7 +266,7 @@ def find_most_probable(by_place, maxima, excluded):
 
 
 @kernel
-def _refine(z, path, exponents, images, times, place_times, masses, means):
+def _refine(z, path, exponents, images, times, place_times, evidence, masses, means):
     """Write the results of :func:`refine`."""
     l, n = len(path), len(place_times)
     likelihoods, moves = np.empty(z.shape), np.empty((l, len(STEPS)))
@@ -274,7 +274,7 @@ def _refine(z, path, exponents, images, times, place_times, masses, means):
     _start(START_DEVIATION, masses[0])
     smooth(likelihoods, moves, masses)
     moved = (images[-1] - images[0]) / max(l - 1, 1)
-    _window_likelihoods(z, path, exponents, EVIDENCE, images, n, likelihoods, moves)
+    _window_likelihoods(z, path, exponents, evidence, images, n, likelihoods, moves)
     uneven = np.empty(z.shape)
     _start(max(START_DEVIATION * moved, LEAST_DEVIATION), uneven[0])
     q = (1 - EVENLY) * np.exp(smooth(likelihoods, moves, uneven))

@@ -49,6 +49,7 @@ REFUTED = 0.01  # factor of the odds by the checks, below which another path is 
 LEAST_CANDIDATE = REFUTED  # probability of its place, at least: above that of refuted ones
 FEWEST = 2  # images of a match
 ON_MAP = 0.5  # probability above which the newest images can have a match
+NEAR_LEVEL = -2.3  # mean z of right places, at most, as evidence between near places
 AT_REST = 0.05  # relative probability of a camera at rest, below which it moves
 
 
@@ -360,9 +361,9 @@ class FilterWindow(QueryWindow):
         """
         Return the places near a path that explain the images of the window best.
 
-        The path is checked where the evidence of the filter has its mean; places are estimated
-        with more (:func:`stavpr_ros.recognition.filter_paths.refine`), which would make
-        paths through look-alike places more even as well.
+        Bad conditions bring the right place nearer to all others, less to those around it: places
+        are estimated with the evidence of usual conditions. The path is checked where the evidence
+        of the filter has its mean: more would make paths through look-alike places more even.
 
         :param path: place of each image, ascending, (l,).
         :param numbers: of the images, (l,): equal ones are of a camera at rest.
@@ -373,10 +374,12 @@ class FilterWindow(QueryWindow):
         n = self.buffer.known
         places = path[:, None] + OFFSETS
         inside = np.minimum(np.maximum(places, 0), n - 1)
-        exponents = np.array([image.weight for image in self._images]) * self._levels[level]
+        mean = self._levels[level]
+        exponents = np.array([image.weight for image in self._images]) * mean
         z = self.buffer.at(inside, len(inside))
-        times = image_times(np.array(self.buffer.stamps[-len(path) :]), numbers)
-        masses, means = refine(z, path, exponents, numbers, times, self._place_times[:n])
+        of_images = image_times(np.array(self.buffer.stamps[-len(path) :]), numbers)
+        times = of_images, self._place_times[:n]
+        masses, means = refine(z, path, exponents, numbers, *times, min(mean, NEAR_LEVEL) / mean)
         checked = self._ascending(path, masses @ OFFSETS)
         placed = self._ascending(path, means)
         close = np.abs(places - placed[:, None]) <= CLOSE
