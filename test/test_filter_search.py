@@ -160,9 +160,9 @@ def offset_errors(true_offsets, gaps=None, images=20, seeds=200):
         window = z, path, np.full(images, 0.28 * -1.4), numbers
         steps = np.ones(images - 1) if gaps is None else gaps(offsets)
         times = np.append(0.0, steps.cumsum()), np.arange(200.0)
-        masses, means = refine(*window, *times, 1.5)
-        found = means, masses @ OFFSETS
-        errors += [np.abs(np.rint(each) - offsets).mean() / seeds for each in found]
+        masses, (by_filter, by_both) = refine(*window, *times, 1.5)
+        np.testing.assert_allclose(by_filter, masses @ OFFSETS)
+        errors += [np.abs(np.rint(e) - offsets).mean() / seeds for e in (by_both, by_filter)]
     return errors
 
 

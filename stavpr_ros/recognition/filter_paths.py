@@ -93,8 +93,8 @@ def refine(
     """
     Return where the camera was beside a path, by all images of the window.
 
-    The mean offset is by other evidence, and by two models. With the likelihoods P of the window
-    if the camera advances evenly in time and Q if not, and the means by both, it is
+    The second mean offset is by other evidence, and by two models. With the likelihoods P of the
+    window if the camera advances evenly in time and Q if not, and the means by both, it is
 
         (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q)
 
@@ -107,10 +107,11 @@ def refine(
     :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
     :param times: of the images, ascending, (l,), float64, of any unit.
     :param place_times: of the n places, ascending, (n,), float64, of any unit.
-    :param evidence: factor of the exponents for the mean offset.
-    :returns: probability of each offset for each image, (l, S), and its mean offset, (l,).
+    :param evidence: factor of the exponents for the second mean offset.
+    :returns: probability of each offset for each image, (l, S), and mean offsets by the first
+        model and by both, (2, l).
     """
-    masses, means = np.empty(z.shape), np.empty(len(path))
+    masses, means = np.empty(z.shape), np.zeros((2, len(path)))
     _refine(z, path, exponents, images, times, place_times, evidence, masses, means)
     return masses, means
 
@@ -280,15 +281,30 @@ def _refine(z, path, exponents, images, times, place_times, evidence, masses, me
         _start(max(START_DEVIATION * moved, LEAST_DEVIATION), uneven[0])
         log = smooth(likelihoods, moves, uneven)
     q = (1 - EVENLY) * np.exp(log)
-    means[:] = 0
     deviation = max(END_DEVIATION * moved, LEAST_DEVIATION)
-    p = EVENLY * straight_offsets(likelihoods, path, times, place_times, deviation, means)
+    p = EVENLY * straight_offsets(likelihoods, path, times, place_times, deviation, means[1])
     share = p / (p + q) if p > 0 else 0.0
     for i in range(l):
         mean = 0.0
         for s in range(len(OFFSETS)):
+            means[0, i] += masses[i, s] * OFFSETS[s]
             mean += uneven[i, s] * OFFSETS[s]
-        means[i] = share * means[i] + (1 - share) * mean
+        means[1, i] = share * means[1, i] + (1 - share) * mean
+
+
+@kernel
+def ascending(path, offsets, first, last):
+    """
+    Return places at offsets from a path, (l,), int64, which never go back.
+
+    :param path: places, (l,), int64, and offsets, (l,), float64.
+    :param first, last: least and largest place.
+    """
+    places = np.empty(len(path), np.int64)
+    for i in range(len(path)):
+        place = min(max(path[i] + int(np.rint(offsets[i])), first), last)
+        places[i] = max(place, places[i - 1]) if i else place
+    return places
 
 
 @kernel

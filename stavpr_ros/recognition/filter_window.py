@@ -13,6 +13,7 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.recognition.filter_paths import (
+    ascending,
     BAND,
     Belief,
     CLOSE,
@@ -380,8 +381,8 @@ class FilterWindow(QueryWindow):
         of_images = image_times(np.array(self.buffer.stamps[-len(path) :]), numbers)
         times = of_images, self._place_times[:n]
         masses, means = refine(z, path, exponents, numbers, *times, min(mean, NEAR_LEVEL) / mean)
-        checked = self._ascending(path, masses @ OFFSETS)
-        placed = self._ascending(path, means)
+        ends = self.layout.first_column(path[-1]), n - 1
+        checked, placed = ascending(path, means[0], *ends), ascending(path, means[1], *ends)
         close = np.abs(places - placed[:, None]) <= CLOSE
         first, last = self.layout.positions_of(inside[[0, -1], [0, -1]]).tolist()
         stretches = self.change.stretches(first, last + 1)
@@ -391,12 +392,6 @@ class FilterWindow(QueryWindow):
         offsets = np.minimum(np.maximum(checked - path, -BAND), BAND) + BAND
         shares = (masses * close).sum(axis=1)
         return checked, shares, placed, z[np.arange(len(path)), offsets]
-
-    def _ascending(self, path: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-        """Return places at offsets from a path, (l,), which never go back."""
-        places = path + np.rint(offsets).astype(np.int64)
-        places = np.maximum(places, self.layout.first_column(path[-1]))
-        return np.maximum.accumulate(np.minimum(places, self.buffer.known - 1))
 
     def _second_best(
         self, n: int, places: np.ndarray, probabilities: np.ndarray, middle: int, radius: int
