@@ -115,7 +115,7 @@ class FilterWindow(QueryWindow):
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._entered = 0  # number of the image with which the latest path came to the map
-        self._place_times = np.arange(width, dtype=np.float64)  # by column, of the camera
+        self._place_times = np.arange(width, dtype=np.float64)  # of each column
 
     @property
     def changes(self) -> tuple[float, ...]:
