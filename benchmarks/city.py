@@ -27,8 +27,8 @@ from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map, save_map
 from stavpr_ros.mapping.builder import extract_features
+from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import unit_norm
 from stavpr_ros.sources import open_source
 from stavpr_ros.threads import thread_count
 

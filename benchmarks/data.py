@@ -9,7 +9,7 @@ import sys
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.memory import aligned_empty
-from stavpr_ros.recognition.robust import normalize
+from stavpr_ros.prepare.centering import normalize
 
 SETTINGS = FeatureSettings('synthetic', None)
 

@@ -5,8 +5,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stavpr_ros.recognition.filter_paths import BLOCK
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.paths import BLOCK
 
 ITEM_BYTES = {'float32': 4, 'int8': 1}
 

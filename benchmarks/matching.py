@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     from report import report
     from results import environment, file_name, write_json, write_lines
     from run import Run
-    from stavpr_ros.recognition.matcher import PRECISIONS
+    from stavpr_ros.prepare.matcher import PRECISIONS
 
     options.precisions = tuple(options.precisions or PRECISIONS)
     about = environment(options.device, options.commit)

@@ -23,8 +23,8 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_components
+from stavpr_ros.prepare.centering import normalize
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.robust import normalize
 
 PAGE = ROOT / 'docs' / 'performance.md'
 BEGIN, END = '<!-- written by benchmarks/projection.py -->', '<!-- end of projection -->'

@@ -23,14 +23,16 @@ from stavpr_ros.alignment.lm_dtw import best_match, match_padded, padded_width, 
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap
+from stavpr_ros.prepare.centering import MeanCentering, normalize
+from stavpr_ros.prepare.int8_features import Int8Features
+from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings, MeanCentering, normalize, z_normalized
 from stavpr_ros.recognition.window import SequenceBuffer
 from stavpr_ros.sources.frame import ImageRecord
 from timing import best_seconds, timed
@@ -226,9 +228,9 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 
 def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     """Measure the image distances of a map in int8 and its first stage, on a CPU."""
-    from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-    from stavpr_ros.recognition.filter_paths import BLOCK, TOP
-    from stavpr_ros.recognition.first_stage import FirstStage
+    from stavpr_ros.filter.paths import BLOCK, TOP
+    from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+    from stavpr_ros.prepare.first_stage import FirstStage
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):

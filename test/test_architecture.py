@@ -26,15 +26,18 @@ ROS |= {
     for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')
 }
 CORE = {
-    *('alignment', 'sources', 'features', 'mapping', 'recognition', 'relative_pose', 'pipeline'),
+    *('alignment', 'sources', 'features', 'mapping', 'filter', 'prepare', 'recognition'),
+    *('relative_pose', 'pipeline'),
 }
 MAY_IMPORT = {
     'alignment': set(),
     'sources': set(),
     'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
-    'recognition': {'alignment', 'features', 'mapping'},
-    'fleet': {'alignment', 'features', 'mapping', 'recognition'},
+    'filter': {'alignment'},
+    'prepare': {'alignment', 'features', 'mapping', 'filter'},
+    'recognition': {'alignment', 'features', 'mapping', 'filter', 'prepare'},
+    'fleet': {'alignment', 'features', 'mapping', 'filter', 'prepare', 'recognition'},
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
     'pipeline': CORE - {'pipeline'},
     'ros': CORE,

@@ -6,10 +6,11 @@ import numpy as np
 from places import features_of, map_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import Session
+from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings, z_normalized
 import torch
 
 N, LAG = 37, 3
@@ -20,7 +21,8 @@ SMALL = FilterSettings(speeds=(0.0, 0.5, 1.0, 2.0, 4.5), levels=(-1.4, -3.4))
 def cuda_filter(cuda_runtime):
     """Return the module, with small blocks."""
     from stavpr_ros.alignment.cuda import place_filter as kernels
-    from stavpr_ros.recognition import cuda_filter, place_filter, recognizer
+    from stavpr_ros.filter import cuda_filter, place_filter
+    from stavpr_ros.recognition import recognizer
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, 'BLOCK', 8)
@@ -85,13 +87,15 @@ def test_update_and_answers_equal_those_of_the_cpu(cuda_filter, gaps):
 
 
 def test_z_normalized_on_device_equals_that_of_the_cpu(cuda_filter):
+    from stavpr_ros.recognition.cuda_windows import z_normalized_on_device
+
     row = np.random.default_rng(0).uniform(0.2, 1, 150).astype(np.float32)
     row[[7, 149]] = np.inf
     flat, banned = np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)
     for values in (row, row[:5], flat, banned, row[:0]):
         for counted in (np.ones(len(values), bool), np.arange(len(values)) % 3 > 0):
             given = torch.from_numpy(values), torch.from_numpy(counted)
-            found = cuda_filter.z_normalized_on_device(*given)
+            found = z_normalized_on_device(*given)
             expected = z_normalized(values, counted=counted)
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 

@@ -27,7 +27,7 @@ TOLERANCE = 1e-5
 def matcher_of(cuda_runtime):
     """Return the function that makes a matcher, with small blocks."""
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
-    from stavpr_ros.recognition.matcher import make_matcher
+    from stavpr_ros.prepare.matcher import make_matcher
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dtw, 'BLOCK', 4)
@@ -93,7 +93,7 @@ def test_distances_of_every_strategy_equal_oracle(matcher_of, strategy, xi, prec
 
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
 def test_distances_in_pieces_are_equal(matcher_of, monkeypatch, precision):
-    from stavpr_ros.recognition import cuda_matcher
+    from stavpr_ros.prepare import cuda_matcher
 
     reference, query = features(11), features(5, seed=1)
     whole = matcher_of(reference, SpatialSettings(), precision)
@@ -192,7 +192,7 @@ def test_cuda_matcher_with_invalid_settings_is_rejected(matcher_of):
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
 def test_distances_of_large_map_on_device_equal_cpu(matcher_of, monkeypatch, precision):
     from stavpr_ros.alignment.cuda import dtw, lm_dtw
-    from stavpr_ros.recognition.matcher import make_matcher
+    from stavpr_ros.prepare.matcher import make_matcher
 
     monkeypatch.setattr(dtw, 'BLOCK', 128)
     monkeypatch.setattr(lm_dtw, 'BLOCK', 128)

@@ -11,17 +11,11 @@ import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.filter.motion import APART
+from stavpr_ros.filter.paths import BAND, OFFSETS, refine, smooth, straight_offsets
+from stavpr_ros.prepare.blocks import PlaceChanges
 from stavpr_ros.recognition import filter_window, PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.blocks import PlaceChanges
-from stavpr_ros.recognition.filter_paths import (
-    BAND,
-    OFFSETS,
-    refine,
-    smooth,
-    straight_offsets,
-)
 from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.map_change import APART
 from stavpr_ros.recognition.recognizer import EARLY
 
 pytestmark = pytest.mark.usefixtures('one_thread')

@@ -10,11 +10,12 @@ import pytest
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import Session
-from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-from stavpr_ros.recognition.first_stage import CHUNK, FirstStage
-from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust import unit_norm
+from stavpr_ros.prepare import first_stage
+from stavpr_ros.prepare.centering import unit_norm
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.first_stage import CHUNK, FirstStage
+from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 W, d = 7, 40
 SETTINGS = RecognizerSettings(mode='robust')

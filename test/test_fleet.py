@@ -25,9 +25,9 @@ from stavpr_ros.fleet.qdrant_store import EdgePoints
 from stavpr_ros.fleet.store import map_vectors, MapIndex, place_vectors, sample_places
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
 from stavpr_ros.pipeline import Pipeline, read_map
+from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.recognizer import EARLY
-from stavpr_ros.recognition.robust import unit_norm
 
 for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
     pytest.importorskip(package, reason='the extra fleet is not installed')

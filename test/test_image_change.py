@@ -6,17 +6,9 @@ import numpy as np
 from places import route_strips
 import pytest
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.recognition.blocks import PlaceChanges
-from stavpr_ros.recognition.map_change import (
-    AHEAD,
-    APART,
-    FLOOR,
-    ImageChange,
-    OFFSET,
-    SMOOTHED,
-    STRETCH,
-)
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.motion import AHEAD, APART, FLOOR, ImageChange, OFFSET, SMOOTHED, STRETCH
+from stavpr_ros.prepare.blocks import PlaceChanges
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SETTINGS = FilterSettings()

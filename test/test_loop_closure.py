@@ -15,15 +15,14 @@ from stavpr_ros.errors import (
     InputError,
     SettingsError,
 )
-from stavpr_ros.recognition import (
-    Match,
-    PlaceRecognizer,
-    RecognizerSettings,
-    route_features,
-    Status,
-)
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher, CpuRouteMatcher
-from stavpr_ros.recognition.filter_paths import BAND, CLOSE
+from stavpr_ros.filter.paths import BAND, CLOSE
+from stavpr_ros.prepare import route_features
+from stavpr_ros.prepare.centering import unit_norm
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher, CpuRouteMatcher
+from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.prepare.route_features import GROWTH, ROOM, RouteFeatures
+from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.filter_window import LEAST_CANDIDATE
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
@@ -33,14 +32,7 @@ from stavpr_ros.recognition.loop_closer import (
     LONGEST_GAP,
     LoopCloser,
 )
-from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.robust import (
-    PAPER,
-    ROBUST,
-    unit_norm,
-    z_normalized,
-)
-from stavpr_ros.recognition.route_features import GROWTH, ROOM, RouteFeatures
+from stavpr_ros.recognition.robust import PAPER, ROBUST
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)

@@ -20,7 +20,7 @@ from stavpr_ros.mapping import (
     select_places,
     select_session,
 )
-from stavpr_ros.recognition.near_duplicates import without_duplicates
+from stavpr_ros.prepare.near_duplicates import without_duplicates
 
 
 @pytest.fixture(scope='module')

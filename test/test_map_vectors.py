@@ -18,9 +18,10 @@ from stavpr_ros.mapping.journal_map import journal_map, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.merging import merge_maps, select_places
 from stavpr_ros.mapping.reduction import with_principal_components
-from stavpr_ros.recognition import first_stage, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-from stavpr_ros.recognition.first_stage import FirstStage
+from stavpr_ros.prepare import first_stage
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.first_stage import FirstStage
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 W, d, D = 3, 8, 20
 BACKBONE = OnnxSettings(model='', layer='map', vector='global', sha256='0' * 64)

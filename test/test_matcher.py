@@ -21,9 +21,9 @@ from stavpr_ros.alignment import (
 )
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
-from stavpr_ros.recognition.matcher import make_matcher, PRECISIONS
 from stavpr_ros.threads import limit_threads
 
 ADAPTIVE = SpatialSettings()

@@ -18,7 +18,7 @@ from stavpr_ros.pipeline import (
     PipelineSettings,
     read_map,
 )
-from stavpr_ros.recognition.matcher import PRECISIONS
+from stavpr_ros.prepare.matcher import PRECISIONS
 from stavpr_ros.recognition.robust import MODES
 from stavpr_ros.recognition.verification import METHODS
 from stavpr_ros.relative_pose.estimator import METHODS as EDGE_METHODS

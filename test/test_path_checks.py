@@ -5,8 +5,8 @@
 import numpy as np
 from places import features_of, map_of, recognize_all, route_strips
 import pytest
-from stavpr_ros.recognition import filter_window, path_checks, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.path_checks import (
+from stavpr_ros.filter import checks as path_checks
+from stavpr_ros.filter.checks import (
     EVEN,
     EVEN_SHARE,
     EXCESS,
@@ -18,6 +18,7 @@ from stavpr_ros.recognition.path_checks import (
     UNEVEN_WEIGHT,
     unevenness,
 )
+from stavpr_ros.recognition import filter_window, PlaceRecognizer, RecognizerSettings
 
 PLACES = 240
 

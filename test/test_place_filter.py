@@ -9,10 +9,10 @@ import oracle
 import pytest
 from stavpr_ros.alignment.cpu.simd import LANES, load, store
 from stavpr_ros.compilation import kernel
-from stavpr_ros.recognition.filter_kernels import exp
-from stavpr_ros.recognition.filter_paths import CLOSE, NEGLIGIBLE, TOP
-from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.filter.kernels import exp
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.paths import CLOSE, NEGLIGIBLE, TOP
+from stavpr_ros.filter.place_filter import PlaceFilter
 
 
 @kernel

@@ -5,9 +5,9 @@
 import numpy as np
 from places import features_of, route_strips
 import pytest
+from stavpr_ros.filter.place_means import DELAY, IMAGES, NEAREST, PlaceMeans, PRIOR
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.recognition.place_means import DELAY, IMAGES, NEAREST, PlaceMeans, PRIOR
 from stavpr_ros.recognition.robust import MIN_PROBABILITY
 
 EXCLUDED = 50

@@ -7,21 +7,18 @@ from places import features_of, recognize_all
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.filter_paths import CLOSE
-from stavpr_ros.recognition.robust import (
+from stavpr_ros.filter.paths import CLOSE
+from stavpr_ros.prepare.centering import (
     MeanCentering,
     norms_of,
-    options_of,
-    PAPER,
     PRIOR,
-    ROBUST,
-    RobustOptions,
     STRENGTH,
     unit_norm,
     Whitening,
-    z_normalized,
 )
+from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.robust import options_of, PAPER, ROBUST, RobustOptions
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 

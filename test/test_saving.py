@@ -10,7 +10,7 @@ from stavpr_ros.mapping import load_map, open_map, save_map
 from stavpr_ros.output_file import FileVersion
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import save_recorded_map, write_map
-from stavpr_ros.recognition import prepared_map
+from stavpr_ros.prepare import prepared_map
 
 
 @pytest.fixture

@@ -12,6 +12,8 @@ from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import (
     GrowingMap,
     load_map,
@@ -23,8 +25,6 @@ from stavpr_ros.mapping import (
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.window import ColumnLayout

@@ -12,8 +12,8 @@ from stavpr_ros.features.extractor import cut_strips
 from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, load_map, save_map
+from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.matcher import make_matcher
 from stavpr_ros.sources.frame import Frame
 
 

@@ -15,7 +15,8 @@ from fixtures import route_images
 import numpy as np
 import pytest
 from scipy.spatial.distance import cosine
-from stavpr_ros.recognition.robust import FilterSettings, norms_of, unit_norm
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.prepare.centering import norms_of, unit_norm
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))

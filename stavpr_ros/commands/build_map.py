@@ -335,7 +335,7 @@ def main(args: list[str] | None = None) -> int:
         arguments.input = arguments.input[0]
         from stavpr_ros.features.descriptors import is_descriptors
         from stavpr_ros.mapping import save_map
-        from stavpr_ros.recognition.prepared_map import statistics_of_map
+        from stavpr_ros.prepare.prepared_map import statistics_of_map
 
         if is_descriptors(arguments.input):
             place_map, journal = _build_of_descriptors(arguments), None

@@ -257,7 +257,7 @@ def _compact(arguments: argparse.Namespace) -> None:
 
     from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.mapping.stored_features import StoredFeatures
-    from stavpr_ros.recognition.near_duplicates import without_duplicates
+    from stavpr_ros.prepare.near_duplicates import without_duplicates
 
     place_map = _verified(arguments.map)
     assert isinstance(place_map.features, StoredFeatures)
@@ -300,7 +300,7 @@ def _sessions(arguments: argparse.Namespace) -> None:
 
 def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import save_map
-    from stavpr_ros.recognition.prepared_map import statistics_of_map, with_codes
+    from stavpr_ros.prepare.prepared_map import statistics_of_map, with_codes
 
     storage = getattr(arguments, 'storage', '')
     learned = statistics_of_map(place_map, storage)

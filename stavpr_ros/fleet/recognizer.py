@@ -11,18 +11,20 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.motion import APART, ImageChange
 from stavpr_ros.fleet.city_map import CityMap
 from stavpr_ros.fleet.neighborhoods import Votes
 from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.memory import aligned_zeros
+from stavpr_ros.prepare.blocks import PlaceChanges
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
-from stavpr_ros.recognition.blocks import PlaceChanges
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher
 from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.map_change import APART, ImageChange
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION, ROBUST
+from stavpr_ros.recognition.robust import ROBUST
 from stavpr_ros.recognition.sessions import SessionLayout
 from stavpr_ros.threads import call_on_thread
 

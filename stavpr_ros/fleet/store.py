@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 from stavpr_ros.errors import FleetError
 from stavpr_ros.mapping import PlaceMap, select_places, Session
-from stavpr_ros.recognition.blocks import blocks
-from stavpr_ros.recognition.robust import evenly, MeanCentering, normalize
+from stavpr_ros.prepare.blocks import blocks
+from stavpr_ros.prepare.centering import evenly, MeanCentering, normalize
 
 RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places
 GROUPS = 3  # of strips in a place's vector

@@ -43,7 +43,7 @@ def save_map(
         are, float32 in memory.
     :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
     :param statistics: learned by recognition from the features as they will be stored, see
-        :func:`stavpr_ros.recognition.prepared_map.statistics_of_map`; None = write none.
+        :func:`stavpr_ros.prepare.prepared_map.statistics_of_map`; None = write none.
     :returns: the id of the map, 16 hexadecimal digits of the hash of its content.
     :raises OutputError: the file is there already, or cannot be written.
     :raises SettingsError: no such storage.

@@ -14,7 +14,7 @@ from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
-from stavpr_ros.recognition.prepared_map import statistics_of_map
+from stavpr_ros.prepare.prepared_map import statistics_of_map
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 

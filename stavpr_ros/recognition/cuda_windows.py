@@ -10,11 +10,24 @@ from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter, z_normalized_on_device
+from stavpr_ros.filter.cuda_filter import CudaPlaceFilter
+from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
 import torch
+
+
+def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
+    """Return a row as :func:`stavpr_ros.prepare.normalization.z_normalized`, without waiting."""
+    if not len(row):
+        return row
+    known = torch.isfinite(row) & counted
+    count = known.sum().clamp(min=1)
+    values = torch.where(known, row, 0)
+    mean = values.sum() / count
+    off = torch.where(known, row - mean, 0)
+    return (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
 
 
 class DeviceBuffer(SequenceBuffer):

@@ -12,7 +12,10 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.recognition.filter_paths import (
+from stavpr_ros.filter.checks import least_at_rest, NEWEST, odds_factor, PathCandidate, unevenness
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.motion import ImageChange
+from stavpr_ros.filter.paths import (
     ascending,
     BAND,
     Belief,
@@ -22,18 +25,9 @@ from stavpr_ros.recognition.filter_paths import (
     OFFSETS,
     refine,
 )
-from stavpr_ros.recognition.map_change import ImageChange
+from stavpr_ros.filter.place_filter import PlaceFilter
+from stavpr_ros.filter.place_means import PlaceMeans
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.path_checks import (
-    least_at_rest,
-    NEWEST,
-    odds_factor,
-    PathCandidate,
-    unevenness,
-)
-from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.place_means import PlaceMeans
-from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import (
     ColumnLayout,
     image_times,
@@ -42,7 +36,7 @@ from stavpr_ros.recognition.window import (
 )
 
 if TYPE_CHECKING:
-    from stavpr_ros.recognition.cuda_filter import CudaPlaceFilter
+    from stavpr_ros.filter.cuda_filter import CudaPlaceFilter
 
 CALIBRATION = 2.0  # factor of the odds of being on the map, which the filter declares too low
 CANDIDATES = 3  # paths that are checked, at most
@@ -82,7 +76,7 @@ class FilterWindow(QueryWindow):
     :param normalizes, around: see :class:`stavpr_ros.recognition.window.QueryWindow`.
     :param to_oldest: for loop closure: states are followed back to the oldest image of the
         window, which :meth:`match_oldest` requires, instead of the middle one, and the mean z of
-        each place is subtracted (:mod:`stavpr_ros.recognition.place_means`).
+        each place is subtracted (:mod:`stavpr_ros.filter.place_means`).
 
     ``change`` compares images, ``filter`` contains the states.
     """

@@ -10,15 +10,15 @@ import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition.cpu_matcher import CpuRouteMatcher
-from stavpr_ros.recognition.filter_paths import BAND
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.paths import BAND
+from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
+from stavpr_ros.prepare.matcher import PRECISIONS
+from stavpr_ros.prepare.route_features import RouteFeatures
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import Match, Status
-from stavpr_ros.recognition.matcher import PRECISIONS
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import FilterSettings
-from stavpr_ros.recognition.route_features import RouteFeatures
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
 
@@ -56,7 +56,7 @@ class LoopCloser(SequenceRecognizer):
         excluded images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :param precision: of the route's features once it is settled, ``float32`` or ``int8``; see
-        :mod:`stavpr_ros.recognition.route_features`.
+        :mod:`stavpr_ros.prepare.route_features`.
     :raises SettingsError: invalid settings.
     """
 

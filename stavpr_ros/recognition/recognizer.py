@@ -14,12 +14,16 @@ from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.recognition.blocks import blocks
+from stavpr_ros.prepare.blocks import blocks
+from stavpr_ros.prepare.centering import MeanCentering
+from stavpr_ros.prepare.int8_features import Int8Features
+from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.int8_features import Int8Features
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import (
     Candidate,
@@ -29,17 +33,13 @@ from stavpr_ros.recognition.match import (
     Status,
     WindowMatch,
 )
-from stavpr_ros.recognition.matcher import make_matcher
-from stavpr_ros.recognition.place_filter import PlaceFilter
-from stavpr_ros.recognition.prepared_map import prepare_map
 from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
-from stavpr_ros.recognition.robust import MeanCentering
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
 
 if TYPE_CHECKING:
-    from stavpr_ros.recognition.first_stage import FirstStage
+    from stavpr_ros.prepare.first_stage import FirstStage
 
 EARLY = 0.9  # least probability of a match before the window is full
 TIMED = 3  # images, to compare the time of one with the time budget
@@ -246,7 +246,7 @@ class PlaceRecognizer(SequenceRecognizer):
     :param settings: see :class:`RecognizerSettings`.
     :param backend: ``cpu``, ``cuda``, or ``auto``; ``cuda`` for mode paper and the place filter.
     :param precision: of the map's features in the matcher, ``float32`` or ``int8``; see
-        :func:`stavpr_ros.recognition.matcher.make_matcher`.
+        :func:`stavpr_ros.prepare.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
     :raises InputError: features of the map are not finite, or an argument of another type.
@@ -279,7 +279,9 @@ class PlaceRecognizer(SequenceRecognizer):
         self._dimension = features.dimension
         # cells are made of float32 strips
         precision = 'float32' if settings.spatial.vertical else precision
-        prepared = prepare_map(features, options, precision)
+        prepared = prepare_map(
+            features, precision, options.mean_centering, options.whitening, options.place_filter
+        )
         self._centering = prepared.centering
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
         if isinstance(self._window, FilterWindow):
@@ -334,8 +336,8 @@ class PlaceRecognizer(SequenceRecognizer):
         budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
         text = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
         if exact > budget:
-            from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-            from stavpr_ros.recognition.first_stage import FirstStage
+            from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+            from stavpr_ros.prepare.first_stage import FirstStage
 
             assert isinstance(self._matcher, CpuMatcher)
             if (vectors := features.vectors) is not None:

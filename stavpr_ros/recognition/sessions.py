@@ -11,10 +11,10 @@ one position: their probabilities add up, and neither is the second best of the 
 from dataclasses import replace
 
 import numpy as np
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.paths import Belief
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.filter_paths import Belief
 from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
-from stavpr_ros.recognition.robust import FilterSettings
 from stavpr_ros.recognition.window import ColumnLayout
 
 

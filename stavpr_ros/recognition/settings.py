@@ -30,7 +30,7 @@ class RecognizerSettings:
         poses, the path of a match is compared with them; 0 = never. See
         :mod:`stavpr_ros.recognition.relative_motion`.
     :param time_budget_ms: of :class:`PlaceRecognizer`, for an image; maps whose exact matching
-        takes longer get a first stage (:mod:`stavpr_ros.recognition.first_stage`). 0 = always
+        takes longer get a first stage (:mod:`stavpr_ros.prepare.first_stage`). 0 = always
         exact.
     :param min_probability: mode robust: a window is matched when its probability is above it;
         above 0, below 1.

@@ -18,10 +18,10 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
 from stavpr_ros.compilation import kernel
+from stavpr_ros.filter.paths import Belief, NO_PLACES
 from stavpr_ros.memory import aligned_empty
-from stavpr_ros.recognition.filter_paths import Belief, NO_PLACES
+from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition.match import WindowMatch
-from stavpr_ros.recognition.robust import z_normalized
 
 LONGEST = 4.0  # intervals between images: beyond, the camera stopped, or its speed is unknown
 
@@ -228,7 +228,7 @@ class QueryWindow(ABC):
     :param buffer: of their distances, empty.
     :param layout: of the places in the columns of the buffer.
     :param normalizes: z-normalize the distances of each image.
-    :param around: see :func:`stavpr_ros.recognition.robust.z_normalized`.
+    :param around: see :func:`stavpr_ros.prepare.normalization.z_normalized`.
     """
 
     def __init__(

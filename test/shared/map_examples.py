@@ -12,7 +12,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
 from stavpr_ros.mapping.error_risks import ErrorRisks
-from stavpr_ros.recognition import prepared_map
+from stavpr_ros.prepare import prepared_map
 from stavpr_ros.sources.frame import Frame
 
 VERSION2 = Path(__file__).parents[1] / 'data' / 'version2'

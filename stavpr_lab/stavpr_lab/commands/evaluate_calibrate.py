@@ -15,9 +15,9 @@ from stavpr_ros.mapping import open_map, save_map, select_places, verify_map
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.output_file import FileVersion, MAP, require_replaceable
+from stavpr_ros.prepare.prepared_map import statistics_of_map, with_codes
 from stavpr_ros.recognition import PlaceRecognizer
 from stavpr_ros.recognition.error_rate import ERRORS, least_probability
-from stavpr_ros.recognition.prepared_map import statistics_of_map, with_codes
 from tqdm import tqdm
 
 WINDOWS = 2  # of a block: as many images as that of the bootstrap has

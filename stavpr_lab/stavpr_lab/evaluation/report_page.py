@@ -19,7 +19,7 @@ from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
 from stavpr_lab.evaluation.protocol import text
 from stavpr_lab.evaluation.report import jsonable, METRICS, Report
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.robust import evenly
+from stavpr_ros.prepare.centering import evenly
 
 TEMPLATE = 'report.html.jinja'
 VIEWS = 240  # windows that can be looked at: more would make a large file

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition.robust import evenly
+from stavpr_ros.prepare.centering import evenly
 import torch
 from torch.nn.functional import normalize
 

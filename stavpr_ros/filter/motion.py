@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.recognition.robust import change_weights, FilterSettings, LEAST_DISTINCT
+from stavpr_ros.filter.model import FilterSettings
 
 APART = 5  # places apart up to which the map's changes are learned
 STANDING = 0.05  # weight of a place by its change, up to which the curve is not learned from it
@@ -29,6 +29,9 @@ SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
 FLOOR = 1e-3  # least relative probability of a speed
 LEAST_SIMILAR = 0.01  # similarity of neighboring places below which it is noise
+MIN_DISTINCT = 5  # places: fewer have no meaningful mean and deviation
+LARGE_CHANGE = 0.97  # quantile of changes from place to place
+REST, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a slow one
 LEAST_LEFT = 0.1  # factor of the similarity by noise, below which images show no motion
 
 
@@ -195,7 +198,7 @@ class ImageChange:
     def distinct(self, n: int) -> np.ndarray:
         """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
         distinct = ~self._equal[:n]
-        return distinct if np.count_nonzero(distinct) >= LEAST_DISTINCT else np.ones(n, bool)
+        return distinct if np.count_nonzero(distinct) >= MIN_DISTINCT else np.ones(n, bool)
 
     def at_rest(self) -> np.ndarray:
         """Return the places where the map's camera was at rest, ascending, (m,)."""
@@ -266,3 +269,20 @@ class ImageChange:
 def _means(rows: Collection[list[float]]) -> list[float]:
     """Return the mean of each column; of few numbers, faster than NumPy."""
     return [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+
+
+def change_weights(changes: np.ndarray) -> np.ndarray:
+    """
+    Return how much each place counts, (n,): less where the camera was at rest or slow.
+
+    Nothing below a change from the place before of ``REST``, fully above ``SLOW`` of the large
+    changes, and in proportion between; the largest, from one drive to another, do not matter.
+
+    :param changes: of each place from the one before, (n,); that of the first does not matter.
+    """
+    large = float(np.quantile(changes, LARGE_CHANGE, method='lower')) if len(changes) else 0.0
+    if not large:
+        return np.ones(len(changes))
+    weights: np.ndarray = np.clip((changes / large - REST) / (SLOW - REST), 0, 1)
+    weights[:1] = 1
+    return weights

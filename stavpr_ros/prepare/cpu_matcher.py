@@ -12,9 +12,9 @@ from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty, is_aligned
-from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.robust import normalize
-from stavpr_ros.recognition.route_strips import RouteStrips
+from stavpr_ros.prepare.centering import normalize
+from stavpr_ros.prepare.int8_features import Int8Features
+from stavpr_ros.prepare.route_strips import RouteStrips
 
 
 def cut_cells(strips: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
@@ -33,7 +33,7 @@ def cut_cells(strips: np.ndarray, cells: tuple[int, int]) -> np.ndarray:
 
 class CpuMatcher:
     """
-    See :class:`stavpr_ros.recognition.matcher.Matcher`.
+    See :class:`stavpr_ros.prepare.matcher.Matcher`.
 
     :param features: those of the map; contiguous float32 ones whose memory begins with a cache
         line are shared, not copied.

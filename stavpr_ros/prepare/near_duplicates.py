@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
+from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.mapping import PlaceMap, select_places
-from stavpr_ros.recognition.blocks import blocks, PlaceChanges
-from stavpr_ros.recognition.robust import FilterSettings, MeanCentering
+from stavpr_ros.prepare.blocks import blocks, PlaceChanges
+from stavpr_ros.prepare.centering import MeanCentering
 from tqdm import tqdm
 
 MIN_MOTION = 0.1  # share of the median step; a camera that moved farther was not at rest

@@ -3,7 +3,7 @@
 """
 The place filter on the CPU: level, speed and place of all states change with an image.
 
-The memory is that of :mod:`stavpr_ros.recognition.place_filter`. For each block of a part,
+The memory is that of :mod:`stavpr_ros.filter.place_filter`. For each block of a part,
 ``_mix`` lets level and speed of its states and of the ``reach`` columns before it change, where
 reach is more than the largest step and one place; ``_move`` moves them on and weighs them by the
 image::
@@ -31,7 +31,7 @@ from stavpr_ros.alignment.cpu.simd import (
     store_bytes,
 )
 from stavpr_ros.compilation import kernel, parallel_kernel
-from stavpr_ros.recognition.filter_paths import BLOCK, ENTERED
+from stavpr_ros.filter.paths import BLOCK, ENTERED
 
 F, INT = np.float32, np.int32
 PLACES = 2048  # of a part; a multiple of BLOCK

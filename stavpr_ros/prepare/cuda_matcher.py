@@ -10,7 +10,7 @@ from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.int8_features import Int8Features
+from stavpr_ros.prepare.int8_features import Int8Features
 import torch
 
 BLOCK_WORDS = 2**26  # most words of products in memory at a time: 256 MiB
@@ -20,7 +20,7 @@ PLACES_IN_PIECES = 2**14  # most places of int8 widened at a time
 
 class CudaMatcher:
     """
-    See :class:`stavpr_ros.recognition.matcher.Matcher`; on torch's current CUDA device.
+    See :class:`stavpr_ros.prepare.matcher.Matcher`; on torch's current CUDA device.
 
     Products by torch, alignment by the kernel of the strategy. Calls are queued on torch's current
     stream.

@@ -11,15 +11,9 @@ are places, so that a place is seldom rounded again.
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition.map_change import APART
-from stavpr_ros.recognition.robust import (
-    change_weights,
-    evenly_weighted,
-    norms_of,
-    unit_norm,
-    Whitening,
-)
-from stavpr_ros.recognition.route_strips import grown, move_up, rounded_strips, RouteStrips
+from stavpr_ros.filter.motion import APART, change_weights
+from stavpr_ros.prepare.centering import evenly_weighted, norms_of, unit_norm, Whitening
+from stavpr_ros.prepare.route_strips import grown, move_up, rounded_strips, RouteStrips
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer

@@ -12,20 +12,14 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.filter.motion import APART
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.map_statistics import MapStatistics
 from stavpr_ros.mapping.stored_features import StoredFeatures
-from stavpr_ros.recognition.blocks import converted_blocks, PlaceChanges
-from stavpr_ros.recognition.int8_features import Int8Features, rounded
-from stavpr_ros.recognition.map_change import APART
-from stavpr_ros.recognition.robust import (
-    MeanCentering,
-    RANK,
-    RobustOptions,
-    SAMPLE,
-    STRENGTH,
-)
+from stavpr_ros.prepare.blocks import converted_blocks, PlaceChanges
+from stavpr_ros.prepare.centering import MeanCentering, RANK, SAMPLE, STRENGTH
+from stavpr_ros.prepare.int8_features import Int8Features, rounded
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
@@ -50,18 +44,26 @@ class PreparedMap:
     note: str = ''
 
 
-def prepare_map(features: LocalFeatures, options: RobustOptions, precision: str) -> PreparedMap:
+def prepare_map(
+    features: LocalFeatures,
+    precision: str,
+    centers: bool = True,
+    whitens: bool = True,
+    learns_changes: bool = True,
+) -> PreparedMap:
     """
     Read and convert the features of a map.
 
-    :param precision: see :func:`stavpr_ros.recognition.matcher.make_matcher`.
+    :param centers, whitens: see :class:`stavpr_ros.prepare.centering.MeanCentering`.
+    :param learns_changes: from place to place, which the place filter needs.
+    :param precision: see :func:`stavpr_ros.prepare.matcher.make_matcher`.
     """
     statistics, note, centering = None, '', None
-    if isinstance(features, StoredFeatures) and options.mean_centering and options.whitening:
+    if isinstance(features, StoredFeatures) and centers and whitens:
         statistics, note = _usable(features)
-    if options.mean_centering or options.whitening:
-        centering = MeanCentering(features, options.mean_centering, options.whitening, statistics)
-    learns = options.place_filter and statistics is None
+    if centers or whitens:
+        centering = MeanCentering(features, centers, whitens, statistics)
+    learns = learns_changes and statistics is None
     changes = PlaceChanges(len(features) if learns else 0, APART)
     prepared: LocalFeatures | Int8Features
     if (

@@ -4,35 +4,16 @@
 
 import numpy as np
 from stavpr_ros.alignment.cuda.compilation import runtime
-from stavpr_ros.recognition.filter_paths import (
-    ALL_ENTERED,
-    Belief,
-    belief_of,
-    NEGLIGIBLE,
-    NO_PLACES,
-    TOP,
-)
-from stavpr_ros.recognition.robust import FilterSettings, MIN_DEVIATION
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.paths import ALL_ENTERED, Belief, belief_of, NEGLIGIBLE, NO_PLACES, TOP
 import torch
 
 MOST = 512  # most probable places that are copied to the host: more than are ever excluded
 
 
-def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
-    """Return a row as :func:`stavpr_ros.recognition.robust.z_normalized`, without waiting."""
-    if not len(row):
-        return row
-    known = torch.isfinite(row) & counted
-    count = known.sum().clamp(min=1)
-    values = torch.where(known, row, 0)
-    mean = values.sum() / count
-    off = torch.where(known, row - mean, 0)
-    return (row - mean) / (off.square().sum() / count).sqrt().clamp(min=MIN_DEVIATION)
-
-
 class CudaPlaceFilter:
     """
-    A :class:`stavpr_ros.recognition.place_filter.PlaceFilter` on torch's current CUDA device.
+    A :class:`stavpr_ros.filter.place_filter.PlaceFilter` on torch's current CUDA device.
 
     Probabilities differ from those of the CPU in the last digits: sums are formed in another
     order. Only the first of :meth:`belief`, :meth:`most_probable` and :meth:`path` after an image

@@ -10,7 +10,7 @@ from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.checks import require_choice
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.int8_features import Int8Features, rounded
+from stavpr_ros.prepare.int8_features import Int8Features, rounded
 
 PRECISIONS = ('float32', 'int8')
 
@@ -75,9 +75,9 @@ def make_matcher(
     if precision == 'int8' and isinstance(features, LocalFeatures):
         features = rounded(features, lambda block: block)
     if backend == 'cuda':
-        from stavpr_ros.recognition.cuda_matcher import CudaMatcher
+        from stavpr_ros.prepare.cuda_matcher import CudaMatcher
 
         return CudaMatcher(features, spatial)
-    from stavpr_ros.recognition.cpu_matcher import CpuMatcher
+    from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 
     return CpuMatcher(features, spatial)

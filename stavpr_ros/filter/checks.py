@@ -10,7 +10,7 @@ distinguish right paths from those through places that look alike, in all kinds 
   others far. s and m are deviation and mean of z over the places of the path;
 - **motion**: a path that creeps explains images of any drive. e is the logarithm of the change of
   the images over that of the map at the speed of the path
-  (:meth:`stavpr_ros.recognition.map_change.ImageChange.excess`).
+  (:meth:`stavpr_ros.filter.motion.ImageChange.excess`).
 
 The odds of a path are multiplied by
 

@@ -19,10 +19,11 @@ import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.recognition.cpu_matcher import CpuMatcher
-from stavpr_ros.recognition.filter_paths import BLOCK
-from stavpr_ros.recognition.int8_features import Int8Features
-from stavpr_ros.recognition.robust import evenly, MIN_DEVIATION, normalize
+from stavpr_ros.filter.paths import BLOCK
+from stavpr_ros.prepare.centering import evenly, normalize
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.int8_features import Int8Features
+from stavpr_ros.prepare.normalization import MIN_DEVIATION
 
 BYTES = 128  # of a place, at most
 LEARNED = 2048  # places that the components are learned from

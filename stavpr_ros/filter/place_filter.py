@@ -32,7 +32,7 @@ Memory, for n columns: places, with a gap between two sessions, whose states are
     sums       of the states of each column, and the largest of each block
     halos      (parts, K, V, reach), float32: copy of the last columns before each part
     origins    (lag, blocks, K, (V + 1) // 2, BLOCK), uint8: ring of the latest images; where
-               each state came from, two in a byte (:mod:`stavpr_ros.recognition.filter_paths`)
+               each state came from, two in a byte (:mod:`stavpr_ros.filter.paths`)
 
 All states advance in one pass, in place. A thread computes a part from its last block to its
 first, since states only move up: the columns before a block are not written yet, and those before
@@ -42,9 +42,9 @@ that makes their sum 1 is part of the next image's level changes.
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES
-from stavpr_ros.memory import aligned_zeros
-from stavpr_ros.recognition.filter_kernels import advance, PLACES
-from stavpr_ros.recognition.filter_paths import (
+from stavpr_ros.filter.kernels import advance, PLACES
+from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.paths import (
     ALL_ENTERED,
     backtrack_states,
     Belief,
@@ -57,7 +57,7 @@ from stavpr_ros.recognition.filter_paths import (
     TOP,
     trace_back,
 )
-from stavpr_ros.recognition.robust import FilterSettings
+from stavpr_ros.memory import aligned_zeros
 
 NO_PLACE = np.float32(-np.inf)  # z of a gap between sessions, where likelihoods are 1
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.recognition.blocks import converted_blocks
+from stavpr_ros.prepare.blocks import converted_blocks
 
 
 @dataclass(frozen=True)

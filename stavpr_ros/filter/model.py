@@ -1,0 +1,83 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The model of the place filter: states, how they change, and the evidence of an image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """
+    Model of the filter; tuned on the data sets named in docs/robust_mode.md.
+
+    :param speeds: places that the query passes an image; between two, a path costs evidence.
+    :param levels: mean z-normalized distance of right places, from bad to good conditions.
+    :param weight: alpha of an image that differs from the one before as neighboring places of the
+        map do.
+    :param most_change, least_change: limits of the change, over that of neighboring places, that
+        alpha is multiplied by.
+    :param standstill: change, over that of neighboring places, below which the camera is at rest.
+    :param keep_level: probability of keeping the level.
+    :param keep_speed: probability of keeping the speed.
+    :param spread: probability of one place more than the speed's, and of one less.
+    :param leave: probability of leaving the map at an image, and enter: of returning to it.
+    :param start: probability of starting on the map.
+    :param change_deviation: of the logarithm of the change at one speed.
+    :param speed_weight: exponent of the likelihood of a speed. Below 1, since successive changes,
+        means of five, are not independent.
+    """
+
+    speeds: tuple[float, ...] = (0.0, 0.25, 0.33, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
+    levels: tuple[float, ...] = (-1.4, -2.3, -3.4)
+    weight: float = 0.28
+    most_change: float = 2.0
+    least_change: float = 0.2
+    standstill: float = 0.1
+    keep_level: float = 0.9995
+    keep_speed: float = 0.98
+    spread: float = 0.05
+    leave: float = 0.01
+    enter: float = 0.006
+    start: float = 0.9
+    change_deviation: float = 0.5
+    speed_weight: float = 0.25
+
+    def level_changes(self) -> np.ndarray:
+        """Return the probability of each level by the one before, (K, K), float32."""
+        K = len(self.levels)
+        changes = np.zeros((K, K), np.float32)
+        for k in range(K):
+            neighbors = [j for j in (k - 1, k + 1) if 0 <= j < K]
+            changes[k, k] = self.keep_level if neighbors else 1
+            changes[k, neighbors] = (1 - changes[k, k]) / max(len(neighbors), 1)
+        return changes
+
+    def speed_changes(
+        self, weights: np.ndarray, likelihoods: np.ndarray | float = 1.0
+    ) -> np.ndarray:
+        """
+        Return the factors of the speeds for the kernels, (5, V), float32.
+
+        To stay, from the speed below, from the one above, of all by the speed after, and from any
+        by the speed before. They include the likelihood of the speed after.
+
+        :param weights: relative probability of each speed for this image, (V,).
+        :param likelihoods: of each speed by the latest images relative to that off the map, (V,).
+        """
+        V = len(self.speeds)
+        near, far = (1 - self.keep_speed) * 0.4, (1 - self.keep_speed) * 0.2 / V
+        total = self.keep_speed * weights + far * weights.sum()
+        total[1:] += near * weights[:-1]
+        total[:-1] += near * weights[1:]
+        changes = np.zeros((5, V), np.float32)
+        changes[0], changes[3], changes[4] = (
+            self.keep_speed * weights / total,
+            weights,
+            far / total,
+        )
+        changes[1, 1:] = near * weights[1:] / total[:-1]
+        changes[2, :-1] = near * weights[:-1] / total[1:]
+        changes[:4] *= likelihoods
+        return changes

@@ -1,0 +1,46 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""z-normalization of the distances of an image to all places."""
+
+import numpy as np
+from stavpr_ros.compilation import reassociating_kernel
+
+MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
+
+
+def z_normalized(
+    row: np.ndarray, around: int = 0, counted: np.ndarray | None = None
+) -> np.ndarray:
+    """
+    Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32.
+
+    :param around: subtract the mean of so many places to either side as well, in which no place
+        counts for less than -1, so that the right one counts little. Images of one light are
+        nearer to each other than to all others, wherever they were taken. 0 = no.
+    :param counted: places whose entries count for mean and deviation, (n,), bool; None = all.
+    """
+    z = np.empty(len(row), np.float32)
+    _z_normalize(row, np.ones(len(row), bool) if counted is None else counted, z)
+    if not around:
+        return z
+    from scipy.ndimage import uniform_filter1d
+
+    clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
+    return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
+
+
+@reassociating_kernel
+def _z_normalize(row: np.ndarray, counted: np.ndarray, z: np.ndarray) -> None:
+    """Write a row with mean 0 and deviation 1 of its finite entries, in float64 until then."""
+    total, squares, count = 0.0, 0.0, 0
+    for i in range(len(row)):
+        known = counted[i] & np.isfinite(row[i])
+        total += row[i] if known else 0.0
+        count += known
+    mean = total / max(count, 1)
+    for i in range(len(row)):
+        off = row[i] - mean
+        squares += off * off if counted[i] & np.isfinite(row[i]) else 0.0
+    scale = np.float32(1 / max(np.sqrt(squares / max(count, 1)), MIN_DEVIATION))
+    for i in range(len(row)):
+        z[i] = (row[i] - np.float32(mean)) * scale
