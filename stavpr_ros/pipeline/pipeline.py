@@ -326,7 +326,9 @@ class Pipeline:
         recognizer = self._recognizer
         if list_candidates and recognizer is not None and match.sequence is not None:
             match = match.with_candidates(recognizer.ranked(self.settings.candidates))
-        return replace(match, threshold=threshold, stages=stages)
+        if math.isnan(match.threshold):  # the recognizer has applied none
+            match = replace(match, threshold=threshold)
+        return replace(match, stages=stages)
 
     def _process(
         self,
