@@ -239,6 +239,7 @@ def test_loop_closure_message_of_a_match(places, first_image, has_poses, is_olde
         header=HEADER, query_index=query, query_stamp=Time(sec=query + 1), place_index=32,
         place_stamp=Time(sec=33), has_poses=has_poses, distance=0.25, threshold=message.threshold,
         probability=0.75, inliers=9, pairs=message.pairs, robot_id='r2', is_late=is_late,
+        query_session='r2', place_session='r2',
     )  # fmt: skip
     if has_poses:
         expected.pose_frame, expected.pose_child_frame = 'odom', 'base'
@@ -256,6 +257,7 @@ def test_loop_closure_message_on_a_map_has_poses_of_two_frames(places):
     frames = PoseFrames('map', 'base', 'odom')
     message = loop_closure_message(HEADER, accepted(), places, 'r2', frames, query)
     assert (message.query_index, message.place_index) == (-1, 32)
+    assert (message.query_session, message.place_session) == ('r2', '')
     assert (message.query_stamp, message.place_stamp) == (time_message(WINDOW[2]), Time(sec=33))
     assert {pair.query_index for pair in message.pairs} == {-1}
     assert [pair.query_stamp for pair in message.pairs] == [time_message(at) for at in WINDOW]

@@ -176,6 +176,7 @@ def loop_closure_message(
     Return the loop closure of a match, without its edge; None without a match.
 
     :param places: the route, whose places the images of the window are, or a map.
+    :param robot_id: the parameter of this name; sessions of several robots' maps are named so.
     :param query_pose: of the odometry, at the image that matched, shape (7,); for maps only, a
         route has it.
     """
@@ -206,7 +207,8 @@ def loop_closure_message(
         query_index=first + middle if is_route else -1,
         query_stamp=time_message(query_stamp),
         is_late=match.is_late,
-        place_session=place.session,
+        query_session=robot_id,
+        place_session=robot_id if is_route else place.session,
         place_index=match.place_index,
         place_stamp=time_message(place.stamp),
         distance=match.distance,
