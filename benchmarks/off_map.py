@@ -3,7 +3,7 @@
 """
 Off the map, at night, at other speeds: mode robust with its defaults on all data sets.
 
-``make off-map``, ``make off-map ARGS=--quick``. Writes docs/off_map.md and its JSON to
+``make off-map``, ``make off-map ARGS=--quick``. Writes off_map.md and its JSON to
 benchmarks/results/. Rows: benchmarks/README.md.
 """
 
@@ -18,7 +18,7 @@ from accuracy import extractors, FEATURES, long_cases, short_cases
 from data import data_folder
 import numpy as np
 from off_map_page import DAY, JUMP, LEVEL, markdown, NIGHT, Results, summary_section
-from results import environment, options_parser, ROOT, write_json, write_lines
+from results import environment, options_parser, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
@@ -375,7 +375,7 @@ def measure(folder: Path, chosen: Sequence[str], coarser: int) -> Results:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    parser = options_parser(__doc__, 'gradient features, coarser steps; not into docs/')
+    parser = options_parser(__doc__, 'gradient features, coarser steps; to off_map-quick')
     kinds = tuple(FEATURES)
     parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
     options = parser.parse_args(arguments)
@@ -383,13 +383,12 @@ def main(arguments: list[str] | None = None) -> int:
     chosen, steps = (('g',), COARSER) if options.quick else (options.features, 1)
     results = measure(data_folder(), chosen, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
-    page = path.with_suffix('.md') if options.quick else ROOT / 'docs/off_map.md'
     step = 'each' if steps == 1 else f'every {steps}th'
     about |= {'stretches': STRETCHES.format(step=step, long=LONG_STRETCHES // steps)}
     write_json(path, about | {'results': results})
-    write_lines(page, markdown(about, results))
+    write_lines(path.with_suffix('.md'), markdown(about, results))
     print(*summary_section(results), sep='\n')
-    print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and {page}')
+    print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its .md')
     return 0
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page docs/off_map.md from the rows that off_map.py measures."""
+"""The page benchmarks/results/off_map.md from the rows that off_map.py measures."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -14,9 +14,9 @@ LEVEL = 0.95  # declared probability whose precision the summary gives
 Results = dict[str, dict[str, Any]]
 TEXT = """\
 `make off-map` measures mode robust with its defaults on all data sets of the
-[accuracy table](../benchmarks/README.md#accuracy), on drives that differ from the recordings.
-[Robust mode](robust_mode.md) explains the method and its limits; every drive and all bins of the
-calibration are in [off_map.json](../benchmarks/results/off_map.json).
+[accuracy table](../README.md#accuracy), on drives that differ from the recordings.
+[Robust mode](../../docs/robust_mode.md) explains the method and its limits; every drive and all
+bins of the calibration are in [off_map.json](off_map.json).
 
 * **Detours:** the map lacks a stretch that the query drives; {stretches}.
   Unseen images are more than 5 places from each place of the map.

@@ -4,7 +4,7 @@
 Loop closures as edges of a pose graph: worlds of the demonstration, offline, without ROS.
 
 Each drive is recognized from its images with the odometry of its draw, the edges are estimated,
-and the graph is solved. Writes docs/slam_measured.md, and its JSON to benchmarks/results/.
+and the graph is solved. Writes benchmarks/results/slam.md.
 """
 
 import argparse
@@ -20,7 +20,7 @@ import time
 from typing import Any
 
 import numpy as np
-from results import environment, RESULTS, ROOT
+from results import environment, RESULTS, write_lines
 from scipy.spatial.transform import Rotation
 from slam_page import markdown, NEAR
 from slam_pairs import CAMERA, Found, measured, recognized, SharedViews, with_edges
@@ -284,10 +284,8 @@ def main() -> None:
             for seed in given.seeds
             for draw in range(given.draws)
         ]
-    about = environment()
-    page = markdown(about, rows)
-    (ROOT / 'docs' / 'slam_measured.md').write_text('\n'.join(page) + '\n')
-    (RESULTS / 'slam.json').write_text(json.dumps({'about': about, 'page': page}, indent=1))
+    page = markdown(environment(), rows)
+    write_lines(RESULTS / 'slam.md', page)
     print('\n'.join(page))
 
 

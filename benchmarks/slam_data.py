@@ -5,7 +5,7 @@ Recorded images arranged as laps: the hallway loop, and Gardens Point as laps of
 
 The images have no poses: lap 1 is laid on a closed curve, the images of the others where the
 ground truth has them, and the odometry of each draw is made of that. No intrinsics are known, so
-edges are aligned by odometry, or by appearance alone. Writes docs/slam_data.png, and its JSON to
+edges are aligned by odometry, or by appearance alone. Writes slam_data.png and its JSON to
 benchmarks/results/.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import environment, RESULTS, ROOT, table, write_json
+from results import environment, RESULTS, table, write_json
 from slam import ate, DRIFTS
 from slam_pairs import measured, recognize, with_edges
 from stavpr_lab.demonstration.slam import trajectory_errors
@@ -126,7 +126,7 @@ def main() -> None:
             lines.append([name, drift, f'{closures:.0f}', *cells])
     text = table(('images', 'drift', 'closures', 'ATE before, m', 'ratio', 'worst'), lines)
     write_json(RESULTS / 'slam_data.json', {'about': environment(), 'rows': rows})
-    with page(ROOT / 'docs' / 'slam_data.png', 12.5, 9.0) as figure:
+    with page(RESULTS / 'slam_data.png', 12.5, 9.0) as figure:
         for axes, (title, (drive, poses)) in zip(
             figure.subplots(2, 2).flat, drawn.items(), strict=True
         ):

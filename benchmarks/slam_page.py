@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page docs/slam_measured.md, from the rows of benchmarks/slam.py."""
+"""The page benchmarks/results/slam.md, from the rows of benchmarks/slam.py."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -27,7 +27,6 @@ def markdown(about: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     seeds = sorted({row['seed'] for row in rows})
     drives = f'Seeds {", ".join(map(str, seeds))}; {len(rows)} draws of the odometry in all.'
     return [
-        *('---', 'orphan: true', '---', ''),  # linked from slam.md, not in the table of contents
         *heading('Loop closures and the pose graph, measured', about),
         *TEXT.splitlines(),
         drives,

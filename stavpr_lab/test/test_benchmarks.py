@@ -217,7 +217,7 @@ def test_simulated_places_have_mean_and_neighbors_of_real_ones():
 
 
 def test_bounds_of_boards_follow_from_costs_and_peaks():
-    page, sizes = (BENCHMARKS.parent / 'docs' / 'boards.md').read_text(), Sizes(100_000, 224)
+    page, sizes = (BENCHMARKS / 'results/boards.md').read_text(), Sizes(100_000, 224)
     alignment = lower_bounds.spatial_alignment(sizes)
     parts = alignment, lower_bounds.filter_update(sizes, FilterSettings())
     product = lower_bounds.product(sizes, 'float32')
