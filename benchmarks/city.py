@@ -7,7 +7,7 @@ The simulated places are a route of images whose features have the mean, the cov
 strips together, its ``RANK`` largest directions) and the correlation from image to image of the
 real map: a first-order autoregressive Gaussian, each strip made unit norm. The real places lie
 together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000`` adds to
-``benchmarks/results/city.json``, and writes the tables of docs/performance.md from it and from
+``benchmarks/results/city.json``, and writes the tables of results/performance.md from it and from
 the results of ``soak.py --output benchmarks/results/node-NAME.json``.
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import commit, cpu_model, RESULTS, ROOT, table, write_json
+from results import commit, cpu_model, RESULTS, table, write_json
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -45,7 +45,7 @@ CASES = {  # map, query, tolerance, speed of the query
     'night_map_half': ('walk_by_night/right_night', 'walk_by_night/right_day', 2, '0.5x'),
     'nordland_vary': ('nordland_64x32/winter', 'nordland_64x32/summer', 3, 'vary'),
 }
-PAGE = ROOT / 'docs' / 'performance.md'
+PAGE = RESULTS / 'performance.md'
 BEGIN, END = '<!-- written by benchmarks/city.py -->', '<!-- end -->'
 
 

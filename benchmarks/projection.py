@@ -4,7 +4,8 @@
 Mode robust with fewer dimensions: no projection, principal components, random ones, int8.
 
 ``PYTHONPATH=. python benchmarks/projection.py`` writes ``benchmarks/results/projection.json`` and
-the table of docs/performance.md: the lowest of best F1, precision and recall over the data sets.
+the table of performance.md beside it: the lowest of best F1, precision and recall over the data
+sets.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from accuracy import Case, extractors, long_cases, numbers, short_cases
 from city import written_between
 from data import data_folder
 import numpy as np
-from results import RESULTS, ROOT, table, write_json
+from results import RESULTS, table, write_json
 from stavpr_lab.evaluation.evaluate import evaluate_on_map
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import descriptor_map, PlaceMap
@@ -26,7 +27,7 @@ from stavpr_ros.mapping.reduction import STRIPS_A_DIRECTION, with_principal_comp
 from stavpr_ros.prepare.centering import normalize
 from stavpr_ros.recognition import RecognizerSettings
 
-PAGE = ROOT / 'docs' / 'performance.md'
+PAGE = RESULTS / 'performance.md'
 BEGIN, END = '<!-- written by benchmarks/projection.py -->', '<!-- end of projection -->'
 NUMBERS = ('f1', 'precision', 'recall')
 COLUMNS = {  # name: projection, dimension, precision

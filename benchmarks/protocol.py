@@ -3,7 +3,7 @@
 """
 Recall@1 and recall at 100 % precision by method, tolerance and sequence length, on the data sets.
 
-``make protocol``, ``make protocol ARGS=--quick``. Data sets and methods: docs/evaluation.md.
+``make protocol``, ``make protocol ARGS=--quick``. Data sets and methods: results/evaluation.md.
 """
 
 from collections.abc import Iterator, Sequence
@@ -51,7 +51,7 @@ STILL = 2.0  # mean change of the gray levels since the image before, below whic
 FEW = (5, 20)  # images of sequences of SqueezeNet on Nordland, 0.1 s an image and length
 PATCHES = 'p'
 LABELS = FEATURES | {PATCHES: 'patches of SeqSLAM'}
-# of docs/evaluation.md: data set, tolerance, images
+# of results/evaluation.md: data set, tolerance, images
 EXCERPT = (
     ('nordland_clean', 1, 5),
     ('nordland', 1, 5),
@@ -127,7 +127,7 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[Row]]]:
 
 
 def excerpt(results: Results) -> list[str]:
-    """Return the table of docs/evaluation.md: recall@1, recall at 100 % precision."""
+    """Return the table of results/evaluation.md: recall@1, recall at 100 % precision."""
     lines: dict[tuple[str, str], list[str]] = {}
     for column, (name, *wanted) in enumerate(EXCERPT):
         for feature, label in LABELS.items():

@@ -172,12 +172,12 @@ def test_generated_tables_are_those_of_their_results():
     def load(name: str):
         return json.loads((RESULTS / name).read_text())
 
-    performance = (ROOT / 'docs' / 'performance.md').read_text()
+    performance = (RESULTS / 'performance.md').read_text()
     assert '\n'.join(projection.lines(load('projection.json'))).rstrip() in performance
     for row in load('city.json'):
         assert city.lines([row])[2] in performance
     recalls = '\n'.join(protocol.excerpt(load('protocol.json')['results'])).rstrip()
-    assert recalls in (ROOT / 'docs' / 'evaluation.md').read_text()
+    assert recalls in (RESULTS / 'evaluation.md').read_text()
     off_map = load('off_map.json')
     page = '\n'.join(off_map_page.markdown(off_map, off_map['results'])).rstrip() + '\n'
     assert page == (RESULTS / 'off_map.md').read_text()
@@ -204,7 +204,7 @@ def test_accuracy_of_pages_is_that_of_accuracy_table():
     speeds = [f'gardens_point/{speed}' for speed in ('2x', '1.5x', '0.7x', '0.5x', 'vary', 'stop')]
     walks = [f'{walk}/{speed}' for walk in WALKS for speed in ('same', 'vary')]
     expected: dict[tuple[str, str], list[float | None]] = {
-        ('docs/robust_mode.md', '**robust**'): [*f1(*walks, 'corridor/same')],
+        ('benchmarks/results/robust_mode.md', '**robust**'): [*f1(*walks, 'corridor/same')],
         ('docs/features.md', 'SqueezeNet `fire6/concat_1`, 7 strips'): of_features('o', True),
         ('docs/features.md', '`gradient`, 7 strips (default)'): of_features('g', False),
     }
@@ -213,10 +213,10 @@ def test_accuracy_of_pages_is_that_of_accuracy_table():
         same = f1('gardens_point/same', 'nordland/same', 'corridor/same', of=of)
         worst = min(f1(*speeds, of=of))
         expected['README.md', f'`{mode}`'] = [same[0], worst, *same[1:]]
-        expected['docs/evaluation.md', name] = [*same[:2]]
+        expected['benchmarks/results/evaluation.md', name] = [*same[:2]]
     tables = json.loads((RESULTS / 'tables.json').read_text())
     walk, *_, train = tables['place recognition networks']['rows'][:5]
-    expected['docs/evaluation.md', 'SeqSLAM'] = [walk['SeqSLAM'], train['SeqSLAM']]
+    expected['benchmarks/results/evaluation.md', 'SeqSLAM'] = [walk['SeqSLAM'], train['SeqSLAM']]
     for (page, row), values in expected.items():
         text = (ROOT / page).read_text()
         (line,) = re.findall(rf'^\| {re.escape(row)} (\| *\d*\.\d.*)$', text, re.M)

@@ -10,7 +10,7 @@ import numpy as np
 @dataclass(frozen=True)
 class FilterSettings:
     """
-    Model of the filter; tuned on the data sets named in docs/robust_mode.md.
+    Model of the filter; tuned on the data sets named in benchmarks/results/robust_mode.md.
 
     :param speeds: places that the query passes an image; between two, a path costs evidence.
     :param levels: mean z-normalized distance of right places, from bad to good conditions.

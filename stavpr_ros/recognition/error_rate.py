@@ -10,8 +10,8 @@ of its images that are matched. The least probability t for an error rate a is s
 
 (Angelopoulos et al., "Conformal Risk Control", ICLR 2024), rounded up so that no kind of drive has
 more than a, except dropped images and maps of every third image, whose wrong matches are near.
-docs/robust_mode.md lists the drives. The mean over drives like these is controlled, not every
-single drive.
+benchmarks/results/robust_mode.md lists the drives. The mean over drives like these is controlled,
+not every single drive.
 """
 
 import numpy as np

@@ -3,7 +3,7 @@
 """
 Recall@1 and recall at 100 % precision by tolerance and sequence length, with 95 % intervals.
 
-Sources, methods and the choice of the block length: docs/evaluation.md.
+Sources, methods and the choice of the block length: benchmarks/results/evaluation.md.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
