@@ -200,40 +200,6 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             bounds=(0.0, 60.0),
         ),
     ),
-    'Image comparison': (
-        NodeParameter(
-            'strategy',
-            'adaptive',
-            'Spatial alignment of the strips of two images.',
-            choices=('adaptive', 'vanilla', 'sliding_window', 'none'),
-        ),
-        NodeParameter(
-            'sigma',
-            1.0,
-            'Strength of the penalty on diagonal steps after a viewpoint change.',
-            bounds=(0.0, 100.0),
-        ),
-        NodeParameter(
-            'xi',
-            0,
-            'Restricted alignment: strips this far apart are not aligned; 0 = no restriction.',
-            'strips',
-            bounds=(0, 1000),
-        ),
-        NodeParameter(
-            'vertical',
-            False,
-            'Align the cells of two strips vertically first, for cameras that change their '
-            'height; slow.',
-        ),
-        NodeParameter(
-            'other_views',
-            False,
-            'Localization in mode robust: compare images rotated by 8 degrees and moved by a '
-            'tenth of their height as well, until one of these views is matched; for a camera '
-            'that is mounted otherwise than that of the map. On the CPU.',
-        ),
-    ),
     'Recognition': (
         NodeParameter(
             'threshold',
@@ -243,12 +209,6 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'distance',
             'live',
             bounds=(-1.0, 1e6),
-        ),
-        NodeParameter(
-            'beta',
-            2.0,
-            'Map images considered per query image, above 1 (mode paper).',
-            bounds=(1.01, 20.0),
         ),
         NodeParameter(
             'nms_radius',
@@ -283,6 +243,13 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'exclude_places.',
             's',
             bounds=(0.0, 1e6),
+        ),
+        NodeParameter(
+            'other_views',
+            False,
+            'Localization in mode robust: compare images rotated by 8 degrees and moved by a '
+            'tenth of their height as well, until one of these views is matched; for a camera '
+            'that is mounted otherwise than that of the map. On the CPU.',
         ),
     ),
     'Recorded maps': (
@@ -379,7 +346,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'precision',
             'float32',
-            'Precision of the features of the map; int8 (not with vertical) quarters their memory '
+            'Precision of the features of the map; int8 quarters their memory '
             'and, on large maps on a CPU, takes less than half the time. In loop closure, of a '
             'route of 2,000 places and more.',
             choices=('float32', 'int8'),

@@ -115,7 +115,7 @@ def test_integer_where_a_number_is_expected_is_converted(make_node):
     [
         ('threshold', 'high', "threshold = 'high' has the wrong type: expected a number"),
         ('queue_size', 4.5, 'queue_size = 4.5 has the wrong type: expected an integer'),
-        ('vertical', 1, 'vertical = 1 has the wrong type: expected true or false'),
+        ('publish_tf', 1, 'publish_tf = 1 has the wrong type: expected true or false'),
         ('robot_id', 2, 'robot_id = 2 has the wrong type: expected text'),
     ],
 )
@@ -133,7 +133,7 @@ def test_parameters_that_are_rejected_change_nothing(make_node, map_file):
     for name, value, words in (
         ('map_path', 'other.stavpr', 'call the service ~/load_map'),
         ('operation', 'mapping', 'call the service ~/set_operation'),
-        ('beta', 3.0, 'while the node is unconfigured'),
+        ('nms_radius', 7, 'while the node is unconfigured'),
         ('threshold', 0.8, 'is of mode paper'),
         ('min_probability', 1.0, 'below 1'),
         ('save_path', '/missing/route.stavpr', 'save_path'),
@@ -230,11 +230,15 @@ def test_limit_of_threads_can_be_removed(make_node):
         assert node.trigger_cleanup() == SUCCESS
 
 
-def test_misspelled_parameter_is_logged_and_not_set(make_node, capfd):
-    node = make_node(sequence_lenght=5)
-    words = "parameter 'sequence_lenght' is unknown: did you mean sequence_length?"
+@pytest.mark.parametrize(
+    ('name', 'remedy'),
+    [('sequence_lenght', 'did you mean sequence_length?'), ('beta', 'see `ros2 param list`')],
+)
+def test_unknown_parameter_is_logged_and_not_set(make_node, capfd, name, remedy):
+    node = make_node(**{name: 5})
+    words = f'parameter {name!r} is unknown: {remedy}'
     assert words in capfd.readouterr().err
-    assert set_parameter(node, 'sequence_lenght', 5).reason == words
+    assert set_parameter(node, name, 5).reason == words
 
 
 def test_lost_images_are_logged_once_with_their_remedy(make_node, capfd):

@@ -22,7 +22,7 @@ STATES = ('unconfigured', 'inactive', 'active')
 @pytest.fixture
 def node(start):
     """Start a node that is not configured and has no map."""
-    return start(wait=False, autostart=False, map_path='', mode='paper', threshold=0.2, xi=0)
+    return start(wait=False, autostart=False, map_path='', mode='paper', threshold=0.2)
 
 
 def configure(robot, path, *, activate=False):
@@ -119,7 +119,7 @@ def with_missing_model(whole: PlaceMap) -> PlaceMap:
     )
 
 
-@pytest.mark.parametrize('fault', ['missing', 'model', 'xi'])
+@pytest.mark.parametrize('fault', ['missing', 'model'])
 def test_node_after_a_failed_configuration_can_be_configured(
     robot, node, map_file, small_map, route, tmp_path, fault
 ):
@@ -127,13 +127,9 @@ def test_node_after_a_failed_configuration_can_be_configured(
     words = {
         'missing': 'does not exist',
         'model': 'copy the file that the map was built with there',
-        'xi': 'xi = 8',
     }[fault]
     if fault == 'model':
         save_map(with_missing_model(small_map), path)
-    elif fault == 'xi':
-        robot.set(xi=8)  # W, 7, is known with the map only
-        path = map_file
     robot.set(map_path=str(path))
     assert not robot.transition('configure')
     assert robot.state() == 'unconfigured'
@@ -143,7 +139,6 @@ def test_node_after_a_failed_configuration_can_be_configured(
     )
     assert all('cannot configure' in message and words in message for message in rejections(robot))
     assert not robot.transition('activate')
-    robot.set(xi=0)
     configure(robot, map_file, activate=True)
     assert robot.statuses(route[:LENGTH])[-1] == PlaceMatch.MATCH
     robot.until_diagnosed('map', DiagnosticStatus.OK, '60 places of')

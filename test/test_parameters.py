@@ -7,7 +7,6 @@ from pathlib import Path
 
 from parameter_files import configuration_yaml, documentation_markdown
 import pytest
-from stavpr_ros.alignment.settings import STRATEGIES
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
@@ -55,7 +54,6 @@ def test_choices_are_those_of_library():
         'geometric_check': ('none', *METHODS),
         'relative_pose': EDGE_METHODS,
         'backend': BACKENDS,
-        'strategy': STRATEGIES,
         'precision': PRECISIONS,
     }
     assert {name: BY_NAME[name].choices for name in library} == library
@@ -76,13 +74,8 @@ def test_default_values_give_default_settings():
 @pytest.mark.parametrize(
     ('values', 'attribute', 'expected'),
     [
-        ({'xi': 3}, 'spatial.xi', 3),
-        ({'sigma': 2.0}, 'spatial.sigma', 2.0),
-        ({'strategy': 'vanilla'}, 'spatial.strategy', 'vanilla'),
-        ({'vertical': True}, 'spatial.vertical', True),
         ({'other_views': True}, 'other_views', True),
         ({'sequence_length': 7}, 'sequence.length', 7),
-        ({'beta': 3.0}, 'sequence.beta', 3.0),
         ({'min_probability': 0.25}, 'applied_threshold', 0.75),
         ({'max_error': 0.05}, 'applied_threshold', pytest.approx(0.7)),
         ({'max_error': 0.05, 'min_probability': 0.25}, 'applied_threshold', pytest.approx(0.7)),
@@ -105,7 +98,7 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
 @pytest.mark.parametrize(
     ('values', 'words'),
     [
-        ({'strategy': 'teleport'}, "strategy = 'teleport' is unknown: take one of adaptive"),
+        ({'precision': 'int4'}, "precision = 'int4' is unknown: take one of float32"),
         ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0 would match nothing'),
         (
             {'threshold': 0.8},
@@ -115,8 +108,6 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
         ({'min_probability': 0.0}, 'min_probability = 0.0 must be above 0 and below 1'),
         ({'min_probability': 1.0}, 'min_probability = 1.0 must be above 0 and below 1'),
         ({'max_error': 0.001}, 'max_error = 0.001: expected 0 = off, or 0.005 to below 1'),
-        ({'operation': 'loop_closure', 'strategy': 'none'}, 'take strategy adaptive or vanilla'),
-        ({'operation': 'loop_closure', 'vertical': True}, 'without vertical alignment'),
         ({'operation': 'loop_closure', 'max_places': 100}, 'take at least 103'),
         ({'operation': 'loop_closure', 'other_views': True}, 'other_views with operation loop_cl'),
         ({'operation': 'mapping', 'other_views': True}, 'take operation localization'),

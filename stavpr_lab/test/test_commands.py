@@ -251,7 +251,7 @@ def test_build_map_of_video_takes_images_at_the_rate(run, tmp_path):
 @pytest.mark.parametrize(
     ('command', 'arguments', 'code', 'words'),
     [
-        (node, ['-p', 'beta:=0.5'], 1, 'beta'),
+        (node, ['-p', 'max_error:=2.0'], 1, 'max_error'),
         (node, ['-p', 'threshold:=low'], 1, 'threshold'),
         (node, ['--params-file', '/missing.yaml'], 1, '--ros-args'),
         (record, ['--output', '{folder}/x', '--ros-args', '-r'], 2, '--ros-args'),

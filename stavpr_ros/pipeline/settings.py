@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
+from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import require_choice
 from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
@@ -49,7 +49,6 @@ class PipelineSettings:
     threshold: float | None = None
     min_probability: float = default('min_probability')
     max_error: float = default('max_error')
-    spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = default('nms_radius')
     odometry_error: float = default('odometry_error')
@@ -94,10 +93,9 @@ class PipelineSettings:
         """Return the settings of the recognizer."""
         return RecognizerSettings(
             self.threshold,
-            self.spatial,
-            self.sequence,
-            self.nms_radius,
-            self.mode,
+            sequence=self.sequence,
+            nms_radius=self.nms_radius,
+            mode=self.mode,
             odometry_error=self.odometry_error,
             time_budget_ms=self.time_budget_ms,
             min_probability=self.min_probability,
@@ -131,13 +129,6 @@ class PipelineSettings:
             self._require_loop_closure()
 
     def _require_loop_closure(self) -> None:
-        spatial = self.spatial
-        if spatial.vertical or spatial.strategy not in ('adaptive', 'vanilla'):
-            raise SettingsError(
-                f'operation loop_closure with strategy {spatial.strategy}, vertical '
-                f'{spatial.vertical}: take strategy adaptive or vanilla, without vertical '
-                'alignment'
-            )
         least = least_limit(self.exclude_places, self.sequence.length)
         if self.max_places < least:
             raise SettingsError(
@@ -249,10 +240,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     values['model_path'] = os.path.expanduser(values['model_path'])  # or a word: cached, download
     method = values['geometric_check']
     pipeline = PipelineSettings(
-        spatial=SpatialSettings(
-            values['strategy'], values['sigma'], values['xi'] or None, values['vertical']
-        ),
-        sequence=SequenceSettings(values['sequence_length'], values['beta']),
+        sequence=SequenceSettings(values['sequence_length']),
         keyframes=KeyframeSettings(
             values['keyframe_interval'],
             values['keyframe_distance'],

@@ -163,6 +163,8 @@ def _add_ground_truth_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_method_options(parser: argparse.ArgumentParser) -> None:
+    from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings, STRATEGIES
+
     group = parser.add_argument_group('method')
     mode = 'paper: as published; robust: with mitigations of failure modes (%(default)s)'
     add_parameter(group, 'mode', mode)
@@ -171,13 +173,15 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     rate = 'mode robust: rate of wrong matches that chooses --min-probability; 0 = off'
     add_parameter(group, 'max_error', rate, metavar='E')
     add_parameter(group, 'sequence_length', 'images in a window (%(default)s)', metavar='L')
-    add_parameter(group, 'beta', 'places per image of a window (%(default)g)')
-    add_parameter(group, 'strategy', 'spatial alignment (%(default)s)')
-    add_parameter(group, 'sigma', 'of the adaptive weight (%(default)g)')
-    add_parameter(
-        group, 'xi', 'restricted alignment: largest shift in strips (none)', default=None
-    )
-    add_parameter(group, 'vertical', 'align the cells of two strips vertically first')
+    add, spatial = group.add_argument, SpatialSettings
+    beta = 'mode paper: places per image of a window (%(default)g)'
+    add('--beta', type=float, default=SequenceSettings.beta, help=beta)
+    strategy = 'spatial alignment (%(default)s)'
+    add('--strategy', choices=STRATEGIES, default=spatial.strategy, help=strategy)
+    sigma = 'of the adaptive weight (%(default)g)'
+    add('--sigma', type=float, default=spatial.sigma, help=sigma)
+    add('--xi', type=int, help='strips this far apart are not aligned (none)')
+    add('--vertical', action='store_true', help='align the cells of two strips vertically first')
     radius = 'other candidates are farther from the match than this (%(default)s)'
     add_parameter(group, 'nms_radius', radius, metavar='PLACES')
     add_parameter(group, 'backend', '(%(default)s)', default='cpu')
@@ -257,13 +261,13 @@ def _evaluate(
 def _report(arguments: argparse.Namespace) -> 'Report':
     from stavpr_lab.commands.evaluate_sequences import (
         load_sequences,
-        node_settings,
+        recognizer_settings,
         settings_json,
     )
     from stavpr_lab.evaluation.report import Report
 
     began = time.perf_counter()
-    settings = node_settings(arguments).recognition()
+    settings = recognizer_settings(arguments)
     sequences = load_sequences(arguments)
     if sequences.reference is not None:
         settings = replace(settings, error_risks=sequences.reference.error_risks)
@@ -349,7 +353,7 @@ def _print_metrics(report: 'Report') -> None:
 
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_lab.commands.evaluate_export import export, require_exportable
-    from stavpr_lab.commands.evaluate_sequences import node_settings
+    from stavpr_lab.commands.evaluate_sequences import recognizer_settings
     from stavpr_lab.evaluation.report import chosen_window
     from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
 
@@ -367,7 +371,7 @@ def _run(arguments: argparse.Namespace) -> None:
     chosen_window(report.evaluation, arguments.window)  # an invalid image fails before writing
     _print_report(report)
     if arguments.export:
-        export(arguments, report, node_settings(arguments).recognition())
+        export(arguments, report, recognizer_settings(arguments))
     if arguments.json:
         write_json(report, Path(arguments.json), arguments.force)
         print(f'numbers: {arguments.json}')

@@ -6,7 +6,11 @@ import argparse
 from dataclasses import replace
 import math
 
-from stavpr_lab.commands.evaluate_sequences import is_saved_map, load_sequences, node_settings
+from stavpr_lab.commands.evaluate_sequences import (
+    is_saved_map,
+    load_sequences,
+    recognizer_settings,
+)
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks
@@ -45,7 +49,7 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         parser.error(f'--calibrate: --map {path} is no saved map; make one by build_map')
     require_replaceable(path, MAP, True)
     version = FileVersion.of(path)
-    settings = node_settings(arguments).recognition()
+    settings = recognizer_settings(arguments)
     sequences = load_sequences(arguments)
     reference, features = sequences.reference, sequences.query.features
     assert reference is not None  # without --loop-closure

@@ -6,7 +6,11 @@ import argparse
 from dataclasses import asdict
 import json
 
-from stavpr_lab.commands.evaluate_sequences import load_sequences, node_settings, settings_json
+from stavpr_lab.commands.evaluate_sequences import (
+    load_sequences,
+    recognizer_settings,
+    settings_json,
+)
 from stavpr_lab.evaluation.protocol import evaluate_protocol, text, TOLERANCES
 from stavpr_lab.evaluation.report import jsonable
 from stavpr_ros.output_file import JSON, require_replaceable, write_output
@@ -32,7 +36,7 @@ def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace)
     arguments.tolerance = 0  # those of the table are added to it
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
-    settings = node_settings(arguments).recognition()
+    settings = recognizer_settings(arguments)
     sequences = load_sequences(arguments)
     drive, query, reference = sequences.drive, sequences.query.features, sequences.reference
     assert reference is not None  # without --loop-closure

@@ -22,7 +22,7 @@ from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
-from stavpr_ros.pipeline.settings import PipelineSettings
+from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_path import is_bag
 from stavpr_ros.sources.folder import text_of
@@ -80,13 +80,13 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
     return _changed(sequences, arguments)
 
 
-def node_settings(arguments: argparse.Namespace) -> PipelineSettings:
+def recognizer_settings(arguments: argparse.Namespace) -> RecognizerSettings:
     """
-    Return the settings of the parsed options as the node has them, without a threshold.
+    Return the settings of the parsed options, without a threshold.
 
     :raises SettingsError: one is out of its range.
     """
-    return PipelineSettings(
+    return RecognizerSettings(
         mode=arguments.mode,
         min_probability=arguments.min_probability,
         max_error=arguments.max_error,
