@@ -6,12 +6,13 @@ import numpy as np
 from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.filter.paths import ALL_ENTERED, Belief, belief_of, NEGLIGIBLE, NO_PLACES, TOP
+from stavpr_ros.filter.protocol import Filter
 import torch
 
 MOST = 512  # most probable places that are copied to the host: more than are ever excluded
 
 
-class CudaPlaceFilter:
+class CudaPlaceFilter(Filter):
     """
     A :class:`stavpr_ros.filter.place_filter.PlaceFilter` on torch's current CUDA device.
 
@@ -193,6 +194,14 @@ class CudaPlaceFilter:
         self._read()
         left = np.flatnonzero(~np.isin(self._top, excluded))
         return (int(self._top[left[0]]), float(self._top_sums[left[0]])) if len(left) else (0, 0.0)
+
+    def mean_z(self, state: np.ndarray) -> float:
+        """See :meth:`Filter.mean_z`."""
+        return self.settings.levels[state[0]]
+
+    def speed(self, state: np.ndarray) -> float:
+        """See :meth:`Filter.speed`."""
+        return self.settings.speeds[state[3]]
 
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
         """See :meth:`PlaceFilter.path`."""

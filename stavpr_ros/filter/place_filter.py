@@ -57,12 +57,13 @@ from stavpr_ros.filter.paths import (
     TOP,
     trace_back,
 )
+from stavpr_ros.filter.protocol import Filter
 from stavpr_ros.memory import aligned_zeros
 
 NO_PLACE = np.float32(-np.inf)  # z of a gap between sessions, where likelihoods are 1
 
 
-class PlaceFilter:
+class PlaceFilter(Filter):
     """
     The filter of the module, on the CPU; ``count`` is the number of images since the reset.
 
@@ -142,16 +143,7 @@ class PlaceFilter:
         speed_likelihoods: np.ndarray | float = 1.0,
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
-        """
-        Advance by an image.
-
-        :param z: z-normalized distances to the first m places, (m,), float32, an array or a tensor
-            on the filter's device; +inf excludes a place.
-        :param weight: alpha; 0 = the image is no evidence.
-        :param speed_weights: relative probability of each speed, (V,).
-        :param speed_likelihoods: of each speed relative to that off the map, (V,).
-        :param not_near: places below m whose z counts as 0 at least.
-        """
+        """See :meth:`Filter.update`."""
         s, n = self.settings, len(z)
         slot = self.count % len(self._steps)
         moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
@@ -202,12 +194,7 @@ class PlaceFilter:
         self._by_place[n:] = self._maxima[-(-n // BLOCK) :] = 0
 
     def belief(self, n: int, images_ago: int) -> Belief:
-        """
-        Return where the camera was a number of images ago, by the images since then, too.
-
-        :param n: places.
-        :param images_ago: at most the lag and ``count - 1``.
-        """
+        """See :meth:`Filter.belief`."""
         top = self._top(n)
         least = NEGLIGIBLE * self._a[top // BLOCK, :, :, top % BLOCK].max(initial=0)
         most = len(top) * len(self._levels) * len(self._speeds)
@@ -232,26 +219,26 @@ class PlaceFilter:
         return np.argpartition(self._maxima, -count)[-count:] * BLOCK
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
-        """
-        Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
-
-        :param excluded: places, ascending.
-        """
+        """See :meth:`Filter.most_probable`."""
         place, probability = find_most_probable(self._by_place, self._maxima, excluded)
         return place, probability * self._scale
 
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
-        """
-        Return the places of the most probable path to a state, newest first, (images + 1,).
-
-        :param state: level, speed, place.
-        """
+        """See :meth:`Filter.path`; a state is level, speed, place, speed then."""
         places = np.empty(images + 1, np.int32)
         trace_back(
             *(int(i) for i in state[:3]), self._origins, self._steps,
             (self.count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
+
+    def mean_z(self, state: np.ndarray) -> float:
+        """See :meth:`Filter.mean_z`."""
+        return self.settings.levels[state[0]]
+
+    def speed(self, state: np.ndarray) -> float:
+        """See :meth:`Filter.speed`."""
+        return self.settings.speeds[state[3]]
 
 
 def _move_up(values: np.ndarray, count: int, none: int) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.filter.motion import APART, ImageChange
 from stavpr_ros.fleet.city_map import CityMap
@@ -25,7 +26,7 @@ from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.robust import ROBUST
-from stavpr_ros.recognition.sessions import SessionLayout
+from stavpr_ros.recognition.sessions import session_gap
 from stavpr_ros.threads import call_on_thread
 
 CHUNK = 32  # places that are fetched together
@@ -40,7 +41,7 @@ LEAST = 1e-3  # their least probability
 TIMEOUT = 0.25  # seconds that an image waits for a lookup
 
 
-class CityLayout(SessionLayout):
+class CityLayout(ColumnLayout):
     """
     Columns for places of a city, with a gap between runs of neighboring ones.
 
@@ -52,12 +53,15 @@ class CityLayout(SessionLayout):
     def __init__(
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
     ) -> None:
-        super().__init__(firsts, same_as, nms_radius)
+        super().__init__(firsts, same_as, session_gap(nms_radius))
         self.loaded = places
-        self._places = places[self._places]
+
+    def names_of(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`ColumnLayout.names_of`."""
+        return self.loaded[super().names_of(columns)]
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """See :meth:`SessionLayout.positions`; of loaded places."""
+        """See :meth:`ColumnLayout.positions`; of loaded places."""
         return super().positions(np.searchsorted(self.loaded, places))
 
     def session_of(self, place: int) -> tuple[int, int]:
@@ -268,7 +272,7 @@ class FleetRecognizer(SequenceRecognizer):
         """Return the places that are most probable now."""
         if not len(self._order):
             return np.empty(0, np.int64)
-        probabilities = self._filter_window.layout.gathered(
+        probabilities = self._filter_window.layout.to_places(
             self._filter_window.filter.places_of_states()
         )
         top = np.argsort(-probabilities)[:LIKELY]

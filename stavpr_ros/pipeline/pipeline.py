@@ -137,7 +137,7 @@ class Pipeline:
     def stages(self) -> str:
         """Return how a time budget is kept; empty without one."""
         recognizer = self._recognizer
-        return recognizer.stages if recognizer and self.operation == 'localization' else ''
+        return recognizer.start_notes if recognizer and self.operation == 'localization' else ''
 
     @property
     def missing(self) -> str:

@@ -10,11 +10,13 @@ from stavpr_ros.alignment.cuda.compilation import runtime
 from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.cuda_filter import CudaPlaceFilter
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
+from stavpr_ros.recognition.sessions import in_places
+from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
 import torch
 
 
@@ -42,9 +44,9 @@ class DeviceBuffer(SequenceBuffer):
     def _filled(self, shape: tuple[int, int]) -> torch.Tensor:
         return torch.full(shape, torch.inf, device=runtime().torch_device)
 
-    def push(self, row: torch.Tensor, stamp: int = 0) -> None:  # type: ignore[override]
+    def push(self, row: torch.Tensor) -> None:  # type: ignore[override]
         """See :meth:`SequenceBuffer.push`; the row is on the device."""
-        self._add(row, stamp)
+        self._add(row)
 
     def newest(self) -> np.ndarray:
         """Return the row of the newest image, (n,), copied from the device."""
@@ -124,12 +126,12 @@ class CudaLmDtwWindow(QueryWindow):
         ]
         self._selection = selection.SelectionBuffer(self._runtime, l, k)
         self._columns = device_columns(layout)
-        self._match(0)  # compiles the kernel, so that the first window does not wait for it
+        self.match(0)  # compiles the kernel, so that the first window does not wait for it
 
     def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
         return spread_on_device(row, self._columns, self.buffer.places)
 
-    def _match(self, nms_radius: int) -> WindowMatch:
+    def match(self, nms_radius: int) -> WindowMatch:
         """Find the nearest start and its second best on the device; trace the path on the host."""
         places = self.buffer.places
         if places == 0:
@@ -160,7 +162,7 @@ class CudaLmDtwWindow(QueryWindow):
             second_best_index=middle if second_best else -1,
             second_best_distance=found.second_best_distance if second_best else float('nan'),
         )
-        return WindowMatch(nearest, path, self._sequences)
+        return in_places(WindowMatch(nearest, path, self._sequences), self.layout, nms_radius)
 
     def _sequences(self) -> WindowSequences:
         """Copy distances and lengths of all starts to the host."""

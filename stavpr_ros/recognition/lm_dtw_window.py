@@ -12,8 +12,10 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.window import ColumnLayout, QueryWindow, SequenceBuffer
+from stavpr_ros.recognition.sessions import in_places
+from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
 
 
 class LmDtwWindow(QueryWindow):
@@ -38,7 +40,8 @@ class LmDtwWindow(QueryWindow):
         buffer = SequenceBuffer(sequence.length, layout.width(places), sequence.k)
         super().__init__(buffer, layout, normalizes, around)
 
-    def _match(self, nms_radius: int) -> WindowMatch:
+    def match(self, nms_radius: int) -> WindowMatch:
+        """See :meth:`QueryWindow.match`."""
         buffer = self.buffer
         n, k, first = buffer.known, buffer.k, buffer.first
         # columns behind the known ones are +inf, as the padding that the kernel needs
@@ -57,6 +60,7 @@ class LmDtwWindow(QueryWindow):
             middle=nearest.middle + first,
             second_best_index=second_best + first if second_best >= 0 else -1,
         )
-        return WindowMatch(
+        match = WindowMatch(
             nearest, path, lambda: WindowSequences(matches.distances, matches.middles + first)
         )
+        return in_places(match, self.layout, nms_radius)

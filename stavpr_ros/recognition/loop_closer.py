@@ -3,7 +3,6 @@
 """Loop closure: the map is the route so far, without its latest images."""
 
 from collections import deque
-from dataclasses import replace
 import math
 
 import numpy as np
@@ -11,14 +10,14 @@ from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.filter.paths import BAND
+from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
 from stavpr_ros.prepare.matcher import PRECISIONS
 from stavpr_ros.prepare.route_features import RouteFeatures
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
-from stavpr_ros.recognition.match import Match, Status
-from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
+from stavpr_ros.recognition.match import Limits, Match, Status
+from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer, Verdict
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
 
@@ -60,6 +59,8 @@ class LoopCloser(SequenceRecognizer):
     :raises SettingsError: invalid settings.
     """
 
+    no_places = 'no earlier place is old enough to be matched with'
+
     def __init__(
         self,
         settings: RecognizerSettings,
@@ -81,11 +82,11 @@ class LoopCloser(SequenceRecognizer):
             feature_settings, options.mean_centering, options.whitening, limit, precision
         )
         # stamps of the latest places, not yet old enough in seconds
-        self._young: deque[int] = deque()
+        self._recent_stamps: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
         length = settings.sequence.length
-        # of the latest path: its last match, probabilities, matches that wait for its confirmation
-        self._last: Match | None = None
+        # of the latest path: image and place of its last match; probabilities; waiting matches
+        self._last: tuple[int, int] | None = None
         self._path: deque[float] = deque(maxlen=2 * length)
         self._waiting: deque[Match] = deque(maxlen=LONGEST_WAIT * length)
 
@@ -110,7 +111,7 @@ class LoopCloser(SequenceRecognizer):
         over a jump.
         """
         super().reset()
-        self._young.clear()
+        self._recent_stamps.clear()
         self._last = None
 
     def update(
@@ -126,58 +127,69 @@ class LoopCloser(SequenceRecognizer):
         self._append(features, stamp)
         self._track.append(position)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)
-        match = replace(self._match(position), image_index=self.first + len(self) - 1)
-        if match.status is Status.NO_MATCH and match.sequence is None:
-            match = replace(match, reason='no earlier place is old enough to be matched with')
-        return self._confirmed(match, self._oldest(match))
+        verdict = self._decide(position)
+        return self._confirmed(verdict, self._oldest(verdict), self.first + len(self) - 1)
 
-    def _confirmed(self, match: Match, oldest: list[Match]) -> Match:
+    def _confirmed(self, verdict: Verdict, oldest: list[Match], image: int) -> Match:
         """
-        Return the match; mode robust: as no match while its path is not confirmed.
+        Return the match; mode robust: no match while its path is not confirmed.
 
         Streets in one light look alike for about a window: a path is confirmed by half a window
-        of matches that are certain, or by two windows of any. Those that waited are late ones of
-        the match that confirms it. A camera at rest confirms nothing.
+        of matches that are certain, or by two windows of any. Matches that waited are late ones of
+        the match that confirms them. A camera at rest confirms nothing.
 
         :param oldest: the match of the oldest image, or none.
+        :param image: number of the newest one.
         """
-        if not match.accepted or math.isnan(match.probability):
-            return match
-        if not self._continues(match):
+        nearest = verdict.found.nearest
+        if verdict.status is not Status.MATCH or math.isnan(verdict.probability):
+            return self._built(verdict, image_index=image)
+        assert nearest is not None
+        if not self._continues(image, nearest.middle):
             self._path.clear()
             self._waiting.clear()
-        self._last = match
-        self._waiting += [self._late(each) for each in oldest]
+        self._last = image, nearest.middle
+        self._waiting += oldest
         if not self._window.is_standstill:
-            self._path.append(match.probability)
+            self._path.append(verdict.probability)
         certain = sum(probability > CERTAIN for probability in self._path)
         length = self._settings.sequence.length
         if certain < length // 2 and len(self._path) < 2 * length:
-            self._waiting.append(self._late(match))
-            match = replace(match, threshold=0.0, min_probability=1.0)
-            return replace(match, status=Status.NO_MATCH, reason='its path is not confirmed yet')
+            self._waiting.append(self._late(verdict, image))
+            verdict = verdict._replace(
+                limits=Limits(0.0, 1.0),
+                status=Status.NO_MATCH,
+                reason='its path is not confirmed yet',
+            )
+            return self._built(verdict, image_index=image)
         # places of the others have been evicted
-        late = [each for each in self._waiting if each.path[:, 1].min() >= self.first]
+        late = tuple(each for each in self._waiting if each.path[:, 1].min() >= self.first)
         self._waiting.clear()
-        return replace(match, late=tuple(late))
+        return self._built(verdict, image_index=image, late=late)
 
-    def _late(self, match: Match) -> Match:
-        """Return a match of the present window with all that is needed of it later."""
-        path = match.path[:, 1]
+    def _late(self, verdict: Verdict, image: int, is_oldest: bool = False) -> Match:
+        """Build a match of the present window with all that is needed of it later."""
+        path = verdict.found.path[:, 1]
         first = max(int(path.min()) - BAND, self.first)
         end = min(int(path.max()) + BAND + 1, self.first + len(self))
         columns = super().window_columns(np.arange(first, end))
-        return replace(match, is_late=True, first_column=first, columns=columns)
+        return self._built(
+            verdict,
+            is_oldest,
+            image_index=image,
+            is_late=True,
+            first_column=first,
+            columns=columns,
+        )
 
-    def _continues(self, match: Match) -> bool:
+    def _continues(self, image: int, place: int) -> bool:
         """Return whether a match continues the path of the last one."""
         if self._last is None:
             return False
-        images = match.image_index - self._last.image_index
-        apart = abs(match.place_index - self._last.place_index)
+        images, apart = image - self._last[0], abs(place - self._last[1])
         return images <= LONGEST_GAP and apart <= BAND * images
 
-    def _oldest(self, match: Match) -> list[Match]:
+    def _oldest(self, verdict: Verdict) -> list[Match]:
         """
         Return the match of the oldest image, if it had none as the middle one and is certain now.
 
@@ -185,9 +197,18 @@ class LoopCloser(SequenceRecognizer):
         """
         if not self._window.buffer.full:
             return []
-        found = self._window.match_oldest(self._settings.nms_radius, match.accepted)
-        oldest = replace(match.of_window(found, 0), is_oldest=True)
-        return [oldest] if oldest.accepted else []
+        match = self._window.match_oldest(
+            self._settings.nms_radius, verdict.status is Status.MATCH
+        )
+        if match.nearest is None:
+            return []
+        status, reason = self._limits.judge(match.nearest.distance, match.probability)
+        if status is not Status.MATCH:
+            return []
+        oldest = Verdict(
+            match, self._limits, status, reason, match.nearest.distance, match.probability
+        )
+        return [self._late(oldest, self.first + len(self) - 1, is_oldest=True)]
 
     def newest_row(self) -> np.ndarray:
         """
@@ -205,19 +226,19 @@ class LoopCloser(SequenceRecognizer):
             route.evict(evicted)
             window.evict(evicted)
             del self._track[:evicted]
-            while len(self._young) > route.count:
-                self._young.popleft()
+            while len(self._recent_stamps) > route.count:
+                self._recent_stamps.popleft()
         if route.append(features):
             window.grow(route.room)
         if isinstance(window, FilterWindow):
             window.change.learn_newest(route.latest, route.count)
             window.change.recenter_query(route.latest[:, -2:][:, 0])
-        self._young.append(stamp)
+        self._recent_stamps.append(stamp)
         self._places = max(0, route.count - max(self._exclude, self._count_young(stamp)))
 
     def _count_young(self, stamp: int) -> int:
         """Count the latest places, the newest included, that are too young for this stamp."""
-        young = self._young
+        young = self._recent_stamps
         # a place whose stamp is unknown is as old as the one before it
         while young and (not young[0] or (stamp and stamp - young[0] >= self._exclude_ns)):
             young.popleft()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import enum
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
@@ -14,7 +14,7 @@ from stavpr_ros.alignment.path import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
 
 NO_SHARES, NO_COLUMNS = np.empty(0), np.empty((0, 0), np.float32)
-LEAST_SHARE = 1e-9  # of a place of the path; ratios to it are finite
+MIN_SHARE = 1e-9  # of a place of the path; ratios to it are finite
 
 
 class Status(enum.IntEnum):
@@ -67,7 +67,7 @@ class WindowSequences(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class WindowMatch:
     """
-    The nearest sequence of a window, and all others.
+    The nearest sequence of a window, by the images alone, and all others.
 
     :param nearest: with the second best; None where no sequence is possible.
     :param path: its warping path, shape (m, 2), int32: position in the window, place.
@@ -75,7 +75,8 @@ class WindowMatch:
     :param shares: probability of each place of the path and its neighbors, given the sequence,
         (m,); empty in mode paper.
     :param sequences: returns all sequences; valid until the next match of the window.
-    :param least_probability: below which it is no match whatever the limits: of a camera at rest.
+    :param min_probability: below which it is no match whatever the limits: of a camera at rest.
+    :param images: number of the newest images that it is of; 0 = of the whole window.
     """
 
     nearest: SequenceMatch | None = None
@@ -83,13 +84,49 @@ class WindowMatch:
     sequences: Callable[[], WindowSequences] = WindowSequences
     probability: float = math.nan
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
-    least_probability: float = 0.0
+    min_probability: float = 0.0
+    images: int = 0
 
     def path_ratios(self, position: int) -> np.ndarray:
-        """Return the shares over that of the place of one image of the window, (m,)."""
+        """Return the shares over the share of the place of one image of the window, (m,)."""
         if not len(self.shares):
             return NO_SHARES
-        return self.shares / max(self.shares[position], LEAST_SHARE)
+        return self.shares / max(self.shares[position], MIN_SHARE)
+
+
+class Limits(NamedTuple):
+    """
+    From which on a window is matched.
+
+    :param threshold: its distance must be below it; NaN = not set, nothing is matched.
+    :param probability: mode robust: its probability must be above it.
+    """
+
+    threshold: float = math.nan
+    probability: float = math.nan
+
+    def raised(self, probability: float) -> 'Limits':
+        """Return these limits, the probability not below another one."""
+        return Limits(1 - probability, probability) if probability > self.probability else self
+
+    def judge(self, distance: float, probability: float) -> tuple[Status, str]:
+        """
+        Return ``MATCH`` or ``NO_MATCH``, and the reason for the latter.
+
+        By the probability or, where it is NaN, by the distance.
+        """
+        if math.isnan(probability):
+            accepted = distance < self.threshold
+            reason = (
+                f'nearest distance {distance:.4f} is not below the threshold {self.threshold:.4f}'
+            )
+        else:
+            accepted = probability > self.probability
+            reason = (
+                f'the probability of the best place, {probability:.3f}, is not above '
+                f'{self.probability:.3f}'
+            )
+        return (Status.MATCH, '') if accepted else (Status.NO_MATCH, reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,43 +250,14 @@ class Match:
         impossible = self.distance >= 1 and not math.isnan(self.probability)
         return math.inf if self.sequence is None or impossible else self.distance
 
-    def of_window(self, found: WindowMatch, position: int) -> 'Match':
-        """
-        Return the match of an image by a full window, accepted or not.
-
-        :param position: of the image in the window.
-        """
-        nearest = found.nearest
-        if nearest is None:
-            return replace(self, status=Status.NO_MATCH, reason='the map is empty')
-        return self._decided(
-            nearest.distance,
-            found.probability,
-            sequence=nearest,
-            path=found.path,
-            path_ratios=found.path_ratios(position),
-        )
-
     def with_probability(self, probability: float) -> 'Match':
         """Return the match of mode robust with another probability, accepted or not by it."""
-        return self._decided(1 - probability, probability)
-
-    def _decided(self, distance: float, probability: float, **fields: Any) -> 'Match':
-        """Return the match, accepted by its probability or, in mode paper, by its distance."""
-        if math.isnan(probability):
-            accepted = distance < self.threshold
-            reason = (
-                f'nearest distance {distance:.4f} is not below the threshold {self.threshold:.4f}'
-            )
-        else:
-            accepted = probability > self.min_probability
-            reason = (
-                f'the probability of the best place, {probability:.3f}, is not above '
-                f'{self.min_probability:.3f}'
-            )
-        status = Status.MATCH if accepted else Status.NO_MATCH
-        fields |= {'status': status, 'reason': '' if accepted else reason}
-        return replace(self, distance=distance, probability=probability, **fields)
+        distance = 1 - probability
+        limits = Limits(self.threshold, self.min_probability)
+        status, reason = limits.judge(distance, probability)
+        return replace(
+            self, status=status, reason=reason, distance=distance, probability=probability
+        )
 
     def with_candidates(self, ranked: Sequence[Candidate]) -> 'Match':
         """Return the match with its ranked places; the first is the match itself."""

@@ -7,7 +7,7 @@ import copy
 from dataclasses import replace
 import math
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.checks import require_type
@@ -28,12 +28,18 @@ from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import (
     Candidate,
     distinct_places,
+    Limits,
     Match,
     ranked_candidates,
     Status,
     WindowMatch,
 )
-from stavpr_ros.recognition.relative_motion import Positions, RelativeMotion
+from stavpr_ros.recognition.relative_motion import (
+    Positions,
+    RelativeMotion,
+    UNUSUAL,
+    with_odometry_test,
+)
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
@@ -41,8 +47,27 @@ from stavpr_ros.recognition.window import QueryWindow
 if TYPE_CHECKING:
     from stavpr_ros.prepare.first_stage import FirstStage
 
-EARLY = 0.9  # least probability of a match before the window is full
+EARLY = 0.9  # minimum probability of a match by the newest images alone
 TIMED = 3  # images, to compare the time of one with the time budget
+
+
+class Verdict(NamedTuple):
+    """
+    What a window showed, and the limits that were applied.
+
+    :param found: by the images alone.
+    :param distance, probability: also by odometry; NaN without a sequence.
+    """
+
+    found: WindowMatch
+    limits: Limits
+    status: Status
+    reason: str
+    distance: float = math.nan
+    probability: float = math.nan
+
+
+EMPTY = Verdict(WindowMatch(), Limits(), Status.WARMING_UP, '')
 
 
 class SequenceRecognizer(ABC):
@@ -55,12 +80,13 @@ class SequenceRecognizer(ABC):
     :param positions: x and y of the places in the window, meters; the path of a match is compared
         with them if the settings require it. Empty = unknown.
 
-    ``problem`` is why places of the map cannot be reached, empty while they can; ``stages`` the
-    choice by a time budget, empty without one.
+    ``problem`` is why places of the map cannot be reached, empty while they can; ``start_notes``
+    are of the start, for the log; ``no_places`` is the reason where a window has no places.
     """
 
     problem = ''
-    stages = ''
+    start_notes = ''
+    no_places = 'the map is empty'
 
     def __init__(
         self,
@@ -75,7 +101,7 @@ class SequenceRecognizer(ABC):
         if not settings.compares_odometry:
             positions = ()
         self._motion = RelativeMotion(settings.sequence.length, settings.odometry_error, positions)
-        self._found, self._newest = WindowMatch(), Match(Status.WARMING_UP)
+        self._newest = EMPTY
 
     @abstractmethod
     def update(
@@ -97,7 +123,7 @@ class SequenceRecognizer(ABC):
         """Drop the images of the window."""
         self._window.reset()
         self._motion.reset()
-        self._found, self._newest = WindowMatch(), Match(Status.WARMING_UP)
+        self._newest = EMPTY
 
     @property
     def window_fill(self) -> int:
@@ -107,7 +133,7 @@ class SequenceRecognizer(ABC):
     @property
     def threshold(self) -> float | None:
         """Return the distance below which a window is matched: as set, or by the map; or None."""
-        return None if math.isnan(self._limits[0]) else self._limits[0]
+        return None if math.isnan(self._limits.threshold) else self._limits.threshold
 
     def set_limits(
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
@@ -125,7 +151,8 @@ class SequenceRecognizer(ABC):
             max_error=max_error,
         )
         threshold = settings.applied_threshold
-        self._limits = math.nan if threshold is None else threshold, settings.applied_probability
+        threshold = math.nan if threshold is None else threshold
+        self._limits = Limits(threshold, settings.applied_probability)
 
     def candidates(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -133,7 +160,7 @@ class SequenceRecognizer(ABC):
 
         :returns: places, int64, and the costs of their sequences, at most ``count`` of each.
         """
-        return distinct_places(self._found.sequences(), count)
+        return distinct_places(self._newest.found.sequences(), count)
 
     def ranked(self, count: int) -> list[Candidate]:
         """
@@ -146,11 +173,11 @@ class SequenceRecognizer(ABC):
         :returns: empty while the window has no match and is not full.
         :raises InputError: count below 0.
         """
-        match, nearest = self._newest, None
-        if match.sequence is not None:
-            nearest = Candidate(match.sequence.middle, match.distance, match.probability)
+        newest, nearest = self._newest, None
+        if (sequence := newest.found.nearest) is not None:
+            nearest = Candidate(sequence.middle, newest.distance, newest.probability)
         positions, radius = self._window.layout.positions, self._settings.nms_radius
-        return ranked_candidates(nearest, self._found.sequences(), count, radius, positions)
+        return ranked_candidates(nearest, newest.found.sequences(), count, radius, positions)
 
     def newest_row(self) -> np.ndarray:
         """
@@ -159,7 +186,7 @@ class SequenceRecognizer(ABC):
         :returns: shape (n,), float32; lower is nearer.
         """
         window = self._window
-        return window.layout.gathered(window.buffer.newest())
+        return window.layout.to_places(window.buffer.newest())
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
@@ -191,47 +218,74 @@ class SequenceRecognizer(ABC):
 
         :param position: of the newest image by odometry, (2,); NaN = unknown.
         """
-        buffer, (threshold, min_probability) = self._window.buffer, self._limits
-        match = Match(
-            Status.WARMING_UP,
-            f'{len(buffer)} of {buffer.length} images in the window',
-            threshold,
-            min_probability=min_probability,
-            window_stamps=buffer.stamps,
-            window_changes=self._window.changes,
-        )
-        self._motion.trajectory.append(position)
-        found = WindowMatch()
-        if buffer.full:
-            found = self._window.match(self._settings.nms_radius)
-            match = self._of_window(match, found, position)
-        if not match.accepted:
-            sure = max(min_probability, EARLY)
-            newest, count = self._window.match_newest(self._settings.nms_radius)
-            if count:
-                early = replace(
-                    match,
-                    threshold=1 - sure,
-                    min_probability=sure,
-                    window_stamps=match.window_stamps[-count:],
-                    window_changes=match.window_changes[-count:],
-                )
-                early = self._of_window(early, newest, position)
-                match, found = (early, newest) if early.accepted else (match, found)
-        self._found, self._newest = found, match
-        return match
+        return self._built(self._decide(position))
 
-    def _of_window(self, match: Match, found: WindowMatch, position: np.ndarray) -> Match:
-        """Return the match by what a window showed."""
-        if found.least_probability > match.min_probability:
-            least = found.least_probability
-            match = replace(match, threshold=1 - least, min_probability=least)
-        match = match.of_window(found, match.position)
-        is_known = len(self._motion.positions) and np.isfinite(position[0])
-        if is_known and match.sequence is not None:
-            session = self._window.layout.session_of(match.sequence.middle)
-            match = self._motion.weighed(match, self._window.buffer.first, session)
-        return match
+    def _decide(self, position: np.ndarray) -> 'Verdict':
+        """Decide on the window, and where it has no match, on its newest images."""
+        window, radius = self._window, self._settings.nms_radius
+        self._motion.trajectory.append(position)
+        fill, length = len(window.images), window.buffer.length
+        reason = f'{fill} of {length} images in the window'
+        verdict = Verdict(WindowMatch(), self._limits, Status.WARMING_UP, reason)
+        if window.buffer.full:
+            verdict = self._judged(window.match(radius), self._limits)
+        if verdict.status is not Status.MATCH:
+            newest = window.match_newest(radius)
+            if newest.nearest is not None:
+                early = self._judged(newest, self._limits.raised(EARLY))
+                verdict = early if early.status is Status.MATCH else verdict
+        self._newest = verdict
+        return verdict
+
+    def _judged(self, match: WindowMatch, limits: Limits) -> 'Verdict':
+        """Judge what a window showed, by the limits and by odometry."""
+        limits = limits.raised(match.min_probability)
+        if match.nearest is None:
+            return Verdict(match, limits, Status.NO_MATCH, self.no_places)
+        distance, probability = match.nearest.distance, match.probability
+        status, reason = limits.judge(distance, probability)
+        if len(self._motion.positions) and np.isfinite(self._motion.trajectory[-1][0]):
+            accepted, layout = status is Status.MATCH, self._window.layout
+            agreed = self._motion.agreement(
+                match,
+                (len(match.path) - 1) // 2,
+                accepted,
+                self._window.buffer.first,
+                layout.session_of(match.nearest.middle),
+            )
+            if agreed < UNUSUAL:
+                probability = with_odometry_test(probability, agreed)
+                distance = 1 - probability
+                status, reason = limits.judge(distance, probability)
+                if accepted and status is not Status.MATCH:
+                    reason += ': odometry disagrees with its path'
+        return Verdict(match, limits, status, reason, distance, probability)
+
+    def _built(self, verdict: 'Verdict', is_oldest: bool = False, **fields: Any) -> Match:
+        """
+        Build the match of an image.
+
+        :param is_oldest: of the oldest image of the window, not of the middle one.
+        :param fields: of a match in loop closure.
+        """
+        window, found = self._window, verdict.found
+        images = found.images or len(window.images)
+        position = 0 if is_oldest else (images - 1) // 2
+        return Match(
+            verdict.status,
+            verdict.reason,
+            verdict.limits.threshold,
+            found.nearest,
+            found.path,
+            verdict.distance,
+            verdict.probability,
+            verdict.limits.probability,
+            found.path_ratios(position),
+            window_stamps=tuple(image.stamp for image in window.images)[-images:],
+            window_changes=window.changes[-images:],
+            is_oldest=is_oldest,
+            **fields,
+        )
 
 
 class PlaceRecognizer(SequenceRecognizer):
@@ -290,7 +344,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self._vectors: tuple[FirstStage, MeanCentering] | None = None
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time budget
-        self.stages = '; '.join(filter(None, [prepared.note, settings.error_note]))
+        self.start_notes = '; '.join(filter(None, [prepared.note, settings.error_note]))
         if settings.time_budget_ms and len(features):
             if backend == 'cuda':
                 raise SettingsError(
@@ -351,7 +405,7 @@ class PlaceRecognizer(SequenceRecognizer):
                 self._vectors = stage, centering
             of = ' of vectors' if self._vectors is not None else ''
             text += f': with a first stage{of} {self._milliseconds(image):.3g} ms'
-        self.stages = '; '.join(filter(None, [self.stages, text]))
+        self.start_notes = '; '.join(filter(None, [self.start_notes, text]))
 
     def _milliseconds(self, image: LocalFeatures) -> float:
         """Return the least time of a few updates by an image, after one that compiles."""
@@ -368,7 +422,7 @@ class PlaceRecognizer(SequenceRecognizer):
         """Return the first places of the most probable blocks of the filter."""
         assert isinstance(self._window, FilterWindow)
         assert isinstance(self._window.filter, PlaceFilter)
-        return self._window.layout.positions_from(self._window.filter.probable_blocks())
+        return self._window.layout.place_before(self._window.filter.probable_blocks() - 1) + 1
 
     @property
     def places(self) -> int:
@@ -449,7 +503,7 @@ def _window_of(place_map: PlaceMap, settings: RecognizerSettings, backend: str) 
 
             window_class = CudaFilterWindow
         window = window_class(sequence, n, None, layout, options.query_znorm)
-        window.learn_times(place_map.stamps)
+        window.choice.learn_times(place_map.stamps)
         return window
     if backend == 'cpu':
         return LmDtwWindow(sequence, n, layout, options.query_znorm)

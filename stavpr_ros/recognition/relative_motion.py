@@ -10,18 +10,17 @@ the bodies whose poses they are.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from stavpr_ros.recognition.match import Match
+from stavpr_ros.recognition.match import WindowMatch
 
 ALONG = 0.5  # deviation of a matched place along the track, places
 TURNS = 2  # degrees of freedom of the shape of the trajectory; its length has one
 UNUSUAL = 0.05  # share of right paths that disagree more, below which probabilities are lowered
-LEAST_IMAGES = 3
+MIN_IMAGES = 3
 LONGEST = 5  # windows of the trajectory that are compared
 FARTHEST = 5  # places from image to image
-LEAST_DOUBT = 1e-9  # no probability is 1
+MIN_DOUBT = 1e-9  # no probability is 1
 Positions = Sequence[np.ndarray] | np.ndarray
 
 
@@ -50,18 +49,27 @@ class RelativeMotion:
         self.trajectory.clear()
         self._followed, self._last = 0, 0  # matches that continued each other; place of the last
 
-    def weighed(self, match: Match, first: int, session: tuple[int, int]) -> Match:
+    def agreement(
+        self,
+        match: WindowMatch,
+        position: int,
+        accepted: bool,
+        first: int,
+        session: tuple[int, int],
+    ) -> float:
         """
-        Return a match with a sequence, less probable if odometry disagrees with its path.
+        Return the p-value of the trajectory, given the path of a match with a sequence.
 
-        The last position of the trajectory, that of the match's newest image, is known.
+        The last position of the trajectory, of the match's newest image, is known.
 
+        :param position: of the matched image in the path.
+        :param accepted: by the images alone.
         :param first: first place that is not evicted.
         :param session: first place of the match's session, and the first one behind it.
         """
-        assert match.sequence is not None
-        place, newest = match.sequence.middle, int(match.path[-1, 1])
-        follows = match.accepted and 0 <= place - self._last <= FARTHEST
+        assert match.nearest is not None
+        place, newest = match.nearest.middle, int(match.path[-1, 1])
+        follows = accepted and 0 <= place - self._last <= FARTHEST
         self._followed = self._followed + 1 if follows else 0
         self._last = place
         reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
@@ -69,39 +77,37 @@ class RelativeMotion:
         high = min(first + len(self.positions), session[1], place + reach)
         track = np.array(self.positions[low - first : high - first])
         trajectory = np.array(self.trajectory)
-        length, agreed = len(match.window_stamps), 1.0
-        after = length - 1 - match.position
+        length, agreed = len(match.path), 1.0
+        after = length - 1 - position
         for count in {length, min(len(trajectory), length + self._followed)}:
             part = trajectory[-count:]
-            found = agreement(
+            p_value = agreement(
                 track, (place - low, newest - low), part, count - 1 - after, self._error
             )
-            agreed = agreed if np.isnan(found) else min(agreed, found)
-        return less_probable(match, agreed)
+            agreed = agreed if np.isnan(p_value) else min(agreed, p_value)
+        return agreed
 
 
-def less_probable(match: Match, agreed: float) -> Match:
+def with_odometry_test(probability: float, agreed: float) -> float:
     """
-    Return a match whose trajectory agrees with its path to a degree from 0 to 1.
+    Return the probability of a match whose trajectory has this p-value.
 
     Agreement is no evidence: other places have a track of that shape as well.
     """
     if agreed >= UNUSUAL:
-        return match
-    odds = match.probability / max(1 - match.probability, LEAST_DOUBT) * agreed / UNUSUAL
-    found = match.with_probability(odds / (1 + odds))
-    if match.accepted and not found.accepted:
-        return replace(found, reason=f'{found.reason}: odometry disagrees with its path')
-    return found
+        return probability
+    odds = probability / max(1 - probability, MIN_DOUBT) * agreed / UNUSUAL
+    return odds / (1 + odds)
 
 
 def agreement(
     track: np.ndarray, places: tuple[int, int], trajectory: np.ndarray, middle: int, error: float
 ) -> float:
     """
-    Return the share of queries on the right path whose trajectory would fit the map less.
+    Return the p-value of the trajectory of a query, given its path.
 
-    The trajectory by odometry is laid along the track, from the middle image of the window on. Two
+    It is the share of queries on the right path whose trajectory would fit the map less. The
+    trajectory by odometry is laid along the track, from the middle image of the window on. Two
     properties are compared: its shape, less one rotation and shift, and its length from the middle
     image to the newest with that of the path. With the deviations sigma_i = hypot(``ALONG``
     spacings, ``error`` s_i) of an image s_i meters from the middle one, the sum
@@ -126,13 +132,13 @@ def agreement(
         return float('nan')
     if not lengths[-1] > 0:  # the map's camera was at rest
         return float('nan')
-    start, end = (float(lengths[found[0]]) for found in ends)
+    start, end = (float(lengths[rows[0]]) for rows in ends)
     driven = driven - driven[own[0]]
     spacing = float(lengths[-1]) / (len(lengths) - 1)
     length_error = driven[-1] - (end - start)
     total = length_error**2 / _variance(2 * ALONG * spacing, error * driven[-1])
     inside = (start + driven >= 0) & (start + driven <= lengths[-1])
-    if np.count_nonzero(inside) < LEAST_IMAGES:
+    if np.count_nonzero(inside) < MIN_IMAGES:
         return float('nan')
     images, driven = images[inside], driven[inside]
     mine = trajectory[images] @ (1, 1j)

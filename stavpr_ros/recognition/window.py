@@ -10,86 +10,36 @@ A recognizer has one window, which is all that is reset between two queries besi
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
-import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
-from stavpr_ros.compilation import kernel
-from stavpr_ros.filter.paths import Belief, NO_PLACES
+from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition.match import WindowMatch
 
-LONGEST = 4.0  # intervals between images: beyond, the camera stopped, or its speed is unknown
 
-
-class ColumnLayout:
+@dataclass
+class WindowImage:
     """
-    Places of one session, or of a route: each is the column of its number.
+    An image of the window.
 
-    :attr:`runs` are the places of each session, ``firsts`` their first ones, ``gaps`` the columns
-    between them.
+    :param stamp: ns; 0 = unknown.
+    :param change: from the image before; mode robust.
+    :param weight: exponent alpha of its likelihood; mode robust.
+    :param number: of the filter's last update; images of a camera at rest share one.
+    :param is_matched: it had a match as the middle image.
     """
 
-    firsts: np.ndarray = np.zeros(1, np.int64)
-    runs: Sequence[slice] = (slice(None),)
-    gaps: np.ndarray = NO_PLACES
-
-    def width(self, places: int) -> int:
-        """Return the number of columns of so many places."""
-        return places
-
-    def spread(self, row: np.ndarray) -> np.ndarray:
-        """Return distances to places (n,) as those to columns, +inf in gaps."""
-        return row
-
-    def gathered(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the columns that are places, (n,)."""
-        return values
-
-    def columns_of(self, places: np.ndarray) -> np.ndarray:
-        """Return the columns of places."""
-        return places
-
-    def positions_of(self, columns: np.ndarray) -> np.ndarray:
-        """Return the numbers of columns among the places; in a gap, of the place before it."""
-        return columns
-
-    def positions_from(self, columns: np.ndarray) -> np.ndarray:
-        """Return the numbers of columns among the places; in a gap, of the place after it."""
-        return columns
-
-    def first_column(self, column: int) -> int:
-        """Return the first column of a column's session."""
-        return 0
-
-    def session_of(self, place: int) -> tuple[int, int]:
-        """Return the first place of a place's session, and the first one behind it."""
-        return 0, sys.maxsize
-
-    def shared(self, belief: Belief, n: int, close: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """
-        Let places of one position share their probability.
-
-        :param n: columns that are known.
-        :param close: columns to either side that count for a column, too.
-        :returns: columns whose probability is not 0, ascending, and their probabilities; among
-            them the most probable one: of the session that is most probable at the most probable
-            position.
-        """
-        columns, probabilities = belief.probabilities(n)
-        return columns, probabilities, int(np.argmax(probabilities))
-
-    def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """Return positions: those at most nms_radius apart are neighbors in one session."""
-        return np.asarray(places)
-
-    def in_places(self, found: WindowMatch) -> WindowMatch:
-        """Return a match whose columns have become places, with its second best."""
-        return found
+    stamp: int = 0
+    change: float = 0.0
+    weight: float = 0.0
+    number: int = 0
+    is_matched: bool = False
 
 
 class SequenceBuffer:
@@ -120,7 +70,6 @@ class SequenceBuffer:
         self.first = 0  # index of the first place that is not evicted
         self.known = 0  # places with an entry in any row of the window; all others are +inf
         self._count = 0
-        self._stamps: deque[int] = deque(maxlen=self.length)
         self._allocate(places)
 
     def _allocate(self, places: int) -> None:
@@ -145,32 +94,25 @@ class SequenceBuffer:
         return self._count >= self.length
 
     @property
-    def stamps(self) -> tuple[int, ...]:
-        """Stamps of the images in the window, ns, oldest first."""
-        return tuple(self._stamps)
-
-    @property
     def oldest(self) -> int:
         """Row of ``memory`` where the window begins."""
         return self._count % self.length
 
-    def push(self, row: np.ndarray, stamp: int = 0) -> None:
+    def push(self, row: np.ndarray) -> None:
         """
         Add the distances of the newest image and drop the oldest.
 
         :param row: shape (m,), float32, of the first m <= n places; the others become +inf.
-        :param stamp: of the image, ns; 0 = unknown.
         :raises InputError: NaN or -inf in the row; the buffer is unchanged.
         """
         if not row.sum() > -np.inf:
             no_nan(row, 'image distances')
-        self._add(row, stamp)
+        self._add(row)
 
-    def _add(self, row: Any, stamp: int) -> None:
+    def _add(self, row: Any) -> None:
         slot, m = self._slots[self._count % self.length], len(row)
         slot[:, :m], slot[:, m:] = row, np.inf
         self.known = max(self.known, m)
-        self._stamps.append(stamp)
         self._count += 1
 
     def rows(self) -> np.ndarray:
@@ -203,7 +145,6 @@ class SequenceBuffer:
     def clear(self) -> None:
         """Empty the window."""
         self.memory[:] = np.inf
-        self._stamps.clear()
         self.known = self._count = 0
 
     def grow(self, places: int) -> None:
@@ -229,6 +170,8 @@ class QueryWindow(ABC):
     :param layout: of the places in the columns of the buffer.
     :param normalizes: z-normalize the distances of each image.
     :param around: see :func:`stavpr_ros.prepare.normalization.z_normalized`.
+
+    ``images`` are those in the window, oldest first.
     """
 
     def __init__(
@@ -239,6 +182,7 @@ class QueryWindow(ABC):
         around: int = 0,
     ) -> None:
         self.buffer, self.layout = buffer, layout
+        self.images: deque[WindowImage] = deque(maxlen=buffer.length)
         self._normalizes, self._around = normalizes, around
 
     @property
@@ -259,7 +203,8 @@ class QueryWindow(ABC):
         :param strips: its features, centered, (W, d).
         :param stamp: ns; 0 = unknown.
         """
-        self.buffer.push(self._as_columns(row), stamp)
+        self.buffer.push(self._as_columns(row))
+        self.images.append(WindowImage(stamp))
 
     def _as_columns(self, row: Any) -> Any:
         """Return distances to the places, normalized, as a row of the buffer."""
@@ -268,32 +213,28 @@ class QueryWindow(ABC):
             row = np.concatenate(
                 [z_normalized(row[run], self._around, counted[run]) for run in self.layout.runs]
             )
-        return self.layout.spread(row)
+        return self.layout.to_columns(row)
 
     def _counted(self, n: int) -> np.ndarray:
         """Return which of n places count for mean and deviation of a row, (n,), bool."""
         return np.ones(n, bool)
 
+    @abstractmethod
     def match(self, nms_radius: int) -> WindowMatch:
         """
         Return the match of the images in the window, in mode paper of a full one.
 
         :param nms_radius: of the non-maximum suppression, places.
         """
-        return self.layout.in_places(self._match(nms_radius))
 
-    @abstractmethod
-    def _match(self, nms_radius: int) -> WindowMatch:
-        """Return the match of the images in the window, in columns of the buffer."""
-
-    def match_newest(self, nms_radius: int) -> tuple[WindowMatch, int]:
+    def match_newest(self, nms_radius: int) -> WindowMatch:
         """
         Return the match of the newest images, since the camera has come to the map.
 
-        :returns: the match, and of how many images: 0 where the full window shows the same, or in
-            loop closure and mode paper.
+        :returns: without a sequence where the full window shows the same, or in loop closure and
+            mode paper.
         """
-        return WindowMatch(), 0
+        return WindowMatch()
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """
@@ -308,6 +249,7 @@ class QueryWindow(ABC):
     def reset(self) -> None:
         """Drop all images."""
         self.buffer.clear()
+        self.images.clear()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -316,25 +258,3 @@ class QueryWindow(ABC):
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         self.buffer.evict(count)
-
-
-@kernel
-def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """
-    Return the times of images, (m,), float64, ascending, in intervals of most of them.
-
-    A camera that loses images still advances evenly in time: the stamps of a window show where
-    images are missing, and those of a map where places are. An interval is 1 where a stamp is
-    unknown or not above the one before.
-
-    :param stamps: ns, (m,), int64; 0 = unknown.
-    :param numbers: (m,), int64; equal ones are of a camera at rest, for which no time passes.
-    """
-    steps = np.diff(stamps).astype(np.float64)
-    is_known = (steps > 0) & (stamps[:-1] > 0)
-    usual = np.median(steps[is_known]) if is_known.any() else 1.0
-    times = np.zeros(len(stamps))
-    for i in range(len(steps)):
-        step = min(steps[i] / usual, LONGEST) if is_known[i] else 1.0
-        times[i + 1] = times[i] + (step if numbers[i + 1] > numbers[i] else 0.0)
-    return times

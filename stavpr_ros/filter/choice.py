@@ -1,0 +1,238 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The path of a window: from the belief of the filter to one path with a probability.
+
+A path c has the probability p_c of its places within ``BAND``, by the filter. The checks of the
+path as a whole (:mod:`stavpr_ros.filter.checks`) multiply its odds by a factor f_c; where they
+refute it, a path through the next most probable place is checked, too. With the rest r of the
+probability on the map, and M = sum_c p_c + r,
+
+    P(c) = f_c p_c / (sum_c f_c p_c + r + (1 - M) / 2),
+
+since the filter declares the odds of being on the map too low, by about 2 (``CALIBRATION``). Loop
+closure needs no calibration.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import sys
+
+import numpy as np
+from stavpr_ros.filter.checks import (
+    least_at_rest,
+    NEWEST,
+    odds_factor,
+    PathCandidate,
+    unevenness,
+)
+from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.filter.motion import ImageChange
+from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
+from stavpr_ros.filter.protocol import Filter
+from stavpr_ros.filter.refine import ascending, BAND, image_times, OFFSETS, refine
+
+CALIBRATION = 2.0  # factor of the odds of being on the map
+CANDIDATES = 3  # paths that are checked, at most
+REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
+MIN_CANDIDATE = REFUTED  # probability of its place, at least: above refuted ones
+NEAR_LEVEL = -2.3  # mean z of right places, at most, as evidence between near places
+
+
+@dataclass(frozen=True, eq=False)
+class WindowImages:
+    """
+    The images of a window, oldest first, and the image whose place is sought.
+
+    :param numbers: of the filter's updates, (l,), int64; equal ones are of a camera at rest.
+    :param weights: exponents alpha of their likelihoods, (l,).
+    :param stamps: ns, (l,), int64; 0 = unknown.
+    :param z: returns z of each image at columns (l, S), float32.
+    :param n: columns that the filter was updated with.
+    :param position: of the image whose place is sought.
+    :param is_whole: these are all images of the window.
+    :param lag_at_rest: images that the path is followed back, at least, where the camera has not
+        moved since that image; None = it has.
+    """
+
+    numbers: np.ndarray
+    weights: np.ndarray
+    stamps: np.ndarray
+    z: Callable[[np.ndarray], np.ndarray]
+    n: int
+    position: int
+    is_whole: bool
+    lag_at_rest: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenPath:
+    """
+    The path of a window, and the other places that the image may show.
+
+    :param path: column of each image, (l,), int64.
+    :param shares: probability of these places and close ones, given the path, (l,).
+    :param probability: of the place of the image at the position.
+    :param min_probability: below which it is no match: of a camera at rest.
+    :param places: columns that the image may show, ascending, (m,), and probabilities: theirs,
+        after the checks.
+    """
+
+    path: np.ndarray
+    shares: np.ndarray
+    probability: float
+    min_probability: float
+    places: np.ndarray
+    probabilities: np.ndarray
+
+
+class PathChoice:
+    """
+    Chooses the path of a window.
+
+    :param filter: after the newest image of the window.
+    :param change: of the images, and of the map.
+    :param layout: of the places.
+    :param width: number of columns.
+    :param calibration: factor of the odds of being on the map.
+    """
+
+    def __init__(
+        self,
+        filter: Filter,  # noqa: A002
+        change: ImageChange,
+        layout: ColumnLayout,
+        width: int,
+        calibration: float,
+    ) -> None:
+        self._filter, self._change, self._layout = filter, change, layout
+        self._calibration = calibration
+        self.grow(width)
+
+    def grow(self, width: int) -> None:
+        """Make room for more columns, at equal times."""
+        self._place_times = np.arange(width, dtype=np.float64)  # of each column
+
+    def learn_times(self, stamps: np.ndarray) -> None:
+        """
+        Learn at what times the camera passed the places of the map.
+
+        :param stamps: ns, (n,), int64; 0 = unknown.
+        """
+        columns = self._layout.columns_of(np.arange(len(stamps)))
+        steps = np.ones(len(self._place_times))
+        steps[columns[1:]] = np.diff(image_times(stamps, columns))
+        self._place_times = steps.cumsum()
+
+    def choose(self, belief: Belief, images: WindowImages) -> ChosenPath:
+        """
+        Return the most probable path after the checks, and its probability.
+
+        :param belief: of the image at the position; it has at least one place.
+        """
+        places, probabilities, best = self._layout.merge_sessions(belief, images.n)
+        candidates: list[PathCandidate] = []
+        while len(candidates) < CANDIDATES:
+            candidate = self._candidate(belief, places[best], probabilities[best], images)
+            candidates.append(candidate)
+            probabilities[np.abs(places - places[best]) <= BAND] *= candidate.factor
+            best = int(np.argmax(probabilities))
+            if candidate.factor >= REFUTED or probabilities[best] < MIN_CANDIDATE:
+                break
+        chosen = max(candidates, key=lambda candidate: candidate.weight)
+        on_map = min(float(belief.weights.sum()), 1.0)
+        unchecked = max(on_map - sum(candidate.probability for candidate in candidates), 0.0)
+        total = unchecked + sum(candidate.weight for candidate in candidates)
+        odds_sum = total + (1 - on_map) / self._calibration
+        of_path = chosen.weight / max(odds_sum, sys.float_info.min)
+        share = float(chosen.shares[images.position])
+        return ChosenPath(
+            chosen.path, chosen.shares, of_path * share, chosen.least * share,
+            places, probabilities,
+        )  # fmt: skip
+
+    def second_best(
+        self, chosen: ChosenPath, n: int, place: int, radius: int
+    ) -> tuple[int, float]:
+        """Return the most probable column beyond a radius, and its probability, 0 if none."""
+        places, probabilities = chosen.places, chosen.probabilities
+        around = np.arange(max(0, place - radius), min(n, place + radius + 1))
+        now, faint = self._filter.most_probable(np.sort(np.append(around, places)))
+        faint *= NEGLIGIBLE
+        apart = np.abs(places - place) > radius
+        if apart.any():
+            second = int(np.argmax(np.where(apart, probabilities, 0)))
+            if probabilities[second] >= faint:
+                return int(places[second]), float(probabilities[second])
+        return now, faint
+
+    def _candidate(
+        self, belief: Belief, place: int, probability: float, images: WindowImages
+    ) -> PathCandidate:
+        """Return the path of the window through a place at the position, and its checks."""
+        apart = np.abs(belief.places - place)
+        near = apart <= CLOSE
+        # of the path: its places are certain within the band
+        of_path = max(float(probability), min(float(belief.weights[apart <= BAND].sum()), 1.0))
+        state = belief.states[near][np.argmax(belief.weights[near])]
+        mean, numbers = self._filter.mean_z(state), images.numbers
+        path = self._path(state, images)
+        path, shares, placed, z = self._refined(path, images, mean)
+        moved = int(numbers[-1] - numbers[0])
+        speed = float(path[-1] - path[0]) / max(moved, 1)
+        excess = self._change.excess(speed) if moved and images.is_whole else 0.0
+        factor = odds_factor(unevenness(path, z, 1.0 if images.is_whole else NEWEST), excess)
+        least = 0.0
+        if images.lag_at_rest is not None:
+            at_rest = z[numbers == numbers[-1]]
+            least = least_at_rest(at_rest, mean, self._filter.settings.weight)
+        return PathCandidate(placed, shares, of_path, factor, least)
+
+    def _path(self, state: np.ndarray, images: WindowImages) -> np.ndarray:
+        """Return the column of each image, (l,); before the image at the position at one speed."""
+        numbers = images.numbers
+        back = numbers[-1] - numbers
+        lag = int(back[images.position])
+        if images.lag_at_rest is not None:  # images before the standstill as well
+            lag = max(lag, int(min(back[0], images.lag_at_rest)))
+        places = self._filter.path(state, lag)
+        lag = int(np.count_nonzero(places >= 0)) - 1  # since the path has entered the map
+        slope = (places[0] - places[lag]) / lag if lag else self._filter.speed(state)
+        earlier = np.maximum(back - lag, 0) * slope
+        path = places[np.minimum(back, lag)].astype(np.int64) - np.rint(earlier).astype(np.int64)
+        return np.maximum(path, self._layout.first_column(places[0]))
+
+    def _refined(
+        self, path: np.ndarray, images: WindowImages, mean: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Return the places near a path that explain the images of the window best.
+
+        Bad conditions bring the right place nearer to all others, less to those around it: places
+        are estimated with the evidence of usual conditions. The path is checked where the evidence
+        of the filter has its mean: more would make paths through look-alike places more even.
+
+        :param path: column of each image, ascending, (l,).
+        :param mean: z of right places, at the path's level.
+        :returns: columns that are checked, (l,), probability of columns close to the estimated
+            ones, (l,), these, (l,), and z of each image at the column that is checked, (l,).
+        """
+        places = path[:, None] + OFFSETS
+        inside = np.minimum(np.maximum(places, 0), images.n - 1)
+        z = images.z(inside)
+        masses, means = refine(
+            z, path, images.weights * mean, images.numbers,
+            image_times(images.stamps, images.numbers), self._place_times[: images.n],
+            min(mean, NEAR_LEVEL) / mean,
+        )  # fmt: skip
+        ends = self._layout.first_column(path[-1]), images.n - 1
+        checked, placed = ascending(path, means[0], *ends), ascending(path, means[1], *ends)
+        close = np.abs(places - placed[:, None]) <= CLOSE
+        first, last = self._layout.place_before(inside[[0, -1], [0, -1]]).tolist()
+        stretches = self._change.stretches(first, last + 1)
+        if stretches[-1] - stretches[0] < last - first:  # equal places are as one
+            own, others = map(self._layout.place_before, (inside, placed[:, None]))
+            close |= stretches[own - first] == stretches[others - first]
+        offsets = np.minimum(np.maximum(checked - path, -BAND), BAND) + BAND
+        shares = (masses * close).sum(axis=1)
+        return checked, shares, placed, z[np.arange(len(path)), offsets]

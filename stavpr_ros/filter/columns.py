@@ -1,0 +1,125 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Columns of the filter's states: places, with a gap between two sessions.
+
+Columns of a gap have infinite distances, and a state that enters one leaves the map, so that no
+path continues from one session into another. A place and the place of an earlier session with the
+same view (:attr:`stavpr_ros.mapping.PlaceMap.same_as`) are one position: their probabilities add
+up, and neither is the second best of the other.
+"""
+
+import sys
+
+import numpy as np
+from stavpr_ros.filter.paths import Belief, CLOSE, NO_PLACES
+
+ONE_SESSION: np.ndarray = np.zeros(1, np.int64)
+
+
+class ColumnLayout:
+    """
+    Columns of the places of a map.
+
+    :param firsts: first place of every run of places of one session, ascending, (m,); the first
+        one is 0. One session: each place is the column of its number.
+    :param same_as: for each place, itself, or the place of an earlier session that shows the
+        same, (n,); not needed for one session.
+    :param gap: columns between two sessions: more than a camera moves from image to image.
+
+    ``runs`` are the places of each session, ``gaps`` the columns between them.
+    """
+
+    def __init__(
+        self, firsts: np.ndarray = ONE_SESSION, same_as: np.ndarray = NO_PLACES, gap: int = 0
+    ) -> None:
+        self.firsts, self.runs, self.gaps = firsts, [slice(None)], NO_PLACES
+        self.columns: np.ndarray | None = None
+        if len(firsts) == 1:
+            return
+        n = len(same_as)
+        self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
+        self.columns = np.arange(n) + gap * np.repeat(
+            np.arange(len(firsts)), np.diff(firsts, append=n)
+        )
+        self._width = int(self.columns[-1]) + 1
+        self._same_as = same_as
+        self._shared = np.arange(self._width)  # column where the position's probability is summed
+        self._shared[self.columns] = self.columns[same_as]
+        self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
+
+    def width(self, places: int) -> int:
+        """Return the number of columns of so many places."""
+        return places if self.columns is None else self._width
+
+    def to_columns(self, row: np.ndarray) -> np.ndarray:
+        """Return distances to places (n,) as distances to columns, +inf in gaps."""
+        if self.columns is None:
+            return row
+        out: np.ndarray = np.full(self._width, np.inf, row.dtype)
+        out[self.columns] = row
+        return out
+
+    def to_places(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the columns that are places, (n,)."""
+        return values if self.columns is None else values[self.columns]
+
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the columns of places."""
+        return places if self.columns is None else self.columns[places]
+
+    def place_before(self, columns: np.ndarray) -> np.ndarray:
+        """Return the place of each column; in a gap, the place before it."""
+        if self.columns is None:
+            return columns
+        return self.columns.searchsorted(columns, 'right') - 1
+
+    def names_of(self, columns: np.ndarray) -> np.ndarray:
+        """Return the places of columns as matches number them."""
+        return self.place_before(columns)
+
+    def first_column(self, column: int) -> int:
+        """Return the first column of a column's session."""
+        if self.columns is None:
+            return 0
+        firsts = self.columns[self.firsts]
+        return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
+
+    def session_of(self, place: int) -> tuple[int, int]:
+        """Return the first place of a place's session, and the first one behind it."""
+        if self.columns is None:
+            return 0, sys.maxsize
+        run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
+        return int(run.start), int(run.stop)
+
+    def positions(self, places: np.ndarray | int) -> np.ndarray:
+        """Return positions: those at most nms_radius apart are neighbors in one session."""
+        return np.asarray(places) if self.columns is None else self.columns[self._same_as[places]]
+
+    def merge_sessions(self, belief: Belief, n: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """
+        Let places of one position share their probability.
+
+        :param n: columns that the filter was updated with.
+        :returns: columns whose probability, with that of close ones, is not 0, ascending, and
+            their probabilities; among them the most probable one: of the session that is most
+            probable at the most probable position.
+        """
+        if self.columns is None:
+            places, probabilities = belief.probabilities(n)
+            return places, probabilities, int(np.argmax(probabilities))
+        weights, own = np.zeros(self._width), np.zeros(self._width)
+        weights[belief.places] = belief.weights
+        near, probabilities_near = belief.probabilities(self._width)
+        own[near] = probabilities_near
+        of_position = np.bincount(self._shared, weights, self._width)
+        sums = np.concatenate([np.zeros(CLOSE + 1), np.cumsum(of_position)])
+        sums = np.concatenate([sums, np.full(CLOSE, sums[-1])])
+        of_position = np.minimum(sums[2 * CLOSE + 1 :] - sums[: -2 * CLOSE - 1], 1)
+        probabilities = of_position[self._shared]
+        best = int(np.argmax(probabilities))
+        at_position = np.abs(self._shared - self._shared[best]) <= CLOSE
+        column = int(np.argmax(np.where(at_position, own, 0)))
+        probabilities[column] = probabilities[best]
+        columns = np.flatnonzero(probabilities)
+        return columns, probabilities[columns], int(np.searchsorted(columns, column))
