@@ -100,8 +100,8 @@ def test_recognizer_keeps_the_error_rate_by_its_map_or_gives_the_reason(
         (probability, 1 - probability)
     )
     assert recognizer.threshold == match.threshold
-    assert word in recognizer.stages
-    assert bool(word) == bool(recognizer.stages)
+    assert word in recognizer.start_notes
+    assert bool(word) == bool(recognizer.start_notes)
     assert PlaceRecognizer(small_map, settings).threshold == pytest.approx(0.7)
 
 

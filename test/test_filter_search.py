@@ -11,10 +11,13 @@ import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.filter import choice
+from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.filter.motion import APART
-from stavpr_ros.filter.paths import BAND, OFFSETS, refine, smooth, straight_offsets
+from stavpr_ros.filter.place_filter import PlaceFilter
+from stavpr_ros.filter.refine import BAND, OFFSETS, refine, smooth, straight_offsets
 from stavpr_ros.prepare.blocks import PlaceChanges
-from stavpr_ros.recognition import filter_window, PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.recognizer import EARLY
 
@@ -230,13 +233,12 @@ def test_faint_light_leaves_the_evidence_between_near_places(recognizer, route, 
         evidence.append(arguments[-1])
         return refine(*arguments)
 
-    drive(recognizer, route[:, 20:60])
-    window = recognizer._window
-    numbers = np.array([image.number for image in window._images])
-    monkeypatch.setattr(filter_window, 'refine', spied)
-    for level in range(3):
-        window._refined(np.arange(60 - LENGTH, 60), numbers, level)
-    assert evidence == [pytest.approx(2.3 / 1.4), 1.0, 1.0]
+    monkeypatch.setattr(choice, 'refine', spied)
+    for level in FilterSettings().levels:
+        monkeypatch.setattr(PlaceFilter, 'mean_z', lambda *_, level=level: level)
+        drive(recognizer, route[:, 20:50])
+        ratios = {evidence.pop() for _ in range(len(evidence))}
+        assert ratios == {min(level, -2.3) / level}
 
 
 def test_path_follows_images_whose_speed_changes(recognizer, route):
@@ -274,7 +276,7 @@ def test_equal_places_of_the_map_are_one_place_of_the_path(route):
     shares = []
     for i in range(len(query)):
         recognizer.update(query[i : i + 1])
-        shares.append(recognizer._found.shares)
+        shares.append(recognizer._newest.found.shares)
     assert np.min(shares[118:135]) > 0.95
 
 

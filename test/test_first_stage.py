@@ -132,10 +132,10 @@ def test_recognizer_over_time_budget_matches_as_exact_one(few, sessions):
     coarse = recognizer(features, sessions, time_budget_ms=1e-6)
     assert isinstance(coarse._matcher, FirstStage)
     assert isinstance(exact._matcher, CpuMatcher)
-    assert recognizer(features).stages == ''
-    assert 'exact matching takes' in exact.stages
-    assert 'with a first stage' in coarse.stages
-    assert 'with a first stage' not in exact.stages
+    assert recognizer(features).start_notes == ''
+    assert 'exact matching takes' in exact.start_notes
+    assert 'with a first stage' in coarse.start_notes
+    assert 'with a first stage' not in exact.start_notes
     found = matches(coarse, query)
     assert found == matches(exact, query)
     assert found[-1] == (True, 2029)

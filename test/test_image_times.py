@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
+from stavpr_ros.filter.refine import image_times, LONGEST
 from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.window import image_times, LONGEST
 
 SECOND = 10**9
 
@@ -51,7 +51,7 @@ def test_times_of_the_places_of_sessions():
     names = Session('a'), Session('b')
     place_map = replace(one, stamps=stamps, sessions=names, session_index=sessions)
     window = PlaceRecognizer(place_map, RecognizerSettings(mode='robust'))._window
-    steps = np.diff(window._place_times[window.layout.columns])
+    steps = np.diff(window.choice._place_times[window.layout.columns])
     steps /= steps[0]
     np.testing.assert_allclose(np.delete(steps[:29], 9), 1)
     assert steps[9] == pytest.approx(3)

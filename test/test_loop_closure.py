@@ -15,15 +15,16 @@ from stavpr_ros.errors import (
     InputError,
     SettingsError,
 )
-from stavpr_ros.filter.paths import BAND, CLOSE
+from stavpr_ros.filter.choice import MIN_CANDIDATE
+from stavpr_ros.filter.paths import CLOSE
+from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare import route_features
 from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher, CpuRouteMatcher
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.prepare.route_features import GROWTH, ROOM, RouteFeatures
-from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.filter_window import LEAST_CANDIDATE
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
     CERTAIN,
@@ -32,6 +33,8 @@ from stavpr_ros.recognition.loop_closer import (
     LONGEST_GAP,
     LoopCloser,
 )
+from stavpr_ros.recognition.match import Limits, WindowMatch
+from stavpr_ros.recognition.recognizer import Verdict
 from stavpr_ros.recognition.robust import PAPER, ROBUST
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -323,15 +326,16 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(
         elif isinstance(event, int):
             place += event
         else:
-            match = Match(
+            verdict = Verdict(
+                WindowMatch(
+                    SequenceMatch(place, place, place, 0.0, -1, math.nan), np.array([[0, place]])
+                ),
+                Limits(0.5, 0.5),
                 Status.NO_MATCH if event == NONE else Status.MATCH,
-                sequence=SequenceMatch(place, place, place, 0.0, -1, math.nan),
-                path=np.array([[0, place]]),
+                '',
                 probability=event,
-                min_probability=0.5,
-                image_index=images,
             )
-            match = closer._confirmed(match, [])
+            match = closer._confirmed(verdict, [], images)
             waits = not match.accepted and event != NONE
             assert match.reason == 'its path is not confirmed yet' * waits
             assert not waits or not match.with_probability(1.0).accepted
@@ -424,7 +428,7 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
             assert ranked == []
             continue
         assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
-        if nearest.distance < 1 - LEAST_CANDIDATE:
+        if nearest.distance < 1 - MIN_CANDIDATE:
             assert closer.candidates(1)[0] == pytest.approx([nearest.middle], abs=CLOSE)
         if len(ranked) > 1:
             assert ranked[1].place == nearest.second_best_index

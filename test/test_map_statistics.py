@@ -62,7 +62,7 @@ def answers(place_map, precision):
         match = recognizer.update(place_map.features[i + 100 : i + 101])
         found += [recognizer.newest_row().tobytes(), match.probability, match.path.tobytes()]
         found.append(match.sequence)
-    return repr(found), recognizer.stages
+    return repr(found), recognizer.start_notes
 
 
 @pytest.mark.parametrize('storage', ['float32', 'float16'])

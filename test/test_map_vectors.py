@@ -198,7 +198,7 @@ def test_recognizer_with_vectors_matches_as_exact_one(few):
     query = noisy(features[800:840], 0.5)
     exact = PlaceRecognizer(map_of(features), RecognizerSettings(mode='robust'))
     coarse = recognizer(features)
-    assert 'a first stage of vectors' in coarse.stages
+    assert 'a first stage of vectors' in coarse.start_notes
     for i in range(len(query)):
         a, b = exact.update(query[i : i + 1]), coarse.update(query[i : i + 1])
         assert (a.status, a.place_index) == (b.status, b.place_index)

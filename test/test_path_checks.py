@@ -6,6 +6,7 @@ import numpy as np
 from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.filter import checks as path_checks
+from stavpr_ros.filter import choice
 from stavpr_ros.filter.checks import (
     EVEN,
     EVEN_SHARE,
@@ -18,7 +19,7 @@ from stavpr_ros.filter.checks import (
     UNEVEN_WEIGHT,
     unevenness,
 )
-from stavpr_ros.recognition import filter_window, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 PLACES = 240
 
@@ -84,7 +85,7 @@ def test_where_the_most_probable_path_is_refuted_the_next_one_is_matched(monkeyp
     def refuted_first(path, z, part):
         return 10.0 if path.mean() < 130 else 0.0
 
-    monkeypatch.setattr(filter_window, 'unevenness', refuted_first)
+    monkeypatch.setattr(choice, 'unevenness', refuted_first)
     matches = [match for match in recognize_all(recognizer, query) if match.accepted]
     assert len(matches) > 50
     for match in matches:

@@ -169,9 +169,8 @@ def test_sequence_buffer_holds_last_rows_in_order(copies):
     buffer = SequenceBuffer(3, 2, 4, copies=copies)
     assert len(buffer.memory) == 3 * copies
     for value in range(8):
-        buffer.push(np.array([value, -value], dtype=np.float32), 10 * value)
+        buffer.push(np.array([value, -value], dtype=np.float32))
         assert len(buffer) == min(value + 1, 3)
-        assert buffer.stamps == tuple(10 * i for i in range(max(0, value - 2), value + 1))
         assert buffer.newest().tolist() == [value, -value]
         if buffer.full:
             columns = np.array([[0, 1], [1, 0], [1, 1]])
@@ -182,7 +181,7 @@ def test_sequence_buffer_holds_last_rows_in_order(copies):
             assert rows.flags.c_contiguous
             assert np.isinf(rows[:, 2:]).all()
     buffer.clear()
-    assert (len(buffer), buffer.known, buffer.stamps) == (0, 0, ())
+    assert (len(buffer), buffer.known) == (0, 0)
     assert np.isinf(buffer.rows()).all()
 
 
@@ -205,12 +204,12 @@ def test_sequence_buffer_that_grows_and_evicts_keeps_rows(copies):
 @pytest.mark.parametrize('value', [np.nan, -np.inf])
 def test_sequence_buffer_with_invalid_row_is_unchanged(value):
     buffer = SequenceBuffer(2, 3, 4)
-    buffer.push(np.array([1.0, np.inf, 2.0], np.float32), 5)
+    buffer.push(np.array([1.0, np.inf, 2.0], np.float32))
     before = buffer.rows().copy()
     with pytest.raises(InputError, match='1 NaN or -inf among 3'):
-        buffer.push(np.array([1.0, value, 2.0], np.float32), 6)
+        buffer.push(np.array([1.0, value, 2.0], np.float32))
     assert np.array_equal(buffer.rows(), before)
-    assert (len(buffer), buffer.stamps) == (1, (5,))
+    assert len(buffer) == 1
 
 
 @pytest.mark.parametrize('mode', ['paper', 'robust'])

@@ -27,7 +27,6 @@ from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.recognition.sessions import layout_of
-from stavpr_ros.recognition.window import ColumnLayout
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 LENGTH, PLACES = 10, 90
@@ -71,7 +70,7 @@ def test_filter_of_sessions_equals_plain_loops():
     for image in range(12):
         z, weights = rng.standard_normal(n).astype(np.float32), rng.uniform(0.1, 1, 3)
         alpha = 0.0 if image == 5 else 0.4
-        one.update(layout.spread(z), alpha, weights)
+        one.update(layout.to_columns(z), alpha, weights)
         plain.update(z, alpha, weights)
         found = one.places_of_states()
         np.testing.assert_allclose(
@@ -93,7 +92,7 @@ class PlaceMapOf:
 
 def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
-    assert type(layout_of(town[0], 20)) is type(layout_of(one, 20)) is ColumnLayout
+    assert layout_of(town[0], 20).columns is layout_of(one, 20).columns is None
     query = features_of(route(0), 1.0, 9)[10:50]
     for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
         assert repr(found) == repr(expected)
@@ -117,8 +116,8 @@ def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
         np.testing.assert_array_equal(
             match.path, matches[nearest].path + np.array([0, first], np.int32)
         )
-        costs, middles, _ = together._found.sequences()
-        alone_costs = np.concatenate([one._found.sequences().costs for one in alone])
+        costs, middles, _ = together._newest.found.sequences()
+        alone_costs = np.concatenate([one._newest.found.sequences().costs for one in alone])
         assert sorted(costs[np.isfinite(costs)]) == sorted(alone_costs[np.isfinite(alone_costs)])
         assert middles.max() < len(merged)
 
