@@ -84,17 +84,18 @@ def recognize(
     route: Any = None  # pairs without their map can be kept in a file
     for i, (lap, number) in enumerate(drive.images.tolist()):
         record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
-        match = pipeline.process(record, int(drive.stamps[i]), odometry[i], camera)
-        for each in (match, *match.late):
+        result = pipeline.process(record, int(drive.stamps[i]), odometry[i], camera)
+        for each in (result, *result.late):
             pair = pipeline.matched_pair(each)
-            if pair is None:
+            if pair is None or each.match is None:
                 continue
-            query = image_of[each.window_stamps[each.position]]
+            window = each.match
+            query = image_of[window.window_stamps[window.position]]
             place = image_of[pair.source.place(each.place_index).stamp]
-            changes = tuple(zip(each.window_stamps, each.window_changes, strict=True))
-            changes = () if each.is_late else changes
+            changes = tuple(zip(window.window_stamps, window.window_changes, strict=True))
+            changes = () if window.is_late else changes
             pair = replace(pair, source=route)
-            found.append(Matched(i, query, place, pair, changes, each.is_late))
+            found.append(Matched(i, query, place, pair, changes, window.is_late))
     return found
 
 

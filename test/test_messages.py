@@ -16,7 +16,7 @@ from stavpr_msgs.msg import LoopClosure, PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
-from stavpr_ros.pipeline import overlay
+from stavpr_ros.pipeline import ImageResult, overlay
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.ros.messages import (
@@ -41,14 +41,18 @@ NEAREST = SequenceMatch(30, 35, 32, 0.25, 50, 0.5)
 WINDOW = tuple((16 + i) * SECOND + 7 for i in range(5))
 
 
-def accepted(path=PATH, **fields):
+def result_of(status, reason, path=PATH, inliers=-1, candidates=(), image=None, **fields):
     fields = {'window_stamps': WINDOW, 'distance': 0.25} | fields
-    return Match(Status.MATCH, '', 0.3, NEAREST, path, **fields)
+    result = ImageResult.of_match(Match(status, reason, 0.3, NEAREST, path, **fields))
+    return replace(result, inliers=inliers, candidates=candidates, image=image)
+
+
+def accepted(path=PATH, **fields):
+    return result_of(Status.MATCH, '', path, **fields)
 
 
 def rejected(**fields):
-    fields = {'window_stamps': WINDOW, 'distance': 0.25} | fields
-    return Match(Status.NO_MATCH, 'too far', 0.3, NEAREST, PATH, **fields)
+    return result_of(Status.NO_MATCH, 'too far', **fields)
 
 
 @pytest.fixture(scope='module')
@@ -106,9 +110,9 @@ def same(message, **expected):
     [Status.INVALID_IMAGE, Status.NOT_READY, Status.DROPPED, Status.SKIPPED, Status.WARMING_UP],
 )
 def test_match_message_without_sequence_is_blank(status):
-    match = Match(status, 'because', 0.3)
+    match = ImageResult(status, 'because', 0.3)
     same(match_message(HEADER, match), status=status, reason='because')
-    assert math.isnan(match_message(HEADER, Match(status)).threshold)
+    assert math.isnan(match_message(HEADER, ImageResult(status)).threshold)
     assert loop_closure_message(HEADER, match, None) is None
     assert candidates_message(HEADER, match, None) is None
     assert matched_pose_message(HEADER, match, None, 'map') is None
@@ -128,9 +132,11 @@ SEQUENCE = {'distance': 0.25, 'sequence_first': 30, 'sequence_last': 35, 'sequen
 @pytest.mark.parametrize(
     ('match', 'fields'),
     [
-        (Match(Status.MAPPED, '', 0.3, image_index=59), {'newest_index': 59}),
+        (ImageResult(Status.MAPPED, '', 0.3, image_index=59), {'newest_index': 59}),
         (
-            Match(Status.WARMING_UP, '2 of 5', 0.3, window_stamps=WINDOW[:2]),
+            ImageResult.of_match(
+                Match(Status.WARMING_UP, '2 of 5', 0.3, window_stamps=WINDOW[:2])
+            ),
             dict.fromkeys(('window_first', 'window_middle'), time_message(WINDOW[0])),
         ),
         (
@@ -149,14 +155,15 @@ SEQUENCE = {'distance': 0.25, 'sequence_first': 30, 'sequence_last': 35, 'sequen
 def test_match_message_has_the_fields_of_its_status(places, match, fields):
     message = match_message(HEADER, match, places)
     path = [(pair.query_index, pair.place_index) for pair in message.path]
-    assert path == [tuple(cell) for cell in match.path.tolist()]
+    expected = [] if match.match is None else match.match.path.tolist()
+    assert path == [tuple(cell) for cell in expected]
     same(message, status=match.status, reason=match.reason, path=message.path, **fields)
 
 
 @pytest.mark.parametrize(('length', 'position'), [(4, 1), (5, 2)])
 def test_position_of_a_match_is_the_middle_of_its_window(length, position):
     """Of two middle images the earlier one."""
-    assert accepted(window_stamps=WINDOW[:length]).position == position
+    assert accepted(window_stamps=WINDOW[:length]).match.position == position
 
 
 def test_match_message_has_the_probability_of_each_place_of_the_path(places):
@@ -170,11 +177,12 @@ def test_match_message_has_the_probability_of_each_place_of_the_path(places):
 def test_messages_of_a_map_name_the_robot_and_the_map(small_map):
     stored = replace(small_map, map_id='0123456789abcdef')
     match = accepted(candidates=(Candidate(32, 0.25),))
+    on_route = accepted(image_index=44)
     info = map_info_message('mapping', 'full', 'a', stored, None, Time(), 'r2')
     for message in (
         match_message(HEADER, match, stored, 'r2'),
         candidates_message(HEADER, match, stored, 'r2'),
-        loop_closure_message(HEADER, replace(match, image_index=44), stored, 'r2'),
+        loop_closure_message(HEADER, on_route, stored, 'r2'),
         info,
     ):
         assert (message.robot_id, message.map_id) == ('r2', '0123456789abcdef')
@@ -382,5 +390,5 @@ def test_draw_match_has_the_text_and_the_thumbnail_of_the_place(monkeypatch, ext
         thumbnail, (text, is_match, label) = overlay.draw_match(match, route)
         assert (thumbnail is not None, label) == (has_place, f'map place {place}')
         assert (words in text, is_match) == (True, match.accepted)
-    skipped = Match(Status.SKIPPED, 'because', image=query)
+    skipped = ImageResult(Status.SKIPPED, 'because', image=query)
     assert overlay.draw_match(skipped, None) == (None, ('skipped because', False))

@@ -38,9 +38,9 @@ def same_recognition(match, core):
     """Every field that the recognizer fills."""
     assert match.status is core.status
     assert match.reason == core.reason
-    assert repr(match.sequence) == repr(core.sequence)
     np.testing.assert_equal(match.threshold, core.threshold)
-    np.testing.assert_array_equal(match.path, core.path)
+    assert repr(match.match.sequence) == repr(core.sequence)
+    np.testing.assert_array_equal(match.match.path, core.path)
 
 
 @pytest.mark.parametrize(('mode', 'threshold'), [('paper', 0.2), ('robust', None)])
@@ -53,8 +53,10 @@ def test_localization_returns_the_matches_of_the_recognizer(
     matches = process(pipeline, images)
     for i, match in enumerate(matches):
         same_recognition(match, core.update(pipeline.extractor.extract([images[i]])))
-        assert match.window_stamps == tuple((j + 1) * SECOND for j in range(max(0, i - 4), i + 1))
-        assert (match.image_index, match.first_image_index, match.inliers) == (-1, -1, -1)
+        assert match.match.window_stamps == tuple(
+            (j + 1) * SECOND for j in range(max(0, i - 4), i + 1)
+        )
+        assert (match.image_index, match.match.first_image_index, match.inliers) == (-1, -1, -1)
         assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
@@ -160,10 +162,10 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
     for i, match in enumerate(process(pipeline, images, poses=True)):
         features = pipeline.extractor.extract([images[i]])
         same_recognition(match, core.update(features, (i + 1) * SECOND, at(i)))
-        assert (match.image_index, len(match.window_stamps)) == (i, min(i + 1, LENGTH))
-        assert match.first_image_index == max(0, i - LENGTH + 1)
-        if match.sequence is not None:
-            assert match.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
+        assert (match.image_index, len(match.match.window_stamps)) == (i, min(i + 1, LENGTH))
+        assert match.match.first_image_index == max(0, i - LENGTH + 1)
+        if match.match.sequence is not None:
+            assert match.match.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
         if i >= 40 + 2 * LENGTH:
             assert (match.status, match.newest_index) == (Status.MATCH, i - 40)
     assert (pipeline.map_state, len(pipeline.places)) == ('growing', 80)
@@ -182,7 +184,7 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
         assert (match.image_index, places.first + len(places) - 1) == (i, i)
         indices = {match.image_index, *(candidate.place for candidate in match.candidates)}
         if match.status is Status.MATCH:
-            indices |= {int(place) for place in match.path[:, 1]}
+            indices |= {int(place) for place in match.match.path[:, 1]}
             assert min(indices) >= places.first
             if i >= 60 + LENGTH:
                 assert match.newest_index == i - 60
@@ -214,7 +216,9 @@ def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkey
                 continue
             end = i + 1
             if operation == 'loop_closure':
-                assert pair.query_pose[0] == (one.first_image_index + one.position) % 30
+                assert (
+                    pair.query_pose[0] == (one.match.first_image_index + one.match.position) % 30
+                )
                 end = one.image_index + 1 - 30
             earlier += end <= i
             columns = np.array(rows)[end - LENGTH : end, pair.first :][:, : len(pair.poses)]

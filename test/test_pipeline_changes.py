@@ -41,7 +41,7 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     pipeline = recorded(route, operation, candidates=3)
     match = process(pipeline, route[:CONFIRMED])[-1]
     assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
-    assert match.candidates[0].place == match.sequence.middle
+    assert match.candidates[0].place == match.nearest_index
     strict = 1 - 1e-9
     pipeline.change(replace(pipeline.settings, min_probability=strict, candidates=0))
     match = process(pipeline, route[11:12], first=11)[0]
@@ -61,7 +61,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
     matches = process(pipeline, [route[0]] * 3 + route[1:LENGTH], poses=True)
     skipped = [match.cause == 'not a keyframe' for match in matches]
     assert skipped == [False, True, True, *[False] * 4]
-    assert matches[-1].window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
+    assert matches[-1].match.window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
     matches = process(pipeline, route[5:7], first=7)
     assert statuses(matches) == [Status.SKIPPED, Status.MATCH]
@@ -90,7 +90,8 @@ def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
     match = process(pipeline, route[9:10], first=9)[0]
     assert (match.status, match.inliers, match.place_index) == (Status.NO_MATCH, found, -1)
     assert f'{found} inliers are fewer than {found + 1}' in match.reason
-    assert match.candidates[0].place == match.sequence.middle
+    assert (match.match.status, match.match.place_index) == (Status.MATCH, match.nearest_index)
+    assert match.candidates[0].place == match.nearest_index
     pipeline.change(replace(pipeline.settings, geometric=None))
     assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
 
@@ -113,7 +114,8 @@ def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route,
     assert match.status is (Status.MATCH if least == 8 else Status.NO_MATCH)
     assert bool(match.reason) == (least != 8)
     assert match.distance == match.candidates[0].distance == 1 - match.probability
-    assert match.sequence.middle == plain.sequence.middle == match.candidates[0].place
+    assert match.nearest_index == plain.nearest_index == match.candidates[0].place
+    assert match.match.probability == plain.probability  # as the recognizer made it
 
 
 def test_geometric_check_decides_each_late_match(route, monkeypatch):
@@ -128,7 +130,7 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
     places, match = closing(geometric=check)
     assert match.accepted
     for each in match.late:
-        query = places.thumbnail(each.first_image_index + each.position)
+        query = places.thumbnail(each.match.first_image_index + each.match.position)
         found = PlaceVerifier(check).inliers(query, places, each.place_index)
         assert each.inliers == found >= 8
     rejected = {match.place_index, match.late[0].place_index}
@@ -192,9 +194,10 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
         good, expected = (
             process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
         )
-        for name in ('status', 'window_stamps', 'image_index', 'candidates'):
-            assert getattr(good, name) == getattr(expected, name)
-        assert repr(good.sequence) == repr(expected.sequence)
+        for name in ('status', 'image_index', 'candidates', 'nearest_index', 'distance'):
+            np.testing.assert_equal(getattr(good, name), getattr(expected, name))
+        if operation != 'mapping':
+            assert good.match.window_stamps == expected.match.window_stamps
     assert stamps_of(pipeline.places) == stamps_of(other.places)
     assert good.status is not Status.WARMING_UP
 
@@ -213,10 +216,10 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     found = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
     assert statuses(matches) == [Status.WARMING_UP] * waiting + [found] * (5 - waiting)
     assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 3
-    assert matches[-1].window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
+    assert matches[-1].match.window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
-        assert matches[-1].first_image_index == places
-    assert matches[-1].path[-1].tolist() == [4, 8]
+        assert matches[-1].match.first_image_index == places
+    assert matches[-1].match.path[-1].tolist() == [4, 8]
 
 
 def test_relocalize_returns_the_match_of_the_window(map_file, route):
@@ -228,8 +231,7 @@ def test_relocalize_returns_the_match_of_the_window(map_file, route):
     last = process(pipeline, route[2:LENGTH], first=2)[-1]
     pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # invalid: the window is unchanged
     match = pipeline.relocalize(4)
-    assert (match.status, match.sequence) == (Status.MATCH, last.sequence)
-    assert match.window_stamps == last.window_stamps
+    assert (match.status, match.match) == (Status.MATCH, last.match)
     assert (len(match.candidates), match.candidates[:2]) == (4, last.candidates)
     assert pipeline.relocalize(0).candidates == ()
     pipeline.reset()

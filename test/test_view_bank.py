@@ -64,7 +64,8 @@ def matched(matches):
     """Return how many images have a match; each is right."""
     found = [i for i, match in enumerate(matches) if match.accepted]
     for i in found:
-        image = i - (len(matches[i].window_stamps) - 1) + matches[i].position
+        match = matches[i].match
+        image = i - (len(match.window_stamps) - 1) + match.position
         assert abs(matches[i].place_index - image) <= 2
     return len(found)
 
@@ -134,7 +135,7 @@ def test_limits_apply_to_all_views(night_map):
     matches = process(pipeline, drive(roll=10))
     assert pipeline.view == RIGHT  # by the probability, whatever limit it has to exceed
     assert not any(match.accepted for match in matches)
-    assert {match.min_probability for match in matches} == {strict}
+    assert {match.match.min_probability for match in matches} == {strict}
 
 
 FULL = 4  # images in a full window of a Scripted

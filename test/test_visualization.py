@@ -21,6 +21,7 @@ from robot import LATCHED
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap
+from stavpr_ros.pipeline import ImageResult
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
@@ -113,7 +114,7 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
 def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
     pipeline, _ = localized
     views, publishers = views_of(*TOPICS)
-    views.publish(header(), Match(Status.DROPPED, 'because'), pipeline, 'map')
+    views.publish(header(), ImageResult(Status.DROPPED, 'because'), pipeline, 'map')
     assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
     assert not publishers.messages('matched_path')
     assert not publishers.messages('match_image/compressed')
@@ -206,7 +207,7 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     row = np.arange(1200, dtype=np.float32)
     views, publishers = views_of('distances')
     pipeline = SimpleNamespace(places=route, newest_distances=lambda: row)
-    views.publish(header(), Match(Status.NO_MATCH), pipeline, 'map')
+    views.publish(header(), ImageResult(Status.NO_MATCH), pipeline, 'map')
     (message,) = publishers.messages('distances')
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
     assert (message.width, numbers[0]) == (512, 3000)
@@ -229,7 +230,9 @@ def test_distances_of_a_window_that_fills_are_those_of_its_images(map_file, rout
 )  # fmt: skip
 def test_places_to_draw_are_around_the_nearest_sequence(middle, count, left, right):
     match = Match(Status.MATCH, sequence=middle and SimpleNamespace(middle=middle))
-    assert places_to_draw(match, 3000, count).tolist() == list(range(left, right))
+    assert places_to_draw(ImageResult.of_match(match), 3000, count).tolist() == list(
+        range(left, right)
+    )
 
 
 def test_least_of_each_part_by_hand():
@@ -247,8 +250,8 @@ def test_draw_window_shows_the_path_over_its_places(places):
     path = np.array([[i, places // 2] for i in range(5)], np.int32)
     sequence = SimpleNamespace(middle=places // 2, distance=0.1)
     match = Match(Status.MATCH, sequence=sequence, path=path, probability=0.9)
-    drawn = draw_window(rows, 0, match)
-    without = draw_window(rows, 0, Match(Status.WARMING_UP))
+    drawn = draw_window(rows, 0, ImageResult.of_match(match))
+    without = draw_window(rows, 0, ImageResult(Status.WARMING_UP))
     assert 200 < drawn.shape[1] < 1400
     assert (drawn == 255).all(axis=2).any()
     if places <= 40:

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.recognition import Status
 from stavpr_ros.recognition.verification import (
     GeometricEvidence,
     GeometricSettings,
@@ -28,13 +29,13 @@ class GeometricCheck:
 
     def checked(
         self,
-        match: Match,
+        result: ImageResult,
         places: PlaceMap | GrowingMap,
         query: np.ndarray | None,
         is_weighed: bool,
-    ) -> Match:
+    ) -> ImageResult:
         """
-        Return a match, and its late ones, after the check; without thumbnails, as they are.
+        Return a result, and its late ones, after the check; without thumbnails, as they are.
 
         Matches with too few inliers are rejected.
 
@@ -44,32 +45,34 @@ class GeometricCheck:
             where the match is doubtful.
         """
         late = []
-        for each in match.late:
-            of_late = places.thumbnail(each.first_image_index + each.position)
+        for each in result.late:
+            assert each.match is not None
+            of_late = places.thumbnail(each.match.first_image_index + each.match.position)
             late.append(self._checked(each, places, of_late, is_weighed))
-        return replace(self._checked(match, places, query, is_weighed), late=tuple(late))
+        return replace(self._checked(result, places, query, is_weighed), late=tuple(late))
 
     def _checked(
         self,
-        match: Match,
+        result: ImageResult,
         places: PlaceMap | GrowingMap,
         query: np.ndarray | None,
         is_weighed: bool,
-    ) -> Match:
-        if match.sequence is None or query is None:
-            return match
+    ) -> ImageResult:
+        match = result.match
+        if match is None or match.sequence is None or query is None:
+            return result
         if not (self._evidence.wants(match.probability) if is_weighed else match.accepted):
-            return match
+            return result
         inliers = self._verifier.inliers(query, places, match.sequence.middle)
         if inliers is None:
-            return match
-        least, match = self.settings.min_inliers, replace(match, inliers=inliers)
+            return result
+        least, result = self.settings.min_inliers, replace(result, inliers=inliers)
         if is_weighed:
             probability = self._evidence.updated(match.probability, inliers >= least)
-            return match.with_probability(probability)
+            return result.with_probability(probability)
         if inliers >= least:
-            return match
+            return result
         reason = (
             f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
         )
-        return replace(match, status=Status.NO_MATCH, reason=reason)
+        return replace(result, status=Status.NO_MATCH, reason=reason)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.recognition import Match
+from stavpr_ros.pipeline.result import ImageResult
 
 RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
 NEARBY = 150  # places shown to each side of a match
@@ -16,29 +16,29 @@ SIZE = (900, 240)  # pixels of the drawn distances, about
 _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
 
 
-def draw_match(match: Match, places: PlaceMap | GrowingMap | None) -> np.ndarray:
+def draw_match(result: ImageResult, places: PlaceMap | GrowingMap | None) -> np.ndarray:
     """
     Draw an image beside its nearest place, with status and probability, or distance.
 
     :returns: RGB, uint8.
     """
-    assert match.image is not None
-    if match.sequence is None or places is None:
+    assert result.image is not None
+    place = result.newest_index if result.accepted else result.nearest_index
+    if place < 0 or places is None:
         return match_image(
-            match.image, None, f'{match.status.label} {match.reason}'.strip(), False
+            result.image, None, f'{result.status.label} {result.reason}'.strip(), False
         )
-    place = match.newest_index if match.accepted else match.sequence.middle
-    text = f'{match.status.label}: place {place}, '
-    if not math.isnan(match.probability):
-        text += f'p {match.probability:.2f}'
+    text = f'{result.status.label}: place {place}, '
+    if not math.isnan(result.probability):
+        text += f'p {result.probability:.2f}'
     else:
-        text += f'distance {match.distance:.3f}'
-        if not math.isnan(match.threshold):
-            text += f' (threshold {match.threshold:.3f})'
-    if match.inliers >= 0:
-        text += f', {match.inliers} inliers'
+        text += f'distance {result.distance:.3f}'
+        if not math.isnan(result.threshold):
+            text += f' (threshold {result.threshold:.3f})'
+    if result.inliers >= 0:
+        text += f', {result.inliers} inliers'
     return match_image(
-        match.image, places.thumbnail(place), text, match.accepted, f'map place {place}'
+        result.image, places.thumbnail(place), text, result.accepted, f'map place {place}'
     )
 
 
@@ -86,14 +86,14 @@ def match_image(
     return sheet
 
 
-def places_to_draw(match: Match, first: int, count: int) -> np.ndarray:
+def places_to_draw(result: ImageResult, first: int, count: int) -> np.ndarray:
     """Return those of the places from ``first`` on that are around the nearest sequence, (k,)."""
-    middle = match.sequence.middle if match.sequence is not None else first
+    middle = result.nearest_index if result.nearest_index >= 0 else first
     left = min(max(first, middle - NEARBY), max(first, first + count - 2 * NEARBY))
     return np.arange(left, min(left + 2 * NEARBY, first + count))
 
 
-def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
+def draw_window(rows: np.ndarray, first: int, result: ImageResult) -> np.ndarray:
     """
     Draw the distances of a window, one row per image, and the warping path over them.
 
@@ -112,17 +112,17 @@ def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
     gray = np.nan_to_num((finite - low) / max(high - low, 1e-9), nan=1.0) * 255
     sheet = cv2.applyColorMap(gray.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
     sheet = np.ascontiguousarray(np.repeat(np.repeat(sheet, down, axis=0), across, axis=1))
-    if match.sequence is not None and len(match.path):
+    if result.match is not None and len(result.match.path):
         points = [
             ((place - first) * across + across // 2, image * down + down // 2)
-            for image, place in match.path.tolist()
+            for image, place in result.match.path.tolist()
         ]
-        ink = (255, 255, 255) if match.accepted else NO_MATCH
+        ink = (255, 255, 255) if result.accepted else NO_MATCH
         cv2.polylines(sheet, [np.array(points, np.int32)], False, ink, 2, cv2.LINE_AA)
     bar = np.full((24, sheet.shape[1], 3), _PAPER, np.uint8)
     text = f'images of the window (newest below) x places {first} to {first + width - 1}'
-    if match.sequence is not None and not math.isnan(match.probability):
-        text += f'; place {match.sequence.middle}, p {match.probability:.2f}'
+    if result.nearest_index >= 0 and not math.isnan(result.probability):
+        text += f'; place {result.nearest_index}, p {result.probability:.2f}'
     _write(bar, text, 11)
     return np.vstack([sheet, bar])
 

@@ -21,11 +21,12 @@ from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.geometric_check import GeometricCheck
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.pipeline.start import LoadedMap, Operation, start_operation
 from stavpr_ros.pipeline.view_bank import ViewBank
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.recognition import Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
@@ -66,7 +67,7 @@ class Pipeline:
         self.operation = operation
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
-        self._last: Match | None = None
+        self._last: ImageResult | None = None
         # thumbnail and pose of each image in the window; None = not needed, unknown
         self._window: deque[tuple[np.ndarray | None, np.ndarray | None]] = deque()
         self.save_state = SaveState()  # of the places in use
@@ -230,9 +231,9 @@ class Pipeline:
         if (updated := self._updated) is not None:
             updated.reset()
 
-    def relocalize(self, count: int) -> Match:
+    def relocalize(self, count: int) -> ImageResult:
         """
-        Return the match of the current window, with ``count`` candidates.
+        Return the result of the current window, with ``count`` candidates.
 
         :raises InputError: the window is not full, or no match is possible; names the reason.
         """
@@ -249,18 +250,19 @@ class Pipeline:
             )
         return self._last.with_candidates(recognizer.ranked(count))
 
-    def matched_pair(self, match: Match, relative_pose: str = 'auto') -> MatchedPair | None:
+    def matched_pair(self, result: ImageResult, relative_pose: str = 'auto') -> MatchedPair | None:
         """
         Return the pair of the newest match, or of one of its late ones, for its edge.
 
         :param relative_pose: the parameter of this name.
         :returns: None without a match, or where the place of a map can have no edge.
         """
-        places, recognizer = self.places, self._recognizer
-        if not match.accepted or match.cause or places is None or recognizer is None:
+        places, recognizer, match = self.places, self._recognizer, result.match
+        if not result.accepted or match is None or places is None or recognizer is None:
             return None
+        place = result.place_index
         if self.operation == 'localization' and (
-            relative_pose == 'none' or places.place(match.place_index).pose is None
+            relative_pose == 'none' or places.place(place).pose is None
         ):
             return None
         distances = recognizer.window_columns if relative_pose in ('auto', 'aligned') else None
@@ -272,7 +274,7 @@ class Pipeline:
             window = match.first_image_index - places.first + np.arange(len(poses))
             poses = places.poses[window]
             distances = distances and match.columns_of
-        return matched_pair(match, places, query, poses, distances)
+        return matched_pair(match, place, places, query, poses, distances)
 
     def newest_distances(self) -> np.ndarray:
         """Return the distances of the newest image to its places, (n,), float32; none before."""
@@ -299,7 +301,7 @@ class Pipeline:
         pose: np.ndarray | None = None,
         camera: Camera | None = None,
         list_candidates: bool = True,
-    ) -> Match:
+    ) -> ImageResult:
         """
         Process one image message, raw or compressed. An invalid image changes nothing.
 
@@ -312,23 +314,23 @@ class Pipeline:
         threshold = math.nan if self.threshold is None else self.threshold
         pose = None if pose is None else checked_pose(pose)
         if self._operation is None or self.missing:
-            return Match(Status.NOT_READY, self.missing, threshold, cause='not ready')
+            return ImageResult(Status.NOT_READY, self.missing, threshold, cause='not ready')
         if reason := self._keyframes.too_soon(stamp, pose):
             blind = pose is None and self.settings.keyframes.needs_poses
             cause = 'no odometry' if blind else NOT_A_KEYFRAME
-            return Match(Status.SKIPPED, reason, threshold, cause=cause)
+            return ImageResult(Status.SKIPPED, reason, threshold, cause=cause)
         stages: dict[str, float] = {}
         try:
-            match = self._process(self._operation, stages, message, stamp, pose, camera)
+            result = self._process(self._operation, stages, message, stamp, pose, camera)
         except StavprError as error:
             kind = error.kind if isinstance(error, ImageError) else type(error).__name__
-            match = Match(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
+            result = ImageResult(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
         recognizer = self._recognizer
-        if list_candidates and recognizer is not None and match.sequence is not None:
-            match = match.with_candidates(recognizer.ranked(self.settings.candidates))
-        if math.isnan(match.threshold):  # the recognizer has applied none
-            match = replace(match, threshold=threshold)
-        return replace(match, stages=stages)
+        if list_candidates and recognizer is not None and result.nearest_index >= 0:
+            result = result.with_candidates(recognizer.ranked(self.settings.candidates))
+        if math.isnan(result.threshold):  # none has applied
+            result = replace(result, threshold=threshold)
+        return replace(result, stages=stages)
 
     def _process(
         self,
@@ -338,36 +340,37 @@ class Pipeline:
         stamp: int,
         pose: np.ndarray | None,
         camera: Camera | None,
-    ) -> Match:
+    ) -> ImageResult:
         width = self._thumbnail_width(camera)
         with _timed(stages, 'decoding'):
             image = decode_message(message, _needed_size(operation, width))
             self.contrast = _contrast(image)
             if reason := self._keyframes.too_alike(image):
-                return Match(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
+                return ImageResult(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
         if self._is_full:
             reason = f'the map is full: parameter max_places = {self.settings.max_places}'
-            return Match(Status.NOT_READY, reason, image=image, cause='map full')
+            return ImageResult(Status.NOT_READY, reason, image=image, cause='map full')
         with _timed(stages, 'extraction'):
             images = operation.views.warped(image) if operation.views else [image]
             features = operation.extractor.extract(images)
         with _timed(stages, 'matching'):
             thumbnail = thumbnail_of(image, width) if width else None
-            match = _update(operation, features, thumbnail, stamp, pose)
+            result = _update(operation, features, thumbnail, stamp, pose)
         self._window.append((thumbnail, pose))
         self._keyframes.accept(stamp, pose, image)
         if isinstance(operation.places, GrowingMap):
             operation.places.camera = operation.places.camera or camera
             self.save_state.record(operation.places, features, self._open_journal)
         if operation.recognizer is None:
-            return replace(match, image=image)
+            return replace(result, image=image)
         with _timed(stages, 'verification'):
             if self._check is not None:
                 middle, _ = self._window[(len(self._window) - 1) // 2]
-                is_weighed = not math.isnan(match.probability) and self.operation == 'localization'
-                match = self._check.checked(match, operation.places, middle, is_weighed)
-            match = replace(match, late=tuple(each for each in match.late if each.accepted))
-        self._last = replace(match, image=image)
+                is_robust = not math.isnan(result.probability)
+                is_weighed = is_robust and self.operation == 'localization'
+                result = self._check.checked(result, operation.places, middle, is_weighed)
+            late = tuple(each for each in result.late if each.accepted)
+        self._last = replace(result, image=image, late=late)
         return self._last
 
     def _thumbnail_width(self, camera: Camera | None) -> int:
@@ -432,22 +435,23 @@ def _update(
     thumbnail: np.ndarray | None,
     stamp: int,
     pose: np.ndarray | None,
-) -> Match:
+) -> ImageResult:
     """Match the window that ends with an image, and add the image to growing places."""
     places, recognizer = operation.places, operation.recognizer
     jpeg = b''
     if isinstance(places, GrowingMap) and thumbnail is not None:
         # first, since it may fail: recognizer and route stay in step
         jpeg = encode_thumbnail(thumbnail)
-    match = Match(Status.MAPPED)
+    result = ImageResult(Status.MAPPED)
     if recognizer is not None:
         match = (operation.views or recognizer).update(features, stamp, pose)
+        result = ImageResult.of_match(match)
     if not isinstance(places, GrowingMap):
-        return match
+        return result
     if isinstance(recognizer, LoopCloser):  # it evicts the oldest places
         places.forget(recognizer.first - places.first)
     index = places.add(features, stamp, pose=pose, thumbnail=jpeg)
-    return replace(match, image_index=index)
+    return replace(result, image_index=index)
 
 
 def _needed_size(operation: Operation, thumbnail_width: int) -> tuple[int, int] | None:

@@ -1,8 +1,8 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The result for one image: its status, the nearest sequence of the map, the matched place."""
+"""The match of one image: its status, the nearest sequence of the map, the matched place."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import enum
 import math
@@ -132,13 +132,10 @@ class Limits(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Match:
     """
-    The result for one image; indices are 0-based places of the map.
-
-    The recognizer fills the fields from ``threshold`` to ``window_changes`` and those of late
-    matches, the pipeline the others.
+    The match of one image; indices are 0-based places of the map.
 
     :param status: only ``MATCH`` names a place.
-    :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.
+    :param reason: why there is no match, one sentence; empty for ``MATCH``.
     :param threshold: a window is matched below this distance; mode robust: 1 - min_probability.
         NaN = not set.
     :param sequence: the nearest sequence of the map by the images alone, accepted or not; None =
@@ -157,12 +154,6 @@ class Match:
     :param window_changes: difference of each of them from the image before it, 0 = equal; empty in
         mode paper.
     :param image_index: place of a growing map that this image has become, -1 = none.
-    :param inliers: of the geometric verification, -1 = not verified.
-    :param candidates: nearest places, nearest first.
-    :param cause: why the image is in no window, two or three words for statistics; '' = it is in
-        one.
-    :param stages: duration of each stage, seconds.
-    :param image: the decoded image, RGB; None = not decoded.
     :param is_oldest: the place is that of the oldest image of the window, not of the middle one.
     :param columns: of a late match: image distances of its window to places from ``first_column``
         on, (l, k), float32.
@@ -182,11 +173,6 @@ class Match:
     window_stamps: tuple[int, ...] = ()
     window_changes: tuple[float, ...] = ()
     image_index: int = -1
-    inliers: int = -1
-    candidates: tuple[Candidate, ...] = ()
-    cause: str = ''
-    stages: Mapping[str, float] = field(default_factory=dict)
-    image: np.ndarray | None = None
     is_oldest: bool = False
     first_column: int = 0
     columns: np.ndarray = field(default_factory=lambda: NO_COLUMNS)
@@ -258,14 +244,6 @@ class Match:
         return replace(
             self, status=status, reason=reason, distance=distance, probability=probability
         )
-
-    def with_candidates(self, ranked: Sequence[Candidate]) -> 'Match':
-        """Return the match with its ranked places; the first is the match itself."""
-        own = (
-            replace(first, distance=self.distance, probability=self.probability)
-            for first in ranked[:1]
-        )
-        return replace(self, candidates=(*own, *ranked[1:]))
 
     @property
     def first_image_index(self) -> int:

@@ -65,6 +65,7 @@ class MatchedPair:
 
 def matched_pair(
     match: Match,
+    place: int,
     places: PlaceMap | GrowingMap,
     query: np.ndarray | None,
     query_poses: np.ndarray,
@@ -73,11 +74,12 @@ def matched_pair(
     """
     Copy what the edge of a match needs.
 
+    :param place: that it is of.
     :param query, query_poses: see :class:`MatchedPair`.
     :param distances_to: returns the distances of the window to places (k,), shape (l, k), +inf =
         not compared; None = not needed. Called only where the pair has both poses.
     """
-    place, start = match.place_index, places.first if isinstance(places, GrowingMap) else 0
+    start = places.first if isinstance(places, GrowingMap) else 0
     low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
     low = max(start, min(low, place) - AROUND)
     high = min(start + len(places), max(high, place) + AROUND + 1)

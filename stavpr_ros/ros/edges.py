@@ -16,8 +16,8 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.recognition import Match
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator, needed_by_pnp
 from stavpr_ros.relative_pose.odometry import align
@@ -74,7 +74,7 @@ class EdgePublisher:
     def prepare(
         self,
         header: Header,
-        match: Match,
+        result: ImageResult,
         pipeline: Pipeline,
         frames: PoseFrames,
         camera: Camera | None,
@@ -90,16 +90,16 @@ class EdgePublisher:
         places, edge, closures = pipeline.places, None, []
         # a route has the camera of the query
         place_camera = places.camera if isinstance(places, PlaceMap) else camera
-        for each in (match, *match.late):
+        for each in (result, *result.late):
             pair = pipeline.matched_pair(each, self._estimator.method)
-            if each is match and match.accepted:
+            if each is result and result.accepted:
                 edge = self._immediate(pair, camera, place_camera)
-            if pair is None:
+            if pair is None or each.match is None:
                 continue
             pose = None if np.isnan(pair.query_pose).any() else pair.query_pose
-            if each.is_late:  # its window may be an earlier one
+            if each.match.is_late:  # its window may be an earlier one
                 header = Header(
-                    frame_id=header.frame_id, stamp=time_message(each.window_stamps[-1])
+                    frame_id=header.frame_id, stamp=time_message(each.match.window_stamps[-1])
                 )
             message = loop_closure_message(header, each, pair.source, self._robot_id, frames, pose)
             if message is not None:

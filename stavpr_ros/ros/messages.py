@@ -25,7 +25,8 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.sources.frame import ImageRecord
 from stavpr_ros.units import SECOND
@@ -78,29 +79,30 @@ def origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str
 
 def match_message(
     header: Header,
-    match: Match,
+    result: ImageResult,
     places: PlaceMap | GrowingMap | None = None,
     robot_id: str = '',
     edge: Edge | None = None,
     frame: str = '',
 ) -> PlaceMatch:
     """
-    Return the message of a match.
+    Return the message of a result.
 
     :param places: the map that the indices of the match refer to.
     :param robot_id: the parameter of this name.
     :param edge: of the middle pair, None = none; frame: of the base.
     """
+    match, is_mapped = result.match, result.status is Status.MAPPED
     message = PlaceMatch(
         header=header,
         **origin(robot_id, places),
-        status=match.status,
-        reason=match.reason,
-        place_index=match.place_index,
-        newest_index=match.image_index if match.status is Status.MAPPED else match.newest_index,
-        distance=match.distance,
-        threshold=match.threshold,
-        probability=match.probability,
+        status=result.status,
+        reason=result.reason,
+        place_index=result.place_index,
+        newest_index=result.image_index if is_mapped else result.newest_index,
+        distance=result.distance,
+        threshold=result.threshold,
+        probability=result.probability,
         sequence_first=-1,
         sequence_last=-1,
         sequence_middle=-1,
@@ -109,23 +111,23 @@ def match_message(
         window_last=header.stamp,
         second_best_index=-1,
         second_best_distance=math.nan,
-        inliers=match.inliers,
+        inliers=result.inliers,
         relative_pose=no_edge(),
     )
-    if match.window_stamps:
+    if match is not None and match.window_stamps:
         stamps = match.window_stamps
         message.window_first = time_message(stamps[0])
         message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
-    if match.sequence is not None:
+    if match is not None and match.sequence is not None:
         sequence = match.sequence
         message.sequence_first, message.sequence_last = sequence.first, sequence.last
         message.sequence_middle = sequence.middle
-        message.path_probabilities = match.path_probabilities.tolist()
+        message.path_probabilities = result.path_probabilities.tolist()
         message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
         message.second_best_index = sequence.second_best_index
         message.second_best_distance = sequence.second_best_distance
-    if match.accepted and places is not None:
-        place, newest = places.place(match.place_index), places.place(match.newest_index)
+    if match is not None and result.accepted and places is not None:
+        place, newest = places.place(result.place_index), places.place(result.newest_index)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
         message.session = place.session
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
@@ -143,13 +145,15 @@ def match_message(
 
 
 def candidates_message(
-    header: Header, match: Match, places: PlaceMap | GrowingMap | None, robot_id: str = ''
+    header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None, robot_id: str = ''
 ) -> PlaceCandidates | None:
     """Return the message of the candidates of a match, None without any."""
-    if not match.candidates or places is None:
+    if not result.candidates or places is None:
         return None
-    message = PlaceCandidates(header=header, **origin(robot_id, places), threshold=match.threshold)
-    for candidate in match.candidates:
+    message = PlaceCandidates(
+        header=header, **origin(robot_id, places), threshold=result.threshold
+    )
+    for candidate in result.candidates:
         place = places.place(candidate.place)
         message.candidates.append(
             PlaceCandidate(
@@ -166,7 +170,7 @@ def candidates_message(
 
 def loop_closure_message(
     header: Header,
-    match: Match,
+    result: ImageResult,
     places: PlaceMap | GrowingMap | None,
     robot_id: str = '',
     frames: PoseFrames = NO_FRAMES,
@@ -180,7 +184,8 @@ def loop_closure_message(
     :param query_pose: of the odometry, at the image that matched, shape (7,); for maps only, a
         route has it.
     """
-    if not match.accepted or places is None:
+    match = result.match
+    if match is None or not result.accepted or places is None:
         return None
     first = match.first_image_index
     is_route = first >= 0
@@ -197,7 +202,7 @@ def loop_closure_message(
     ]
     middle = match.position
     query_stamp, query_frame = stamps[middle], frames.odometry
-    place = places.place(match.place_index)
+    place = places.place(result.place_index)
     if is_route:
         own = places.place(first + middle)
         query_stamp, query_pose, query_frame = own.stamp, own.pose, frames.frame
@@ -209,12 +214,12 @@ def loop_closure_message(
         is_late=match.is_late,
         query_session=robot_id,
         place_session=robot_id if is_route else place.session,
-        place_index=match.place_index,
+        place_index=result.place_index,
         place_stamp=time_message(place.stamp),
-        distance=match.distance,
-        threshold=match.threshold,
-        probability=match.probability,
-        inliers=match.inliers,
+        distance=result.distance,
+        threshold=result.threshold,
+        probability=result.probability,
+        inliers=result.inliers,
         relative_pose=no_edge(),
         pairs=pairs,
     )
@@ -253,7 +258,7 @@ def no_edge() -> RelativePose:
 
 
 def matched_pose_message(
-    header: Header, match: Match, places: PlaceMap | GrowingMap | None, frame: str
+    header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None, frame: str
 ) -> PoseWithCovarianceStamped | None:
     """
     Return the pose of the place of the newest image; None without a match or a known pose.
@@ -264,9 +269,9 @@ def matched_pose_message(
 
     :param frame: of the poses of the map.
     """
-    if not match.accepted or places is None:
+    if not result.accepted or places is None:
         return None
-    newest = match.newest_index
+    newest = result.newest_index
     pose = places.place(newest).pose
     if pose is None:
         return None

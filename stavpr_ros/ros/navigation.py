@@ -11,7 +11,8 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.recognition import Status
 from stavpr_ros.ros.messages import matched_pose_message, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
@@ -44,7 +45,7 @@ class Navigation:
     def publish(
         self,
         header: Header,
-        match: Match,
+        result: ImageResult,
         places: PlaceMap | GrowingMap | None,
         odometry: np.ndarray | None,
         odometry_frame: str,
@@ -54,28 +55,28 @@ class Navigation:
 
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
-        if match.cause or not isinstance(places, PlaceMap):
+        if result.cause or not isinstance(places, PlaceMap):
             return
         if places is not self._places:
             self._places, self._transform = places, None
             self._unmatched = self._settings.pipeline.sequence.length
         map_frame = self._settings.map_frame
-        pose = places.place(match.newest_index).pose if match.accepted else None
+        pose = places.place(result.newest_index).pose if result.accepted else None
         if pose is not None and odometry is not None:
             moved = map_to_odometry(pose, odometry)
             self._transform = transform_message(moved, map_frame, odometry_frame)
         # a whole window without a match, or a new window
         length = self._settings.pipeline.sequence.length
         lost = self._unmatched >= length - 1
-        if match.status is Status.WARMING_UP:
+        if result.status is Status.WARMING_UP:
             self._unmatched = length
         else:
-            self._unmatched = 0 if match.accepted else self._unmatched + 1
+            self._unmatched = 0 if result.accepted else self._unmatched + 1
         with until_shutdown(self._node):
             if self._tf is not None and self._transform is not None:
                 self._transform.header.stamp = header.stamp  # without a match, the last transform
                 self._tf.publish(tf_message()(transforms=[self._transform]))
-            found = matched_pose_message(header, match, places, map_frame) if lost else None
+            found = matched_pose_message(header, result, places, map_frame) if lost else None
             if self._initial_pose is not None and found is not None:
                 self._initial_pose.publish(planar(found))
 

@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.overlay import draw_match
-from stavpr_ros.recognition import Match
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.ros.messages import (
     candidates_message,
@@ -79,7 +79,7 @@ class Output:
     def publish(
         self,
         header: Header,
-        match: Match,
+        result: ImageResult,
         places: PlaceMap | GrowingMap | None = None,
         frames: PoseFrames = NO_FRAMES,
         edge: Edge | None = None,
@@ -94,19 +94,19 @@ class Output:
         :param edge: of the middle pair, None = none.
         """
         robot_id = self._robot_id
-        message = match_message(header, match, places, robot_id, edge, frames.child)
-        pose = matched_pose_message(header, match, places, frames.frame)
-        candidates = candidates_message(header, match, places, robot_id)
+        message = match_message(header, result, places, robot_id, edge, frames.child)
+        pose = matched_pose_message(header, result, places, frames.frame)
+        candidates = candidates_message(header, result, places, robot_id)
         with until_shutdown(self._node):
-            if match.accepted:
+            if result.accepted:
                 self.place_index.publish(Int32(data=message.place_index))
                 self.distance.publish(Float32(data=message.distance))
             if pose is not None:
                 self.pose.publish(pose)
             if candidates is not None:
                 self.candidates.publish(candidates)
-            if match.image is not None and self.match_image.get_subscription_count():
-                self.match_image.publish(image_message(header, draw_match(match, places)))
+            if result.image is not None and self.match_image.get_subscription_count():
+                self.match_image.publish(image_message(header, draw_match(result, places)))
             self.match.publish(message)
         return message
 

@@ -17,6 +17,7 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
     close_journals,
     open_journal,
@@ -25,7 +26,7 @@ from stavpr_ros.pipeline.saving import (
 )
 from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
@@ -324,8 +325,8 @@ class Runtime:
         """Publish the status of an image that is not processed."""
         self._statistics.dropped(cause)
         threshold = self.pipeline.threshold
-        match = Match(status, reason, math.nan if threshold is None else threshold)
-        self._output.publish(message.header, match)
+        result = ImageResult(status, reason, math.nan if threshold is None else threshold)
+        self._output.publish(message.header, result)
 
     def _process(self, item: _Item) -> None:
         """Process one image, on the worker."""
@@ -342,19 +343,21 @@ class Runtime:
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
         view = self.pipeline.view
-        match = self._match(item.message, pose, camera)
+        result = self._match(item.message, pose, camera)
         if self.pipeline.view != view:
             self._node.get_logger().info(f'images are compared {self.pipeline.view}')
         began = time.monotonic()
-        message = self._publish(header, match, pose, frames, camera)
-        stages = {WAITING: waited, **match.stages, 'publishing': time.monotonic() - began}
-        if match.cause:
-            self._statistics.dropped(match.cause)
-            self._log_cause(match)
+        message = self._publish(header, result, pose, frames, camera)
+        stages = {WAITING: waited, **result.stages, 'publishing': time.monotonic() - began}
+        if result.cause:
+            self._statistics.dropped(result.cause)
+            self._log_cause(result)
             return
         self.last_match, self.last_frame = message, frames.frame
-        place = message.newest_index if match.status is Status.MAPPED else message.place_index
-        self._statistics.answered(match.status.name, match.reason, place, message.distance, stages)
+        place = message.newest_index if result.status is Status.MAPPED else message.place_index
+        self._statistics.answered(
+            result.status.name, result.reason, place, message.distance, stages
+        )
 
     def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
         """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""
@@ -367,28 +370,28 @@ class Runtime:
             frame, odometry.child_frame, odometry.frame
         )
 
-    def _match(self, message: Any, pose: np.ndarray | None, camera: Camera | None) -> Match:
+    def _match(self, message: Any, pose: np.ndarray | None, camera: Camera | None) -> ImageResult:
         """Process an image; an internal error is logged, and invalidates this image only."""
         candidates = (
             is_requested(self._node, self._output.candidates) or self._views.needs_candidates
         )
         stamp = nanoseconds(message.header.stamp)
         try:
-            match = self.pipeline.process(message, stamp, pose, camera, candidates)
+            result = self.pipeline.process(message, stamp, pose, camera, candidates)
         except Exception as error:
             self._node.get_logger().error(
                 f'an image could not be processed: {traceback.format_exc()}'
             )
             reason = f'internal error: {type(error).__name__}: {error}'
-            return Match(Status.INVALID_IMAGE, reason, cause='internal error')
-        if match.status is Status.NOT_READY and (path := self._maps.path):
-            return replace(match, reason=f'map {path} is being loaded')
-        return match
+            return ImageResult(Status.INVALID_IMAGE, reason, cause='internal error')
+        if result.status is Status.NOT_READY and (path := self._maps.path):
+            return replace(result, reason=f'map {path} is being loaded')
+        return result
 
     def _publish(
         self,
         header: Header,
-        match: Match,
+        result: ImageResult,
         pose: np.ndarray | None,
         frames: PoseFrames,
         camera: Camera | None,
@@ -396,13 +399,13 @@ class Runtime:
         """Publish a match; its closure, and that of its late match, when their edges are ready."""
         pipeline = self.pipeline
         if self._navigation is not None:
-            self._navigation.publish(header, match, pipeline.places, pose, frames.odometry)
-        self._views.publish(header, match, pipeline, frames.frame, pose)
+            self._navigation.publish(header, result, pipeline.places, pose, frames.odometry)
+        self._views.publish(header, result, pipeline, frames.frame, pose)
         edge: Edge | None = None
         closures: list[WaitingClosure] = []
-        if match.accepted:
-            edge, closures = self._edges.prepare(header, match, pipeline, frames, camera)
-        message = self._output.publish(header, match, pipeline.places, frames, edge)
+        if result.accepted:
+            edge, closures = self._edges.prepare(header, result, pipeline, frames, camera)
+        message = self._output.publish(header, result, pipeline.places, frames, edge)
         for closure in closures:
             self._edges.put(closure)
         return message
@@ -414,15 +417,16 @@ class Runtime:
             frame = self.settings.map_frame if in_map else self._views.frame
             self._views.publish_route(self.pipeline.places, frame)
 
-    def _log_cause(self, match: Match) -> None:
+    def _log_cause(self, result: ImageResult) -> None:
         """Log why an image is in no window: an invalid one once for each cause."""
-        if match.status is Status.INVALID_IMAGE and match.cause not in self._explained:
-            self._explained.add(match.cause)
+        if result.status is Status.INVALID_IMAGE and result.cause not in self._explained:
+            self._explained.add(result.cause)
             self._node.get_logger().warning(
-                f'invalid image: {match.reason} (logged once; /diagnostics counts "{match.cause}")'
+                f'invalid image: {result.reason} (logged once; /diagnostics counts '
+                f'"{result.cause}")'
             )
-        elif match.status is Status.NOT_READY:
+        elif result.status is Status.NOT_READY:
             self._node.get_logger().warning(
-                f'images arrive, but cannot be matched: {match.reason}',
+                f'images arrive, but cannot be matched: {result.reason}',
                 throttle_duration_sec=REPORT_PERIOD,
             )

@@ -12,8 +12,9 @@ from rclpy.qos import QoSProfile
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.maps_folder import inside
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import write_map
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.recognition import Status
 from stavpr_ros.ros.messages import candidates_message, match_message, matched_pose_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
@@ -82,8 +83,8 @@ class Services:
             self._faults[name] = response.message
             response.success = False
             if name == 'relocalize':  # indices of -1, where the default 0 would be a place
-                match = Match(Status.NOT_READY, response.message)
-                response.match = match_message(Header(), match, robot_id=self._robot_id())
+                result = ImageResult(Status.NOT_READY, response.message)
+                response.match = match_message(Header(), result, robot_id=self._robot_id())
             return response
 
         return callback
@@ -125,12 +126,12 @@ class Services:
         def relocalize() -> None:
             # messages are made on the worker: a growing route may evict places before the next
             # call
-            match = runtime.pipeline.relocalize(count)
+            result = runtime.pipeline.relocalize(count)
             response.match = runtime.last_match
             header, places = response.match.header, runtime.pipeline.places
-            candidates = candidates_message(header, match, places)
+            candidates = candidates_message(header, result, places)
             response.candidates = candidates.candidates if candidates is not None else []
-            pose = matched_pose_message(header, match, places, runtime.last_frame)
+            pose = matched_pose_message(header, result, places, runtime.last_frame)
             response.has_pose = pose is not None
             response.pose = pose or response.pose
 

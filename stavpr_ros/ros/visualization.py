@@ -19,7 +19,7 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
-from stavpr_ros.recognition import Match
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.ros.messages import image_message, pose_message
 from stavpr_ros.ros.output import is_requested
 from stavpr_ros.ros.qos import LATCHED
@@ -68,7 +68,7 @@ class Visualization:
     def publish(
         self,
         header: Header,
-        match: Match,
+        result: ImageResult,
         pipeline: Pipeline,
         frame: str,
         odometry: np.ndarray | None = None,
@@ -85,21 +85,21 @@ class Visualization:
             self.frame, self._map, self._correction = frame, fixed, None
             self._poses.clear()
             self._lines.clear()
-        self._note(header, match, places, odometry)
+        self._note(header, result, places, odometry)
         with until_shutdown(self._node):
             self.publish_route(places, frame)
-            if self._is_requested(self._matched) and match.accepted:
+            if self._is_requested(self._matched) and result.accepted:
                 own = Header(stamp=header.stamp, frame_id=frame)
                 self._matched.publish(Path(header=own, poses=list(self._poses)))
             if self._is_requested(self._markers):
-                self._markers.publish(self._markers_message(header, match, places))
-            if match.image is not None and self._is_requested(self._image):
-                drawn = cv2.cvtColor(draw_match(match, places), cv2.COLOR_RGB2BGR)
+                self._markers.publish(self._markers_message(header, result, places))
+            if result.image is not None and self._is_requested(self._image):
+                drawn = cv2.cvtColor(draw_match(result, places), cv2.COLOR_RGB2BGR)
                 _, jpeg = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
                 image = CompressedImage(header=header, format='jpeg', data=jpeg.tobytes())
                 self._image.publish(image)
             if self._is_requested(self._window) or self._is_requested(self._distances):
-                self._publish_distances(header, match, pipeline)
+                self._publish_distances(header, result, pipeline)
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
@@ -129,15 +129,15 @@ class Visualization:
         ):
             self._node.destroy_publisher(publisher)
 
-    def _publish_distances(self, header: Header, match: Match, pipeline: Pipeline) -> None:
+    def _publish_distances(self, header: Header, result: ImageResult, pipeline: Pipeline) -> None:
         row, places = pipeline.newest_distances(), pipeline.places
         if places is None or not row.size:
             return
         first = places.first if isinstance(places, GrowingMap) else 0
-        shown = places_to_draw(match, first, len(row))
+        shown = places_to_draw(result, first, len(row))
         if self._is_requested(self._window):
             rows = pipeline.window_distances(shown)
-            self._window.publish(image_message(header, draw_window(rows, int(shown[0]), match)))
+            self._window.publish(image_message(header, draw_window(rows, int(shown[0]), result)))
         if self._is_requested(self._distances):
             row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]
             numbers = np.arange(first, first + row.size)[None]
@@ -147,7 +147,7 @@ class Visualization:
             self._distances.publish(image_message(header, columns[None], '32FC2'))
 
     def _note(
-        self, header: Header, match: Match, places: Places, odometry: np.ndarray | None
+        self, header: Header, result: ImageResult, places: Places, odometry: np.ndarray | None
     ) -> None:
         """
         Keep the pose of the matched place, and the line from the query to it.
@@ -155,23 +155,23 @@ class Visualization:
         On a map, the query is where the odometry leads to from the last match: a long line is a
         jump.
         """
-        if not match.accepted or places is None:
+        if not result.accepted or places is None:
             return
-        pose = places.place(match.newest_index).pose
+        pose = places.place(result.newest_index).pose
         if pose is not None:
             stamped = Header(stamp=header.stamp, frame_id=self.frame)
             self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
         query = None
-        if match.image_index >= 0:
-            query = places.place(match.image_index).pose
+        if result.image_index >= 0:
+            query = places.place(result.image_index).pose
         elif pose is not None and odometry is not None:
             if self._correction is not None:
                 query = to_poses(self._correction @ matrices(odometry))
             self._correction = matrices(pose) @ inverse(matrices(odometry))
         if pose is not None and query is not None:
-            self._lines.append((_point(query), _point(pose), color(match.probability)))
+            self._lines.append((_point(query), _point(pose), color(result.probability)))
 
-    def _markers_message(self, header: Header, match: Match, places: Places) -> MarkerArray:
+    def _markers_message(self, header: Header, result: ImageResult, places: Places) -> MarkerArray:
         """Return the lines, the matched place with its text, and the candidates."""
         own = Header(stamp=header.stamp, frame_id=self.frame)
         markers = [Marker(header=own, action=Marker.DELETEALL)]
@@ -188,22 +188,22 @@ class Visualization:
             lines.points = [point for a, b, _ in self._lines for point in (a, b)]
             lines.colors = [shade for *_, shade in self._lines for _ in range(2)]
         if places is not None:
-            best = [] if not match.accepted else [(match.newest_index, match.probability, 0.8)]
+            best = [] if not result.accepted else [(result.newest_index, result.probability, 0.8)]
             for place, probability, size in best + [
-                (each.place, each.probability, 0.4) for each in match.candidates
+                (each.place, each.probability, 0.4) for each in result.candidates
             ]:
                 if (pose := places.place(place).pose) is not None:
                     ball = add(Marker.SPHERE, color=color(probability))
                     ball.pose.position = _point(pose)
                     ball.scale.x = ball.scale.y = ball.scale.z = size
-            if match.accepted and (pose := places.place(match.newest_index).pose) is not None:
-                text = add(Marker.TEXT_VIEW_FACING, color=color(match.probability))
+            if result.accepted and (pose := places.place(result.newest_index).pose) is not None:
+                text = add(Marker.TEXT_VIEW_FACING, color=color(result.probability))
                 text.pose.position = _point(pose)
                 text.pose.position.z += 1.0
                 text.scale.z = 0.6
-                text.text = f'place {match.newest_index}'
-                if not math.isnan(match.probability):
-                    text.text += f', p {match.probability:.2f}'
+                text.text = f'place {result.newest_index}'
+                if not math.isnan(result.probability):
+                    text.text += f', p {result.probability:.2f}'
         return MarkerArray(markers=markers)
 
     def _latched(self, kind: type, topic: str) -> Publisher:
