@@ -10,12 +10,20 @@ import sys
 import time
 from unittest.mock import Mock
 
+from map_files import changed
 import numpy as np
 from pipelines import process, save, settings_of
 import pytest
 from stavpr_ros.errors import JournalError, OutputTakenError
 from stavpr_ros.mapping import journal_writer, load_map, save_map
-from stavpr_ros.mapping.journal import Base, frame, JournalPlace, JournalReader
+from stavpr_ros.mapping.journal import (
+    Base,
+    frame,
+    header,
+    JournalPlace,
+    JournalReader,
+    row_of,
+)
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.place_map import Place
@@ -108,6 +116,24 @@ def test_recover_returns_every_part_of_every_place(written, small_map, target):
     assert (result.path, result.places, result.recorded) == (str(target), 60, 60)
     assert_equal(target, small_map)
     assert os.listdir(target.parent) == ['route.stavpr']
+
+
+def test_vectors_in_an_older_journal_are_ignored(written, small_map, target, caplog):
+    """They are in the map of its header, and behind the strips of each place but the last."""
+    section = {'vectors': {'version': 1, 'required': False, 'data': None}}
+    with JournalReader(written) as reader:
+        template = changed(
+            reader.template_content,
+            lambda manifest: manifest['sections'].update(section),
+            vectors__vectors=np.ones((1, 2), np.float32),
+        )
+    end = row_of(small_map.features).itemsize
+    *records, last = [place.encode() for place in places_of(small_map)]
+    frames = [frame(record[:end] + bytes(8) + record[end:]) for record in records]
+    written.write_bytes(b''.join([header(Base(), template), *frames, frame(last)]))
+    assert recover(written).places == 60
+    assert_equal(target, small_map)
+    assert caplog.messages == [f'the vectors of whole images in {written} are ignored']
 
 
 def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path, monkeypatch):

@@ -168,6 +168,21 @@ def test_map_without_optional_parts_has_three_parts(example, tmp_path):
     assert (set(loaded.ids), loaded.sessions) == ({''}, ())
 
 
+def test_vectors_of_an_older_map_are_ignored(saved, example, tmp_path, caplog):
+    def older(manifest):
+        network(vector='global')(manifest)
+        manifest['sections']['vectors'] = {'version': 1, 'required': False, 'data': None}
+
+    old, new = tmp_path / 'old', tmp_path / 'new'
+    vectors = np.zeros((24, 5), np.float32)
+    old.write_bytes(changed(saved.read_bytes(), older, vectors__vectors=vectors))
+    save_map(open_map(old), new)
+    assert np.array_equal(load_map(old).features.strips, example.features.strips)
+    assert load_map(new).settings == load_map(old).settings
+    assert 'vectors' not in parts_of(new.read_bytes())[0]['sections']
+    assert caplog.messages == [f'the vectors of whole images in {old} are ignored']
+
+
 @pytest.mark.parametrize('required', [False, True])
 def test_unknown_section_is_ignored_unless_it_is_required(saved, example, required):
     sections = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}

@@ -6,14 +6,14 @@ import numpy as np
 from pipelines import localizing, process
 import pytest
 from stavpr_ros.alignment import SpatialSettings
-from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.extractor import cut_strips
 from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, load_map, save_map
 from stavpr_ros.prepare.matcher import make_matcher
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition import Status
 from stavpr_ros.sources.frame import Frame
 
 
@@ -126,9 +126,7 @@ def test_extractor_of_tokens_equals_that_of_their_map(network, route):
         ({'layer': 'tokens'}, '63 without the first 1'),
         ({'layer': 'map', 'strips': 9}, r'Wf = 8 .*W = 9'),
         ({'layer': 'map', 'pooling': 'max'}, "pooling = 'max'"),
-        ({'layer': 'map', 'vector': 'map'}, "vector = 'map' is what the strips are made of"),
-        ({'layer': 'map', 'vector': 'local'}, "no layer 'local'.* are global, conv, map"),
-        ({'layer': 'map', 'vector': 'conv'}, r"'conv'.*\(1, 16, 8, 8\).*expected one vector"),
+        ({'layer': 'local'}, "no layer 'local'.* are global, conv, map"),
     ],
 )
 def test_unusable_layers_are_rejected_before_any_image(network, changes, text):
@@ -211,26 +209,3 @@ def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision, erro
 def test_sliding_window_over_one_strip_is_rejected_with_the_map():
     with pytest.raises(InputError, match='W = 1 strips: the sliding window'):
         make_matcher(vectors(5, 4), SpatialSettings('sliding_window'), 'cpu', 'float32')
-
-
-def test_extractor_of_vector_and_strips_equals_both_alone(network, route):
-    both = extractor(network, 'map', vector='global').extract(route[:3])
-    np.testing.assert_allclose(
-        both.strips, extractor(network, 'map').extract(route[:3]).strips, rtol=1e-5, atol=1e-5
-    )
-    alone = extractor(network, 'global').extract(route[:3])
-    np.testing.assert_allclose(both.vectors, alone.strips[0], rtol=1e-5, atol=1e-5)
-    assert alone.vectors is None
-    assert both[1:].vectors.shape == (2, 32)
-    joined = LocalFeatures.concatenate([both[:1], both[1:]])
-    assert np.array_equal(joined.vectors, both.vectors)
-    bare = extractor(network, 'map').extract(route[:1])
-    assert LocalFeatures.concatenate([both, bare]).vectors is None
-
-
-def test_query_without_vector_on_map_with_vectors_is_rejected(network, route):
-    frames = [Frame(image, i + 1, '') for i, image in enumerate(route[:5])]
-    made = build_map(frames, extractor(network, 'map', vector='global'), progress=False)
-    recognizer = PlaceRecognizer(made, RecognizerSettings(0.5))
-    with pytest.raises(FeatureMismatchError, match=r'"vector": "".*"vector": "global"'):
-        recognizer.update(extractor(network, 'map').extract(route[:1]))

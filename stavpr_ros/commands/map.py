@@ -181,8 +181,6 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
     features, settings, n = place_map.features, place_map.settings, len(place_map)
     risks = place_map.error_risks
     assert isinstance(features, StoredFeatures)
-    vectors = features[:1].vectors
-    beside = '' if vectors is None else f' and a vector of {vectors.shape[1]}'
     posed = sum(place_map.pose(place) is not None for place in range(n))
     known = place_map.stamps[place_map.stamps != 0]
     rows = {
@@ -191,7 +189,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         'places': f'{n}, {posed} with a pose, {sum(map(bool, place_map.ids))} with an identifier, '
         f'{"with" if len(place_map.thumbnails) else "without"} thumbnails',
         'features': f'{settings.kind}, version {settings.feature_version}: {settings.strips} '
-        f'strips of {place_map.dimension} dimensions{beside}, {features.storage}',
+        f'strips of {place_map.dimension} dimensions, {features.storage}',
         'settings': settings.to_json(),
         'projection': place_map.projection.identity if place_map.projection else 'none',
         'statistics': 'none'

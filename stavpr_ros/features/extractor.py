@@ -66,15 +66,12 @@ class LocalFeatures:
     :param settings: the settings of the extractor.
     :param cells: rows H and columns of a strip's cells: strips are (channels, H, columns),
         flattened; None if unknown, and after a random projection.
-    :param vectors: a vector of each whole image beside its strips, unit-norm or all zeros, shape
-        (n, D), float32, for the first stage of large maps; None without.
     """
 
     strips: np.ndarray
     weights: np.ndarray
     settings: FeatureSettings
     cells: tuple[int, int] | None = None
-    vectors: np.ndarray | None = None
 
     def __len__(self) -> int:
         return self.strips.shape[1]
@@ -93,8 +90,7 @@ class LocalFeatures:
 
     def __getitem__(self, images: slice | np.ndarray) -> 'LocalFeatures':
         strips, weights = self.strips[:, images], self.weights[:, images]
-        vectors = None if self.vectors is None else self.vectors[images]
-        return dataclasses.replace(self, strips=strips, weights=weights, vectors=vectors)
+        return dataclasses.replace(self, strips=strips, weights=weights)
 
     def require_same_settings(self, other: FeatureSettings, where: str) -> None:
         """
@@ -110,14 +106,12 @@ class LocalFeatures:
 
     @staticmethod
     def concatenate(parts: 'Sequence[LocalFeatures]') -> 'LocalFeatures':
-        """Join the features of several batches of images; vectors if all have them."""
-        vectors = [part.vectors for part in parts if part.vectors is not None]
+        """Join the features of several batches of images."""
         return LocalFeatures(
             np.concatenate([part.strips for part in parts], axis=1),
             np.concatenate([part.weights for part in parts], axis=1),
             parts[0].settings,
             parts[0].cells,
-            np.concatenate(vectors) if len(vectors) == len(parts) else None,
         )
 
 
@@ -154,8 +148,8 @@ class FeatureExtractor:
         tried = None
         if isinstance(backbone, NetworkSettings) or isinstance(projection, int):
             image = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
-            tried, vectors = self._computed([image])
-            if not (_finite(tried) and _finite(vectors)):
+            tried = self._backbone.feature_maps([image])
+            if not np.isfinite(tried).all():
                 raise SettingsError(
                     f'features {kind} of a test image are not finite: the network is damaged, or '
                     f'its input out of range; its settings are {self._backbone.settings}'
@@ -212,9 +206,8 @@ class FeatureExtractor:
         :returns: local features of shape (W, len(images), d).
         :raises ImageError: the features are not finite.
         """
-        maps, vectors = self._computed(images)
-        strips, cells = self._cut(maps)
-        if not (_finite(strips) and _finite(vectors)):
+        strips, cells = self._cut(self._backbone.feature_maps(images))
+        if not np.isfinite(strips).all():
             raise ImageError(
                 'the features of an image are not finite: the network or its input is out of '
                 'range',
@@ -222,15 +215,7 @@ class FeatureExtractor:
             )
         if self.projection is not None:
             strips, cells = self.projection.apply(strips), None
-        if vectors is not None:
-            vectors = normalize(np.asarray(vectors, np.float32)[None])[0][0]
-        return LocalFeatures(*normalize(strips), self.settings, cells, vectors)
-
-    def _computed(self, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return maps, and vectors if the settings want them."""
-        if getattr(self._backbone.settings, 'vector', ''):
-            return self._backbone.maps_and_vectors(images)
-        return self._backbone.feature_maps(images), None
+        return LocalFeatures(*normalize(strips), self.settings, cells)
 
     def _cut(self, maps: np.ndarray) -> tuple[np.ndarray, tuple[int, int] | None]:
         """Return strips (W, n, d), not normalized, and the cells of each."""
@@ -244,10 +229,6 @@ class FeatureExtractor:
             return np.asarray(maps, np.float32)[None], (1, 1)
         cells = (maps.shape[2], maps.shape[3] // W) if pooling == 'flatten' else (1, 1)
         return cut_strips(maps, W, pooling), cells
-
-
-def _finite(values: np.ndarray | None) -> bool:
-    return values is None or bool(np.isfinite(values).all())
 
 
 def resize_square(image: np.ndarray, size: int, method: str) -> np.ndarray:

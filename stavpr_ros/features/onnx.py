@@ -19,7 +19,7 @@ from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.extractor import resize_square, TEST_SIDE
 from stavpr_ros.features.model_files import read_model
-from stavpr_ros.features.outputs import as_maps, as_vectors
+from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.threads import thread_limit
 
@@ -66,8 +66,7 @@ class Onnx:
             content = file.read()
         self.settings = replace(settings, sha256=digest)
         self._device = choose_device(device)
-        self._layers = [settings.layer, *([settings.vector] if settings.vector else [])]
-        model = self._with_outputs(onnx, content)
+        model = self._with_output(onnx, content)
         properties = {row.key: row.value for row in model.metadata_props}
         # whether images go through the network alone; None = not known yet
         self._one_by_one = True if properties.get(BATCH) == '1' else None
@@ -104,9 +103,9 @@ class Onnx:
             raise UnavailableError(f"device 'cuda': {reason}, or take 'cpu' or 'auto'")
         _log.warning('device auto: %s', reason)
 
-    def _with_outputs(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
-        """Return the model with the layers as its only outputs and a variable batch size."""
-        name = self.settings.model
+    def _with_output(self, onnx: ModuleType, content: bytes):  # type: ignore[no-untyped-def]
+        """Return the model with the layer as its only output and a variable batch size."""
+        name, layer = self.settings.model, self.settings.layer
         try:
             model = onnx.load_model_from_string(content)
             if any(tensor.external_data for tensor in model.graph.initializer):
@@ -115,9 +114,7 @@ class Onnx:
         except Exception as error:  # protobuf and the checker have exception types of their own
             raise UnavailableError(f'{name} is no usable ONNX model: {error}') from error
         layers = [output for node in model.graph.node for output in node.output]
-        for layer in self._layers:
-            if layer in layers:
-                continue
+        if layer not in layers:
             outputs = [value.name for value in model.graph.output]
             named = outputs + [each for each in layers if each not in outputs]
             shown = ', '.join(named[:60]) + (', ...' if len(named) > 60 else '')
@@ -128,11 +125,10 @@ class Onnx:
             raise SettingsError(f'{name} has {len(inputs)} inputs: expected one, the image')
         self._require_images(inputs[0])
         inputs[0].type.tensor_type.shape.dim[0].dim_param = 'batch'
-        _prune(model.graph, self._layers)
+        _prune(model.graph, layer)
         del model.graph.output[:]
         del model.graph.value_info[:]  # it may fix the batch size
-        for layer in self._layers:
-            model.graph.output.append(onnx.ValueInfoProto(name=layer))
+        model.graph.output.append(onnx.ValueInfoProto(name=layer))
         return model
 
     def _require_images(self, value: Any) -> None:
@@ -162,71 +158,55 @@ class Onnx:
         :raises SettingsError: the network rejects this size, or the layer is neither maps nor
             tokens nor vectors.
         """
-        return self._maps(self._run(images)[0], len(images))
-
-    def maps_and_vectors(self, images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Compute feature maps, see :meth:`feature_maps`, and the vectors (n, D) of layer ``vector``.
-
-        :raises SettingsError: likewise; that layer is no vector.
-        """
-        maps, vectors = self._run(images)
-        name = f'layer {self.settings.vector!r} of {self.settings.model}'
-        return self._maps(maps, len(images)), as_vectors(vectors, len(images), name)
-
-    def _maps(self, output: np.ndarray, images: int) -> np.ndarray:
         name = f'layer {self.settings.layer!r} of {self.settings.model}'
-        maps: np.ndarray = as_maps(output, images, self.settings.prefix_tokens, name)
+        maps: np.ndarray = as_maps(
+            self._run(images), len(images), self.settings.prefix_tokens, name
+        )
         return maps
 
-    def _run(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the outputs of the layers for images, in a batch if that changes nothing."""
+    def _run(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the output of the layer for images, in a batch if that changes nothing."""
         if len(images) == 1:
             return self._run_batch(images)
         if self._one_by_one is None:
             self._one_by_one = not self._runs_batches()
         if not self._one_by_one:
             return self._run_batch(images)
-        single = [self._run_batch([image]) for image in images]
-        return [np.concatenate(outputs) for outputs in zip(*single, strict=True)]
+        return np.concatenate([self._run_batch([image]) for image in images])
 
     def _runs_batches(self) -> bool:
-        """Return whether two images in a batch have the outputs that each has alone."""
+        """Return whether two images in a batch have the output that each has alone."""
         bright = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
         two = [bright, bright // 8]
-        single = [self._run_batch([one]) for one in two]
+        alone = np.concatenate([self._run_batch([one]) for one in two])
         try:
-            together = self._run_batch(two)
+            both = self._run_batch(two)
         except SettingsError:  # a batch of one is written into the network
             return False
-        for outputs, both in zip(zip(*single, strict=True), together, strict=True):
-            alone = np.concatenate(outputs)
-            if alone.shape != both.shape:
-                return False
-            if abs(alone - both).max() > TOLERANCE * abs(alone).max():
-                return False
-        return True
+        if alone.shape != both.shape:
+            return False
+        return bool(abs(alone - both).max() <= TOLERANCE * abs(alone).max())
 
-    def _run_batch(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def _run_batch(self, images: Sequence[np.ndarray]) -> np.ndarray:
         batch = np.stack([self._prepare(image) for image in images]).astype(self._dtype)
         try:
-            outputs = self._session.run(self._layers, {self._input.name: batch})
+            (output,) = self._session.run([self.settings.layer], {self._input.name: batch})
         except Exception as error:  # onnxruntime has exception types of its own
             raise SettingsError(
                 f'{self.settings.model} rejects images of size {self.settings.size}: {error}'
             ) from error
-        for layer, output in zip(self._layers, outputs, strict=True):
-            if not np.issubdtype(output.dtype, np.floating):
-                raise SettingsError(
-                    f'layer {layer!r} is {output.dtype}, expected float numbers: of the '
-                    'quantized numbers, name the output of their DequantizeLinear'
-                )
-            if output.shape[:1] != (len(images),):
-                raise SettingsError(
-                    f'layer {layer!r} of {self.settings.model} returns {output.shape} for '
-                    f'{len(images)} images: expected as many rows; name another layer'
-                )
-        return [output.astype(np.float32, copy=False) for output in outputs]
+        if not np.issubdtype(output.dtype, np.floating):
+            raise SettingsError(
+                f'layer {self.settings.layer!r} is {output.dtype}, expected float numbers: of the '
+                'quantized numbers, name the output of their DequantizeLinear'
+            )
+        if output.shape[:1] != (len(images),):
+            raise SettingsError(
+                f'layer {self.settings.layer!r} of {self.settings.model} returns {output.shape} '
+                f'for {len(images)} images: expected as many rows; name another layer'
+            )
+        converted: np.ndarray = output.astype(np.float32, copy=False)
+        return converted
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""
@@ -239,9 +219,9 @@ class Onnx:
         return ((values - mean) / std).transpose(2, 0, 1)
 
 
-def _prune(graph: Any, layers: list[str]) -> None:
-    """Remove the nodes that layers do not depend on: onnxruntime would compute them as well."""
-    needed, kept = set(layers), []
+def _prune(graph: Any, layer: str) -> None:
+    """Remove the nodes that a layer does not depend on: onnxruntime would compute them as well."""
+    needed, kept = {layer}, []
     for node in reversed(graph.node):
         if needed.intersection(node.output):
             needed |= _inputs(node)

@@ -41,18 +41,3 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:
             f'{largest}'
         )
     return output[:, prefix_tokens:].swapaxes(1, 2).reshape(n, C, side, side)
-
-
-def as_vectors(output: Any, images: int, name: str) -> Any:
-    """
-    Return what a network computes for a batch as vectors (n, D).
-
-    :raises SettingsError: it is something else.
-    """
-    vectors = as_maps(output, images, 0, name)
-    if vectors.ndim != 2:
-        raise SettingsError(
-            f'{name} returns {tuple(output.shape)} for {images} images: expected one vector an '
-            'image, (n, D), as setting vector'
-        )
-    return vectors

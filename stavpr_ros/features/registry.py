@@ -103,11 +103,8 @@ class NetworkSettings:
 class OnnxSettings(NetworkSettings):
     """Settings of the ONNX features; mean and std are in units of scale * (0..255)."""
 
-    BEFORE: ClassVar[dict[str, Any]] = {
-        **NetworkSettings.BEFORE,
-        'prefix_tokens': 1,
-        'vector': '',
-    }
+    BEFORE: ClassVar[dict[str, Any]] = {**NetworkSettings.BEFORE, 'prefix_tokens': 1}
+    DROPPED: ClassVar = ('vector',)  # settings of older maps, without effect on the strips
 
     model: str = setting(help='the ONNX file', identity=False)
     layer: str = setting(
@@ -122,11 +119,6 @@ class OnnxSettings(NetworkSettings):
     prefix_tokens: int = setting(
         1, help='of layers (n, T, C): leading tokens that are no patches (class token, registers)'
     )
-    vector: str = setting(
-        '',
-        help='output with one vector (n, D) an image, beside the strips of the layer, for the '
-        'first stage of large maps (time_budget_ms)',
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -138,10 +130,6 @@ class OnnxSettings(NetworkSettings):
                 f'mean {self.mean} and std {self.std} must be three numbers each, std not 0'
             )
         require_at_least('prefix_tokens', self.prefix_tokens, 0)
-        if self.vector and self.vector == self.layer:
-            raise SettingsError(
-                f'vector = {self.vector!r} is what the strips are made of: leave it out'
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,10 +186,6 @@ class Backbone(Protocol):
 
         :param images: each (h, w, 3), uint8.
         """
-        ...
-
-    def maps_and_vectors(self, images: 'Sequence[np.ndarray]') -> 'tuple[np.ndarray, np.ndarray]':
-        """Compute both; of kinds with a setting ``vector``, where it is given."""
         ...
 
 

@@ -3,7 +3,6 @@
 """A map that grows by one place at a time."""
 
 from collections.abc import Callable
-import dataclasses
 import itertools
 
 import numpy as np
@@ -109,15 +108,13 @@ class GrowingMap:
 
         Where another object holds the features, a copy.
         """
-        known = {name: rows[: self._count] for name, rows in self._rows.items()}
-        vectors = known.get('vectors')
         if self._held_features is not None:
-            vectors = None if vectors is None else vectors.copy()
-            return dataclasses.replace(self._held_features(), vectors=vectors)
+            return self._held_features()
+        known = {name: rows[: self._count] for name, rows in self._rows.items()}
         W = self.settings.strips
         strips = known.get('strips', np.empty((0, W, 0), np.float32)).transpose(1, 0, 2)
         weights = known.get('weights', np.empty((0, W), np.float32)).T
-        return LocalFeatures(strips, weights, self.settings, self._cells, vectors)
+        return LocalFeatures(strips, weights, self.settings, self._cells)
 
     @property
     def stamps(self) -> np.ndarray:
@@ -165,7 +162,7 @@ class GrowingMap:
             'poses': np.full((1, 7), np.nan) if pose is None else checked_pose(pose)[None],
         }
         if self._held_features is not None:
-            rows = {name: rows[name] for name in rows if name == 'vectors'}
+            rows = {}
         if n == len(self._rows['stamps']) or not n:
             self._make_room(min(max(2 * n, ROOM), self.limit), rows)
         self.dimension = features.dimension
@@ -240,11 +237,6 @@ class GrowingMap:
         added = _rows_of(features)
         if self.dimension not in (0, d := features.dimension):
             raise InputError(f'strips of {d} dimensions: the map has {self.dimension}')
-        if 'vectors' in self._rows:
-            found = added['vectors'].shape[1] if 'vectors' in added else 0
-            if found != (expected := self._rows['vectors'].shape[1]):
-                vector = f'a vector of {found} dimensions' if found else 'no vector'
-                raise InputError(f'{vector}: places of the map have one of {expected}')
         if not all(np.isfinite(values).all() for values in added.values()):
             raise InputError('the features are not finite: check the network and its input')
         return added
@@ -261,8 +253,5 @@ class GrowingMap:
 
 
 def _rows_of(features: LocalFeatures) -> dict[str, np.ndarray]:
-    """Return the features of n images: strips (n, W, d), weights (n, W), vectors (n, D) if any."""
-    rows = {'strips': features.strips.transpose(1, 0, 2), 'weights': features.weights.T}
-    if features.vectors is not None:
-        rows['vectors'] = features.vectors
-    return rows
+    """Return the features of n images: strips (n, W, d), weights (n, W)."""
+    return {'strips': features.strips.transpose(1, 0, 2), 'weights': features.weights.T}

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 import fcntl
-from functools import cache
 import json
 import os
 from pathlib import Path
@@ -25,9 +24,9 @@ import zlib
 import numpy as np
 from stavpr_ros.errors import JournalError, StavprError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping.map_container import read_json
+from stavpr_ros.mapping.map_container import errors_of, MapFile, read_json
 from stavpr_ros.mapping.map_content import require_jpegs, require_weights
-from stavpr_ros.mapping.map_file import load_map
+from stavpr_ros.mapping.map_file import in_memory, map_of
 from stavpr_ros.mapping.place_map import Place, PlaceMap
 from stavpr_ros.mapping.stored_features import require_normalized
 from stavpr_ros.regular_file import open_regular
@@ -79,11 +78,10 @@ class JournalPlace(NamedTuple):
         """Return the content of its record."""
         stamp, identifier = self.place.stamp, self.place.identifier.encode()
         pose = np.nan if self.place.pose is None else self.place.pose
-        arrays = self.features.strips, self.features.weights, self.features.vectors
-        strips, weights, vector = (0 if each is None else each.squeeze() for each in arrays)
-        row = np.zeros((), _row(*sizes_of(self.features)))
+        strips, weights = self.features.strips[:, 0], self.features.weights[:, 0]
+        row = np.zeros((), row_of(self.features))
         sizes = len(identifier), len(self.thumbnail)
-        values = self.number, stamp, *sizes, pose, weights, strips, vector
+        values = self.number, stamp, *sizes, pose, weights, strips
         for name, value in zip(row.dtype.names or (), values, strict=True):
             row[name] = value
         return b''.join((row.data, identifier, self.thumbnail))
@@ -97,41 +95,31 @@ class JournalPlace(NamedTuple):
         :raises ValueError: not of this format, or values that no map file has.
         :raises StavprError: likewise.
         """
-        row = np.frombuffer(content, _row(*sizes_of(template.features)), 1)[0]
-        rest = content[row.nbytes :]
+        row = np.frombuffer(content, row_of(template.features), 1)[0]
+        # older journals have a vector of the whole image before the identifier
+        vector = len(content) - row.nbytes - int(row['of_id']) - int(row['of_thumbnail'])
+        rest = content[row.nbytes + max(vector, 0) :]
         identifier, thumbnail = rest[: row['of_id']].decode(), rest[row['of_id'] :]
         if len(thumbnail) != row['of_thumbnail']:
             raise ValueError(f'its thumbnail has {len(thumbnail)} of {row["of_thumbnail"]} bytes')
         require_jpegs(np.frombuffer(thumbnail, np.uint8), np.array([len(thumbnail)]))
         require_weights(row['weights'])
-        strips, weights, vector = (row[name].copy() for name in ('strips', 'weights', 'vector'))
+        strips, weights = row['strips'].copy(), row['weights'].copy()
         require_normalized(strips, 'strips', 0)
-        require_normalized(vector[None], 'vectors', 0)
         features = LocalFeatures(
-            strips[:, None],
-            weights[:, None],
-            template.settings,
-            template.features.cells,
-            vector[None] if len(vector) else None,
+            strips[:, None], weights[:, None], template.settings, template.features.cells
         )
         stamps, poses = np.array([row['stamp']]), row['pose'][None]
         places = PlaceMap(features, template.projection, stamps, (identifier,), poses)
         return cls(int(row['number']), places.place(0), features, thumbnail)
 
 
-def sizes_of(features: LocalFeatures) -> tuple[int, int, int]:
-    """Return the sizes W, d and D of the features of a place; D = 0 without a vector."""
-    vectors = features.vectors
-    return features.settings.strips, features.dimension, 0 if vectors is None else vectors.shape[1]
-
-
-@cache
-def _row(W: int, d: int, D: int) -> np.dtype:
+def row_of(features: LocalFeatures) -> np.dtype:
     """Return the fields of a place, all little-endian; identifier and thumbnail follow them."""
+    W, d = features.settings.strips, features.dimension
     return np.dtype(
         [('number', '<i8'), ('stamp', '<i8'), ('of_id', '<u4'), ('of_thumbnail', '<u4'),
-         ('pose', '<f8', 7), ('weights', '<f4', W), ('strips', '<f4', (W, d)),
-         ('vector', '<f4', D)]
+         ('pose', '<f8', 7), ('weights', '<f4', W), ('strips', '<f4', (W, d))]
     )  # fmt: skip
 
 
@@ -166,14 +154,15 @@ class JournalReader:
     A journal that no one writes; it stays locked until it is closed.
 
     ``base`` is the map that it continues, ``source`` what it was made of, ``template`` a map of
-    one place with its settings (``template_content`` its file). ``end`` is the end of the last
-    whole record, in bytes; ``problem`` the first damage that was found so far, '' = none.
+    one place with its settings (``template_content`` its file). ``start`` and ``end`` are those of
+    the content of the last whole record, in bytes; ``problem`` the first damage that was found so
+    far, '' = none.
 
     :raises JournalError: it cannot be read, or a living program writes it.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path, self.problem, self.end = Path(path), '', 0
+        self.path, self.problem, self.start, self.end = Path(path), '', 0, 0
         try:
             self._file = open_regular(self.path)
         except OSError as error:
@@ -230,9 +219,9 @@ class JournalReader:
                     self.source, self.base = source, Base(path, places, checksum)
                 case _:
                     raise ValueError('another format or version')
-            with tempfile.NamedTemporaryFile() as file:
-                Path(file.name).write_bytes(self.template_content)
-                self.template = load_map(file.name)
+            with tempfile.TemporaryFile(buffering=0) as raw, errors_of(self.path):
+                raw.write(self.template_content)
+                self.template = in_memory(map_of(MapFile(raw, self.path)))
         except (ValueError, OSError, StavprError) as error:
             raise JournalError(
                 f'{self.path} is no journal, or its header is damaged ({error}): move it elsewhere'
@@ -248,7 +237,8 @@ class JournalReader:
                 _, length, checksum = _HEAD.unpack_from(head)
             content = self.read(start, length) if length <= LONGEST else b''
             if content and zlib.crc32(content) == checksum:
-                self.end = at = start + length
+                self.start, self.end = start, start + length
+                at = self.end
                 yield content
             else:
                 self.problem = self.problem or f'no whole record at byte {at}'

@@ -12,7 +12,7 @@ import tempfile
 import numpy as np
 from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
 from stavpr_ros.mapping.growing_map import GrowingMap
-from stavpr_ros.mapping.journal import Base, JournalReader, sizes_of, SUFFIX
+from stavpr_ros.mapping.journal import Base, JournalReader, row_of, SUFFIX
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import PlaceMap
@@ -45,21 +45,20 @@ def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
     :raises JournalError: there are none.
     """
     template = reader.template
-    W, d, D = sizes_of(template.features)
+    row = row_of(template.features)
+    W, d = row['strips'].shape
     places, weights, records, ends = [], [], [], [0]
     for _, place, features, thumbnail in reader.places():
         places.append(place)
         weights.append(features.weights)
-        size = 4 * (W * d + D) + len(place.identifier.encode()) + len(thumbnail)
-        records.append((reader.end - size, size))  # strips, vector, identifier, thumbnail
+        start = reader.start + row.itemsize - row['strips'].itemsize
+        records.append((start, reader.end - start))  # strips, ..., identifier, thumbnail
         ends.append(ends[-1] + len(thumbnail))
     if not places:
         raise JournalError(f'{reader.path} has no places: {reader.problem or "delete it"}')
     n = len(places)
-    strips, vectors = Part('F32', (W, n, d)), Part('F32', (n, D), 4 * W * n * d)
-    parts = {'strips': strips} | ({'vectors/vectors': vectors} if D else {})
-    first = strips.size + vectors.size
-    parts['thumbnails'] = Part('U8', (ends[-1],), first)
+    strips = Part('F32', (W, n, d))
+    first = strips.size
     raw = tempfile.TemporaryFile(dir=folder, buffering=0)  # noqa: SIM115
     assert isinstance(raw, io.FileIO)
     for i, (start, size) in enumerate(records):
@@ -69,11 +68,9 @@ def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
         for j in range(W):
             strip = content[4 * j * d : 4 * (j + 1) * d]
             write_at(raw.fileno(), strip, 4 * (j * n + i) * d)
-        vector = content[4 * W * d : 4 * (W * d + D)]
-        write_at(raw.fileno(), vector, vectors.start + 4 * i * D)
         write_at(raw.fileno(), content[size - (ends[i + 1] - ends[i]) :], first + ends[i])
     file = MapFile(raw, reader.path)
-    file.parts = parts
+    file.parts = {'strips': strips, 'thumbnails': Part('U8', (ends[-1],), first)}
     poses = np.array([np.full(7, np.nan) if one.pose is None else one.pose for one in places])
     cells = template.features.cells
     return PlaceMap(

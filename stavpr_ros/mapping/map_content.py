@@ -4,6 +4,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import cache
+import logging
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -28,8 +31,9 @@ from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
 
 T = TypeVar('T')
+_log = logging.getLogger(__name__)
 # parts that are read, and compared with their hashes, later
-LARGE = ('strips', 'thumbnails', 'vectors/vectors', 'statistics/codes')
+LARGE = ('strips', 'thumbnails', 'statistics/codes')
 THUMBNAILS_AT_ONCE = 2**24  # bytes
 # Types and shape of each part; W, n, d are known from the others, a letter alone is any number.
 PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
@@ -49,7 +53,6 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
     'statistics/gains': (('F64',), ('W', 'r')),
     'statistics/changes': (('F32',), (CHANGES, 'n')),
     'statistics/codes': (('I8',), ('W', 'n', 'd')),
-    'vectors/vectors': (('F32', 'F16'), ('n', 'D of a vector')),
 }
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 
@@ -63,6 +66,8 @@ def map_content(file: MapFile) -> PlaceMap:
     """
     manifest, sections = file.manifest, file.manifest['sections']
     settings = _settings(manifest['settings'])
+    if 'vectors' in sections:
+        _note_vectors(file.path)
     known = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
     described = {name: part for name, part in file.parts.items() if name in PARTS}
     if STATISTICS not in known:
@@ -115,6 +120,11 @@ def map_content(file: MapFile) -> PlaceMap:
     )
 
 
+@cache  # once for each file
+def _note_vectors(path: Path) -> None:
+    _log.warning('the vectors of whole images in %s are ignored', path)
+
+
 def _threshold(data: Any) -> float:
     number(data, 'section threshold')
     return float(data)
@@ -126,6 +136,8 @@ def _settings(content: dict[str, Any]) -> FeatureSettings:
     rows = identity_fields(kind)
     # settings that there were none of when the map was made
     values = getattr(settings_class(kind), 'BEFORE', {}) | content['backbone']
+    for name in getattr(settings_class(kind), 'DROPPED', ()):
+        values.pop(name, None)
     record(rows)(values, f'settings of features {kind}')
     if 'sha256' in rows and not values['sha256']:
         raise ValueError(f'settings of features {kind} lack the sha256 of the model')
@@ -161,8 +173,8 @@ def _sizes(parts: dict[str, Part], settings: FeatureSettings) -> dict[str, int]:
             known = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
             if axis != 'bytes' and size != known:
                 raise ValueError(f'part {name} has shape {shape}: expected {known} for {axis}')
-    if min(sizes['d'], sizes.get('D of a vector', 1)) < 1:
-        raise ValueError('the strips, or the vectors, have no dimensions')
+    if sizes['d'] < 1:
+        raise ValueError('the strips have no dimensions')
     return sizes
 
 

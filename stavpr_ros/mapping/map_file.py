@@ -65,8 +65,6 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
         data['threshold'] = place_map.threshold
     if place_map.error_risks is not None:
         data['error_risks'] = asdict(place_map.error_risks)
-    if place_map.features.vectors is not None:
-        data['vectors'] = None
     if statistics is not None:  # the writer knows the hash of the features
         data[STATISTICS] = {'method': statistics.method, 'features': '0' * 64}
     settings, projection = place_map.settings, place_map.projection
@@ -119,8 +117,6 @@ def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
             ends = np.cumsum([len(content) for content in part])
             require_jpegs(np.frombuffer(b''.join(part), np.uint8), ends, first)
         add_texts('thumbnails', 'thumbnail_ends', place_map.thumbnails)
-    if (vectors := features.vectors) is not None:
-        parts['vectors/vectors'] = _part('vectors/vectors', vectors, dtype)
     return parts
 
 
@@ -143,10 +139,17 @@ def load_map(path: str | Path) -> PlaceMap:
     :raises MapFileError: no such file, not a regular one, or one that is damaged, truncated,
         foreign or of a newer version.
     """
-    place_map = open_map(path)
+    return in_memory(open_map(path))
+
+
+def in_memory(place_map: PlaceMap) -> PlaceMap:
+    """
+    Return an opened map, its features and thumbnails read and checked.
+
+    :raises MapFileError: see :func:`verify_map`.
+    """
     verify_map(place_map)
-    with errors_of(Path(path)):
-        thumbnails = tuple(place_map.thumbnails)
+    thumbnails = tuple(place_map.thumbnails)
     return replace(place_map, features=place_map.features[:], thumbnails=thumbnails)
 
 
@@ -161,10 +164,19 @@ def open_map(path: str | Path) -> PlaceMap:
     require_type('path', path, (str, Path), 'the path of a map file')
     path = Path(path)
     with errors_of(path):
-        file = MapFile(open_regular(path), path)
-        file.require_whole()
-        read_header(file)
-        return map_content(file)
+        return map_of(MapFile(open_regular(path), path))
+
+
+def map_of(file: MapFile) -> PlaceMap:
+    """
+    Return the map in an open file; see :func:`open_map`.
+
+    :raises ValueError: names what is wrong with it.
+    :raises StavprError: likewise.
+    """
+    file.require_whole()
+    read_header(file)
+    return map_content(file)
 
 
 def verify_map(place_map: PlaceMap, rest: Callable[[float], None] = lambda seconds: None) -> None:

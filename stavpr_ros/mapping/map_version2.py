@@ -16,7 +16,7 @@ FORMAT, VERSION = 'stavpr-map', 2
 MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 # name: highest known version
 KNOWN_SECTIONS = dict.fromkeys(
-    ('error_risks', 'intrinsics', 'same_places', 'statistics', 'threshold', 'vectors'), 1
+    ('error_risks', 'intrinsics', 'same_places', 'statistics', 'threshold'), 1
 )
 _METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MOST_HEADER)))
 _TENSOR = record(

@@ -50,7 +50,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     settings = replace(place_map.settings, projection=projection.identity)
     return replace(
         place_map,
-        features=LocalFeatures(strips, features.weights, settings, vectors=features.vectors),
+        features=LocalFeatures(strips, features.weights, settings),
         projection=projection,
         threshold=None,
         map_id='',

@@ -7,7 +7,7 @@ from typing import Any, overload
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
+from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 from stavpr_ros.memory import aligned_empty
 
@@ -46,8 +46,8 @@ class StoredFeatures(LocalFeatures):
     """
     Features of a map that stay in its file, without a copy in memory.
 
-    Every access to ``strips`` or ``vectors`` reads them all, ``features[places]`` a part.
-    The file stays open, so that it may be replaced or deleted. Thread-safe.
+    Every access to ``strips`` reads them all, ``features[places]`` a part. The file stays open, so
+    that it may be replaced or deleted. Thread-safe.
 
     :param weights: see :class:`LocalFeatures`; in memory.
 
@@ -66,7 +66,6 @@ class StoredFeatures(LocalFeatures):
         cells: tuple[int, int] | None,
     ) -> None:
         self.file, self._part = file, file.parts['strips']
-        self._vectors = file.parts.get('vectors/vectors')
         for name, value in (('weights', weights), ('settings', settings), ('cells', cells)):
             object.__setattr__(self, name, value)
 
@@ -80,9 +79,8 @@ class StoredFeatures(LocalFeatures):
         return f'StoredFeatures({str(self.file.path)!r}, {self._part.shape}, {self.settings})'
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
-        places = np.arange(len(self))[images]
-        strips, vectors = self._read(places), self._read_vectors(places)
-        return LocalFeatures(strips, self.weights[:, images], self.settings, self.cells, vectors)
+        strips = self._read(np.arange(len(self))[images])
+        return LocalFeatures(strips, self.weights[:, images], self.settings, self.cells)
 
     @property
     def dimension(self) -> int:
@@ -98,11 +96,6 @@ class StoredFeatures(LocalFeatures):
     def strips(self) -> np.ndarray:
         """Return the features, read from the file; shape (W, n, d), float32."""
         return self._read(np.arange(len(self)))
-
-    @property
-    def vectors(self) -> np.ndarray | None:
-        """Return the vectors, read from the file; shape (n, D), float32."""
-        return self._read_vectors(np.arange(len(self)))
 
     def stored_strip(self, j: int) -> np.ndarray:
         """Return the features of one strip in the type of the file, shape (n, d)."""
@@ -127,25 +120,15 @@ class StoredFeatures(LocalFeatures):
 
     def _read(self, places: np.ndarray) -> np.ndarray:
         """Return the features of places, shape (W, len(places), d), float32."""
-        W, n, d = self._part.shape
+        W, _, d = self._part.shape
         out = aligned_empty((W, len(places), d))
         for j in range(W):
-            self._fill(out[j], self._part, j * n, places, f'strips, strip {j}')
+            self._fill(out[j], j, places)
         return out
 
-    def _read_vectors(self, places: np.ndarray) -> np.ndarray | None:
-        """Return the vectors of places, shape (len(places), D), float32."""
-        if self._vectors is None:
-            return None
-        out = aligned_empty((len(places), self._vectors.shape[1]))
-        self._fill(out, self._vectors, 0, places, 'vectors/vectors')
-        return out
-
-    def _fill(
-        self, out: np.ndarray, part: Part, first: int, places: np.ndarray, name: str
-    ) -> None:
-        """Read the rows of places of a part; ``first`` is the row of place 0."""
-        dtype = np.dtype(DTYPES[part.dtype])
+    def _fill(self, out: np.ndarray, j: int, places: np.ndarray) -> None:
+        """Read strip j of places."""
+        part, dtype = self._part, np.dtype(DTYPES[self._part.dtype])
         runs = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) != 1) + 1)
         starts = [(run, at) for run in runs for at in range(0, len(run), PLACES_AT_ONCE)]
         with errors_of(self.file.path):
@@ -153,10 +136,11 @@ class StoredFeatures(LocalFeatures):
                 rows = run[at : at + PLACES_AT_ONCE]
                 target, place = out[rows[0] : rows[-1] + 1], int(places[rows[0]])
                 block = target if dtype == np.float32 else np.empty(target.shape, dtype)
-                self.file.fill(block, part.start + (first + place) * block[0].nbytes)
+                row = j * part.shape[1] + place
+                self.file.fill(block, part.start + row * block[0].nbytes)
                 if dtype != np.float32:
                     target[:] = block
-                require_normalized(target, name, place)
+                require_normalized(target, f'strips, strip {j}', place)
 
 
 def require_normalized(rows: np.ndarray, name: str, place: int) -> None:

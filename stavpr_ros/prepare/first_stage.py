@@ -5,8 +5,7 @@ A first stage for maps too large to be compared exactly within a time budget.
 
 Every strip of every place is reduced to a few principal components, so that an image is one vector
 of ``BYTES`` bytes. The *coarse* distance of two images is 1 less their largest cosine similarity,
-when one is shifted against the other by whole strips. Where places have vectors of whole images
-beside their strips, it is that of the vectors instead. It is computed for all places. Exact
+when one is shifted against the other by whole strips. It is computed for all places. Exact
 distances are computed in chunks of places: those with the smallest coarse distances, those that
 the place filter finds probable after the images so far, and a fixed sample. Mean and deviation of
 the sample scale the coarse distances to exact ones, so that z-normalization, the filter and the
@@ -37,7 +36,7 @@ class FirstStage:
     A matcher that compares images with few places exactly, see the module.
 
     :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
-    :param features: of the places: those of the matcher; or their vectors, as one strip.
+    :param features: of the places, as the matcher has them.
     :param probable: returns the first places of the blocks of ``BLOCK`` places that the filter
         finds probable.
     """
@@ -66,18 +65,12 @@ class FirstStage:
         """Return the number of places n."""
         return self._matcher.places
 
-    def distances(
-        self, strips: np.ndarray, weights: np.ndarray, vector: np.ndarray | None = None
-    ) -> np.ndarray:
-        """
-        Return the distances of one image to every place, (n,); exact ones where they count.
-
-        :param vector: of the image, (1, D), where those of the places are compared.
-        """
+    def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return the distances of one image to every place, (n,); exact ones where they count."""
         n = self.places
         out: np.ndarray = np.empty(n, np.float32)
         nearest = np.empty(self._chunks, np.float32)
-        query = int8.tiled(self._shifted(strips if vector is None else vector)[:, None])
+        query = int8.tiled(self._shifted(strips)[:, None])
         int8.smallest_distances(self._reduced.kernel_arguments(), query, CHUNK, out, nearest)
         coarse = self._of_sample(out)
         chunks = np.union1d(self._sample, self._candidates(nearest))

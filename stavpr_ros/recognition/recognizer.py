@@ -7,7 +7,7 @@ import copy
 from dataclasses import replace
 import math
 import time
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.checks import require_type
@@ -19,7 +19,6 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.prepare.blocks import blocks
-from stavpr_ros.prepare.centering import MeanCentering
 from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
@@ -43,9 +42,6 @@ from stavpr_ros.recognition.relative_motion import (
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
-
-if TYPE_CHECKING:
-    from stavpr_ros.prepare.first_stage import FirstStage
 
 EARLY = 0.9  # minimum probability of a match by the newest images alone
 TIMED = 3  # images, to compare the time of one with the time budget
@@ -340,8 +336,6 @@ class PlaceRecognizer(SequenceRecognizer):
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
         if isinstance(self._window, FilterWindow):
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
-        # where a first stage compares vectors of whole images: it, and their centering
-        self._vectors: tuple[FirstStage, MeanCentering] | None = None
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time budget
         self.start_notes = '; '.join(filter(None, [prepared.note, settings.error_note]))
@@ -351,7 +345,7 @@ class PlaceRecognizer(SequenceRecognizer):
                     f"time_budget_ms = {settings.time_budget_ms} with backend 'cuda': the first "
                     "stage is of backend 'cpu'; take that, or 0"
                 )
-            self._keep_time_budget(prepared.features, features)
+            self._keep_time_budget(prepared.features, features[:1])
 
     def set_limits(
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
@@ -384,9 +378,8 @@ class PlaceRecognizer(SequenceRecognizer):
         return self._window.is_standstill
 
     def _keep_time_budget(
-        self, prepared: LocalFeatures | Int8Features, features: LocalFeatures
+        self, prepared: LocalFeatures | Int8Features, image: LocalFeatures
     ) -> None:
-        image, options = features[:1], self._settings.applied_options
         budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
         text = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
         if exact > budget:
@@ -394,17 +387,8 @@ class PlaceRecognizer(SequenceRecognizer):
             from stavpr_ros.prepare.first_stage import FirstStage
 
             assert isinstance(self._matcher, CpuMatcher)
-            if (vectors := features.vectors) is not None:
-                ones = np.ones((1, len(vectors)), np.float32)
-                whole = LocalFeatures(vectors[None], ones, features.settings)
-                centering = MeanCentering(whole, options.mean_centering, options.whitening)
-                prepared = centering.places(whole)
-                require_finite(prepared, 'the map')
-            self._matcher = stage = FirstStage(self._matcher, prepared, self._probable_places)
-            if vectors is not None:
-                self._vectors = stage, centering
-            of = ' of vectors' if self._vectors is not None else ''
-            text += f': with a first stage{of} {self._milliseconds(image):.3g} ms'
+            self._matcher = FirstStage(self._matcher, prepared, self._probable_places)
+            text += f': with a first stage {self._milliseconds(image):.3g} ms'
         self.start_notes = '; '.join(filter(None, [self.start_notes, text]))
 
     def _milliseconds(self, image: LocalFeatures) -> float:
@@ -432,14 +416,8 @@ class PlaceRecognizer(SequenceRecognizer):
     def reset(self) -> None:
         """Drop the images of the window, and the running statistics of the query."""
         super().reset()
-        for centering in self._centerings:
-            centering.reset()
-
-    @property
-    def _centerings(self) -> list[MeanCentering]:
-        """Return the running means of the query."""
-        own = [] if self._centering is None else [self._centering]
-        return own if self._vectors is None else [*own, self._vectors[1]]
+        if self._centering is not None:
+            self._centering.reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """
@@ -464,11 +442,6 @@ class PlaceRecognizer(SequenceRecognizer):
                 f'strips of {features.dimension} dimensions, the map has {self._dimension}: it '
                 'was not made with this network; build it again'
             )
-        if features.vectors is None and self._vectors is not None:
-            raise FeatureMismatchError(
-                'features without a vector of the whole image, the map has them: extract the '
-                'query with the settings of the map'
-            )
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -480,15 +453,10 @@ class PlaceRecognizer(SequenceRecognizer):
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
-        weights = features.weights[:, 0]
-        if self._vectors is None or features.vectors is None:
-            row = self._matcher.distances(strips, weights)
-        else:
-            stage, centering = self._vectors
-            row = stage.distances(strips, weights, centering.next_query(features.vectors))
+        row = self._matcher.distances(strips, features.weights[:, 0])
         self._window.push(row, strips, stamp)
-        for centering in self._centerings:
-            centering.note_standstill(self._window.is_standstill)
+        if self._centering is not None:
+            self._centering.note_standstill(self._window.is_standstill)
         return self._match(position)
 
 

@@ -139,7 +139,7 @@ def main(args: list[str] | None = None) -> int:
             f'--onnx-size {arguments.size}'
         )
         if len(exported.shapes) > 1:
-            print('or, strips and a vector: --onnx-layer map --onnx-vector global')
+            print('or, strips: --onnx-layer map')
 
     return run_program('export_model', work)
 
