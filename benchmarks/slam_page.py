@@ -31,8 +31,8 @@ def markdown(about: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
         *TEXT.splitlines(),
         drives,
         '',
-        *table(('', 'mark', 'median', 'worst'), [*_drift_rows(rows), *_other_rows(rows)]),
-        *table(('edges', 'mark', 'large drift', 'small drift'), _edge_rows(rows)),
+        *table(('', 'target', 'median', 'worst'), [*_drift_rows(rows), *_other_rows(rows)]),
+        *table(('edges', 'target', 'large drift', 'small drift'), _edge_rows(rows)),
         'Each drive, ATE in m:',
         '',
         *table(
