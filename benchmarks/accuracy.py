@@ -32,7 +32,6 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import MIN_PROBABILITY
 from stavpr_ros.sources import open_source
 
 MODES = ('paper', 'robust')
@@ -133,7 +132,7 @@ def numbers(evaluation: Evaluation, mode: str) -> dict[str, Any]:
         accepted, has_match = evaluation.results.accepted, evaluation.ground_truth.has_match
         counts = accepted_counts(accepted, evaluation.correct, has_match)
         found['at_default'] = {
-            'threshold': 1 - MIN_PROBABILITY,
+            'threshold': 1 - RecognizerSettings.min_probability,
             'precision': counts.precision, 'recall': counts.recall,
         }  # fmt: skip
     return found

@@ -43,8 +43,9 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
 
     settings = FeatureSettings('synthetic', None)
     place_map = descriptor_map(features(strips, weights))
+    limit = {'threshold': 1.0} if mode == 'paper' else {'min_probability': 1e-9}
     recognizer = PlaceRecognizer(
-        place_map, RecognizerSettings(1.0, mode=mode, min_probability=1e-9), 'cpu', precision
+        place_map, RecognizerSettings(mode=mode, **limit), 'cpu', precision
     )
 
     def update(strips: np.ndarray, weights: np.ndarray) -> tuple[int, float]:

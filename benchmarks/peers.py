@@ -133,7 +133,7 @@ def methods(
             match_differences(differences(places, queries).T, settings),
         )
     for mode in ('paper', 'robust'):
-        settings = RecognizerSettings(threshold=1.0, mode=mode)
+        settings = RecognizerSettings(mode=mode)
         results = evaluate_on_map(place_map, query.features, truth, settings).results
         if mode == 'paper':
             yield 'ours, aligned single images', (results.single.best, results.single.scores)

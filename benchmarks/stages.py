@@ -40,7 +40,7 @@ import torch
 
 MODES = ('robust', 'paper')  # the default first
 SEQUENCE, SPATIAL, FILTER = SequenceSettings(), SpatialSettings(), FilterSettings()
-NMS_RADIUS = 20
+NMS_RADIUS = RecognizerSettings.nms_radius
 STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
@@ -365,7 +365,7 @@ def frame(
     places: LocalFeatures, queries: LocalFeatures, mode: str, precision: str, device: str
 ) -> Call:
     """Return a call that updates a recognizer, its window full, with the next image."""
-    settings = RecognizerSettings(1.0, SPATIAL, SEQUENCE, NMS_RADIUS, mode)
+    settings = RecognizerSettings(1.0 if mode == 'paper' else None, mode=mode)
     recognizer = PlaceRecognizer(descriptor_map(places), settings, device, precision)
     following = cycle([queries[i : i + 1] for i in range(len(queries))])
     for _ in range(SEQUENCE.length):

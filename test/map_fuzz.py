@@ -40,7 +40,7 @@ def use(place_map: PlaceMap) -> None:
         place_map.session(i)
         place_map.thumbnail(i)
     for mode, precision in (('paper', 'float32'), ('robust', 'int8')) if n else ():
-        settings = RecognizerSettings(0.5, mode=mode)
+        settings = RecognizerSettings(0.5 if mode == 'paper' else None, mode=mode)
         recognizer = PlaceRecognizer(place_map, settings, 'cpu', precision)
         for i in range(22):
             match = recognizer.update(place_map.features[[i % n]])

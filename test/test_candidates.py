@@ -73,7 +73,6 @@ def test_ranked_candidates_by_hand():
 @pytest.mark.parametrize('mode', ['paper', 'robust', 'dtw'])
 def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
     settings = RecognizerSettings(
-        1.0,
         sequence=SHORT,
         nms_radius=5,
         mode='paper' if mode == 'paper' else 'robust',
@@ -101,7 +100,7 @@ def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
 def test_ranked_on_empty_map_is_empty(small_map):
     optional = {'stamps': small_map.stamps[:0], 'ids': (), 'poses': None, 'thumbnails': ()}
     empty = dataclasses.replace(small_map, features=small_map.features[0:0], **optional)
-    one = PlaceRecognizer(empty, RecognizerSettings(1.0, sequence=SHORT))
+    one = PlaceRecognizer(empty, RecognizerSettings(mode='paper', sequence=SHORT))
     for i in range(6):
         one.update(small_map.features[i : i + 1])
     assert one.ranked(5) == []

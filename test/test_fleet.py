@@ -250,7 +250,7 @@ def test_recognizer_does_not_wait_for_a_slow_store(city, query):
 def test_recognizer_rejects_mode_paper_and_vertical(city):
     made = CityMap.of(MemoryStore(city))
     with pytest.raises(SettingsError, match='mode paper'):
-        FleetRecognizer(made, RecognizerSettings(0.5))
+        FleetRecognizer(made, RecognizerSettings(mode='paper'))
     spatial = replace(SETTINGS.spatial, vertical=True)
     with pytest.raises(SettingsError, match='vertical True'):
         FleetRecognizer(made, replace(SETTINGS, spatial=spatial))

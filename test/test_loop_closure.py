@@ -62,7 +62,11 @@ def laps():
 
 def settings_of(robust_options, **changes):
     return RecognizerSettings(
-        0.5, sequence=SHORT, nms_radius=5, robust_options=robust_options, **changes
+        None if robust_options.place_filter else 0.5,
+        sequence=SHORT,
+        nms_radius=5,
+        robust_options=robust_options,
+        **changes,
     )
 
 
@@ -277,7 +281,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
 
 
 def test_mode_paper_and_localization_have_no_late_matches(laps, small_map):
-    paper = LoopCloser(RecognizerSettings(10.0, sequence=SHORT), 12, laps.settings)
+    paper = LoopCloser(RecognizerSettings(10.0, sequence=SHORT, mode='paper'), 12, laps.settings)
     assert not any(match.late for match in drive(paper, laps[:150]))
     localizer = PlaceRecognizer(small_map, RecognizerSettings(mode='robust'))
     assert {match.late for match in drive(localizer, small_map.features)} == {()}
@@ -473,7 +477,7 @@ def test_loop_closer_with_invalid_input_is_rejected(laps, small_map):
     with pytest.raises(SettingsError, match='exclude'):
         LoopCloser(robust, 0, laps.settings)
     with pytest.raises(SettingsError, match='none'):
-        LoopCloser(RecognizerSettings(1.0, SpatialSettings('none')), 12, laps.settings)
+        LoopCloser(RecognizerSettings(spatial=SpatialSettings('none')), 12, laps.settings)
     closer = LoopCloser(robust, 12, laps.settings)
     with pytest.raises(InputError, match='2 images'):
         closer.update(laps[:2])

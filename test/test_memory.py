@@ -40,7 +40,7 @@ def test_features_read_from_a_file_begin_with_a_cache_line(path):
     ('mode', 'precision'), [('paper', 'float32'), ('robust', 'float32'), ('robust', 'int8')]
 )
 def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, precision):
-    settings = RecognizerSettings(1.0, mode=mode)
+    settings = RecognizerSettings(mode=mode)
     opened, loaded = (
         PlaceRecognizer(read(path), settings, 'cpu', precision) for read in (open_map, load_map)
     )

@@ -99,7 +99,7 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
     ('values', 'words'),
     [
         ({'precision': 'int4'}, "precision = 'int4' is unknown: take one of float32"),
-        ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0 would match nothing'),
+        ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0.0 must be above 0'),
         (
             {'threshold': 0.8},
             'threshold = 0.8 is of mode paper: .* min_probability = 0.5; set that',

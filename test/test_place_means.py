@@ -8,7 +8,6 @@ import pytest
 from stavpr_ros.filter.place_means import DELAY, IMAGES, NEAREST, PlaceMeans, PRIOR
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.recognition.robust import MIN_PROBABILITY
 
 EXCLUDED = 50
 
@@ -84,7 +83,7 @@ def with_shared_content(seed, amount):
 
 
 def probable(matches):
-    return sum(match.probability > MIN_PROBABILITY for match in matches)
+    return sum(match.probability > RecognizerSettings.min_probability for match in matches)
 
 
 @pytest.mark.parametrize('seed', [0, 1])

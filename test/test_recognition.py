@@ -25,7 +25,8 @@ SHORT = SequenceSettings(length=5, beta=2.0)
 
 
 def recognizer(place_map: PlaceMap, threshold: float = 0.3, **changes) -> PlaceRecognizer:
-    changes = {'sequence': SHORT, 'nms_radius': 5} | changes
+    changes = {'sequence': SHORT, 'nms_radius': 5, 'mode': 'paper'} | changes
+    threshold = threshold if changes['mode'] == 'paper' else None
     return PlaceRecognizer(place_map, RecognizerSettings(threshold, **changes))
 
 
@@ -77,7 +78,7 @@ def test_recognizer_at_threshold_does_not_match(small_map, route):
 def test_recognizer_without_a_threshold_takes_that_of_the_map(small_map):
     place_map = replace(small_map, threshold=0.3)
     for threshold, applied in ((None, 0.3), (0.1, 0.1)):
-        settings = RecognizerSettings(threshold, sequence=SequenceSettings(length=5))
+        settings = RecognizerSettings(threshold, sequence=SHORT, mode='paper')
         recognizer = PlaceRecognizer(place_map, settings)
         match = [recognizer.update(place_map.features[i : i + 1]) for i in range(5)][-1]
         assert (match.status, match.threshold) == (Status.MATCH, applied)
@@ -122,7 +123,7 @@ def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, m
 
 
 def test_arguments_of_wrong_types_are_rejected_with_the_expected_one(small_map):
-    one, settings, image = recognizer(small_map), RecognizerSettings(0.5), np.zeros((9, 9, 3))
+    one, settings, image = recognizer(small_map), RecognizerSettings(), np.zeros((9, 9, 3))
     for call, error, words in (
         (lambda: PlaceRecognizer('route.stavpr', settings), InputError, 'a PlaceMap, as of load_'),
         (
@@ -155,9 +156,11 @@ def test_match_and_map_are_shown_on_one_line(small_map):
 def test_recognizer_settings_out_of_range_are_rejected(small_map):
     for threshold in (0.0, -1.0, float('nan')):
         with pytest.raises(SettingsError, match='threshold'):
-            RecognizerSettings(threshold)
+            RecognizerSettings(threshold, mode='paper')
+    with pytest.raises(SettingsError, match='is of mode paper'):
+        RecognizerSettings(0.5)
     with pytest.raises(SettingsError, match='nms_radius'):
-        RecognizerSettings(0.1, nms_radius=-1)
+        RecognizerSettings(nms_radius=-1)
     with pytest.raises(SettingsError, match='xi = 8'):
         recognizer(small_map, spatial=SpatialSettings(xi=8))
     with pytest.raises(SettingsError, match='threshold'):

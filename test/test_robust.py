@@ -159,7 +159,7 @@ def test_robust_recognizer_after_reset_is_as_new(small_map):
 def test_recognizer_without_one_option_finds_places(small_map, without, strategy):
     robust_options = ROBUST.without(without) if without else ROBUST
     settings = RecognizerSettings(
-        1e6, SpatialSettings(strategy), SHORT, 5, mode='robust', robust_options=robust_options
+        None, SpatialSettings(strategy), SHORT, 5, robust_options=robust_options
     )
     one = PlaceRecognizer(small_map, settings)
     answers = recognize_all(one, small_map.features[10:30])

@@ -48,7 +48,7 @@ def town():
 
 
 def recognizer(place_map, mode='robust'):
-    threshold = 0.5 if mode == 'robust' else 2.0
+    threshold = None if mode == 'robust' else 2.0
     settings = RecognizerSettings(
         threshold, sequence=SequenceSettings(LENGTH), nms_radius=8, mode=mode
     )

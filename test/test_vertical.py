@@ -67,7 +67,7 @@ def test_vertical_distances_equal_oracle(n, strategy, xi):
 def test_vertical_alignment_of_other_settings_is_rejected(small_map):
     spatial = SpatialSettings(vertical=True)
     with pytest.raises(InputError, match='without projection'):
-        PlaceRecognizer(small_map, RecognizerSettings(1.0, spatial))
+        PlaceRecognizer(small_map, RecognizerSettings(spatial=spatial))
     with pytest.raises(SettingsError, match='vertical'):
         SpatialSettings('none', vertical=True)
     with pytest.raises(SettingsError, match='cuda'):

@@ -79,7 +79,7 @@ def results(folder: Path, foreign: Path) -> Iterator[tuple[str, np.ndarray]]:
         save_map(place_map, folder / storage, storage, force=True)
         yield f'features read from {storage}', load_map(foreign / storage).features.strips
     for storage, precision, mode in CASES:
-        settings = RecognizerSettings(threshold=0.1, mode=mode)
+        settings = RecognizerSettings(0.1 if mode == 'paper' else None, mode=mode)
         recognizer = PlaceRecognizer(load_map(folder / storage), settings, 'cpu', precision)
         name = f'map in {storage}, {precision}, {mode}'
         yield f'{name}: distances of the query', recognizer.distances(query)

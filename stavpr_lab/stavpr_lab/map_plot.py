@@ -79,7 +79,7 @@ def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) ->
     """Draw the distances of places to each other, as mode robust compares images."""
     n, places = len(place_map), evenly(len(place_map), COMPARED)
     part = select_places(place_map, places)
-    recognizer = PlaceRecognizer(part, RecognizerSettings(mode='robust'))
+    recognizer = PlaceRecognizer(part, RecognizerSettings())
     distances = recognizer.distances(part.features)
     apart = ~np.eye(len(part), dtype=bool)  # a place itself is 0, which is left out of the scale
     distances = np.where(apart, distances, distances.min(where=apart, initial=np.inf))

@@ -55,7 +55,7 @@ def test_recognize_traverse_of_four_images_by_hand(small_map):
         paths=[None, None, [(0, 0), (1, 1), (2, 3)], [(0, 2), (1, 4), (2, 5)]],
         candidates=[None, None, [1, 5, 0], [3, 4]],
     )
-    settings = RecognizerSettings(1.0, sequence=SequenceSettings(length=3))
+    settings = RecognizerSettings(1.0, sequence=SequenceSettings(3), mode='paper')
     stamps = np.array([7, 8, 10, 11]) * 10**9
     found = recognize_traverse(online, small_map.features[:4], 6, settings, stamps=stamps)
     assert online.stamps == stamps.tolist()
@@ -75,7 +75,7 @@ def test_recognize_traverse_of_four_images_by_hand(small_map):
 def test_recognize_traverse_reduces_distances_to_block_minima(monkeypatch, small_map):
     monkeypatch.setattr(module, 'MATRIX_SIDE', 2)
     rows = [[5, 4, 9], [3, 8, 7], [6, 6, 1], [2, 6]]  # the last one has two places only
-    settings = RecognizerSettings(1.0, sequence=SequenceSettings(length=3))
+    settings = RecognizerSettings(1.0, sequence=SequenceSettings(3), mode='paper')
     online = Scripted(rows, [None] * 4, [None] * 4)
     reduced = recognize_traverse(online, small_map.features[:4], 3, settings).distances
     assert reduced.block == (2, 2)

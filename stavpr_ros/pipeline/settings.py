@@ -69,16 +69,6 @@ class PipelineSettings:
     other_views: bool = default('other_views')
 
     def __post_init__(self) -> None:
-        if self.threshold is not None and options_of(self.mode).place_filter:
-            raise SettingsError(
-                f'threshold = {self.threshold} is of mode paper: mode {self.mode} matches above '
-                f'the probability min_probability = {self.min_probability}; set that, and leave '
-                'threshold negative = not set'
-            )
-        if self.threshold == 0:
-            raise SettingsError(
-                'threshold = 0 would match nothing: set it above 0, or negative = not set'
-            )
         settings_class(self.features)  # rejects an unknown kind
         if self.feature_settings:
             settings_from_json(self.features, self.feature_settings, self.model_path)

@@ -355,7 +355,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
         :raises SettingsError: out of range.
         """
-        threshold = self._suggested if threshold is None else threshold
+        if threshold is None and not self._settings.has_probability:
+            threshold = self._suggested
         super().set_limits(threshold, min_probability, max_error)
 
     def another(self, place_map: PlaceMap) -> 'PlaceRecognizer':

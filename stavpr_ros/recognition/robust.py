@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, replace
 from stavpr_ros.checks import require_choice
 
 MODES = ('paper', 'robust')
-MIN_PROBABILITY = 0.5  # above which mode robust matches a window
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def with_same_places(place_map: PlaceMap) -> PlaceMap:
 
 def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) -> np.ndarray:
     """Return the place of a reference that each image shows, -1 = none, (m,)."""
-    settings = RecognizerSettings(mode='robust', min_probability=SURE)
+    settings = RecognizerSettings(min_probability=SURE)
     recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length
     found, near = (np.full(len(images), -1) for _ in range(2))
     for i, image in enumerate(images.tolist()):

@@ -8,8 +8,9 @@ from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.checks import require_above, require_at_least, require_between, require_number
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.parameters import default
 from stavpr_ros.recognition.error_rate import least_probability
-from stavpr_ros.recognition.robust import MIN_PROBABILITY, options_of, RobustOptions
+from stavpr_ros.recognition.robust import options_of, RobustOptions
 
 
 @dataclass(frozen=True)
@@ -18,13 +19,13 @@ class RecognizerSettings:
     Settings of the recognizer.
 
     :param threshold: mode paper: a window is matched when its distance is below it; > 0. None =
-        not set, nothing is matched. Mode robust has ``min_probability`` instead.
+        not set: the map's, else nothing is matched. Mode robust has ``min_probability`` instead.
     :param spatial: how two images are compared.
     :param sequence: how a window is matched.
     :param nms_radius: the second best's midpoint is more than this many places from the nearest
         one's.
-    :param mode: ``paper``, or ``robust``, with all options of
-        :class:`stavpr_ros.recognition.robust.RobustOptions`.
+    :param mode: ``robust``, with all options of
+        :class:`stavpr_ros.recognition.robust.RobustOptions`, or ``paper``, LM-DTW as published.
     :param robust_options: another choice of options than the mode's.
     :param odometry_error: of a distance by odometry, as a share of it; where query and places have
         poses, the path of a match is compared with them; 0 = never. See
@@ -44,13 +45,13 @@ class RecognizerSettings:
     threshold: float | None = None
     spatial: SpatialSettings = field(default_factory=SpatialSettings)
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
-    nms_radius: int = 20
-    mode: str = 'paper'
+    nms_radius: int = default('nms_radius')
+    mode: str = default('mode')
     robust_options: RobustOptions | None = None
-    odometry_error: float = 0.1
-    time_budget_ms: float = 0.0
-    min_probability: float = MIN_PROBABILITY
-    max_error: float = 0.0
+    odometry_error: float = default('odometry_error')
+    time_budget_ms: float = default('time_budget_ms')
+    min_probability: float = default('min_probability')
+    max_error: float = default('max_error')
     error_risks: ErrorRisks | None = None
 
     def __post_init__(self) -> None:
@@ -59,6 +60,12 @@ class RecognizerSettings:
         if self.threshold is not None and not self.threshold > 0:
             raise SettingsError(
                 f'threshold = {self.threshold} must be above 0: nothing is nearer than 0'
+            )
+        if self.threshold is not None and self.has_probability:
+            raise SettingsError(
+                f'threshold = {self.threshold} is of mode paper: mode {self.mode} matches above '
+                f'the probability min_probability = {self.min_probability}; set that, and leave '
+                'threshold out (parameter threshold of the node: negative)'
             )
         require_above('min_probability', self.min_probability, 0, below=1)
         if self.max_error:
@@ -93,7 +100,7 @@ class RecognizerSettings:
         """Return the probability above which mode robust matches a window."""
         if not self.max_error:
             return self.min_probability
-        given = self.min_probability != MIN_PROBABILITY
+        given = self.min_probability != RecognizerSettings.min_probability
         probability = least_probability(self.max_error, self._own_risks)
         return max(probability, self.min_probability if given else 0)
 

@@ -48,7 +48,7 @@ def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
     :param model: file of the network, see :meth:`PlaceMap.extractor`.
     :raises InputError: the map has no thumbnails, or is too short to have an elsewhere.
     """
-    settings = RecognizerSettings()
+    settings = RecognizerSettings(mode='paper')
     sequence = settings.sequence
     n, l = len(place_map), sequence.length
     if n < 4 * l:

@@ -20,7 +20,7 @@ def align(place_map: PlaceMap, reference: PlaceMap) -> PlaceMap:
     """
     if place_map.poses is None or reference.poses is None:
         raise InputError('--align: a map has no poses; expected maps recorded with odometry')
-    recognizer = PlaceRecognizer(reference, RecognizerSettings(mode='robust'))
+    recognizer = PlaceRecognizer(reference, RecognizerSettings())
     pairs = []
     for i in range(len(place_map)):
         match = recognizer.update(place_map.features[i : i + 1])

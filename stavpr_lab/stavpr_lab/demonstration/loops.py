@@ -135,7 +135,7 @@ def _compared_distances(result: LoopResult, place_map: PlaceMap) -> np.ndarray |
     """Return the distances of every image to those it is compared with, NaN elsewhere, (N, N)."""
     if result.N > LARGEST:
         return None
-    recognizer = PlaceRecognizer(place_map, RecognizerSettings(threshold=1.0))
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='paper'))
     index = np.arange(result.N)
     compared = index[:, None] - index >= result.exclude
     return np.where(compared, recognizer.distances(place_map.features), np.nan)

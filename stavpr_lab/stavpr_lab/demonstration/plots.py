@@ -32,7 +32,7 @@ def draw_result(
 
     :param query: a map of the query, with thumbnails.
     """
-    recognizer = PlaceRecognizer(place_map, RecognizerSettings(threshold=1.0))
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='paper'))
     outcomes = outcomes_of(result)
     pairs = [_pair(result, i, outcomes[i], query, place_map) for i in choose_images(outcomes)]
     demo_sheet(path, pairs, recognizer.distances(query.features), result, threshold, title)

@@ -195,7 +195,6 @@ class DatasetExperiment:
             return self._evaluate_descriptors(configuration.name)
         reference, query = self._maps(configuration)
         settings = RecognizerSettings(
-            threshold=1.0,
             spatial=configuration.spatial,
             sequence=configuration.sequence,
             mode=self._mode,
@@ -219,7 +218,7 @@ class DatasetExperiment:
                 f'descriptors {" and ".join(self._inputs.arrays[name])} are of {found} images: '
                 f'expected {expected}'
             )
-        settings = RecognizerSettings(threshold=1.0, spatial=NO_ALIGNMENT)
+        settings = RecognizerSettings(mode='paper', spatial=NO_ALIGNMENT)
         truth = self._dataset.ground_truth
         return evaluate_on_map(descriptor_map(reference), query, truth, settings).single
 
