@@ -23,7 +23,7 @@ from stavpr_ros.alignment.lm_dtw import best_match, match_padded, padded_width, 
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
@@ -39,7 +39,7 @@ from timing import best_seconds, timed
 import torch
 
 MODES = ('robust', 'paper')  # the default first
-SEQUENCE, SPATIAL, FILTER = SequenceSettings(), SpatialSettings(), FilterSettings()
+SEQUENCE, SPATIAL, FILTER = SequenceSettings(), SpatialSettings(), MODEL
 NMS_RADIUS = RecognizerSettings.nms_radius
 STRIPS = 7
 FRAMES = 20  # of the distance matrix

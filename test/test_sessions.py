@@ -12,7 +12,7 @@ from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import (
     GrowingMap,
@@ -64,7 +64,7 @@ def test_filter_of_sessions_equals_plain_loops():
     sizes, rng = (6, 1, 9), np.random.default_rng(0)
     n = sum(sizes)
     index = np.repeat(np.arange(3, dtype=np.int32), sizes)
-    layout = layout_of(PlaceMapOf(index), 2)
+    layout = layout_of(PlaceMapOf(index), 2, LIVELY)
     plain = oracle.PlaceFilter(LIVELY, (0, 6, 7))
     one = PlaceFilter(layout.width(n), 4, LIVELY, layout.gaps)
     for image in range(12):
@@ -92,7 +92,7 @@ class PlaceMapOf:
 
 def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
-    assert layout_of(town[0], 20).columns is layout_of(one, 20).columns is None
+    assert {layout_of(each, 20, MODEL).columns for each in (town[0], one)} == {None}
     query = features_of(route(0), 1.0, 9)[10:50]
     for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
         assert repr(found) == repr(expected)

@@ -4,7 +4,7 @@
 
 import numpy as np
 from stavpr_ros.alignment.cuda.compilation import runtime
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import ALL_ENTERED, Belief, belief_of, NEGLIGIBLE, NO_PLACES, TOP
 from stavpr_ros.filter.protocol import Filter
 import torch
@@ -25,12 +25,12 @@ class CudaPlaceFilter(Filter):
         self,
         places: int,
         lag: int,
-        settings: FilterSettings | None = None,
+        settings: FilterSettings = MODEL,
         gaps: np.ndarray = NO_PLACES,
     ) -> None:
         from stavpr_ros.alignment.cuda import place_filter
 
-        self.settings = s = settings or FilterSettings()
+        self.settings = s = settings
         self._kernels, self._runtime = place_filter, runtime()
         self._device = device = self._runtime.torch_device
         self._shape, self._speeds = (len(s.levels), len(s.speeds)), np.array(s.speeds, np.float64)

@@ -81,3 +81,7 @@ class FilterSettings:
         changes[2, :-1] = near * weights[:-1] / total[1:]
         changes[:4] *= likelihoods
         return changes
+
+
+MODEL = FilterSettings()
+"""The model of localization; loop closure has its own."""

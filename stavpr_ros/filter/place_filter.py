@@ -43,7 +43,7 @@ that makes their sum 1 is part of the next image's level changes.
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES
 from stavpr_ros.filter.kernels import advance, PLACES
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import (
     ALL_ENTERED,
     backtrack_states,
@@ -79,10 +79,10 @@ class PlaceFilter(Filter):
         self,
         places: int,
         lag: int,
-        settings: FilterSettings | None = None,
+        settings: FilterSettings = MODEL,
         gaps: np.ndarray = NO_PLACES,
     ) -> None:
-        self.settings = settings or FilterSettings()
+        self.settings = settings
         self._gaps = gaps
         self._speeds = np.array(self.settings.speeds, np.float64)
         self._levels = np.array(self.settings.levels, np.float32)

@@ -12,7 +12,7 @@ from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.motion import APART, ImageChange
 from stavpr_ros.fleet.city_map import CityMap
 from stavpr_ros.fleet.neighborhoods import Votes
@@ -53,7 +53,7 @@ class CityLayout(ColumnLayout):
     def __init__(
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
     ) -> None:
-        super().__init__(firsts, same_as, session_gap(nms_radius))
+        super().__init__(firsts, same_as, session_gap(nms_radius, MODEL))
         self.loaded = places
 
     def names_of(self, columns: np.ndarray) -> np.ndarray:
@@ -137,7 +137,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._matcher = CpuMatcher(
             LocalFeatures(self._strips, self._weights, city.settings), settings.spatial
         )
-        self._learned = ImageChange(self._sampled, FilterSettings())
+        self._learned = ImageChange(self._sampled, MODEL)
         self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
         self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that wanted it last
@@ -163,7 +163,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._centering.reset()
         self._images: deque[_Image] = deque(maxlen=HISTORY)
         self._unasked: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
-        self._votes = Votes(self._settings.sequence.length, FilterSettings().speeds)
+        self._votes = Votes(self._settings.sequence.length, MODEL.speeds)
         super().reset()
         self._rebuild()
 
@@ -325,8 +325,8 @@ class FleetRecognizer(SequenceRecognizer):
         here = places[same_as] == self._same_as[self._order]
         same_as = np.where(here, same_as, np.arange(len(places)))
         layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)
-        model, share = FilterSettings(), len(places) / len(self._city)
-        model = replace(model, start=model.start * share, enter=model.enter * share)
+        share = len(places) / len(self._city)
+        model = replace(MODEL, start=MODEL.start * share, enter=MODEL.enter * share)
         window = FilterWindow(self._settings.sequence, len(places), model, layout)
         window.change.copy_statistics(self._learned, self._from_before[self._order])
         self._window = self._filter_window = window

@@ -11,7 +11,7 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.filter.choice import CALIBRATION, ChosenPath, PathChoice, WindowImages
 from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import NEGLIGIBLE, NO_PLACES
 from stavpr_ros.filter.place_filter import PlaceFilter
@@ -49,13 +49,13 @@ class FilterWindow(QueryWindow):
         self,
         sequence: SequenceSettings,
         places: int,
-        settings: FilterSettings | None = None,
+        settings: FilterSettings = MODEL,
         layout: ColumnLayout | None = None,
         normalizes: bool = False,
         around: int = 0,
         to_oldest: bool = False,
     ) -> None:
-        layout, settings = layout or ColumnLayout(), settings or FilterSettings()
+        layout = layout or ColumnLayout()
         length, width = sequence.length, layout.width(places)
         buffer = self.buffer_class(length, width, sequence.k, copies=1)
         super().__init__(buffer, layout, normalizes, around)

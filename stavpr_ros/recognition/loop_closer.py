@@ -3,13 +3,14 @@
 """Loop closure: the map is the route so far, without its latest images."""
 
 from collections import deque
+from dataclasses import replace
 import math
 
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
 from stavpr_ros.prepare.matcher import PRECISIONS
@@ -25,9 +26,8 @@ EVICTED = 8  # the oldest one in so many is evicted at a time
 AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
 # A route's mean follows its light late: until then all its images change little. Most of a route
 # passes no earlier place: its model has fewer speeds, and comes to the map less.
-MODEL = FilterSettings(
-    speeds=(0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5), enter=0.003, speed_weight=0
-)
+SPEEDS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
+ROUTE_MODEL = replace(MODEL, speeds=SPEEDS, enter=0.003, speed_weight=0)
 LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
 CERTAIN = 0.95  # probability above which half a window of matches confirms their path
 LONGEST_GAP = 3  # images from a match to the one that continues it, at most
@@ -256,7 +256,9 @@ def _route_window(settings: RecognizerSettings) -> QueryWindow:
     options, sequence = settings.applied_options, settings.sequence
     if not options.place_filter:
         return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
-    return FilterWindow(sequence, 0, MODEL, None, options.query_znorm, AROUND, to_oldest=True)
+    return FilterWindow(
+        sequence, 0, ROUTE_MODEL, None, options.query_znorm, AROUND, to_oldest=True
+    )
 
 
 def least_limit(exclude: int, length: int) -> int:

@@ -14,6 +14,7 @@ from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
@@ -464,14 +465,14 @@ class PlaceRecognizer(SequenceRecognizer):
 def _window_of(place_map: PlaceMap, settings: RecognizerSettings, backend: str) -> QueryWindow:
     """Return an empty window for a map."""
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
-    layout = layout_of(place_map, settings.nms_radius)
+    layout = layout_of(place_map, settings.nms_radius, MODEL)
     if options.place_filter:
         window_class = FilterWindow
         if backend == 'cuda':
             from stavpr_ros.recognition.cuda_windows import CudaFilterWindow
 
             window_class = CudaFilterWindow
-        window = window_class(sequence, n, None, layout, options.query_znorm)
+        window = window_class(sequence, n, MODEL, layout, options.query_znorm)
         window.choice.learn_times(place_map.stamps)
         return window
     if backend == 'cpu':

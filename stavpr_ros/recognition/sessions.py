@@ -11,20 +11,20 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 
 
-def layout_of(place_map: PlaceMap, nms_radius: int) -> ColumnLayout:
-    """Return the layout of a map."""
+def layout_of(place_map: PlaceMap, nms_radius: int, model: FilterSettings) -> ColumnLayout:
+    """Return the layout of a map, for a window of the same model."""
     if place_map.session_index is None or not len(place_map):
         return ColumnLayout()
     firsts = np.flatnonzero(np.diff(place_map.session_index, prepend=-1))
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(len(place_map))
-    return ColumnLayout(firsts, same_as.astype(np.int64), session_gap(nms_radius))
+    return ColumnLayout(firsts, same_as.astype(np.int64), session_gap(nms_radius, model))
 
 
-def session_gap(nms_radius: int) -> int:
+def session_gap(nms_radius: int, model: FilterSettings) -> int:
     """Return the number of columns between two sessions: no place is near to another session."""
-    farthest = int(np.ceil(max(FilterSettings().speeds))) + 1  # places from image to image
+    farthest = int(np.ceil(max(model.speeds))) + 1  # places from image to image
     return max(farthest, nms_radius) + 1
 
 
