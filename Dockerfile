@@ -18,6 +18,7 @@ WORKDIR /ros_ws
 # Only the manifests and requirements: this layer stays cached while the sources change.
 COPY package.xml src/stavpr_ros/
 COPY stavpr_msgs/package.xml src/stavpr_ros/stavpr_msgs/
+COPY stavpr_fleet/package.xml src/stavpr_ros/stavpr_fleet/
 COPY stavpr_slam/package.xml src/stavpr_ros/stavpr_slam/
 COPY requirements/robot.txt src/stavpr_ros/requirements/
 
@@ -26,7 +27,7 @@ COPY requirements/robot.txt src/stavpr_ros/requirements/
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3-pip python3-venv \
     && rosdep update --rosdistro "$ROS_DISTRO" \
-    && ln -s stavpr_ros/stavpr_{msgs,slam} src/ \
+    && ln -s stavpr_ros/stavpr_{msgs,fleet,slam} src/ \
     && rosdep install --from-paths src --ignore-src -y \
     && rm -rf /var/lib/apt/lists/*
 

@@ -23,7 +23,7 @@ export MAP QUERY LOOP SLAM TRUTH
 SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
-TESTS := test stavpr_slam/test stavpr_lab/test
+TESTS := test stavpr_fleet/test stavpr_slam/test stavpr_lab/test
 PYTEST = pytest -n 2 --dist loadfile $(TESTS)
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN)
 # Package and least percentage of its lines and branches that the tests reach.

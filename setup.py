@@ -4,7 +4,7 @@
 Package description for both ways to install: ``colcon build`` and ``pip install .``.
 
 colcon runs ``setup.py install`` of each package. pip builds a wheel of this folder, with the
-Python packages of stavpr_slam and stavpr_lab in it, since it does not find these as dependencies.
+Python packages of its siblings in it, since it does not find these as dependencies.
 
 Both install the command ``stavpr`` on the PATH, and the executables of ``ros2 run`` as plain
 scripts in ``lib/stavpr_ros``. The latter are data files, not entry points: pip writes entry
@@ -24,7 +24,7 @@ from setuptools import find_packages, setup
 
 MANIFEST = ElementTree.parse('package.xml')
 NAME = 'stavpr_ros'
-SIBLINGS = ('stavpr_slam', 'stavpr_lab')
+SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
 
 # Commands of other packages run here as well, if these are installed.
@@ -37,7 +37,7 @@ MESSAGES = 'share/ament_index/resource_index/packages/stavpr_msgs'
 NO_MESSAGES = """
 stavpr_ros needs stavpr_msgs, a package in its folder, where colcon does not search. In the folder
 of the workspace, make links beside it, then build again:
-  ln -s stavpr_ros/stavpr_{msgs,slam,lab} src/
+  ln -s stavpr_ros/stavpr_{msgs,fleet,slam,lab} src/
 """
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']

@@ -15,8 +15,8 @@ import time
 
 from data import data_folder
 import numpy as np
+from stavpr_fleet import FleetRecognizer, open_city_map, upload
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.fleet import FleetRecognizer, open_city_map, upload
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings

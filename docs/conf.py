@@ -8,7 +8,8 @@ import sys
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / folder) for folder in ('.', 'stavpr_slam', 'stavpr_lab')]
+PACKAGES = ('.', 'stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+sys.path[:0] = [str(ROOT / folder) for folder in PACKAGES]
 
 project = 'stavpr_ros'
 author = 'The stavpr_ros authors'

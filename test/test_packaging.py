@@ -22,9 +22,8 @@ from stavpr_ros import plugins
 from stavpr_ros.commands import COMMANDS, stavpr
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = {
-    'stavpr_ros': ROOT, 'stavpr_slam': ROOT / 'stavpr_slam', 'stavpr_lab': ROOT / 'stavpr_lab'
-}  # fmt: skip
+SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+PACKAGES = {'stavpr_ros': ROOT} | {name: ROOT / name for name in SIBLINGS}
 FOLDERS = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
 EXTRAS = ('onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam')
 
@@ -55,6 +54,9 @@ ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_inde
 ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 
 each_package = pytest.mark.parametrize('package', PACKAGES)
+each_with_commands = pytest.mark.parametrize(
+    'package', ['stavpr_ros', *sorted({*stavpr.PACKAGES.values()})]
+)
 
 
 def setup_arguments(package: str, monkeypatch) -> dict:
@@ -123,9 +125,10 @@ def test_every_import_with_a_rosdep_key_is_dependency(package):
 
 def test_dependencies_between_packages_are_declared():
     found = {name: declared(name, 'exec_depend', 'depend', 'test_depend') for name in PACKAGES}
-    assert {'stavpr_slam', 'stavpr_lab'} & (found['stavpr_ros'] | found['stavpr_slam']) == set()
+    lower = set().union(*(found[name] for name in PACKAGES if name != 'stavpr_lab'))
+    assert {*SIBLINGS} & lower == set()
     assert 'stavpr_lab' not in found['stavpr_lab']
-    assert 'stavpr_ros' in found['stavpr_slam'] & found['stavpr_lab']
+    assert all('stavpr_ros' in found[name] for name in SIBLINGS)
 
 
 def test_versions_agree(monkeypatch):
@@ -201,7 +204,8 @@ def colcon_arguments(folder: Path) -> list[str]:
 
 
 def test_build_by_colcon_without_messages_names_the_links(sources, tmp_path):
-    with pytest.raises(AssertionError, match=r'ln -s stavpr_ros/stavpr_{msgs,slam,lab} src/'):
+    links = r'ln -s stavpr_ros/stavpr_{msgs,fleet,slam,lab} src/'
+    with pytest.raises(AssertionError, match=links):
         run_setup(sources, *colcon_arguments(tmp_path), prefix='/opt/ros/jazzy')
     assert not list(tmp_path.iterdir())
 
@@ -253,7 +257,7 @@ def test_install_puts_one_command_on_path(installed):
     assert found == ['stavpr']
 
 
-@each_package
+@each_with_commands
 def test_install_keeps_names_of_ros2_run(installed, package):
     scripts = next(installed[package].glob(f'**/lib/{package}'))
     own = {name for name, owner in stavpr.PACKAGES.items() if owner == package}
@@ -267,7 +271,7 @@ def test_install_keeps_names_of_ros2_run(installed, package):
         assert (PACKAGES[owner] / owner / 'commands' / f'{name}.py').is_file()
 
 
-@each_package
+@each_with_commands
 def test_executable_without_environment_names_remedy(installed, package):
     scripts = next(installed[package].glob(f'**/lib/{package}'))
     for script in scripts.iterdir():
@@ -318,9 +322,9 @@ def test_wheel_has_all_python_packages_and_entry_points(sources, installed, tmp_
         (file,) = (name for name in names if name.endswith('entry_points.txt'))
         entries = archive.read(file).decode()
     assert set().union(*map(modules_in, installed.values())) <= names
-    for package in ('stavpr_slam', 'stavpr_lab'):
+    for package in SIBLINGS:
         table = (PACKAGES[package] / 'setup.cfg').read_text(encoding='utf-8')
-        for line in re.findall(r'^    (\w+ = .*)$', table, re.MULTILINE):
+        for line in re.findall(r'^    ([\w+]+ = .*)$', table, re.MULTILINE):
             assert line in entries
 
 

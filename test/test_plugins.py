@@ -5,7 +5,7 @@
 import pytest
 from stavpr_ros import plugins
 from stavpr_ros.commands import stavpr
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.registry import backbone_class, kinds, settings_class
 from stavpr_ros.mapping.stores import is_address, store_of
 
@@ -29,7 +29,6 @@ plain = plugged:KIND
 
 [stavpr.stores]
 drawer = plugged:STORE
-faiss = plugged:STORE
 """
 
 
@@ -53,11 +52,8 @@ def test_command_of_another_package_runs(plugged, capsys):
     assert 'greet' in capsys.readouterr().out
 
 
-def test_command_and_scheme_of_this_package_are_not_replaced(plugged):
-    from stavpr_ros.fleet.addresses import STORE
-
+def test_command_of_this_package_is_not_replaced(plugged):
     assert stavpr.all_commands()['node'].module == 'stavpr_ros.commands.node'
-    assert store_of('faiss:file') is STORE
 
 
 def test_broken_plugin_is_named_and_skipped(plugged, caplog):
@@ -75,6 +71,14 @@ def test_unknown_scheme_lists_known_ones():
     assert not is_address('drawer:socks')
     with pytest.raises(SettingsError, match=r'drawer:socks is no address.*faiss:, qdrant:'):
         store_of('drawer:socks')
+
+
+@pytest.mark.parametrize('address', ['faiss:FILE', 'qdrant:FOLDER', 'qdrant+https://HOST:1/NAME'])
+def test_address_without_stavpr_fleet_names_it(monkeypatch, address):
+    monkeypatch.setattr(plugins, 'load', lambda group: {})
+    assert is_address(address)
+    with pytest.raises(UnavailableError, match=r"the package stavpr_fleet.*install '\.\[fleet\]'"):
+        store_of(address)
 
 
 def test_kind_of_features_of_another_package_is_listed_and_loaded(plugged):

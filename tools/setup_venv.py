@@ -44,6 +44,7 @@ SOURCES = {
         'package.xml', 'setup.py', 'setup.cfg', 'pyproject.toml',
         'resource', 'config', 'launch', 'scripts', 'stavpr_ros',
     ),
+    'stavpr_fleet': ('stavpr_fleet',),
     'stavpr_slam': ('stavpr_slam',),
     'stavpr_lab': ('stavpr_lab',),
 }  # fmt: skip

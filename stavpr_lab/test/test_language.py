@@ -51,7 +51,8 @@ REPLACEMENTS = WORDS | SPELLINGS
 # Vague words, where the terms of the field are exact: path, state, block, contain, except.
 VAGUE = re.compile(r'\b(ways?|some|holds?|held|stands?|sees?|seen)\b', re.IGNORECASE)
 MOST_VAGUE, SLACK = 168, 20  # MOST_VAGUE only falls
-PACKAGES = ('stavpr_ros', 'stavpr_slam/stavpr_slam', 'stavpr_lab/stavpr_lab', 'stavpr_msgs')
+INNER = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+PACKAGES = ('stavpr_ros', 'stavpr_msgs', *(f'{name}/{name}' for name in INNER))
 AVOIDED = re.compile('|'.join([rf'(?<![^\W_])(?:{"|".join(WORDS)})(?![^\W_])', *SPELLINGS]))
 
 

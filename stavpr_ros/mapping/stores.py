@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from stavpr_ros import plugins
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.mapping.place_map import PlaceMap
 
-FLEET = 'stavpr_ros.fleet.addresses:STORE'
-BUILT_IN = {'faiss': FLEET, 'qdrant': FLEET, 'qdrant+https': FLEET}
-"""Schemes and their stores as MODULE:NAME, found without entry points and imported on use."""
+FLEET = ('faiss', 'qdrant', 'qdrant+https')
+"""Schemes of the package stavpr_fleet, for the message where it is missing."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +28,14 @@ class Store:
 
 
 def schemes() -> list[str]:
-    """Return the schemes that have a store."""
-    return list(BUILT_IN | plugins.load(plugins.STORES))
+    """Return the schemes that have a store, and those of stavpr_fleet."""
+    return sorted({*FLEET, *plugins.load(plugins.STORES)})
 
 
 def is_address(path: str) -> bool:
     """Return whether this is the address of a map in a store, not a file: docs/fleet.md."""
     scheme, colon, _ = path.partition(':')
-    return bool(colon) and (scheme in BUILT_IN or scheme in schemes())
+    return bool(colon) and (scheme in FLEET or scheme in schemes())
 
 
 def store_of(address: str) -> Store:
@@ -44,11 +43,17 @@ def store_of(address: str) -> Store:
     Return the store of an address; imports its module.
 
     :raises SettingsError: no store has this scheme.
+    :raises UnavailableError: stavpr_fleet has it, and is not installed.
     """
     if not is_address(address):
         known = ', '.join(f'{name}:' for name in schemes())
         raise SettingsError(f'{address} is no address: expected one that begins with {known}')
     scheme = address.partition(':')[0]
-    target = BUILT_IN.get(scheme)
-    store: Store = plugins.resolve(target) if target else plugins.load(plugins.STORES)[scheme]
+    stores = plugins.load(plugins.STORES)
+    if scheme not in stores:
+        raise UnavailableError(
+            f'{address} needs the package stavpr_fleet, which is not installed: build it, or '
+            "`pip install '.[fleet]'` in the repository"
+        )
+    store: Store = stores[scheme]
     return store

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from stavpr_fleet.city_map import CityMap
+from stavpr_fleet.neighborhoods import Votes
+from stavpr_fleet.store import place_vectors, sample_places
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.motion import APART, ImageChange
-from stavpr_ros.fleet.city_map import CityMap
-from stavpr_ros.fleet.neighborhoods import Votes
-from stavpr_ros.fleet.store import place_vectors, sample_places
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.prepare.blocks import PlaceChanges

@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Addresses of maps: ``faiss:FILE``, ``qdrant:FOLDER``, ``qdrant://HOST:PORT/COLLECTION``."""
 
-from stavpr_ros.fleet.faiss_store import FaissStore, upload_to_faiss
-from stavpr_ros.fleet.qdrant_store import (
+from stavpr_fleet.faiss_store import FaissStore, upload_to_faiss
+from stavpr_fleet.qdrant_store import (
     EdgePoints,
     Points,
     QdrantStore,
     server_points,
     upload_to_qdrant,
 )
-from stavpr_ros.fleet.recognizer import FleetMap
+from stavpr_fleet.recognizer import FleetMap
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stores import Store
 

@@ -7,10 +7,10 @@ Optional: only maps that are named by an address (``faiss:FILE``, ``qdrant://HOS
 import this package. docs/fleet.md explains it.
 """
 
-from stavpr_ros.fleet.addresses import open_city_map, upload
-from stavpr_ros.fleet.city_map import CityMap
-from stavpr_ros.fleet.recognizer import FleetMap, FleetRecognizer
-from stavpr_ros.fleet.store import PlaceStore
+from stavpr_fleet.addresses import open_city_map, upload
+from stavpr_fleet.city_map import CityMap
+from stavpr_fleet.recognizer import FleetMap, FleetRecognizer
+from stavpr_fleet.store import PlaceStore
 
 __all__ = [
     'CityMap',

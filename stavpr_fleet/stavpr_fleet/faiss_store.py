@@ -9,8 +9,8 @@ import tempfile
 from typing import Any
 
 import numpy as np
+from stavpr_fleet.store import map_vectors, MapIndex
 from stavpr_ros.errors import FleetError, OutputTakenError, UnavailableError
-from stavpr_ros.fleet.store import map_vectors, MapIndex
 from stavpr_ros.mapping import open_map, PlaceMap, save_map, select_places
 
 EXACT = 4096  # places up to which all vectors are compared
@@ -60,11 +60,11 @@ class FaissStore:
             faiss.extract_index_ivf(self._index).nprobe = PROBED
 
     def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
-        """See :class:`stavpr_ros.fleet.store.PlaceStore`."""
+        """See :class:`stavpr_fleet.store.PlaceStore`."""
         return np.asarray(self._index.search(vectors, count)[1])
 
     def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
-        """See :class:`stavpr_ros.fleet.store.PlaceStore`."""
+        """See :class:`stavpr_fleet.store.PlaceStore`."""
         same_as = self._map.same_as
         return select_places(self._map, places), places if same_as is None else same_as[places]
 

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 from urllib.parse import urlsplit
 
 import numpy as np
+from stavpr_fleet.store import MapIndex, place_vectors
 from stavpr_ros.errors import (
     FleetError,
     OutputTakenError,
@@ -28,7 +29,6 @@ from stavpr_ros.errors import (
     UnavailableError,
 )
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.fleet.store import MapIndex, place_vectors
 from stavpr_ros.mapping import load_map, PlaceMap, save_map, select_places, Session
 
 INDEX_POINT = 2**40
@@ -209,7 +209,7 @@ class EdgePoints:
 
 class QdrantStore:
     """
-    A map whose places are points; see :class:`stavpr_ros.fleet.store.PlaceStore`.
+    A map whose places are points; see :class:`stavpr_fleet.store.PlaceStore`.
 
     :raises FleetError: unreachable, or no complete map.
     """
@@ -223,7 +223,7 @@ class QdrantStore:
             self.index = _read_index(payload)
 
     def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
-        """See :class:`stavpr_ros.fleet.store.PlaceStore`."""
+        """See :class:`stavpr_fleet.store.PlaceStore`."""
         found = self._points.nearest(vectors, count + 1)  # the point of the index may be found
         out = np.full((len(vectors), count), -1, np.int64)
         for row, ids in zip(out, found, strict=True):
@@ -232,7 +232,7 @@ class QdrantStore:
         return out
 
     def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
-        """See :class:`stavpr_ros.fleet.store.PlaceStore`."""
+        """See :class:`stavpr_fleet.store.PlaceStore`."""
         payloads = self._points.payloads(places.tolist())
         if missing := set(places.tolist()) - payloads.keys():
             raise FleetError(f'{len(missing)} places are missing, such as {min(missing)}')

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from stavpr_fleet.store import PlaceStore, sample_places
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.fleet.store import PlaceStore, sample_places
 from stavpr_ros.mapping import Place, PlaceMap
 
 

@@ -13,16 +13,16 @@ from pipelines import message, MIN_PROBABILITY, SECOND, settings_of
 from processes import TIMEOUT
 import pytest
 from robot import image_message
+from stavpr_fleet import CityMap, FleetRecognizer, open_city_map, upload
+from stavpr_fleet.neighborhoods import Votes
+from stavpr_fleet.qdrant_store import EdgePoints
+from stavpr_fleet.store import map_vectors, MapIndex, place_vectors, sample_places
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import FleetError, InputError, OutputTakenError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.fleet import CityMap, FleetRecognizer, open_city_map, upload
-from stavpr_ros.fleet.neighborhoods import Votes
-from stavpr_ros.fleet.qdrant_store import EdgePoints
-from stavpr_ros.fleet.store import map_vectors, MapIndex, place_vectors, sample_places
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.prepare.centering import unit_norm
@@ -345,6 +345,12 @@ def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route
         return status.level == DiagnosticStatus.WARN and 'Qdrant server' in status.message
 
     robot.until(reported, 'the finding on the map')
+
+
+def test_former_name_warns_and_is_the_same():
+    with pytest.warns(DeprecationWarning, match=r'stavpr_ros\.fleet\.upload is now stavpr_fleet'):
+        from stavpr_ros.fleet import upload as former
+    assert former is upload
 
 
 def test_load_map_service_rejects_addresses(robot, start, server):
