@@ -13,7 +13,7 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.filter import choice
 from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.filter.motion import APART
+from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.filter.refine import BAND, OFFSETS, refine, smooth, straight_offsets
 from stavpr_ros.prepare.blocks import PlaceChanges
@@ -306,7 +306,7 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
     dark = features_of(route).strips.copy()
     dark[:, 20:50] = 0
     window = FilterWindow(SequenceSettings(4), PLACES)
-    seen = PlaceChanges(PLACES, APART)
+    seen = PlaceChanges(PLACES, MAX_LAG)
     seen.add(dark)
     window.change.learn(seen.changes)
     at, images = np.arange(PLACES), 30

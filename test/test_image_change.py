@@ -7,7 +7,15 @@ from places import route_strips
 import pytest
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.filter.motion import AHEAD, APART, FLOOR, ImageChange, OFFSET, SMOOTHED, STRETCH
+from stavpr_ros.filter.motion import (
+    ImageChange,
+    LOOK_AHEAD,
+    MAX_LAG,
+    MIN_SPEED_WEIGHT,
+    OFFSET,
+    SMOOTHED,
+    STRETCH,
+)
 from stavpr_ros.prepare.blocks import PlaceChanges
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -26,7 +34,7 @@ def plain_change(a, b):
 
 
 def learned(strips):
-    change, seen = ImageChange(strips.shape[1], SETTINGS), PlaceChanges(strips.shape[1], APART)
+    change, seen = ImageChange(strips.shape[1], SETTINGS), PlaceChanges(strips.shape[1], MAX_LAG)
     seen.add(strips)
     change.learn(seen.changes)
     return change
@@ -47,7 +55,7 @@ def test_curve_is_mean_change_of_places_apart():
     strips[0, 7:9] = strips[1, 20] = 0  # one strip, and two in the same place, without features
     expected = [0.0] + [
         np.mean([plain_change(strips[:, y], strips[:, y - apart]) for y in range(apart, 40)])
-        for apart in range(1, APART + 1)
+        for apart in range(1, MAX_LAG + 1)
     ]
     np.testing.assert_allclose(learned(strips).curve, expected, rtol=1e-5, atol=1e-7)
 
@@ -104,7 +112,7 @@ def test_speed_weights_are_of_smoothed_change_over_curve():
         mean = np.log(np.mean(came[-SMOOTHED:]) + OFFSET)
         there = np.array([change.expected_change(speed) for speed in SETTINGS.speeds])
         off = (mean - np.log(there + OFFSET)) / SETTINGS.change_deviation
-        expected = np.exp(-(off**2) / 2) + FLOOR
+        expected = np.exp(-(off**2) / 2) + MIN_SPEED_WEIGHT
         np.testing.assert_allclose(change.speed_weights(seen), expected, rtol=1e-5)
 
 
@@ -130,7 +138,7 @@ def test_expected_change_below_one_place_is_that_of_a_denser_map(step):
 def test_expected_change_is_the_curve_at_whole_places_and_never_decreases():
     change = learned(drive_strips(300))
     found = [change.expected_change(places) for places in np.linspace(0, 30, 301)]
-    np.testing.assert_allclose(found[: 10 * APART + 1 : 10], change.curve)
+    np.testing.assert_allclose(found[: 10 * MAX_LAG + 1 : 10], change.curve)
     assert (np.diff(found) >= 0).all()
 
 
@@ -157,7 +165,7 @@ def test_images_that_are_all_unrelated_have_no_excess_at_the_speed_of_the_map():
 
 def test_excess_of_the_first_images_is_zero():
     change = learned(drive_strips(100))
-    likelihoods_of(change, drive_strips(APART, seed=1))
+    likelihoods_of(change, drive_strips(MAX_LAG, seed=1))
     assert change.excess(0.25) == 0.0
 
 
@@ -175,11 +183,11 @@ def test_speed_likelihoods_are_highest_at_speed_of_query(apart):
 
 
 def test_speed_likelihoods_of_first_images_are_equal():
-    change, query = learned(drive_strips(100)), drive_strips(APART + 2)
-    np.testing.assert_array_equal(likelihoods_of(change, query[:, :APART]), 1)
+    change, query = learned(drive_strips(100)), drive_strips(MAX_LAG + 2)
+    np.testing.assert_array_equal(likelihoods_of(change, query[:, :MAX_LAG]), 1)
     assert likelihoods_of(change, query).min() < 0.9
     change.reset()
-    np.testing.assert_array_equal(likelihoods_of(change, query[:, :APART]), 1)
+    np.testing.assert_array_equal(likelihoods_of(change, query[:, :MAX_LAG]), 1)
 
 
 def test_speed_likelihoods_reject_a_path_that_stands_while_images_change():
@@ -208,7 +216,7 @@ def test_dark_stretch_is_where_places_of_map_are_equal_or_soon_will_be():
     strips[:, 30:41] = 0  # 31..40 equal the one before
     change = learned(strips)
     dark = [change.is_dark_stretch(probable_at(place, 60)) for place in range(60)]
-    assert dark == [30 + STRETCH - AHEAD < place <= 40 for place in range(60)]
+    assert dark == [30 + STRETCH - LOOK_AHEAD < place <= 40 for place in range(60)]
     assert not change.is_dark_stretch(np.zeros(60))
     change.evict(5)
     assert [change.is_dark_stretch(probable_at(place, 55)) for place in range(55)] == dark[5:]

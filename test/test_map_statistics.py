@@ -15,7 +15,7 @@ from stavpr_ros.commands.build_map import main as build_map_main
 from stavpr_ros.commands.map import main as map_main
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.filter.motion import APART
+from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import load_map, open_map, save_map
 from stavpr_ros.prepare import prepared_map
 from stavpr_ros.prepare.centering import MeanCentering
@@ -91,7 +91,7 @@ def test_several_threads_learn_the_same_as_one(place_map):
 def test_changes_are_those_of_neighbors_up_to_five_places_apart(place_map):
     found = statistics_of_map(place_map)
     centered = MeanCentering(place_map.features).places(place_map.features).strips
-    assert found.changes.shape == (APART, 600)
+    assert found.changes.shape == (MAX_LAG, 600)
     for place, apart in ((8, 1), (256, 1), (258, 4), (599, 5), (3, 3)):
         similarity = np.einsum('jd,jd->j', centered[:, place], centered[:, place - apart])
         assert found.changes[apart - 1, place] == pytest.approx(1 - similarity.mean(), abs=1e-5)

@@ -16,7 +16,7 @@ from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.model import MODEL
-from stavpr_ros.filter.motion import APART, ImageChange
+from stavpr_ros.filter.motion import ImageChange, MAX_LAG
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.prepare.blocks import PlaceChanges
@@ -130,7 +130,7 @@ class FleetRecognizer(SequenceRecognizer):
         # the sample, then the chunks: the matcher shares the memory
         self._strips = aligned_zeros((W, self._sampled + CHUNKS * CHUNK, d))
         self._weights: np.ndarray = np.zeros(self._strips.shape[:2], np.float32)
-        changes = PlaceChanges(self._sampled, APART)
+        changes = PlaceChanges(self._sampled, MAX_LAG)
         centered = self._centering.places(sample, changes.add)
         self._strips[:, : self._sampled] = centered.strips
         self._weights[:, : self._sampled] = centered.weights

@@ -9,14 +9,14 @@ distinguish right paths from those through places that look alike, in all kinds 
 - **evenness**: at right places z is about equal; at look-alike ones a few images are very near and
   others far. s and m are deviation and mean of z over the places of the path;
 - **motion**: a path that creeps explains images of any drive. e is the logarithm of the change of
-  the images over that of the map at the speed of the path
+  the images over the change of the map at the speed of the path
   (:meth:`stavpr_ros.filter.motion.ImageChange.excess`).
 
-The odds of a path are multiplied by
+The odds of a path are multiplied by::
 
     exp(-10 max(0, s - max(1.4, 0.45 |m|)) - 30 max(0, e - 0.04))
 
-The place of a camera at rest is not confirmed by later images. Its path needs the odds
+The place of a camera at rest is not confirmed by later images. Its path needs the odds::
 
     9 exp(-(1 - alpha) max(0, mu z - mu^2 / 2))
 
@@ -94,7 +94,7 @@ def odds_factor(uneven: float, excess: float) -> float:
     Return the factor of the odds of a path, above 0, at most 1.
 
     :param uneven: of :func:`unevenness`.
-    :param excess: logarithm of the change of the images over that of the map along the path.
+    :param excess: logarithm of the change of the images over the map's change along the path.
     """
     return math.exp(-UNEVEN_WEIGHT * uneven - EXCESS_WEIGHT * max(excess - EXCESS, 0.0))
 

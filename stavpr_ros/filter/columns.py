@@ -101,7 +101,7 @@ class ColumnLayout:
         Let places of one position share their probability.
 
         :param n: columns that the filter was updated with.
-        :returns: columns whose probability, with that of close ones, is not 0, ascending, and
+        :returns: columns whose probability, close ones included, is not 0, ascending, and
             their probabilities; among them the most probable one: of the session that is most
             probable at the most probable position.
         """

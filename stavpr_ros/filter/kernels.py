@@ -3,7 +3,7 @@
 """
 The place filter on the CPU: level, speed and place of all states change with an image.
 
-The memory is that of :mod:`stavpr_ros.filter.place_filter`. For each block of a part,
+:mod:`stavpr_ros.filter.place_filter` describes the memory. For each block of a part,
 ``_mix`` lets level and speed of its states and of the ``reach`` columns before it change, where
 reach is more than the largest step and one place; ``_move`` moves them on and weighs them by the
 image::
@@ -35,20 +35,20 @@ from stavpr_ros.filter.paths import BLOCK, ENTERED
 
 F, INT = np.float32, np.int32
 PLACES = 2048  # of a part; a multiple of BLOCK
-LEAST, MOST = -87.0, 80.0  # exponents whose powers are finite float32 numbers
+MIN_EXPONENT, MAX_EXPONENT = -87.0, 80.0  # exponents whose powers are finite float32 numbers
 NEAR_INFINITY = -1e30  # z below it is of a gap
 LINE = 16  # numbers of a cache line
 
 
 @kernel
 def exp(x):
-    """Return e^x, within 2e-7 relative; 0 below LEAST, e^MOST above MOST."""
-    kept = select(splat(F(LEAST)) < x, x, splat(F(LEAST)))
-    kept = select(kept < splat(F(MOST)), kept, splat(F(MOST)))
+    """Return e^x, within 2e-7 relative; 0 below MIN_EXPONENT, and x at most MAX_EXPONENT."""
+    clamped = select(splat(F(MIN_EXPONENT)) < x, x, splat(F(MIN_EXPONENT)))
+    clamped = select(clamped < splat(F(MAX_EXPONENT)), clamped, splat(F(MAX_EXPONENT)))
     magic = splat(F(12582912))  # 1.5 * 2^23: adding it rounds to whole numbers
-    shifted = kept * splat(F(1.44269504)) + magic
+    shifted = clamped * splat(F(1.44269504)) + magic
     whole = shifted - magic
-    rest = kept - whole * splat(F(0.693359375)) - whole * splat(F(-2.12194440e-4))
+    rest = clamped - whole * splat(F(0.693359375)) - whole * splat(F(-2.12194440e-4))
     power = splat(F(1.9875691500e-4))
     power = power * rest + splat(F(1.3981999507e-3))
     power = power * rest + splat(F(8.3334519073e-3))
@@ -56,8 +56,8 @@ def exp(x):
     power = power * rest + splat(F(1.6666665459e-1))
     power = power * rest + splat(F(5.0000001201e-1))
     power = power * rest * rest + rest + splat(F(1))
-    found = from_bits(bits(power) + (bits(shifted) << splat(INT(23))))
-    return select(x < splat(F(LEAST)), splat(F(0)), found)
+    result = from_bits(bits(power) + (bits(shifted) << splat(INT(23))))
+    return select(x < splat(F(MIN_EXPONENT)), splat(F(0)), result)
 
 
 @kernel

@@ -16,9 +16,10 @@ class FilterSettings:
     :param levels: mean z-normalized distance of right places, from bad to good conditions.
     :param weight: alpha of an image that differs from the one before as neighboring places of the
         map do.
-    :param most_change, least_change: limits of the change, over that of neighboring places, that
-        alpha is multiplied by.
-    :param standstill: change, over that of neighboring places, below which the camera is at rest.
+    :param most_change, least_change: limits of the change, over the change of neighboring places,
+        that alpha is multiplied by.
+    :param standstill: change, over the change of neighboring places, below which the camera is
+        at rest.
     :param keep_level: probability of keeping the level.
     :param keep_speed: probability of keeping the speed.
     :param spread: probability of one place more than the speed's, and of one less.
@@ -64,7 +65,7 @@ class FilterSettings:
         by the speed before. They include the likelihood of the speed after.
 
         :param weights: relative probability of each speed for this image, (V,).
-        :param likelihoods: of each speed by the latest images relative to that off the map, (V,).
+        :param likelihoods: of each speed by the latest images, relative to off the map, (V,).
         """
         V = len(self.speeds)
         near, far = (1 - self.keep_speed) * 0.4, (1 - self.keep_speed) * 0.2 / V

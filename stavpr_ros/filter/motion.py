@@ -16,30 +16,30 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.filter.model import FilterSettings
 
-APART = 5  # places apart up to which the map's changes are learned
-STANDING = 0.05  # weight of a place by its change, up to which the curve is not learned from it
-AHEAD = 8  # places within which an unlit stretch may begin
+MAX_LAG = 5  # places apart up to which the map's changes are learned
+MIN_WEIGHT = 0.05  # weight of a place by its change, up to which the curve is not learned from it
+LOOK_AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
-UNLIT = 0.3  # probability of such places above which equal images are no standstill
+DARK_PROBABILITY = 0.3  # probability of such places above which equal images are no standstill
 SPREAD, SCALE = 0.25, 0.4  # deviations of the logarithm: of each change, of all in other light
 NOISE = 0.15  # deviation of the change by noise, common to all
-LEAST_LIKELY = -8.0  # logarithm of the least likelihood of a speed, without its exponent
+MIN_LOG_LIKELIHOOD = -8.0  # logarithm of the least likelihood of a speed, without its exponent
 COMPARED = 1, 2, 3  # images apart that the window is compared with its path at
 SMOOTHED = 5  # latest changes of the query whose mean predicts the speed
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
-FLOOR = 1e-3  # least relative probability of a speed
-LEAST_SIMILAR = 0.01  # similarity of neighboring places below which it is noise
+MIN_SPEED_WEIGHT = 1e-3  # least relative probability of a speed
+MIN_SIMILARITY = 0.01  # similarity of neighboring places below which it is noise
 MIN_DISTINCT = 5  # places: fewer have no meaningful mean and deviation
 LARGE_CHANGE = 0.97  # quantile of changes from place to place
 REST, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a slow one
-LEAST_LEFT = 0.1  # factor of the similarity by noise, below which images show no motion
+MIN_SIMILARITY_RATIO = 0.1  # factor of the similarity by noise, below which images show no motion
 
 
 class ImageChange:
     """
     Changes of a map from place to place, and of a query from image to image.
 
-    ``curve`` is the mean change of places 0, 1, ... ``APART`` apart while the camera moves, 1
+    ``curve`` is the mean change of places 0, 1, ... ``MAX_LAG`` apart while the camera moves, 1
     where none is known; ``standstill`` the change below which a camera is at rest.
 
     :param places: places that there is room for.
@@ -48,7 +48,7 @@ class ImageChange:
 
     def __init__(self, places: int, settings: FilterSettings, length: int = 20) -> None:
         self._settings, self._length = settings, length
-        self._sums, self._counts = np.zeros(APART + 1), np.zeros(APART + 1)
+        self._sums, self._counts = np.zeros(MAX_LAG + 1), np.zeros(MAX_LAG + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
         self._update_curve()
         self.reset()
@@ -57,16 +57,16 @@ class ImageChange:
         """
         Learn from the changes of all places of a map.
 
-        :param changes: of each place from the ones 1 to ``APART`` places before, (``APART``, n).
+        :param changes: of each place from the places 1 to L = ``MAX_LAG`` before, (L, n).
         :param firsts: first place of each session.
         """
         n = changes.shape[1]
         if not n:
             return
-        steps = change_weights(changes[0]) > STANDING
+        steps = change_weights(changes[0]) > MIN_WEIGHT
         steps[list(firsts)] = False
         moving = np.ones(n, bool)  # all steps from the place so far before
-        for apart in range(1, min(APART, n - 1) + 1):
+        for apart in range(1, min(MAX_LAG, n - 1) + 1):
             moving[apart - 1 :] &= steps[: n - apart + 1]
             moving[: apart - 1] = False
             self._sums[apart] = changes[apart - 1, moving].sum(dtype=np.float64)
@@ -79,14 +79,14 @@ class ImageChange:
         """
         Learn from the newest place of a route.
 
-        :param latest: strips of the newest places, oldest first, (W, m, d); ``APART`` + 1 of them
-            if there are so many.
+        :param latest: strips of the newest places, oldest first, (W, m, d); ``MAX_LAG`` + 1 of
+            them if there are so many.
         :param n: places of the route.
         """
         last = latest.shape[1] - 1
         changes = [
             change_between(latest[:, last], latest[:, last - apart])
-            for apart in range(1, min(APART, last) + 1)
+            for apart in range(1, min(MAX_LAG, last) + 1)
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
         self._equal[n - 1] = self._from_before[n - 1] < self.standstill
@@ -117,23 +117,25 @@ class ImageChange:
         self._find_equal()
 
     def _update_curve(self) -> None:
-        known = self._counts > 0
-        self.curve = np.where(known, self._sums / np.maximum(self._counts, 1), 1)
+        measured = self._counts > 0
+        self.curve = np.where(measured, self._sums / np.maximum(self._counts, 1), 1)
         self.curve[0] = 0
         self.standstill = self._settings.standstill * self.curve[1]
         self._find_equal()
         speeds = np.array(self._settings.speeds)
-        left = np.maximum(1 - self.curve, 0)  # of the similarity: it shrinks in one ratio further
-        ratio = min(left[-1] / left[-2], 1) if left[-2] > 0 else 0.0
-        beyond = np.arange(1, int(np.ceil(APART * speeds.max())) - APART + 1)
-        further = self.curve[-1] + left[-1] * (1 - ratio**beyond)
+        similarity = np.maximum(
+            1 - self.curve, 0
+        )  # of the similarity: it shrinks in one ratio further
+        ratio = min(similarity[-1] / similarity[-2], 1) if similarity[-2] > 0 else 0.0
+        beyond = np.arange(1, int(np.ceil(MAX_LAG * speeds.max())) - MAX_LAG + 1)
+        further = self.curve[-1] + similarity[-1] * (1 - ratio**beyond)
         self._extended: list[float] = [*self.curve.tolist(), *further.tolist()]
-        self._decay = float(-np.log(np.clip(left[1], LEAST_SIMILAR, 1)))
-        places = np.outer(speeds, range(1, APART + 1)).tolist()
+        self._decay = float(-np.log(np.clip(similarity[1], MIN_SIMILARITY, 1)))
+        places = np.outer(speeds, range(1, MAX_LAG + 1)).tolist()
         changes = np.array(
             [[self.expected_change(each) + OFFSET for each in row] for row in places]
         )
-        covariances = SPREAD**2 * np.eye(APART) + SCALE**2
+        covariances = SPREAD**2 * np.eye(MAX_LAG) + SCALE**2
         covariances = covariances + NOISE**2 / (changes[:, :, None] * changes[:, None])
         # by speed, and images apart
         self._expected, self._precisions = np.log(changes), np.linalg.inv(covariances)
@@ -166,17 +168,17 @@ class ImageChange:
         for _ in range(STRETCH - 1):  # equal places before, too
             equal[1:] &= equal[:-1].copy()
         ahead = np.zeros(n, bool)
-        for places in range(min(AHEAD, n)):
+        for places in range(min(LOOK_AHEAD, n)):
             ahead[: n - places] |= equal[places:]
-        return bool(by_place[ahead].sum() > UNLIT * by_place.sum())
+        return bool(by_place[ahead].sum() > DARK_PROBABILITY * by_place.sum())
 
     def reset(self) -> None:
         """Forget the query."""
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
-        self._moving: deque[np.ndarray] = deque(maxlen=APART + 1)  # latest images with motion
+        self._moving: deque[np.ndarray] = deque(maxlen=MAX_LAG + 1)  # latest images with motion
         self._by_apart: deque[list[float]] = deque(maxlen=SMOOTHED)  # their latest changes
-        self._of_window: deque[list[float]] = deque(maxlen=self._length)  # those of the window
+        self._of_window: deque[list[float]] = deque(maxlen=self._length)  # of its images
 
     def next_query(self, strips: np.ndarray) -> float:
         """Return the change of the query's next image (W, d) from the one before, 1 at first."""
@@ -230,8 +232,8 @@ class ImageChange:
             return 0.0
         changes = [min(change, 1) for change in _means(self._of_window)]
         expected = [min(self.expected_change(speed * apart), 1) for apart in COMPARED]
-        noise = (1 - changes[0]) / max(1 - expected[0], LEAST_SIMILAR)
-        noise = min(max(noise, LEAST_LEFT), 1)
+        noise = (1 - changes[0]) / max(1 - expected[0], MIN_SIMILARITY)
+        noise = min(max(noise, MIN_SIMILARITY_RATIO), 1)
         logs = [
             math.log((1 - min((1 - change) / noise, 1) + OFFSET) / (each + OFFSET))
             for change, each in zip(changes, expected, strict=True)
@@ -243,26 +245,28 @@ class ImageChange:
         self._latest.append(change)
         logarithm = np.log(sum(self._latest) / len(self._latest) + OFFSET)
         off = (logarithm - self._expected[:, 0]) / self._settings.change_deviation
-        return np.asarray(np.exp(-0.5 * off**2) + FLOOR)
+        return np.asarray(np.exp(-0.5 * off**2) + MIN_SPEED_WEIGHT)
 
     def speed_likelihoods(self, change: float) -> np.ndarray:
         """
         Return the likelihood of each speed after another change, of the most likely one 1, (V,).
 
         The likelihood of the state off the map is 1. Compared are the logarithms of the changes of
-        images 1 to ``APART`` apart, each the mean of the latest ones, with those on the curve of
+        images 1 to ``MAX_LAG`` apart, each the mean of the latest ones, with those on the curve of
         the map. Light makes all of them smaller or larger, and noise larger: both count as
         Gaussian errors that the changes have in common.
         """
-        if len(self._moving) <= APART or not self._settings.speed_weight:
+        if len(self._moving) <= MAX_LAG or not self._settings.speed_weight:
             return np.ones(len(self._expected))
         newest = self._moving[-1]
-        before = [self._moving[-1 - apart] for apart in range(2, APART + 1)]
+        before = [self._moving[-1 - apart] for apart in range(2, MAX_LAG + 1)]
         self._by_apart.append([change, *(change_between(newest, image) for image in before)])
         self._of_window.append(self._by_apart[-1][: len(COMPARED)])
         off = np.log(np.array(_means(self._by_apart)) + OFFSET) - self._expected
         logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
-        likely = np.exp(self._settings.speed_weight * np.maximum(logs - logs.max(), LEAST_LIKELY))
+        likely = np.exp(
+            self._settings.speed_weight * np.maximum(logs - logs.max(), MIN_LOG_LIKELIHOOD)
+        )
         return np.asarray(likely)
 
 
@@ -278,7 +282,7 @@ def change_weights(changes: np.ndarray) -> np.ndarray:
     Nothing below a change from the place before of ``REST``, fully above ``SLOW`` of the large
     changes, and in proportion between; the largest, from one drive to another, do not matter.
 
-    :param changes: of each place from the one before, (n,); that of the first does not matter.
+    :param changes: of each place from the one before, (n,); the first does not matter.
     """
     large = float(np.quantile(changes, LARGE_CHANGE, method='lower')) if len(changes) else 0.0
     if not large:

@@ -3,8 +3,8 @@
 """
 Where the camera was: states of the place filter followed back over the latest images.
 
-For each image, an origin of every state is kept. Two of them share a byte, that of an even speed
-in the lower half and that of the next speed in the upper one::
+For each image, an origin of every state is kept. Two of them share a byte, the origin for
+an even speed in the lower half and for the next speed in the upper one::
 
     origin = 3 * step + speed    step 0: as far as the speed, 1: one place more, 2: one less
                                  speed 0: the same, 1: one lower, 2: one higher
@@ -25,7 +25,7 @@ ALL_ENTERED = ENTERED | ENTERED << 4  # two origins
 NO_PLACES: np.ndarray = np.empty(0, np.int64)
 TOP = 64  # places whose states are followed back
 NEGLIGIBLE = 1e-3  # of the most probable state: states below are not followed back
-CLOSE = 2  # places: the probability of a place is that of its neighbors within CLOSE, too
+CLOSE = 2  # places: the probability of a place includes its neighbors within CLOSE
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Belief:
 
     def probabilities(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the places of n whose probability, with that of close ones, is not 0.
+        Return the places of n whose probability, close ones included, is not 0.
 
         :returns: places, ascending, (m,), and their probabilities.
         """
@@ -65,8 +65,8 @@ def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
     order = np.argsort(states[:, 0], kind='stable')
     best, weights = np.empty(len(order), np.int64), np.zeros(len(order))
     count = _merge(states, probabilities, order, best, weights)
-    found = states[best[:count]]
-    return Belief(found[:, 0], weights[:count], found[:, 1:])
+    merged = states[best[:count]]
+    return Belief(merged[:, 0], weights[:count], merged[:, 1:])
 
 
 # ------------------------------------------------ kernels
@@ -118,35 +118,35 @@ def backtrack_states(a, least, tops, origins, steps, newest, count, states, prob
     :param probabilities: (m K V,), written: of these states.
     :returns: number of states that were on the map then.
     """
-    found = 0
+    total = 0
     for y in tops:
         for k in range(a.shape[1]):
             for v in range(a.shape[2]):
                 p = a[y // BLOCK, k, v, y % BLOCK]
                 if p >= least:
-                    states[found, 0], states[found, 1], states[found, 2] = y, k, v
-                    states[found, 3], states[found, 4] = y, v
-                    probabilities[found] = p
-                    found += 1
+                    states[total, 0], states[total, 1], states[total, 2] = y, k, v
+                    states[total, 3], states[total, 4] = y, v
+                    probabilities[total] = p
+                    total += 1
     _, blocks, _, halves, _ = origins.shape
     flat = origins.reshape(-1)
     for i in range(count):  # all together: each waits for its memory
-        slot, left = (newest - i) % len(origins), 0
+        slot, remaining = (newest - i) % len(origins), 0
         earlier = (newest - i - 1) % len(origins) * blocks
-        for at in range(found):
+        for at in range(total):
             speed, place = _before(
                 states[at, 1], states[at, 4], states[at, 0], origins[slot], steps[slot]
             )
             if place >= 0:
                 for column in range(1, 4):
-                    states[left, column] = states[at, column]
-                states[left, 0], states[left, 4] = place, speed
-                probabilities[left] = probabilities[at]
+                    states[remaining, column] = states[at, column]
+                states[remaining, 0], states[remaining, 4] = place, speed
+                probabilities[remaining] = probabilities[at]
                 row = ((earlier + place // BLOCK) * a.shape[1] + states[at, 1]) * halves
                 prefetch(flat, (row + speed // 2) * BLOCK + place % BLOCK)
-                left += 1
-        found = left
-    return found
+                remaining += 1
+        total = remaining
+    return total
 
 
 @kernel
@@ -173,21 +173,21 @@ def _merge(states, probabilities, order, best, weights):
     :param best, weights: of each place, its most probable state and its sum, written.
     :returns: number of places.
     """
-    found = -1
+    last = -1
     for i in order:
-        if found < 0 or states[i, 0] != states[best[found], 0]:
-            found += 1
-            best[found] = i
-        elif probabilities[i] > probabilities[best[found]]:
-            best[found] = i
-        weights[found] += probabilities[i]
-    return found + 1
+        if last < 0 or states[i, 0] != states[best[last], 0]:
+            last += 1
+            best[last] = i
+        elif probabilities[i] > probabilities[best[last]]:
+            best[last] = i
+        weights[last] += probabilities[i]
+    return last + 1
 
 
 @kernel
 def _sum_close(places, weights, n, near, sums):
     """Write the places below n within ``CLOSE`` of any place, and their sums, at most 1."""
-    found = low = end = 0
+    count = low = end = 0
     for place in places:
         for y in range(max(place - CLOSE, end), min(place + CLOSE + 1, n)):
             while places[low] < y - CLOSE:
@@ -196,9 +196,9 @@ def _sum_close(places, weights, n, near, sums):
             while i < len(places) and places[i] <= y + CLOSE:
                 total += weights[i]
                 i += 1
-            near[found], sums[found] = y, min(total, 1.0)
-            found, end = found + 1, y + 1
-    return found
+            near[count], sums[count] = y, min(total, 1.0)
+            count, end = count + 1, y + 1
+    return count
 
 
 @kernel

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-How near each place of a route is to the latest images, wherever they were taken.
+Running mean of z per place (hubness correction).
 
 Images of one light are nearer to each other than to all others, and certain places of that light
 are near to a whole stretch of images. A camera that moves passes a place in a few images: what is
@@ -44,12 +44,12 @@ class PlaceMeans:
             self._sums = _extended(self._sums, len(z))
         less: np.ndarray = z - self._sums[: len(z)] / np.float32(self._count + PRIOR)
         if len(z) and not is_standstill:
-            known = np.isfinite(z)
-            self._latest.append(np.where(known, np.maximum(z, NEAREST), np.float32(0)))
+            compared = np.isfinite(z)
+            self._latest.append(np.where(compared, np.maximum(z, NEAREST), np.float32(0)))
         if len(self._latest) > DELAY:
-            kept = np.float32(1 - 1 / IMAGES)
-            self._count = self._count * float(kept) + 1
-            self._sums *= kept
+            decay = np.float32(1 - 1 / IMAGES)
+            self._count = self._count * float(decay) + 1
+            self._sums *= decay
             self._sums += _extended(self._latest.popleft(), len(self._sums))
         return less
 

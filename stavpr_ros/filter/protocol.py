@@ -15,7 +15,7 @@ class Filter(Protocol):
 
     A state is a row of :attr:`Belief.states`; only its filter reads it.
 
-    ``settings`` are those of the model; ``count`` is the number of updates since the reset.
+    ``settings`` describe the model; ``count`` is the number of updates since the reset.
     """
 
     settings: FilterSettings
@@ -36,7 +36,7 @@ class Filter(Protocol):
             on the filter's device; +inf excludes a place.
         :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
-        :param speed_likelihoods: of each speed relative to that off the map, (V,).
+        :param speed_likelihoods: of each speed, relative to off the map, (V,).
         :param not_near: places below m whose z counts as 0 at least.
         """
 

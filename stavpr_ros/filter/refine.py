@@ -64,7 +64,7 @@ def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     Return the times of images, (m,), float64, ascending, in intervals of most of them.
 
     A camera that loses images still advances evenly in time: the stamps of a window show where
-    images are missing, and those of a map where places are. An interval is 1 where a stamp is
+    images are missing, the stamps of a map where places are. An interval is 1 where a stamp is
     unknown or not above the one before.
 
     :param stamps: ns, (m,), int64; 0 = unknown.
@@ -194,7 +194,7 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> fl
 
 @kernel
 def _normalize(masses: np.ndarray) -> float:
-    """Make a row's sum 1, that of a row of zeros evenly, and return the sum before."""
+    """Make a row's sum 1, evenly for a row of zeros, and return the sum before."""
     total = masses.sum()
     for s in range(len(masses)):
         masses[s] = masses[s] / total if total > 0 else 1 / len(masses)
@@ -209,10 +209,10 @@ def straight_offsets(
     """
     Add up the offsets of straight paths, each by the likelihood of the images.
 
-    They lead from a place near that of the oldest image to one near that of the newest, and pass
-    all places at one ratio of the time on the map to that of the query.
+    They lead from near the place of the oldest image to near the place of the newest, and pass all
+    places at one ratio of the time on the map to the time of the query.
 
-    :param likelihoods: those of :func:`smooth`; offsets beyond are excluded.
+    :param likelihoods: see :func:`smooth`; offsets beyond are excluded.
     :param path: place of each image, ascending, (l,), int64.
     :param times: of the images, (l,), and place_times: of the places, (n,); ascending.
     :param deviation: of the ends of a path, places.

@@ -51,8 +51,8 @@ class Whitening:
     @staticmethod
     def learned(strips: np.ndarray) -> 'Whitening':
         """Learn from unit-norm features of places, (W, m, d), m > 0."""
-        found = [_principal_directions(strip) for strip in strips]  # one by one: less memory
-        directions, gains = zip(*found, strict=True)
+        learned = [_principal_directions(strip) for strip in strips]  # one by one: less memory
+        directions, gains = zip(*learned, strict=True)
         return Whitening(np.stack(directions), np.stack(gains))
 
     def __call__(self, strips: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ class Whitening:
 
 
 def _principal_directions(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return those of (m, d), at most ``RANK``, (rank, d), float32, and their gains (rank,)."""
+    """Return ``RANK`` directions at most of (m, d), (rank, d), float32, and gains (rank,)."""
     samples = features.astype(np.float64)
     # of the places with each other: there are fewer of them than dimensions
     values, vectors = np.linalg.eigh(samples @ samples.T)
@@ -90,7 +90,7 @@ class MeanCentering:
     Features have unit norm again afterwards; zero features stay zero. All images of a camera at
     rest count as one: the mean would become its place.
 
-    :param features: those of the map, strips (W, n, d).
+    :param features: of the map, strips (W, n, d).
     :param centering, whitening: which of the two to apply.
     :param statistics: learned from the features before, for both; None = learn them.
     """

@@ -35,7 +35,7 @@ class CpuMatcher:
     """
     See :class:`stavpr_ros.prepare.matcher.Matcher`.
 
-    :param features: those of the map; contiguous float32 ones whose memory begins with a cache
+    :param features: of the map; contiguous float32 ones whose memory begins with a cache
         line are shared, not copied.
     """
 

@@ -34,13 +34,13 @@ def without_duplicates(place_map: PlaceMap) -> PlaceMap:
     positions = np.full((n, 3), np.nan) if place_map.poses is None else place_map.poses[:, :3]
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moved = MIN_MOTION * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    keeper, kept, last = np.arange(n), 0, np.empty((0, 0))
+    keeper, reference, last = np.arange(n), 0, np.empty((0, 0))
     for places, block in _centered(place_map, centering, 'drop duplicates'):
         for place, strips in zip(range(n)[places], block.swapaxes(0, 1), strict=True):
-            distance = np.linalg.norm(positions[place] - positions[kept])  # NaN = unknown
+            distance = np.linalg.norm(positions[place] - positions[reference])  # NaN = unknown
             if is_first[place] or change_between(strips, last) >= least or distance > moved:
-                kept, last = place, strips
-            keeper[place] = kept
+                reference, last = place, strips
+            keeper[place] = reference
     if place_map.same_as is not None:
         place_map = replace(place_map, same_as=_related(place_map.same_as, keeper))
     return select_places(place_map, np.flatnonzero(keeper == np.arange(n)))

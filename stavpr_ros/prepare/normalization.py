@@ -34,9 +34,9 @@ def _z_normalize(row: np.ndarray, counted: np.ndarray, z: np.ndarray) -> None:
     """Write a row with mean 0 and deviation 1 of its finite entries, in float64 until then."""
     total, squares, count = 0.0, 0.0, 0
     for i in range(len(row)):
-        known = counted[i] & np.isfinite(row[i])
-        total += row[i] if known else 0.0
-        count += known
+        counts = counted[i] & np.isfinite(row[i])
+        total += row[i] if counts else 0.0
+        count += counts
     mean = total / max(count, 1)
     for i in range(len(row)):
         off = row[i] - mean

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.filter.motion import APART
+from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.map_statistics import MapStatistics
@@ -21,9 +21,9 @@ from stavpr_ros.prepare.blocks import converted_blocks, PlaceChanges
 from stavpr_ros.prepare.centering import MeanCentering, RANK, SAMPLE, STRENGTH
 from stavpr_ros.prepare.int8_features import Int8Features, rounded
 
-METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {APART}, 2'
+METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {MAX_LAG}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
-LEAST_PLACES = 1000  # of a map whose statistics are kept: as long as those of 70 places
+LEAST_PLACES = 1000  # of a map whose statistics are kept: as large as 70 places
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ def prepare_map(
     if centers or whitens:
         centering = MeanCentering(features, centers, whitens, statistics)
     learns = learns_changes and statistics is None
-    changes = PlaceChanges(len(features) if learns else 0, APART)
+    changes = PlaceChanges(len(features) if learns else 0, MAX_LAG)
     prepared: LocalFeatures | Int8Features
     if (
         statistics is not None
@@ -80,13 +80,13 @@ def prepare_map(
 
 
 def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
-    found = features.statistics
+    statistics = features.statistics
     if features.has_stale_statistics:
         why = 'are of other features'
-    elif found is not None and found.method != METHOD:
-        why = f'were learned by another version ({found.method!a})'
+    elif statistics is not None and statistics.method != METHOD:
+        why = f'were learned by another version ({statistics.method!a})'
     else:
-        return found, ''
+        return statistics, ''
     path = features.file.path
     return None, f'the statistics in {path} {why}: learned again; map compact renews them'
 
@@ -140,11 +140,11 @@ def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics |
     features = place_map.features
     stored = features.storage if isinstance(features, StoredFeatures) else 'float32'
     if (storage or stored) == stored and getattr(features, 'statistics', None) is not None:
-        known, note = _usable(features)  # type: ignore[arg-type]
+        statistics, note = _usable(features)  # type: ignore[arg-type]
         if not note:
-            return known
+            return statistics
     features = _AsStored(features, storage or stored)
-    centering, changes = MeanCentering(features), PlaceChanges(len(features), APART)
+    centering, changes = MeanCentering(features), PlaceChanges(len(features), MAX_LAG)
     for _, strips in converted_blocks(features, lambda block: centering.places(block).strips):
         changes.add(strips)
     assert centering.whitening is not None

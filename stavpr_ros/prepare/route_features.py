@@ -11,7 +11,7 @@ are places, so that a place is seldom rounded again.
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.filter.motion import APART, change_weights
+from stavpr_ros.filter.motion import change_weights, MAX_LAG
 from stavpr_ros.prepare.centering import evenly_weighted, norms_of, unit_norm, Whitening
 from stavpr_ros.prepare.route_strips import grown, move_up, rounded_strips, RouteStrips
 
@@ -19,7 +19,7 @@ ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
 SAMPLE = 128  # places that whitening is learned from
 SETTLED = 2000  # places from which on it is not learned again; a full route is settled as well
-LATEST = APART + 1  # places that the newest one is compared with, itself included
+LATEST = MAX_LAG + 1  # places that the newest one is compared with, itself included
 AT_ONCE = 64  # places whitened at a time
 PIECE = 512  # places centered at a time: the intermediate results stay in the cache
 
@@ -133,20 +133,20 @@ class RouteFeatures:
         return grows
 
     def _write(self, first: int, strips: np.ndarray) -> None:
-        """Make strips (W, m, d) those of the places from ``first`` on."""
+        """Write strips (W, m, d) of the places from ``first`` on."""
         if isinstance(self.strips, np.ndarray):
             self.strips[:, first : first + strips.shape[1]] = strips
         else:
             self.strips.write(first, strips)
 
     def evict(self, count: int) -> None:
-        """Drop the oldest places; the mean is then that of the others until the next eviction."""
-        kept = self.count - count
-        self._weights[:, :kept] = self._weights[:, count : self.count].copy()
+        """Drop the oldest places; the mean is of the others until the next eviction."""
+        remaining = self.count - count
+        self._weights[:, :remaining] = self._weights[:, count : self.count].copy()
         self._sum -= self._total(np.ones(count))
-        self._changes[:kept] = self._changes[count : self.count].copy()
+        self._changes[:remaining] = self._changes[count : self.count].copy()
         if (self._centering or self._whitens) and not self._is_settled:
-            self.count = kept
+            self.count = remaining
             self._learn(count)
             self._next_mean = self.count + count + 1
             return
@@ -155,7 +155,7 @@ class RouteFeatures:
         else:
             self.strips.evict(count)
         move_up(self._norms, count, self.count)
-        self.count = kept
+        self.count = remaining
 
     def _whitened(self, strips: np.ndarray) -> np.ndarray:
         return self._whitening(strips) if self._whitening else strips

@@ -148,7 +148,7 @@ class FilterWindow(QueryWindow):
 
     def match(self, nms_radius: int) -> WindowMatch:
         """
-        Return the match of the middle image; that of a camera at rest, for as long as it rests.
+        Return the match of the middle image; of a camera at rest, the match before it stopped.
 
         A window of equal images would show neither how even the path to them was nor how fast.
         """

@@ -42,7 +42,7 @@ class LoopCloser(SequenceRecognizer):
     images and ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is
     full; the mean that is subtracted (option ``mean_centering``) is updated when the route is an
     eighth longer, as is ``whitening`` until it is settled. The closer is the owner of the route's
-    features; :meth:`features` returns them as they came.
+    features; :meth:`features` returns the original ones.
 
     With a ``limit``, the oldest eighth of the places is evicted whenever there are so many. Places
     are numbered from the start of the route all the same: a number never comes to mean another
@@ -100,7 +100,7 @@ class LoopCloser(SequenceRecognizer):
         return self._window.buffer.first
 
     def features(self) -> LocalFeatures:
-        """Return the features of the places, strips (W, n, d), as they came."""
+        """Return the features of the places, strips (W, n, d), neither centered nor whitened."""
         return self._route.original()
 
     def reset(self) -> None:

@@ -146,7 +146,7 @@ class Match:
     :param probability: that the nearest sequence is the right place; NaN in mode paper. It has
         memory: successive values are correlated.
     :param min_probability: mode robust: a window is matched above this probability.
-    :param path_ratios: probability of each place of the path over that of the matched place, (m,);
+    :param path_ratios: probability of each place of the path over the matched place's, (m,);
         empty in mode paper.
     :param is_late: it is one of the late matches of another.
     :param late: loop closure: matches of earlier images that had none until now.
@@ -154,7 +154,7 @@ class Match:
     :param window_changes: difference of each of them from the image before it, 0 = equal; empty in
         mode paper.
     :param image_index: place of a growing map that this image has become, -1 = none.
-    :param is_oldest: the place is that of the oldest image of the window, not of the middle one.
+    :param is_oldest: it is the place of the oldest image of the window, not of the middle one.
     :param columns: of a late match: image distances of its window to places from ``first_column``
         on, (l, k), float32.
     """
@@ -219,9 +219,9 @@ class Match:
         :returns: +inf where they are not known.
         """
         columns = places - self.first_column
-        known = (columns >= 0) & (columns < self.columns.shape[1])
+        inside = (columns >= 0) & (columns < self.columns.shape[1])
         rows: np.ndarray = np.full((len(self.columns), len(places)), np.inf, np.float32)
-        rows[:, known] = self.columns[:, columns[known]]
+        rows[:, inside] = self.columns[:, columns[inside]]
         return rows
 
     def at(self, position: int) -> 'Match':
@@ -276,15 +276,15 @@ def ranked_candidates(
         return []
     costs, places, probabilities = sequences
     costs, at_position = costs.copy(), positions(places)
-    found = [nearest]
-    while len(found) < count and len(costs):
-        costs[np.abs(at_position - positions(found[-1].place)) <= nms_radius] = np.inf
+    ranked = [nearest]
+    while len(ranked) < count and len(costs):
+        costs[np.abs(at_position - positions(ranked[-1].place)) <= nms_radius] = np.inf
         best = int(np.argmin(costs))
         if math.isinf(costs[best]):
             break
         probability = math.nan if probabilities is None else float(probabilities[best])
-        found.append(Candidate(int(places[best]), float(costs[best]), probability))
-    return found
+        ranked.append(Candidate(int(places[best]), float(costs[best]), probability))
+    return ranked
 
 
 def distinct_places(sequences: WindowSequences, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -109,7 +109,7 @@ class SequenceRecognizer(ABC):
 
         An error changes nothing.
 
-        :param features: those of one image, strips (W, 1, d).
+        :param features: of one image, strips (W, 1, d).
         :param stamp: when it was taken, ns; 0 = unknown.
         :param pose: by odometry, shape (7,), z is up; None = unknown.
         :raises FeatureMismatchError: made with other settings than the places.
@@ -206,7 +206,7 @@ class SequenceRecognizer(ABC):
             require_type('features', features, LocalFeatures, expected)
         features.require_same_settings(self._feature_settings, where)
         if len(features) != 1:
-            raise InputError(f'features of {len(features)} images: expected those of one')
+            raise InputError(f'features of {len(features)} images: expected one image')
         require_finite(features, 'the image')
 
     def _match(self, position: np.ndarray) -> Match:
@@ -352,7 +352,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
     ) -> None:
         """
-        Change the limits; without a threshold, mode paper takes that of the map.
+        Change the limits; without a threshold, mode paper takes the map's.
 
         :raises SettingsError: out of range.
         """
@@ -364,7 +364,7 @@ class PlaceRecognizer(SequenceRecognizer):
         """
         Return a recognizer with a window of its own, of the same features in memory.
 
-        :param place_map: that of this recognizer: of mode robust, on the CPU, without time budget.
+        :param place_map: of this recognizer: of mode robust, on the CPU, without time budget.
         """
         other, window = copy.copy(self), _window_of(place_map, self._settings, 'cpu')
         assert isinstance(window, FilterWindow)
@@ -425,7 +425,7 @@ class PlaceRecognizer(SequenceRecognizer):
         """
         Return the distances of images to every place; centered, if at all, by the map's mean.
 
-        :param features: those of Q images, strips (W, Q, d), made with the settings of the map.
+        :param features: of Q images, strips (W, Q, d), made with the settings of the map.
         :returns: shape (Q, n), float32.
         :raises FeatureMismatchError: made with other settings.
         :raises InputError: features that are not finite.

@@ -29,7 +29,7 @@ class RelativeMotion:
     Compares the trajectory of a query by odometry with the paths of its matches.
 
     A disagreement stays in the test for ``LONGEST`` windows: while matches continue each other,
-    the trajectory since the first of them is compared beside that of the window.
+    the trajectory since the first of them is compared beside the window's.
 
     :param length: images in a window, l.
     :param error: see :func:`agreement`.
@@ -109,7 +109,7 @@ def agreement(
     It is the share of queries on the right path whose trajectory would fit the map less. The
     trajectory by odometry is laid along the track, from the middle image of the window on. Two
     properties are compared: its shape, less one rotation and shift, and its length from the middle
-    image to the newest with that of the path. With the deviations sigma_i = hypot(``ALONG``
+    image to the newest with the path's. With the deviations sigma_i = hypot(``ALONG``
     spacings, ``error`` s_i) of an image s_i meters from the middle one, the sum
 
         chi^2 = 2 mean_i (|r_i| / sigma_i)^2 + (length - length of path)^2 / sigma^2
@@ -158,6 +158,6 @@ def _variance(along: float, drift: np.ndarray | float) -> np.ndarray:
 
 def _lengths(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows of (m, 2) that are known, and the distance driven until each, meters."""
-    known = np.flatnonzero(np.isfinite(positions[:, 0]))
-    steps = np.linalg.norm(np.diff(positions[known], axis=0), axis=1)
-    return known, np.concatenate([[0.0], np.cumsum(steps)])[: len(known)]
+    rows = np.flatnonzero(np.isfinite(positions[:, 0]))
+    steps = np.linalg.norm(np.diff(positions[rows], axis=0), axis=1)
+    return rows, np.concatenate([[0.0], np.cumsum(steps)])[: len(rows)]

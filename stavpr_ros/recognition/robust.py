@@ -43,13 +43,13 @@ class RobustOptions:
 
     def without(self, *names: str) -> 'RobustOptions':
         """
-        Return these options without those of certain names.
+        Return these options without certain ones.
 
         :raises SettingsError: no option of that name.
         """
-        known = [field.name for field in fields(self)]
+        options = [field.name for field in fields(self)]
         for name in names:
-            require_choice('option', name, known)
+            require_choice('option', name, options)
         return replace(self, **dict.fromkeys(names, False))
 
 

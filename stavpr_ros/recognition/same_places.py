@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Relates places of a session to those of earlier sessions with the same view, by recognition."""
+"""Relates places of a session to places of earlier sessions with the same view, by recognition."""
 
 from dataclasses import replace
 
@@ -29,9 +29,9 @@ def with_same_places(place_map: PlaceMap) -> PlaceMap:
     for session in tqdm(numbers, desc='same places', unit='session', disable=None):
         earlier, places = np.flatnonzero(index < session), np.flatnonzero(index == session)
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
-        found = _recognized(reference, place_map, places)
-        known = found >= 0
-        same_as[places[known]] = same_as[earlier[found[known]]]
+        matched = _recognized(reference, place_map, places)
+        is_matched = matched >= 0
+        same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 
@@ -39,11 +39,11 @@ def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) ->
     """Return the place of a reference that each image shows, -1 = none, (m,)."""
     settings = RecognizerSettings(min_probability=SURE)
     recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length
-    found, near = (np.full(len(images), -1) for _ in range(2))
+    matched, near = (np.full(len(images), -1) for _ in range(2))
     for i, image in enumerate(images.tolist()):
         match = recognizer.update(place_map.features[image : image + 1])
         if match.accepted and len(match.window_stamps) == length:
             window = i - len(match.window_stamps) + 1 + match.path[:, 0]
             near[window] = match.path[:, 1]
-            found[window[(len(window) - 1) // 2]] = match.place_index
-    return np.where(found >= 0, found, near)
+            matched[window[(len(window) - 1) // 2]] = match.place_index
+    return np.where(matched >= 0, matched, near)

@@ -39,7 +39,7 @@ class RecognizerSettings:
         (:func:`stavpr_ros.recognition.error_rate.least_probability`), 0 = off. A
         ``min_probability`` other than the default applies as well where it is stricter.
     :param error_risks: of drives with these settings, for ``max_error``; :class:`PlaceRecognizer`
-        takes those of its map.
+        takes its map's.
     """
 
     threshold: float | None = None
@@ -100,9 +100,9 @@ class RecognizerSettings:
         """Return the probability above which mode robust matches a window."""
         if not self.max_error:
             return self.min_probability
-        given = self.min_probability != RecognizerSettings.min_probability
+        is_set = self.min_probability != RecognizerSettings.min_probability
         probability = least_probability(self.max_error, self._own_risks)
-        return max(probability, self.min_probability if given else 0)
+        return max(probability, self.min_probability if is_set else 0)
 
     @property
     def method(self) -> str:

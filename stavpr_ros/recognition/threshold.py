@@ -13,7 +13,7 @@ from tqdm import tqdm
 WINDOWS = 24  # that are tried
 
 
-def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
+def alter_image(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:
     """
     Alter an image as another day and another lane might.
 
@@ -24,9 +24,10 @@ def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
     """
     height, width = image.shape[:2]
     shift = round(0.15 * width)
-    kept = image[:, shift:] if variant % 2 else image[:, : width - shift]
+    visible = image[:, shift:] if variant % 2 else image[:, : width - shift]
     value: np.ndarray = (
-        cv2.resize(kept, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
+        cv2.resize(visible, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32)
+        / 255
     )
     value **= 1.6 if variant // 2 % 2 else 0.6
     shade = cv2.resize(rng.normal(0, 0.4, (4, 5)), (width, height), interpolation=cv2.INTER_CUBIC)
@@ -38,15 +39,15 @@ def harder_look(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
 
 def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
     """
-    Ask how near the map's places come to *other* places of it when they look different.
+    Estimate the distances of wrong matches from altered windows of the map.
 
-    Windows spread over the map are altered (:func:`harder_look`, on the thumbnails) and matched
-    with the map without their own nms_radius. All those answers are wrong; the suggestion is the
-    median of their distances. It is a start: where precision matters, evaluate with a second real
-    drive.
+    Windows spread over the map are altered (:func:`alter_image`, on the thumbnails) and matched
+    with the places outside their own nms_radius. All these matches are false positives; the
+    suggestion is the median of their distances. It is a start: where precision matters, evaluate
+    with a second real drive.
 
     :param model: file of the network, see :meth:`PlaceMap.extractor`.
-    :raises InputError: the map has no thumbnails, or is too short to have an elsewhere.
+    :raises InputError: the map has no thumbnails, or has no place outside nms_radius.
     """
     settings = RecognizerSettings(mode='paper')
     sequence = settings.sequence
@@ -60,15 +61,15 @@ def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
     recognizer = PlaceRecognizer(place_map, settings)
     extractor = place_map.extractor(model=model)
     rng = np.random.default_rng(0)
-    elsewhere = []
+    distances = []
     starts = np.unique(np.linspace(0, n - l, min(WINDOWS, n - l + 1)).astype(int))
     for variant, start in enumerate(tqdm(starts, desc='threshold', unit='window', disable=None)):
         images = [place_map.thumbnail(place) for place in range(start, start + l)]
-        altered = [harder_look(image, variant, rng) for image in images if image is not None]
+        altered = [alter_image(image, variant, rng) for image in images if image is not None]
         features = extractor.extract(altered)
         window = recognizer.distances(features)
         window[:, max(0, start - l) : start + 2 * l] = np.inf
         nearest = best_match(match_sequence(window, sequence), settings.nms_radius)
         if nearest is not None:
-            elsewhere.append(nearest.distance)
-    return float(np.median(elsewhere))
+            distances.append(nearest.distance)
+    return float(np.median(distances))

@@ -164,7 +164,7 @@ def mutual_matches(
         )
         mutual = back[:, 0] == clear
         return clear[mutual], matched[mutual]
-    # squares of L2 by one product: exact, as those of SIFT are whole numbers below 2**24
+    # squares of L2 by one product: exact: SIFT's are whole numbers below 2**24
     squares = mine @ theirs.T
     squares *= -2
     squares += (mine * mine).sum(axis=1)[:, None]
@@ -221,7 +221,7 @@ def _detector(method: str) -> Any:
 
 
 def _explained(points: np.ndarray, others: np.ndarray) -> int:
-    """Count matches that the best fundamental matrix explains; also those of a flat scene."""
+    """Count matches that the best fundamental matrix explains; also of a flat scene."""
     try:
         _, mask = cv2.findFundamentalMat(
             points, others, cv2.USAC_MAGSAC, PIXELS, CONFIDENCE, ITERATIONS
