@@ -94,7 +94,7 @@ class ImageResult:
         """Return the result of mode robust with another probability, matched or not by it."""
         assert self.match is not None
         distance, limits = 1 - probability, Limits(self.threshold, self.match.min_probability)
-        status, reason = limits.judge(distance, probability)
+        status, reason = limits.decide(distance, probability)
         return replace(
             self, status=status, reason=reason, distance=distance, probability=probability
         )

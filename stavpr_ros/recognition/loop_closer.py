@@ -202,7 +202,7 @@ class LoopCloser(SequenceRecognizer):
         )
         if match.nearest is None:
             return []
-        status, reason = self._limits.judge(match.nearest.distance, match.probability)
+        status, reason = self._limits.decide(match.nearest.distance, match.probability)
         if status is not Status.MATCH:
             return []
         oldest = Verdict(

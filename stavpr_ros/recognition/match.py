@@ -109,7 +109,7 @@ class Limits(NamedTuple):
         """Return these limits, the probability not below another one."""
         return Limits(1 - probability, probability) if probability > self.probability else self
 
-    def judge(self, distance: float, probability: float) -> tuple[Status, str]:
+    def decide(self, distance: float, probability: float) -> tuple[Status, str]:
         """
         Return ``MATCH`` or ``NO_MATCH``, and the reason for the latter.
 
@@ -240,7 +240,7 @@ class Match:
         """Return the match of mode robust with another probability, accepted or not by it."""
         distance = 1 - probability
         limits = Limits(self.threshold, self.min_probability)
-        status, reason = limits.judge(distance, probability)
+        status, reason = limits.decide(distance, probability)
         return replace(
             self, status=status, reason=reason, distance=distance, probability=probability
         )

@@ -225,22 +225,22 @@ class SequenceRecognizer(ABC):
         reason = f'{fill} of {length} images in the window'
         verdict = Verdict(WindowMatch(), self._limits, Status.WARMING_UP, reason)
         if window.buffer.full:
-            verdict = self._judged(window.match(radius), self._limits)
+            verdict = self._verdict(window.match(radius), self._limits)
         if verdict.status is not Status.MATCH:
             newest = window.match_newest(radius)
             if newest.nearest is not None:
-                early = self._judged(newest, self._limits.raised(EARLY))
+                early = self._verdict(newest, self._limits.raised(EARLY))
                 verdict = early if early.status is Status.MATCH else verdict
         self._newest = verdict
         return verdict
 
-    def _judged(self, match: WindowMatch, limits: Limits) -> 'Verdict':
-        """Judge what a window showed, by the limits and by odometry."""
+    def _verdict(self, match: WindowMatch, limits: Limits) -> 'Verdict':
+        """Decide on what a window showed, by the limits and by odometry."""
         limits = limits.raised(match.min_probability)
         if match.nearest is None:
             return Verdict(match, limits, Status.NO_MATCH, self.no_places)
         distance, probability = match.nearest.distance, match.probability
-        status, reason = limits.judge(distance, probability)
+        status, reason = limits.decide(distance, probability)
         if len(self._motion.positions) and np.isfinite(self._motion.trajectory[-1][0]):
             accepted, layout = status is Status.MATCH, self._window.layout
             agreed = self._motion.agreement(
@@ -253,7 +253,7 @@ class SequenceRecognizer(ABC):
             if agreed < UNUSUAL:
                 probability = with_odometry_test(probability, agreed)
                 distance = 1 - probability
-                status, reason = limits.judge(distance, probability)
+                status, reason = limits.decide(distance, probability)
                 if accepted and status is not Status.MATCH:
                     reason += ': odometry disagrees with its path'
         return Verdict(match, limits, status, reason, distance, probability)
