@@ -30,7 +30,8 @@ WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(s
 # Commands of other packages run here as well, if these are installed.
 EXECUTABLES = (
     'node', 'build_map', 'map', 'replay', 'record', 'warm',
-    'weights', 'monitor', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph', 'bridge'
+    'weights', 'monitor', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph',
+    'bridge', 'build_descriptor_map',
 )  # fmt: skip
 BY_COLCON = not {'--build-base', '--build-directory'}.isdisjoint(sys.argv)
 MESSAGES = 'share/ament_index/resource_index/packages/stavpr_msgs'

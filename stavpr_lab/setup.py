@@ -8,7 +8,9 @@ from setuptools import find_packages, setup
 
 MANIFEST = ElementTree.parse('package.xml')
 NAME = 'stavpr_lab'
-EXECUTABLES = ('demo', 'evaluate', 'experiments', 'export_model', 'monitor', 'weights')
+EXECUTABLES = (
+    'build_descriptor_map', 'demo', 'evaluate', 'experiments', 'export_model', 'monitor', 'weights'
+)  # fmt: skip
 
 setup(
     name=NAME,
@@ -40,6 +42,7 @@ setup(
         'tqdm>=4.66',
     ],
     extras_require={
+        'hdf5': ['h5py>=3.10'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'slam': ['evo>=1.31', 'stavpr_slam'],
     },

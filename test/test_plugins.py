@@ -82,7 +82,7 @@ def test_address_without_stavpr_fleet_names_it(monkeypatch, address):
 
 
 def test_kind_of_features_of_another_package_is_listed_and_loaded(plugged):
-    assert 'plain' in kinds(from_images=True)
+    assert 'plain' in kinds()
     assert settings_class('plain').__name__ == 'GradientSettings'
     assert backbone_class('plain').__name__ == 'Gradient'
 

@@ -45,7 +45,6 @@ examples:
   build_map --input drive.bag --topic /camera/image_raw --output route.stavpr
   build_map --input drive.bag --output route.stavpr --odometry /odom \\
       --keyframe-distance 1 --keyframe-angle 15
-  build_map --input netvlad.mat:features --output route.stavpr --descriptors-source netvlad
   build_map --input drive/ --output route.stavpr --projection 512 --features onnx \\
       --onnx-model squeezenet.onnx --onnx-layer fire6/concat_1
   build_map --input drives/*.bag --output maps/ --processes 4
@@ -68,9 +67,8 @@ def _parser() -> argparse.ArgumentParser:
         '--input',
         required=True,
         nargs='+',
-        metavar='FOLDER|VIDEO|BAG|ARRAY',
-        help='images, a video, a ROS 1 or ROS 2 bag, or descriptors: .npy .npz .csv .mat, or '
-        'FILE:NAME; several: a map of each',
+        metavar='FOLDER|VIDEO|BAG',
+        help='images, a video, a ROS 1 or ROS 2 bag; several: a map of each',
     )
     parser.add_argument(
         '--output',
@@ -245,31 +243,6 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     return place_map, journal
 
 
-def _build_of_descriptors(arguments: argparse.Namespace) -> 'PlaceMap':
-    """Return a map of descriptors that another program computed."""
-    import numpy as np
-    from stavpr_ros.checks import require_at_least
-    from stavpr_ros.commands.feature_options import require_descriptors_alone
-    from stavpr_ros.features.descriptors import read_descriptors
-    from stavpr_ros.mapping import descriptor_map
-
-    require_replaceable(arguments.output, MAP, arguments.force)
-    require_descriptors_alone(arguments, arguments.input)
-    keyframes = (f'keyframe_{rule}' for rule in RULES)
-    for name in ('topic', 'fps', 'odometry', 'thumbnail_width', 'skip_bad_images', *keyframes):
-        if getattr(arguments, name):
-            raise SettingsError(
-                f'--{name.replace("_", "-")}: {arguments.input} holds descriptors, not images; '
-                'leave it out'
-            )
-    require_at_least('--every', arguments.every, 1)
-    source, bits = arguments.descriptors_source or '', bool(arguments.descriptors_bits)
-    features = read_descriptors(arguments.input, source, bits)
-    poses = _poses(arguments, len(features))
-    assert poses is None or isinstance(poses, np.ndarray)
-    return descriptor_map(features[:: arguments.every], poses)
-
-
 def _source_of(arguments: argparse.Namespace) -> str:
     """Describe the images and the options: only the same are continued after an interruption."""
     given = vars(arguments) | {'input': str(Path(arguments.input).resolve())}
@@ -333,20 +306,15 @@ def main(args: list[str] | None = None) -> int:
         if len(arguments.input) > 1:
             return _build_each(arguments, sys.argv[1:] if args is None else args)
         arguments.input = arguments.input[0]
-        from stavpr_ros.features.descriptors import is_descriptors
         from stavpr_ros.mapping import save_map
         from stavpr_ros.prepare.prepared_map import statistics_of_map
 
-        if is_descriptors(arguments.input):
-            place_map, journal = _build_of_descriptors(arguments), None
-        else:
-            state = 'nothing was written; the same command continues the work'
-            place_map, journal = _build(arguments)
+        state = 'nothing was written; the same command continues the work'
+        place_map, journal = _build(arguments)
         place_map = replace(place_map, threshold=_suggested(place_map, arguments))
         statistics = statistics_of_map(place_map)
         save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
-        if journal is not None:
-            journal.unlink()
+        journal.unlink()
         state = f'{arguments.output} is written'
         _report(place_map, arguments.output)
         return None

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from stavpr_ros.features import FeatureExtractor
 
 
-def _boolean(text: str) -> bool:
+def boolean(text: str) -> bool:
+    """Convert ``true`` or ``false``."""
     if text.lower() not in ('true', 'false'):
         raise argparse.ArgumentTypeError(f'{text!r} must be true or false')
     return text.lower() == 'true'
@@ -25,7 +26,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     return tuple(float(part) for part in text.split(','))
 
 
-CONVERTERS = {bool: _boolean, tuple: _numbers}
+CONVERTERS = {bool: boolean, tuple: _numbers}
 
 
 def add_feature_options(parser: argparse.ArgumentParser) -> None:
@@ -78,21 +79,6 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
         arguments.seed,
         arguments.device,
     )
-
-
-def require_descriptors_alone(arguments: argparse.Namespace, path: str) -> None:
-    """
-    Reject options of other features beside descriptors, which come as they are.
-
-    :raises SettingsError: names the option.
-    """
-    given = kind_options(arguments)
-    given |= {'--strips': arguments.strips, '--projection': arguments.projection}
-    for option, value in given.items():
-        if value is not None and not option.startswith('--descriptors-'):
-            raise SettingsError(f'{option}: {path} holds descriptors as they are; leave it out')
-    if arguments.features not in (None, 'gradient', 'descriptors'):
-        raise SettingsError(f'--features {arguments.features}: {path} holds descriptors')
 
 
 def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -16,6 +16,7 @@ ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 PACKAGES = {
     'weights': 'stavpr_lab',
     'export_model': 'stavpr_lab',
+    'build_descriptor_map': 'stavpr_lab',
     'evaluate': 'stavpr_lab',
     'experiments': 'stavpr_lab',
     'demo': 'stavpr_lab',

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, TYPE_CHECKING
 
 from stavpr_ros import plugins
 from stavpr_ros.checks import require_at_least, require_between, require_choice
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import SettingsError, UnavailableError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -134,7 +134,7 @@ class OnnxSettings(NetworkSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class DescriptorSettings:
-    """Settings of features that another program computed, read from arrays."""
+    """Settings of features that another program computed, see ``build_descriptor_map``."""
 
     BEFORE: ClassVar[dict[str, Any]] = {'bits': False}
 
@@ -148,13 +148,12 @@ class Kind:
     A kind of features.
 
     :param settings: the frozen dataclass of its settings.
-    :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use.
-    :param from_images: False for features that a node cannot extract.
+    :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use;
+        '' for features that are not computed from images.
     """
 
     settings: Any
-    backbone: str
-    from_images: bool = True
+    backbone: str = ''
 
 
 LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
@@ -164,9 +163,7 @@ _FEATURES = 'stavpr_ros.features'
 KINDS = {
     'gradient': Kind(GradientSettings, f'{_FEATURES}.gradient:Gradient'),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
-    'descriptors': Kind(
-        DescriptorSettings, f'{_FEATURES}.descriptors:Descriptors', from_images=False
-    ),
+    'descriptors': Kind(DescriptorSettings),
 }
 
 
@@ -189,13 +186,9 @@ class Backbone(Protocol):
         ...
 
 
-def kinds(*, from_images: bool = False) -> tuple[str, ...]:
-    """
-    Return the names of the kinds.
-
-    :param from_images: only those that are extracted from images.
-    """
-    return tuple(name for name, kind in _all().items() if kind.from_images or not from_images)
+def kinds() -> tuple[str, ...]:
+    """Return the names of the kinds that are computed from images."""
+    return tuple(name for name, kind in _all().items() if kind.backbone)
 
 
 def _all() -> dict[str, Kind]:
@@ -229,8 +222,15 @@ def backbone_class(kind: str) -> Any:
     Return the class of a kind, a :class:`Backbone`; imports its module.
 
     :raises SettingsError: no such kind.
+    :raises UnavailableError: its features are not computed from images.
     """
-    return plugins.resolve(_kind(kind).backbone)
+    if not (backbone := _kind(kind).backbone):
+        raise UnavailableError(
+            f'features {kind!r} come from arrays that another program computed, not from images: '
+            'give arrays of map and query both (evaluate --map FILE --query FILE), or make the '
+            'map with the network itself'
+        )
+    return plugins.resolve(backbone)
 
 
 def settings_from_json(kind: str, text: str, model: str = '') -> Any:

@@ -220,7 +220,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     :raises UnavailableError: the backend is not available.
     """
     for name, value in values.items():
-        allowed = kinds(from_images=True) if name == 'features' else BY_NAME[name].choices
+        allowed = kinds() if name == 'features' else BY_NAME[name].choices
         if allowed:
             require_choice(name, value, allowed)
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}

@@ -7,6 +7,7 @@ from stavpr_ros.commands import Command
 TEXTS = {
     'weights': 'download the published weights of a network',
     'export_model': 'make one ONNX file of a network of vectors and maps',
+    'build_descriptor_map': 'make a map of descriptors that another program computed',
     'evaluate': 'evaluate the recognition of one traverse on the map of another',
     'experiments': "reproduce the paper's tables on local data sets",
     'monitor': 'show the node in a web browser',

@@ -77,6 +77,7 @@ exit codes: 0 done, 1 failed (the reason is printed), 2 usage, 130 interrupted
 
 
 def _parser() -> argparse.ArgumentParser:
+    from stavpr_lab.commands.build_descriptor_map import add_descriptor_options
     from stavpr_lab.commands.evaluate_export import FORMATS
     from stavpr_ros.commands.feature_options import add_feature_options
 
@@ -126,6 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--window', type=int, metavar='I', help='plot the warping path around query image I')
     add_job_options(parser)
     add_feature_options(parser)
+    add_descriptor_options(parser)
     return parser
 
 

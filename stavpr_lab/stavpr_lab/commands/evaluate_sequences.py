@@ -12,15 +12,11 @@ import numpy as np
 from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
+from stavpr_lab.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.commands.feature_options import (
-    kind_options,
-    make_extractor,
-    require_descriptors_alone,
-)
+from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import open_source
@@ -169,8 +165,15 @@ class _Loader:
 
     def _read(self, path: str) -> PlaceMap:
         """Read descriptors; those of the map and the query must be comparable."""
-        require_descriptors_alone(self._arguments, path)
-        source, bits = self._arguments.descriptors_source, self._arguments.descriptors_bits
+        given = self._arguments
+        names = 'features', 'strips', 'projection'
+        options = {f'--{name}': getattr(given, name) for name in names} | kind_options(given)
+        for option, value in options.items():
+            if value is not None:
+                raise SettingsError(
+                    f'{option}: {path} holds descriptors as they are; leave it out'
+                )
+        source, bits = given.descriptors_source, given.descriptors_bits
         first = self._saved
         if first is not None and first.settings.kind == 'descriptors':
             own = first.settings.backbone
@@ -199,10 +202,10 @@ class _Loader:
                     f'--{name} {requested}: the map {path} was made with {present}; leave it out'
                 )
         # a map does not state where its model is
-        usable = f'--{found.settings.kind}-model', '--descriptors-source', '--descriptors-bits'
+        usable = f'--{found.settings.kind}-model'
         options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
         for option, value in options.items():
-            if value is not None and option not in usable:
+            if value is not None and option != usable:
                 raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
         self._saved = found
         return found
@@ -254,10 +257,10 @@ def _of_paths(
     drive = DriveChanges().apply(ground_truth)
     odometry = None
     if arguments.odometry is not None:
-        odometry = _poses(arguments.odometry, query, 'query', None)
+        odometry = poses_of(arguments.odometry, query, 'query', None)
         if reference is not None:
             reference = replace(
-                reference, poses=_poses(arguments.map_poses, reference, 'map', None)
+                reference, poses=poses_of(arguments.map_poses, reference, 'map', None)
             )
     return Sequences(reference, query, unknown, drive, tolerance, title, times, odometry)
 
@@ -277,14 +280,16 @@ def _ground_truth(
     if arguments.truth != 'poses':
         return GroundTruth.from_file(arguments.truth, N, n, tolerance)
     same = reference is query
-    queries = _poses(arguments.query_poses, query, 'query', arguments.degrees)
+    queries = poses_of(arguments.query_poses, query, 'query', arguments.degrees)
     path = arguments.query_poses if same else arguments.map_poses
-    places = _poses(path, reference, 'map', arguments.degrees)
+    places = poses_of(path, reference, 'map', arguments.degrees)
     found = GroundTruth.from_poses(queries, places, arguments.meters, arguments.degrees)
     return found.widened(tolerance)
 
 
-def _poses(path: str | None, place_map: PlaceMap, name: str, degrees: float | None) -> np.ndarray:
+def poses_of(
+    path: str | None, place_map: PlaceMap, name: str, degrees: float | None
+) -> np.ndarray:
     """Return the poses of an input, from a file or from the saved map."""
     if path is None:
         if place_map.poses is None or not place_map.has_poses:

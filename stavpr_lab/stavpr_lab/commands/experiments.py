@@ -142,7 +142,7 @@ def _check(options: argparse.Namespace) -> dict[str, str]:
 
 def _arrays(folder: Path) -> tuple[str, str] | None:
     """Return the descriptors of map and query in a folder; None where one is missing."""
-    from stavpr_ros.features.descriptors import is_descriptors
+    from stavpr_lab.features.descriptors import is_descriptors
 
     places, queries = (
         [str(path) for path in sorted(folder.glob(f'{name}.*')) if is_descriptors(str(path))]

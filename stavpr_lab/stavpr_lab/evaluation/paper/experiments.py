@@ -13,10 +13,10 @@ from stavpr_lab.evaluation.metrics import evaluate_ranking, Metrics, Ranking
 from stavpr_lab.evaluation.paper.datasets import Dataset
 from stavpr_lab.evaluation.seqslam import seqslam, SeqSlamSettings
 from stavpr_lab.evaluation.ssm_vpr import SsmVpr
+from stavpr_lab.features.descriptors import read_descriptors, require_comparable
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.descriptors import read_descriptors, require_comparable
 from stavpr_ros.features.registry import backbone_class
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.recognition import RecognizerSettings

@@ -15,7 +15,7 @@ import re
 import zipfile
 
 import numpy as np
-from stavpr_ros.errors import SourceError, UnavailableError
+from stavpr_ros.errors import SourceError
 from stavpr_ros.features.extractor import FeatureSettings, LocalFeatures, normalize
 from stavpr_ros.features.registry import DescriptorSettings
 from stavpr_ros.regular_file import require_regular
@@ -25,17 +25,6 @@ _NUMERIC = ('double', 'single', *(f'{u}int{bits}' for u in ('', 'u') for bits in
 MOST_STRIPS = 1024
 AT_ONCE = 1024  # images converted together
 MAPPED = 2**26  # bytes of a .npy file from which on it is not read as a whole
-
-
-class Descriptors:
-    """The kind of features of such arrays: no images can be extracted."""
-
-    def __init__(self, settings: DescriptorSettings, device: str = 'cpu') -> None:
-        raise UnavailableError(
-            "features 'descriptors' come from arrays that another program computed, not from "
-            'images: give those of map and query both (evaluate --map FILE --query FILE), or make '
-            'the map with the network itself'
-        )
 
 
 def is_descriptors(path: str | None) -> bool:

@@ -8,13 +8,13 @@ from checkpoints import Hostile
 import numpy as np
 import pytest
 from scipy.io import savemat
-from stavpr_ros.errors import FeatureMismatchError, SourceError
-from stavpr_ros.features import descriptors
-from stavpr_ros.features.descriptors import (
+from stavpr_lab.features import descriptors
+from stavpr_lab.features.descriptors import (
     is_descriptors,
     read_descriptors,
     require_comparable,
 )
+from stavpr_ros.errors import FeatureMismatchError, SourceError
 
 D = 24
 
