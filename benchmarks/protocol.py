@@ -17,7 +17,7 @@ from accuracy import extractors, FEATURES
 import cv2
 from data import data_folder
 import numpy as np
-from results import environment, heading, options_parser, table, write_json, write_lines
+from results import environment, heading, options_parser, table, write_lines
 from stavpr_lab.evaluation.drive import FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.protocol import (
@@ -143,6 +143,8 @@ def excerpt(results: Results) -> list[str]:
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the page: a table of each data set with each kind of features."""
     lines = heading('Recalls by tolerance and sequence length', about)
+    lines += ['`make protocol` writes this page. Recall@1 and recall at 100 % precision:', '']
+    lines += excerpt(results)
     lines += ['Cells: best F1 / recall@1 / recall at 100 % precision, with 95 % intervals.', '']
     head = ['method', 'images', *(f'+-{t}' for t in TOLERANCES)]
     for key, found in results.items():
@@ -162,10 +164,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = options_parser(__doc__, 'gradient features, without Nordland').parse_args(arguments)
     about = environment(named_commit=options.commit)
     results = dict(measure(data_folder(), options.quick))
-    path = options.output / f'protocol{"-quick" if options.quick else ""}.json'
-    write_json(path, about | {'results': results})
-    write_lines(path.with_suffix('.md'), markdown(about, results))
-    print(*excerpt(results), f'wrote {path} and its .md', sep='\n')
+    path = options.output / f'protocol{"-quick" if options.quick else ""}.md'
+    write_lines(path, markdown(about, results))
+    print(*excerpt(results), f'wrote {path}', sep='\n')
     return 0
 
 
