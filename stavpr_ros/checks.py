@@ -58,17 +58,33 @@ def require_whole(name: str, value: float, least: int, unit: str = '') -> None:
         raise SettingsError(f'{name} = {value} must be a whole number')
 
 
-def float_array(values: np.ndarray, name: str, ndim: int) -> np.ndarray:
+def require_shape(name: str, array: np.ndarray, axes: str, *dtypes: str) -> tuple[int, ...]:
     """
-    Return ``values`` as a C-contiguous float32 or float64 array of ``ndim`` axes.
+    Return the shape of an array.
 
-    :raises InputError: another type or number of axes.
+    :param axes: of each axis its size, or a name: axes of one name have one size, which is above 0
+        where the name begins with a capital, as ``W W n``.
+    :param dtypes: allowed types; none = any.
+    :raises InputError: another shape or type.
+    """
+    words = axes.split()
+    sizes = dict(zip(words, array.shape, strict=False))
+    shape = tuple(int(word) if word.isdecimal() else sizes.get(word) for word in words)
+    is_empty = any(not size for word, size in sizes.items() if word[0].isupper())
+    if array.shape != shape or is_empty or (dtypes and array.dtype not in dtypes):
+        expected = f'({", ".join(words)}) {" or ".join(dtypes)}'.rstrip()
+        raise InputError(f'{name}: shape {array.shape} {array.dtype}, expected {expected}')
+    return tuple(array.shape)
+
+
+def float_array(values: np.ndarray, name: str, axes: str) -> np.ndarray:
+    """
+    Return ``values`` as a C-contiguous float32 or float64 array.
+
+    :raises InputError: another type or other axes, see :func:`require_shape`.
     """
     array = np.asarray(values)
-    if array.ndim != ndim:
-        raise InputError(f'{name} has shape {array.shape}: expected {ndim} axes')
-    if array.dtype not in (np.float32, np.float64):
-        raise InputError(f'{name} is {array.dtype}: expected float32 or float64')
+    require_shape(name, array, axes, 'float32', 'float64')
     return np.ascontiguousarray(array)
 
 

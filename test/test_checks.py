@@ -5,9 +5,10 @@
 import math
 import re
 
+import numpy as np
 import pytest
 from stavpr_ros import checks
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import InputError, SettingsError
 
 
 @pytest.mark.parametrize(
@@ -45,3 +46,25 @@ def test_values_in_range_pass(check, arguments):
 def test_values_out_of_range_are_rejected(check, arguments, text):
     with pytest.raises(SettingsError, match=f'^{re.escape(text)}$'):
         getattr(checks, f'require_{check}')('x', *arguments)
+
+
+@pytest.mark.parametrize('axes', ['W W n', '2 2 0', 'W m n', 'a a n'])
+def test_shape_that_fits_is_returned(axes):
+    assert checks.require_shape('x', np.ones((2, 2, 0)), axes, 'float32', 'float64') == (2, 2, 0)
+
+
+@pytest.mark.parametrize(
+    ('axes', 'dtypes', 'expected'),
+    [
+        ('W n', (), '(W, n)'),
+        ('W W', (), '(W, W)'),
+        ('W 2 N', (), '(W, 2, N)'),
+        ('W 3 n', ('float64',), '(W, 3, n) float64'),
+        ('W 2 n', ('float32', 'uint8'), '(W, 2, n) float32 or uint8'),
+        ('n n n', (), '(n, n, n)'),
+    ],
+)
+def test_other_shape_or_type_is_rejected_with_both(axes, dtypes, expected):
+    text = f'x: shape (2, 2, 0) float64, expected {expected}'
+    with pytest.raises(InputError, match=f'^{re.escape(text)}$'):
+        checks.require_shape('x', np.ones((2, 2, 0)), axes, *dtypes)

@@ -399,7 +399,7 @@ HAND_MADE = [
     (_thumbnail(_jpeg(20000, 20000)), None, 'thumbnail of place 0 has 400000000 pixels'),
     (_thumbnail(b'\x89PNG\r\n\x1a\n' + bytes(40)), None, 'thumbnail of place 0 is no JPEG'),
     ({'session': np.full(24, 2, np.int32)}, None, 'session index is not between 0 and 1'),
-    ({'session': None}, None, 'session index of 2 sessions: none'),
+    ({'session': None}, None, '2 sessions without a session index'),
     ({'projection': np.eye(32, dtype=np.float32)}, None, 'whether there is a projection'),
     ({'surplus': np.zeros(3)}, None, 'part surplus is unknown'),
     ({'codes__words': np.zeros(3)}, None, 'part codes/words is of no section'),

@@ -43,7 +43,7 @@ def test_gaussian_entries_are_normal_with_mean_zero():
 
 
 def test_apply_of_other_dimension_is_rejected():
-    with pytest.raises(InputError, match='d = 5, the projection takes 6'):
+    with pytest.raises(InputError, match=r'shape \(7, 2, 5\) float32, expected \(W, n, 6\)'):
         Projection.gaussian(6, 4).apply(np.zeros((7, 2, 5), np.float32))
 
 

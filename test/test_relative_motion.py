@@ -216,6 +216,6 @@ def test_invalid_settings_and_poses_are_rejected():
     with pytest.raises(SettingsError, match='odometry_error = 1\\.5 must be 0 to 1'):
         settings_of(odometry_error=1.5)
     one = PlaceRecognizer(driven_map(places, track()), settings_of())
-    with pytest.raises(InputError, match='pose has shape'):
+    with pytest.raises(InputError, match=r'pose, x y z .*: shape'):
         one.update(query[:1], pose=np.zeros(3))
     assert one.window_fill == 0

@@ -200,7 +200,7 @@ def test_related_places_stay_related(town):
 @pytest.mark.parametrize(
     ('same_as', 'message'),
     [
-        (np.zeros(3, np.int32), r'expected int32 \(90,\)'),
+        (np.zeros(3, np.int32), r'expected \(90\) int32'),
         (np.full(PLACES, PLACES, np.int32), 'itself or an earlier one'),
         (np.maximum(np.arange(PLACES, dtype=np.int32) - 1, 0), 'same as another one'),
     ],

@@ -122,8 +122,8 @@ def test_holistic_distances_equal_oracle(seed, W, n, zeros):
 @pytest.mark.parametrize(
     ('query', 'reference', 'named'),
     [
-        ((7, 5), (7, 3, 6), r'\(7, 5\)'),
-        ((6, 5), (7, 3, 5), r'\(6, 5\)'),
+        ((7, 5), (7, 3, 6), r'\(7, 3, 6\) float32, expected \(7, n, 5\)'),
+        ((6, 5), (7, 3, 5), r'\(7, 3, 5\) float32, expected \(6, n, 5\)'),
         ((7, 5, 1), (7, 3, 5), r'\(7, 5, 1\)'),
         ((7, 5), (7, 5), r'\(7, 5\)'),
     ],

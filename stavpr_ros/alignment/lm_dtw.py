@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import float_array, no_nan
-from stavpr_ros.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -82,12 +81,8 @@ def match_sequence(distances: np.ndarray, settings: SequenceSettings) -> Sequenc
     :returns: distance and length for each of the n starts.
     :raises InputError: wrong shape or type, NaN.
     """
-    D = no_nan(float_array(distances, 'image distances', 2), 'image distances')
-    l, n = D.shape
-    if l != settings.length:
-        raise InputError(
-            f'image distances have shape {D.shape}: expected l = {settings.length} rows'
-        )
+    D = float_array(distances, 'image distances', f'{settings.length} n')
+    l, n = no_nan(D, 'image distances').shape
     window = np.full((l, padded_width(n, settings.k)), np.inf, D.dtype)
     window[:, :n] = D
     return match_padded(window, n, settings.k)

@@ -3,24 +3,14 @@
 """Cosine distances between one query image and all map images."""
 
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.checks import require_shape
 
 
 def _checked(query: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return both as float32 arrays."""
     query, reference = np.asarray(query), np.asarray(reference)
-    if query.dtype != np.float32 or reference.dtype != np.float32:
-        raise InputError(f'query is {query.dtype}, reference {reference.dtype}: expected float32')
-    if query.ndim != 2 or reference.ndim != 3:
-        raise InputError(
-            f'query has shape {query.shape}, reference {reference.shape}: '
-            'expected (W, d) and (W, n, d)'
-        )
-    if query.shape[0] != reference.shape[0] or query.shape[1] != reference.shape[2]:
-        raise InputError(
-            f'query strips {query.shape} do not fit reference strips '
-            f'{reference.shape}: W and d must be equal'
-        )
+    W, d = require_shape('query strips', query, 'W d', 'float32')
+    require_shape('reference strips', reference, f'{W} n {d}', 'float32')
     return query, reference
 
 
@@ -73,12 +63,9 @@ def holistic_distances(
     """
     query, reference = _checked(query, reference)
     query_weights, reference_weights = np.asarray(query_weights), np.asarray(reference_weights)
-    if query_weights.shape != query.shape[:1] or reference_weights.shape != reference.shape[:2]:
-        raise InputError(
-            f'weights have shapes {query_weights.shape} and '
-            f'{reference_weights.shape}: '
-            f'expected {query.shape[:1]} and {reference.shape[:2]}'
-        )
+    W, n, _ = reference.shape
+    require_shape('query weights', query_weights, f'{W}')
+    require_shape('reference weights', reference_weights, f'{W} {n}')
     weighted = query * query_weights[:, None]
     similarity = (reference @ weighted[:, :, None])[:, :, 0]
     distances: np.ndarray = 1 - (similarity * reference_weights).sum(axis=0)

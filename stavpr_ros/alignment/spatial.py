@@ -36,13 +36,8 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     from stavpr_ros.alignment.cpu import dtw
     from stavpr_ros.alignment.cpu.simd import LANES
 
-    d = float_array(d, 'strip distances', 3)
-    W, columns, n = d.shape
-    if columns != W or W == 0:
-        raise InputError(
-            f'strip distances have shape {d.shape}: expected W x W with W >= 1 on the first axes'
-        )
-    d = no_nan(d, 'strip distances')
+    d = no_nan(float_array(d, 'strip distances', 'W W n'), 'strip distances')
+    W, _, n = d.shape
     band = settings.band(W)
     if settings.strategy == 'none':
         raise SettingsError("strategy 'none' compares whole images: call holistic_distances")

@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_at_least
+from stavpr_ros.checks import require_at_least, require_shape
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.projection import Projection
 from stavpr_ros.features.registry import (
@@ -261,9 +261,7 @@ def cut_strips(feature_maps: np.ndarray, W: int, pooling: str = 'flatten') -> np
         or C if they are pooled.
     :raises InputError: fewer columns than strips, or not four axes.
     """
-    if feature_maps.ndim != 4:
-        raise InputError(f'feature maps have shape {feature_maps.shape}: expected (n, C, H, Wf)')
-    n, channels, height, Wf = feature_maps.shape
+    n, channels, height, Wf = require_shape('feature maps', feature_maps, 'n C H Wf')
     if not 1 <= W <= Wf:
         raise InputError(
             f'feature maps are Wf = {Wf} columns wide: they cannot be cut into W = {W} strips'

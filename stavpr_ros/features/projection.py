@@ -7,8 +7,7 @@ from functools import cached_property
 import hashlib
 
 import numpy as np
-from stavpr_ros.checks import require_at_least
-from stavpr_ros.errors import InputError
+from stavpr_ros.checks import require_at_least, require_shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +52,6 @@ class Projection:
         :returns: shape (W, n, dimension), float32.
         :raises InputError: another d than the matrix has rows.
         """
-        if strips.shape[-1] != self.matrix.shape[0]:
-            raise InputError(
-                f'local features have d = {strips.shape[-1]}, the projection takes '
-                f'{self.matrix.shape[0]}'
-            )
+        require_shape('local features', strips, f'W n {len(self.matrix)}')
         projected: np.ndarray = strips @ self.matrix
         return projected

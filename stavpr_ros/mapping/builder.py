@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from stavpr_ros.checks import require_at_least, require_type
+from stavpr_ros.checks import require_at_least, require_shape, require_type
 from stavpr_ros.errors import InputError, JournalError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, SUFFIX
@@ -254,8 +254,7 @@ def _with_poses(
     elif isinstance(poses, Trajectory):
         yield from ((frame, poses.at(frame.stamp)) for frame in frames)
     else:
-        if poses.ndim != 2 or poses.shape[1] != 7:
-            raise InputError(f'poses have shape {poses.shape}: expected (images, 7)')
+        require_shape('poses', poses, 'images 7')
         count = 0
         for count, frame in enumerate(frames, 1):
             if count <= len(poses):

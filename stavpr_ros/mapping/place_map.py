@@ -10,6 +10,7 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
+from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
@@ -99,17 +100,11 @@ class PlaceMap:
 
     def __post_init__(self) -> None:
         n = len(self.features)
-        if self.stamps.ndim != 1 or self.stamps.dtype != np.int64:
-            raise InputError(
-                f'stamps are {self.stamps.dtype} {self.stamps.shape}: expected int64 ({n},)'
-            )
-        if n != len(self.stamps) or n != len(self.ids):
-            raise InputError(
-                f'{n} places, {len(self.stamps)} stamps, {len(self.ids)} ids: expected one a place'
-            )
-        if self.poses is not None and self.poses.shape != (n, 7):
-            raise InputError(f'poses have shape {self.poses.shape}: expected ({n}, 7)')
+        require_shape('stamps', self.stamps, f'{n}', 'int64')
+        if len(self.ids) != n:
+            raise InputError(f'{len(self.ids)} ids for {n} places: expected one a place')
         if self.poses is not None:
+            require_shape('poses', self.poses, f'{n} 7')
             _require_whole_rows(self.poses)
         if len(self.thumbnails) not in (0, n):
             raise InputError(
@@ -246,11 +241,9 @@ def plain_text(text: str) -> str:
 def _require_sessions(sessions: tuple[Session, ...], index: np.ndarray | None, n: int) -> None:
     if not sessions and index is None:
         return
-    if index is None or index.dtype != np.int32 or index.shape != (n,):
-        found = 'none' if index is None else f'{index.dtype} {index.shape}'
-        raise InputError(
-            f'session index of {len(sessions)} sessions: {found}, expected int32 ({n},)'
-        )
+    if index is None:
+        raise InputError(f'{len(sessions)} sessions without a session index: give one, ({n})')
+    require_shape('session index', index, f'{n}', 'int32')
     if n and not 0 <= index.min() <= index.max() < len(sessions):
         raise InputError(f'the session index is not between 0 and {len(sessions) - 1}')
     ids = [session.id for session in sessions]
@@ -261,8 +254,7 @@ def _require_sessions(sessions: tuple[Session, ...], index: np.ndarray | None, n
 def _require_same_as(same_as: np.ndarray | None, n: int) -> None:
     if same_as is None:
         return
-    if same_as.dtype != np.int32 or same_as.shape != (n,):
-        raise InputError(f'same_as is {same_as.dtype} {same_as.shape}: expected int32 ({n},)')
+    require_shape('same_as', same_as, f'{n}', 'int32')
     if n and (same_as.min() < 0 or (same_as > np.arange(n)).any()):
         raise InputError('same_as: expected of each place itself or an earlier one')
     if (same_as[same_as] != same_as).any():

@@ -6,6 +6,7 @@ from bisect import bisect_left
 from threading import Lock
 
 import numpy as np
+from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.units import SECOND
 
@@ -24,10 +25,7 @@ def checked_pose(pose: np.ndarray) -> np.ndarray:
         quaternion of a norm outside ``NORMS``.
     """
     own = np.array(pose, np.float64)
-    if own.shape != (7,):
-        raise InputError(
-            f'pose has shape {own.shape}: expected 7 numbers, x y z and quaternion x y z w'
-        )
+    require_shape('pose, x y z and quaternion x y z w', own, '7')
     if not (np.abs(own) <= FARTHEST).all():  # NaN as well
         raise InputError(
             f'pose {own.tolist()} is not finite: expected meters up to {FARTHEST:g} and a '

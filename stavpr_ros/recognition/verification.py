@@ -13,8 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_at_least, require_choice
-from stavpr_ros.errors import InputError
+from stavpr_ros.checks import require_at_least, require_choice, require_shape
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 
 METHODS = ('orb', 'sift')
@@ -117,11 +116,7 @@ class PlaceVerifier:
 
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return an image at the common width, (h, w) uint8."""
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-            raise InputError(
-                f'{name} is {image.dtype} {image.shape}: expected RGB (h, w, 3) uint8'
-            )
-        height, width = image.shape[:2]
+        height, width, _ = require_shape(f'{name}, RGB', image, 'H W 3', 'uint8')
         size = WIDTH, min(max(1, round(height * WIDTH / width)), TALLEST * WIDTH)
         interpolation = cv2.INTER_AREA if width > WIDTH else cv2.INTER_LINEAR
         return cv2.resize(

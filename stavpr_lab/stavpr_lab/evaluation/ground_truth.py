@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from scipy.spatial import KDTree
 from stavpr_lab.evaluation.ground_truth_files import read_pairs
+from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.sources.folder import text_of
 
@@ -258,8 +259,7 @@ class GroundTruth:
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
     """Return poses with quaternions of norm 1; unknown poses stay rows of NaN."""
     poses = np.array(poses, np.float64)
-    if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
-        raise InputError(f'{name} poses have shape {poses.shape}: expected (images, 7)')
+    require_shape(f'{name} poses', poses, 'N 7')
     known = ~np.isnan(poses).all(axis=1)
     lengths = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
     if not np.isfinite(poses[known]).all() or not lengths.all():

@@ -5,7 +5,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.checks import require_shape
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
 
@@ -25,10 +25,7 @@ def optimize(
     :raises InputError: other shapes.
     :raises UnavailableError: GTSAM is not installed.
     """
-    if odometry.shape != (len(stamps), 7):
-        raise InputError(
-            f'odometry of shape {odometry.shape} with {len(stamps)} stamps: expected (N, 7)'
-        )
+    require_shape('odometry', odometry, f'{len(stamps)} 7')
     graph = PoseGraph(settings)
     for stamp, pose in zip(stamps.tolist(), odometry, strict=True):
         graph.add_odometry(stamp, pose)
