@@ -3,8 +3,7 @@
 """Loop closures are completed with their relative poses on a thread of its own, in order."""
 
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import threading
 import time
 import traceback
@@ -120,13 +119,17 @@ class EdgePublisher:
             return Edge(Source.NONE, NO_POSE)
         if self._estimator.verifier is not None:
             return Edge(Source.NONE, 'the loop closure of this header has it, verified')
+        reason = f'parameter relative_pose is {self._estimator.method}'
         if self._estimator.method == 'auto':
-            with suppress(InputError):
+            try:
                 needed_by_pnp(pair, query_camera, place_camera)
                 return Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
-        if self._estimator.method in ('auto', 'aligned'):
-            return align(pair)
-        return Edge(Source.NONE, f'parameter relative_pose is {self._estimator.method}')
+            except InputError as error:
+                reason = f'PnP: {error}'
+        if self._estimator.method == 'pnp':
+            return Edge(Source.NONE, reason)
+        edge = align(pair)
+        return replace(edge, reason=f'{reason}; {edge.reason}' if edge.reason else reason)
 
     def put(self, closure: WaitingClosure) -> None:
         """Publish a closure when its edge is ready."""

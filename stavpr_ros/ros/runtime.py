@@ -326,7 +326,7 @@ class Runtime:
         self._statistics.dropped(cause)
         threshold = self.pipeline.threshold
         result = ImageResult(status, reason, math.nan if threshold is None else threshold)
-        self._output.publish(message.header, result)
+        self._output.publish(message.header, result, self.pipeline.places)
 
     def _process(self, item: _Item) -> None:
         """Process one image, on the worker."""
