@@ -101,7 +101,7 @@ def test_command_help_names_the_command_as_called(run, monkeypatch):
         monkeypatch.setattr('sys.argv', [program])
         text = run(build_map, '--help').out
         assert ' '.join(text.split()).startswith(f'usage: {name} --input FOLDER|VIDEO|BAG ')
-        assert text.partition('examples:')[2].count(f'\n  {name} ') == 7
+        assert text.partition('examples:')[2].count(f'\n  {name} ') == 6
         assert '--onnx-layer' not in text.partition('examples:')[0]
     assert '--onnx-layer LAYER' in run(build_map, '--help-features').out
 
