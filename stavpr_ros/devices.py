@@ -4,10 +4,13 @@
 
 import ctypes
 from functools import cache
-import importlib.util
+from typing import TYPE_CHECKING
 
 from stavpr_ros.checks import require_choice
 from stavpr_ros.errors import UnavailableError
+
+if TYPE_CHECKING:
+    import torch
 
 DEVICES = BACKENDS = ('auto', 'cpu', 'cuda')
 
@@ -28,32 +31,29 @@ def choose_device(requested: str) -> str:
     return ('cuda' if available else 'cpu') if requested == 'auto' else requested
 
 
-def choose_backend(requested: str) -> str:
+def choose_backend(requested: 'str | torch.device') -> 'str | torch.device':
     """
-    Turn ``auto`` into the backend of the matching, ``cuda`` or ``cpu``.
+    Turn ``auto`` and ``cuda`` into what distances are computed on.
 
+    :param requested: ``cpu``, ``cuda``, ``auto``, which is ``cuda`` where torch has such a device,
+        a certain one such as ``cuda:1``, or any device of torch.
+    :returns: ``cpu``, the kernels for the CPU, or a device of torch.
     :raises SettingsError: no such backend.
-    :raises UnavailableError: ``cuda`` was requested, and its device or the package numba-cuda is
-        not available.
+    :raises UnavailableError: ``cuda`` was requested and is not available.
     """
     if requested == 'auto':
-        return 'cpu' if why_no_cuda() else 'cuda'
-    require_choice('backend', requested, BACKENDS)
-    if requested == 'cuda' and why_no_cuda():
-        raise UnavailableError(f"backend 'cuda': {why_no_cuda()}; take 'cpu' or 'auto'")
-    return requested
-
-
-def why_no_cuda() -> str:
-    """Return the reason why the ``cuda`` backend is not available; empty when it is."""
-    if not torch_has_cuda():
-        return 'torch finds no CUDA device here'
-    if importlib.util.find_spec('numba_cuda') is None:
-        return (
-            'the package numba-cuda is not installed: pip install numba-cuda[cu13], '
-            'or numba-cuda[cu12] where the driver is one for CUDA 12'
+        requested = 'cuda' if torch_has_cuda() else 'cpu'
+    if isinstance(requested, str) and not requested.startswith('cuda:'):
+        require_choice('backend', requested, BACKENDS)
+        if requested == 'cpu':
+            return 'cpu'
+    if str(requested).startswith('cuda') and not torch_has_cuda():
+        raise UnavailableError(
+            f"backend '{requested}': torch finds no CUDA device here; take 'cpu' or 'auto'"
         )
-    return ''
+    import torch
+
+    return torch.device(requested)
 
 
 @cache

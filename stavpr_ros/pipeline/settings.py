@@ -11,7 +11,7 @@ from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import require_choice
-from stavpr_ros.devices import choose_backend, why_no_cuda
+from stavpr_ros.devices import choose_backend, torch_has_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import kinds, settings_class, settings_from_json
@@ -132,12 +132,15 @@ class PipelineSettings:
 
         :raises UnavailableError: ``cuda`` is set and not available.
         """
-        backend = choose_backend(self.backend)
+        backend = str(choose_backend(self.backend))
         return 'cpu' if operation == 'loop_closure' or self.other_views else backend
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""
-        why = f' ({why_no_cuda() or "CUDA is available"})' if self.backend == 'auto' else ''
+        found = (
+            'torch has a CUDA device' if torch_has_cuda() else 'torch finds no CUDA device here'
+        )
+        why = f' ({found})' if self.backend == 'auto' else ''
         stages = f'backend {self.backend}{why}: networks on {choose_backend(self.backend)}'
         if operation == 'mapping':
             return stages

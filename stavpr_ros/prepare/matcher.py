@@ -2,15 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matchers: distances of images to all places of a map, whose features are on one backend."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import WINDOW
 from stavpr_ros.checks import require_choice
+from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.prepare.int8_features import Int8Features, rounded
+
+if TYPE_CHECKING:
+    import torch
 
 PRECISIONS = ('float32', 'int8')
 
@@ -32,7 +36,7 @@ class Matcher(Protocol):
 
         :param strips: its unit-norm local features, shape (W, d), float32.
         :param weights: norm of each strip over the norm of all, shape (W,), float32.
-        :returns: shape (n,), float32; a NumPy array, or a tensor on a CUDA device.
+        :returns: shape (n,), float32; a NumPy array, or a tensor on the backend's device.
         """
 
     def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -46,12 +50,15 @@ class Matcher(Protocol):
 
 
 def make_matcher(
-    features: LocalFeatures | Int8Features, spatial: SpatialSettings, backend: str, precision: str
+    features: LocalFeatures | Int8Features,
+    spatial: SpatialSettings,
+    backend: 'str | torch.device',
+    precision: str,
 ) -> Matcher:
     """
     Put a map's features on a backend.
 
-    :param backend: ``cpu`` or ``cuda``.
+    :param backend: see :func:`stavpr_ros.devices.choose_backend`.
     :param features: of the map; rounded already, for ``int8``, or not.
     :param precision: of the map's features in memory: ``float32``; image distances of the backends
         differ by 1e-5 at most, except where a tie of two strips is decided otherwise. ``int8``: a
@@ -68,16 +75,17 @@ def make_matcher(
     spatial.band(W)
     if spatial.strategy == 'sliding_window' and W < WINDOW:
         raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')
-    if backend == 'cuda' and spatial.vertical:
-        raise SettingsError("backend 'cuda' has no vertical alignment: take 'cpu'")
+    if backend != 'cpu' and spatial.vertical:
+        raise SettingsError(f"backend '{backend}' has no vertical alignment: take 'cpu'")
     if precision == 'int8' and spatial.vertical:
         raise SettingsError("precision 'int8' has no vertical alignment: take float32")
     if precision == 'int8' and isinstance(features, LocalFeatures):
         features = rounded(features, lambda block: block)
-    if backend == 'cuda':
-        from stavpr_ros.prepare.cuda_matcher import CudaMatcher
+    device = choose_backend(backend)
+    if isinstance(device, str):
+        from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 
-        return CudaMatcher(features, spatial)
-    from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+        return CpuMatcher(features, spatial)
+    from stavpr_ros.prepare.device_matcher import DeviceMatcher
 
-    return CpuMatcher(features, spatial)
+    return DeviceMatcher(features, spatial, device)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The window of mode robust: a place filter, read at the middle of the window."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -42,8 +43,8 @@ class FilterWindow(QueryWindow):
     ``change`` compares images, ``filter`` contains the states.
     """
 
-    buffer_class: type[SequenceBuffer] = SequenceBuffer
-    filter_class: type[Any] = PlaceFilter
+    buffer_class: Callable[..., SequenceBuffer] = SequenceBuffer
+    filter_class: Callable[..., Filter] = PlaceFilter
 
     def __init__(
         self,

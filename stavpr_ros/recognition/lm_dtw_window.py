@@ -20,7 +20,7 @@ from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
 
 class LmDtwWindow(QueryWindow):
     """
-    LM-DTW on the CPU; :mod:`stavpr_ros.recognition.cuda_windows` has the one on a CUDA device.
+    LM-DTW on the CPU; its twin is in :mod:`stavpr_ros.recognition.device_windows`.
 
     :param sequence: l and k.
     :param places: number of places n.

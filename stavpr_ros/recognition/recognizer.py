@@ -7,7 +7,7 @@ import copy
 from dataclasses import replace
 import math
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.checks import require_type
@@ -43,6 +43,9 @@ from stavpr_ros.recognition.relative_motion import (
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
+
+if TYPE_CHECKING:
+    import torch
 
 EARLY = 0.9  # minimum probability of a match by the newest images alone
 TIMED = 3  # images, to compare the time of one with the time budget
@@ -295,7 +298,8 @@ class PlaceRecognizer(SequenceRecognizer):
 
     :param place_map: the reference map.
     :param settings: see :class:`RecognizerSettings`.
-    :param backend: ``cpu``, ``cuda``, or ``auto``; ``cuda`` for mode paper and the place filter.
+    :param backend: ``cpu``, ``cuda``, ``auto``, or any device of torch, for mode paper and the
+        place filter: :func:`stavpr_ros.devices.choose_backend`.
     :param precision: of the map's features in the matcher, ``float32`` or ``int8``; see
         :func:`stavpr_ros.prepare.matcher.make_matcher`.
     :raises UnavailableError: no such backend here.
@@ -307,7 +311,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self,
         place_map: PlaceMap,
         settings: RecognizerSettings,
-        backend: str = 'cpu',
+        backend: 'str | torch.device' = 'cpu',
         precision: str = 'float32',
     ) -> None:
         maps, given = 'a PlaceMap, as of load_map() or build_map()', 'RecognizerSettings(...)'
@@ -341,10 +345,10 @@ class PlaceRecognizer(SequenceRecognizer):
         # kept, and the time budget
         self.start_notes = '; '.join(filter(None, [prepared.note, settings.error_note]))
         if settings.time_budget_ms and len(features):
-            if backend == 'cuda':
+            if backend != 'cpu':
                 raise SettingsError(
-                    f"time_budget_ms = {settings.time_budget_ms} with backend 'cuda': the first "
-                    "stage is of backend 'cpu'; take that, or 0"
+                    f'time_budget_ms = {settings.time_budget_ms} with backend {str(backend)!r}: '
+                    "the first stage is of backend 'cpu'; take that, or 0"
                 )
             self._keep_time_budget(prepared.features, features[:1])
 
@@ -462,29 +466,33 @@ class PlaceRecognizer(SequenceRecognizer):
         return self._match(position)
 
 
-def _window_of(place_map: PlaceMap, settings: RecognizerSettings, backend: str) -> QueryWindow:
+def _window_of(
+    place_map: PlaceMap, settings: RecognizerSettings, backend: 'str | torch.device'
+) -> QueryWindow:
     """Return an empty window for a map."""
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
     layout = layout_of(place_map, settings.nms_radius, MODEL)
     if options.place_filter:
-        window_class = FilterWindow
-        if backend == 'cuda':
-            from stavpr_ros.recognition.cuda_windows import CudaFilterWindow
+        window: FilterWindow
+        arguments = sequence, n, MODEL, layout, options.query_znorm
+        if isinstance(backend, str):
+            window = FilterWindow(*arguments)
+        else:
+            from stavpr_ros.recognition.device_windows import DeviceFilterWindow
 
-            window_class = CudaFilterWindow
-        window = window_class(sequence, n, MODEL, layout, options.query_znorm)
+            window = DeviceFilterWindow(*arguments, device=backend)
         window.choice.learn_times(place_map.stamps)
         return window
-    if backend == 'cpu':
+    if isinstance(backend, str):
         return LmDtwWindow(sequence, n, layout, options.query_znorm)
     if options.any:
         raise SettingsError(
-            f"options {options} with backend 'cuda': without the place filter, it runs mode paper "
-            "only; take 'cpu'"
+            f"options {options} with backend '{backend}': without the place filter, it runs mode "
+            "paper only; take 'cpu'"
         )
-    from stavpr_ros.recognition.cuda_windows import CudaLmDtwWindow
+    from stavpr_ros.recognition.device_windows import DeviceLmDtwWindow
 
-    return CudaLmDtwWindow(sequence, n, layout)
+    return DeviceLmDtwWindow(sequence, n, layout, backend)
 
 
 def position_of(pose: np.ndarray | None) -> np.ndarray:

@@ -10,6 +10,7 @@ from domain import DOMAIN
 from hypothesis import settings
 import numpy as np
 import pytest
+from stavpr_ros.devices import torch_has_cuda
 from stavpr_ros.threads import wait_passively
 
 wait_passively()  # torch and numba are not imported yet
@@ -79,16 +80,12 @@ def one_thread():
     limit_threads(0)
 
 
-@pytest.fixture(scope='module')
-def cuda_runtime():
-    """Return the CUDA runtime; skip where there is no device."""
-    from stavpr_ros.alignment.cuda.compilation import runtime
-    from stavpr_ros.errors import UnavailableError
+@pytest.fixture(params=['cpu', 'cuda'][: 1 + torch_has_cuda()])
+def device(request):
+    """Return each device of torch here: the CPU, and CUDA where there is one."""
+    import torch
 
-    try:
-        return runtime()
-    except UnavailableError as error:
-        pytest.skip(f'{error}; the same test runs in the simulator')
+    return torch.device(request.param)
 
 
 @pytest.fixture

@@ -1,0 +1,191 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The windows of a query on a device of torch: twins of those on the CPU, with rows as tensors."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from stavpr_ros.alignment.device import lm_dtw, nearest_starts
+from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch
+from stavpr_ros.alignment.path import trace_sequence
+from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.device_graph import DeviceGraph, HostCopy
+from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.filter.device_filter import DevicePlaceFilter
+from stavpr_ros.prepare.normalization import MIN_DEVIATION
+from stavpr_ros.recognition.filter_window import FilterWindow
+from stavpr_ros.recognition.match import WindowMatch, WindowSequences
+from stavpr_ros.recognition.sessions import in_places
+from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
+import torch
+
+
+def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
+    """Return a row as :func:`stavpr_ros.prepare.normalization.z_normalized`, without waiting."""
+    known = torch.isfinite(row) & counted
+    count = known.sum().clamp(min=1)
+    off = row - torch.where(known, row, 0).sum(dtype=torch.float64) / count
+    variance = torch.where(known, off, 0).square().sum() / count
+    return (off / variance.sqrt().clamp(min=MIN_DEVIATION)).float()
+
+
+class DeviceBuffer(SequenceBuffer):
+    """A :class:`SequenceBuffer` on a device; rows are not checked, which would wait for it."""
+
+    def __init__(self, *arguments: Any, device: torch.device, **options: Any) -> None:
+        self._device = device
+        super().__init__(*arguments, **options)
+
+    def _filled(self, shape: tuple[int, int]) -> torch.Tensor:
+        return torch.full(shape, torch.inf, device=self._device)
+
+    def push(self, row: torch.Tensor) -> None:  # type: ignore[override]
+        """See :meth:`SequenceBuffer.push`; the row is on the device."""
+        self._add(row)
+
+    def newest(self) -> np.ndarray:
+        """Return the row of the newest image, (n,), copied from the device."""
+        row: np.ndarray = self._slots[self.oldest - 1][0].cpu().numpy()
+        return row
+
+    def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
+        """See :meth:`SequenceBuffer.at`; copied from the device."""
+        flat = torch.from_numpy(self._ring(images) * self.memory.shape[1] + columns)
+        entries: np.ndarray = self.memory.take(flat.to(self._device)).cpu().numpy()
+        return entries
+
+
+class RowColumns:
+    """
+    Distances to places as a row of a window's columns, normalized, on the device.
+
+    :param counted: places that count for mean and deviation of a row, (n,), bool; None: distances
+        are not normalized.
+    :param layout: of the places.
+    """
+
+    def __init__(
+        self, counted: np.ndarray | None, layout: ColumnLayout, places: int, device: torch.device
+    ) -> None:
+        self._layout = layout
+        self._counted = None if counted is None else torch.from_numpy(counted).to(device)
+        columns = torch.from_numpy(layout.columns_of(np.arange(places)))
+        self._columns = columns.to(device)
+        self._row = torch.zeros(places, device=device)
+        self._out = torch.full((layout.width(places),), torch.inf, device=device)
+        self._graph = DeviceGraph(device, self._compute)
+
+    def __call__(self, row: torch.Tensor) -> torch.Tensor:
+        """Return the row of columns; valid until the next call."""
+        if len(row):
+            self._row.copy_(row)
+            self._graph()
+        return self._out
+
+    def _compute(self) -> None:
+        row = self._row
+        if (counted := self._counted) is not None:
+            runs = self._layout.runs
+            row = torch.cat([z_normalized_on_device(row[run], counted[run]) for run in runs])
+        self._out.index_copy_(0, self._columns, row)
+
+
+class DeviceFilterWindow(FilterWindow):
+    """
+    A :class:`FilterWindow` whose rows and filter are on a device.
+
+    :param device: of torch; other parameters: see :class:`FilterWindow`.
+    """
+
+    def __init__(self, *arguments: Any, device: torch.device) -> None:
+        self._device = device
+        self._row_columns: RowColumns | None = None
+        self.buffer_class = partial(DeviceBuffer, device=device)
+        self.filter_class = partial(DevicePlaceFilter, device=device)
+        super().__init__(*arguments)
+
+    def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
+        if self._row_columns is None:  # the map has been learned
+            n = len(row)
+            counted = self._counted(n) if self._normalizes else None
+            self._row_columns = RowColumns(counted, self.layout, n, self._device)
+        return self._row_columns(row)
+
+
+class DeviceLmDtwWindow(QueryWindow):
+    """
+    LM-DTW on a device; only a match waits for it.
+
+    :param sequence: l and k.
+    :param places: number of places n.
+    :param layout: of the places.
+    """
+
+    def __init__(
+        self,
+        sequence: SequenceSettings,
+        places: int,
+        layout: ColumnLayout,
+        device: torch.device,
+    ) -> None:
+        n, l, k = layout.width(places), sequence.length, sequence.k
+        buffer = DeviceBuffer(l, n, k, lambda n, k: n + k - 1, device=device)
+        super().__init__(buffer, layout)
+        self._row_columns = RowColumns(None, layout, places, device)
+        self._window = torch.full((l, n + k - 1), torch.inf, device=device)
+        self._distances = torch.full((n,), torch.inf, device=device)
+        self._lengths = torch.zeros(n, dtype=torch.int64, device=device)
+        self._radius = torch.zeros((), dtype=torch.int64, device=device)
+        # of the nearest start and the nearest elsewhere: s, m and q; and the cells of the nearest
+        self._out = torch.zeros(6 + l * k, dtype=torch.float64, device=device)
+        self._received = HostCopy(self._out)
+        self._graph = DeviceGraph(device, self._compute)
+
+    def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
+        return self._row_columns(row)
+
+    def _compute(self) -> None:
+        k = self.buffer.k
+        distances, lengths = lm_dtw(self._window, k)
+        self._distances.copy_(distances)
+        self._lengths.copy_(lengths)
+        starts, nearest = nearest_starts(distances, lengths, self._radius)
+        columns = starts[:1] + torch.arange(k, device=starts.device)
+        cells = self._window.index_select(1, columns).view(-1)
+        parts = starts, lengths.index_select(0, starts), nearest, cells
+        torch.cat([part.double() for part in parts], out=self._out)
+
+    def match(self, nms_radius: int) -> WindowMatch:
+        """Find the nearest start and its second best on the device; trace the path on the host."""
+        buffer = self.buffer
+        if not buffer.places:
+            return WindowMatch()
+        self._radius.fill_(min(nms_radius, buffer.places))  # no two midpoints are farther apart
+        self._window.copy_(buffer.memory[buffer.oldest : buffer.oldest + buffer.length])
+        self._graph()
+        self._received.receive()
+        self._received.wait()
+        start, second, length, second_length = self._received.numpy[:4].astype(np.int64).tolist()
+        distance, second_distance = self._received.numpy[4:6].tolist()
+        if not np.isfinite(distance):
+            return WindowMatch()
+        cells = self._received.numpy[6:].astype(np.float32).reshape(buffer.length, buffer.k)
+        path = trace_sequence(cells, 0, buffer.k)
+        path[:, 1] += start
+        has_second = np.isfinite(second_distance)
+        nearest = SequenceMatch(
+            first=start,
+            last=start + length - 1,
+            middle=(2 * start + length - 1) // 2,
+            distance=distance,
+            second_best_index=(2 * second + second_length - 1) // 2 if has_second else -1,
+            second_best_distance=second_distance if has_second else float('nan'),
+        )
+        found = WindowMatch(nearest, path, self._sequences)
+        return in_places(found, self.layout, nms_radius)
+
+    def _sequences(self) -> WindowSequences:
+        """Copy distances and lengths of all starts to the host."""
+        found = SequenceDistances(self._distances.cpu().numpy(), self._lengths.cpu().numpy())
+        return WindowSequences(found.distances, found.middles)

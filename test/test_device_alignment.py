@@ -1,0 +1,192 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Both alignments and the matcher in torch operations, against the oracle."""
+
+from dataclasses import astuple
+
+import numpy as np
+import oracle
+import pytest
+from stavpr_ros.alignment import best_match, SequenceDistances, SequenceSettings, SpatialSettings
+from stavpr_ros.alignment.cpu.int8 import Int8Strips, rounded_queries
+from stavpr_ros.alignment.device import lm_dtw, spatial_alignment
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.recognition.device_windows import DeviceLmDtwWindow
+from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
+import torch
+
+W, D = 4, 24
+# Sums are formed in the order of the library, and products may be fused with sums. Random features
+# have no near-ties, where the last bit decides on a path or the nearest strip.
+TOLERANCE = 1e-5
+
+
+def random_distances(seed, shape, levels=None):
+    products = np.random.default_rng(seed).random(shape, np.float32)
+    if levels is not None:
+        products = np.round(products * levels).astype(np.float32) / np.float32(levels)
+    return np.float32(1) - products
+
+
+@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window'])
+@pytest.mark.parametrize(
+    ('strips', 'xi', 'n', 'sigma', 'levels'),
+    [
+        (7, None, 50, 1.0, None),
+        (7, 3, 50, 0.3, 3),  # three levels: ties everywhere
+        (6, None, 1, 0.0, 3),
+        (4, None, 6, 5.0, None),  # an even number of strips
+        (5, 1, 9, 1.0, None),
+    ],
+)
+def test_image_distances_equal_oracle(device, strategy, strips, xi, n, sigma, levels):
+    d = random_distances(strips, (strips, strips, n), levels)
+    settings = SpatialSettings(strategy, sigma, xi)
+    found = spatial_alignment(strips, settings, device)(torch.from_numpy(d).to(device))
+    expected = oracle.image_distances(d, strategy, sigma, xi, np.float32)
+    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=1e-6)
+
+
+def test_published_figure(device):
+    d = torch.from_numpy(oracle.GOLDEN[:, :, None].astype(np.float32)).to(device)
+    found = spatial_alignment(7, SpatialSettings(), device)(d).item()
+    assert found == pytest.approx(0.28724851, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('l', 'n', 'beta', 'levels', 'banned'),
+    [
+        (3, 11, 2.0, None, 0.1),
+        (5, 30, 2.0, 4, 0.1),  # ties
+        (2, 1, 1.5, None, 0),
+        (6, 20, 1.3, 2, 0.3),
+        (4, 3, 3.0, None, 0),  # fewer places than a start searches
+        (3, 5, 2.0, None, 1),  # no path
+    ],
+)
+def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned):
+    """Distances, lengths, nearest start and second best, and the path that the CPU finds."""
+    rng, sequence = np.random.default_rng(n), SequenceSettings(l, beta)
+    window = DeviceLmDtwWindow(sequence, n, ColumnLayout(), device)
+    twin = LmDtwWindow(sequence, n)
+    rows = random_distances(n, (2 * l + 1, n), levels)
+    rows[rng.random(rows.shape) < banned] = np.inf
+    for t, row in enumerate(rows):
+        window.push(torch.from_numpy(row).to(device), row, t)
+        twin.push(row, row, t)
+        if t + 1 < l:
+            continue
+        for radius in (0, 3):
+            found, expected = window.match(radius), twin.match(radius)
+            q, m = oracle.match_sequence(rows[t + 1 - l : t + 1], beta, np.float32)
+            answer = oracle.best_match(q, m, radius)
+            np.testing.assert_array_equal(found.path, expected.path)
+            if answer is None:
+                assert found.nearest is None
+                continue
+            assert found.nearest.first == answer.start
+            assert found.nearest.last == answer.last
+            assert found.nearest.distance == answer.distance
+            np.testing.assert_equal(astuple(found.nearest), astuple(expected.nearest))
+            costs, middles = found.sequences()[:2]
+            np.testing.assert_array_equal(costs, q)
+            m = np.where(np.isfinite(q), m, 0)
+            np.testing.assert_array_equal(middles, SequenceDistances(q, m).middles)
+            assert best_match(SequenceDistances(q, m), radius).first == answer.start
+    window.reset()
+    assert len(window.buffer) == 0
+
+
+def test_starts_of_default_window_equal_oracle(device):
+    rows, sequence = random_distances(1, (20, 60)), SequenceSettings()
+    window = torch.full((20, 60 + sequence.k - 1), torch.inf, device=device)
+    window[:, :60] = torch.from_numpy(rows)
+    distances, lengths = lm_dtw(window, sequence.k)
+    q, m = oracle.match_sequence(rows, 2.0, np.float32)
+    np.testing.assert_array_equal(distances.cpu(), q)
+    np.testing.assert_array_equal(lengths.cpu(), m)
+
+
+def features(n, seed=0, strips=W, zero=()):
+    """Features of n images, unit norm; those of ``zero`` (strip, image) are all zeros."""
+    rng = np.random.default_rng(seed)
+    x = rng.random((strips, n, D), np.float32) - np.float32(0.2)
+    x /= np.linalg.norm(x, axis=2, keepdims=True)
+    weights = rng.random((strips, n), np.float32) + np.float32(0.1)
+    for strip, image in zero:
+        x[strip, image] = weights[strip, image] = 0
+    return LocalFeatures(
+        x, weights / np.linalg.norm(weights, axis=0), FeatureSettings('gradient', None, strips)
+    )
+
+
+def expected_row(reference, query, i, settings, precision):
+    """Distances of image i of the query, by products in float64 and the oracle."""
+    x, y = query.strips[:, i].astype(float), reference.strips.astype(float)
+    if precision == 'int8':
+        whole, lengths = rounded_queries(query.strips)
+        x = whole[i].astype(float) * lengths[i, :, None]
+        held = Int8Strips(*y.shape)
+        held.write(0, reference.strips)
+        y = held[:, :].astype(float)
+    products = np.einsum('id,jnd->ijn', x, y)
+    if settings.strategy == 'none':
+        weights = query.weights[:, i].astype(float)[:, None] * reference.weights.astype(float)
+        return 1 - (np.einsum('iin->in', products) * weights).sum(axis=0)
+    return oracle.image_distances(1 - products, settings.strategy, settings.sigma, settings.xi)
+
+
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
+@pytest.mark.parametrize(
+    ('strategy', 'xi'),
+    [('adaptive', None), ('adaptive', 2), ('vanilla', 2), ('sliding_window', 2), ('none', None)],
+)
+def test_distances_of_every_strategy_equal_oracle(device, monkeypatch, strategy, xi, precision):
+    monkeypatch.setattr('stavpr_ros.prepare.device_matcher.WIDENED', 3 * W * D)
+    reference, query = features(7, zero=[(1, 2)]), features(4, seed=1, zero=[(0, 0)])
+    settings = SpatialSettings(strategy, 0.7, xi)
+    matcher = make_matcher(reference, settings, device, precision)
+    assert matcher.places == 7
+    matrix = matcher.distance_matrix(query.strips, query.weights)
+    rows = [matcher.distances(query.strips[:, i], query.weights[:, i]) for i in range(4)]
+    for i, row in enumerate(rows):
+        expected = expected_row(reference, query, i, settings, precision)
+        np.testing.assert_allclose(matrix[i], expected, rtol=0, atol=TOLERANCE)
+        np.testing.assert_array_equal(row.cpu().numpy(), matrix[i])
+
+
+def test_strip_distances_of_int8_are_those_of_cpu_bit_for_bit(device):
+    reference, query = features(9, strips=7), features(2, seed=1, strips=7)
+    matcher = make_matcher(reference, SpatialSettings(), device, 'int8')
+    held = Int8Strips(*reference.strips.shape)
+    held.write(0, reference.strips)
+    whole, lengths = rounded_queries(query.strips)
+    for i in range(2):
+        matcher.distances(query.strips[:, i], query.weights[:, i])
+        expected = oracle.whole_number_distances(
+            whole[i], held.rounded(), lengths[i], held.reciprocals[:, :9]
+        )
+        np.testing.assert_array_equal(matcher._strip_distances().cpu(), expected)
+
+
+def test_empty_map_has_no_distances_and_no_match(device):
+    query = features(1)
+    matcher = make_matcher(features(3)[0:0], SpatialSettings(), device, 'float32')
+    window = DeviceLmDtwWindow(SequenceSettings(3), 0, ColumnLayout(), device)
+    for t in range(3):
+        row = matcher.distances(query.strips[:, 0], query.weights[:, 0])
+        assert row.shape == (0,)
+        window.push(row, query.strips[:, 0], t)
+    assert window.match(20).nearest is None
+
+
+def test_invalid_settings_are_rejected(device):
+    with pytest.raises(SettingsError, match='xi = 5'):
+        make_matcher(features(3), SpatialSettings(xi=5), device, 'float32')
+    with pytest.raises(InputError, match='at least 4'):
+        make_matcher(features(3, strips=3), SpatialSettings('sliding_window'), device, 'float32')
+    with pytest.raises(SettingsError, match='no vertical alignment'):
+        make_matcher(features(3), SpatialSettings(vertical=True), device, 'float32')
