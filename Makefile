@@ -40,7 +40,7 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx cuda"         optional packages: onnx, hdf5, faiss, fleet, ray, cuda, slam, evaluation, bench, dev, docs'
+	@echo '  EXTRAS="onnx slam"         optional packages: onnx, hdf5, faiss, fleet, ray, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your images, videos, bags or saved maps'
 	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'

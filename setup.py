@@ -110,7 +110,6 @@ setup(
         *(EVALUATION if WHEEL else []),
     ],
     extras_require={
-        'cuda': ['numba-cuda>=0.30'],
         'dev': [*TEST, *LINT],
         'docs': ['furo>=2024.8', 'myst-parser>=2.0', 'sphinx>=7.2'],
         'evaluation': EVALUATION,

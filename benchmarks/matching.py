@@ -51,7 +51,6 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
     from extraction import extraction_stages
     from stages import (
         city_stages,
-        device_retrieval,
         feature_stages,
         memory_problem,
         paper_stages,
@@ -82,8 +81,6 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
         process_stages(run, n, 'int8' if n >= CITY else 'float32', options.seed)
     for n in (size for size in options.sizes if size < CITY):
         paper_stages(run, n, options.seed)
-        if run.device == 'cuda':
-            device_retrieval(run, n, options.seed)
 
 
 def main(arguments: list[str] | None = None) -> int:

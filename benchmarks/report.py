@@ -21,7 +21,7 @@ ROBUST_STAGES = (
     'filter_belief',
 )
 OUTCOME = {True: 'reached', False: '**not reached**', None: 'not measured'}
-CELLS, BOUND, SECONDS = 'cells per second', 'over the lower bound', 'seconds'
+CELLS, BOUND = 'cells per second', 'over the lower bound'
 PRODUCT, READ = 'torch float32', READING  # peers: the time over theirs is wanted
 TARGETS = {  # stage, mode, n, d in float32: value or peer, least or most
     ('cpu', 'lm_dtw', 'paper', 20_000, 0): ((CELLS, 2.5e9), ('prange', 8), ('librosa', 100)),
@@ -32,8 +32,6 @@ TARGETS = {  # stage, mode, n, d in float32: value or peer, least or most
     ('cpu', 'frame', 'robust', 20_000, 512): ((READ, 1.5),),
     ('cpu', 'frame', 'robust', 100_000, 224): ((READ, 1.5),),
     ('cpu', 'frame', 'paper', 20_000, 512): ((BOUND, 1.5),),
-    ('cuda', 'distance_matrix', '', 2_000, 512): ((SECONDS, 3e-4),),
-    ('cuda', 'retrieval', 'paper', 2_000, 0): ((SECONDS, 1e-4),),
 }
 AT_LEAST = (CELLS, 'prange', 'librosa')
 
@@ -42,8 +40,8 @@ def value_of(row: Row, name: str) -> float | None:
     """Return a value of :data:`TARGETS`; None where the row has no such peer."""
     if name == CELLS:
         return row.extra['cells'] / row.median_s if 'cells' in row.extra else None
-    if name in (BOUND, SECONDS):
-        return row.ratio if name == BOUND else row.median_s
+    if name == BOUND:
+        return row.ratio
     ratio = next((peer['ratio'] for peer in row.peers if peer['name'] == name), None)
     return 1 / ratio if ratio and name not in AT_LEAST else ratio
 

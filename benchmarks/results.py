@@ -19,7 +19,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / 'benchmarks' / 'results'
-PACKAGES = ('numpy', 'torch', 'numba', 'numba-cuda', 'opencv-python-headless', 'onnxruntime')
+PACKAGES = ('numpy', 'torch', 'numba', 'opencv-python-headless', 'onnxruntime')
 # that decide how fast the kernels and torch's products are
 INSTRUCTION_SETS = re.compile(r'sse4_2|avx\w*|fma|f16c|amx_\w+|asimd\w*|sve\w*|bf16|fphp')
 READING = 'reading the map'  # a peer

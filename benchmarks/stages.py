@@ -123,18 +123,6 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
     add('path_trace', call=trace, works=[bounds.path_trace(SEQUENCE.length, width)])
 
 
-def device_retrieval(run: Run, n: int, seed: int) -> None:
-    """Measure LM-DTW, selection and path on a GPU: one launch, one copy back."""
-    from stavpr_ros.recognition.cuda_windows import CudaLmDtwWindow
-
-    rows = make_window(SEQUENCE.length, n, seed)
-    window = CudaLmDtwWindow(SEQUENCE, n)
-    for row in rows:
-        window.buffer.push(torch.from_numpy(row).to(run.device))
-    works = [bounds.lm_dtw(Sizes(n, 0)), bounds.selection(Sizes(n, 0))]
-    run.measure('retrieval', (n, 0), partial(window.match, NMS_RADIUS), works, mode='paper')
-
-
 def sequence_peers(run: Run, window: np.ndarray, ours: SequenceDistances) -> list[Peer]:
     """Return the peers of LM-DTW on the same window; their results must be ours."""
     found = [_prange_peer(window, ours)]

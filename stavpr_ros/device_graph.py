@@ -4,43 +4,49 @@
 
 from collections.abc import Callable
 import gc
+from weakref import WeakMethod
 
 import torch
 
 
 class DeviceGraph:
     """
-    A function of fixed tensors, which it reads and writes in place.
+    A method that reads and writes tensors in place, always the same ones.
 
     On a CUDA device, the first call runs it and the second one captures it in a CUDA graph: each
-    call from then on is one launch. On other devices, each call runs the function.
+    call from then on is one launch. On other devices, each call runs it.
 
-    :param function: of no arguments; it must not wait for the device.
+    :param method: without arguments, of the owner of this object; it must not wait for the device.
     """
 
-    def __init__(self, device: torch.device, function: Callable[[], None]) -> None:
-        self._device, self._function = device, function
+    def __init__(self, device: torch.device, method: Callable[[], None]) -> None:
+        self._device, self._method = device, WeakMethod(method)  # no cycle keeps tensors alive
         self._calls, self._graph = 0, torch.cuda.CUDAGraph() if device.type == 'cuda' else None
 
     def __call__(self) -> None:
-        """Run the function; returns before the device has finished."""
+        """Run the method; returns before the device has finished."""
         self._calls += 1
         if self._graph is None or self._calls == 1:  # this call loads libraries, a capture cannot
-            self._function()
+            self._run()
             return
         if self._calls == 2:
             with torch.cuda.device(self._device):
                 self._capture(self._graph)
         self._graph.replay()
 
+    def _run(self) -> None:
+        method = self._method()
+        assert method is not None
+        method()
+
     def _capture(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Capture the function; no object may free memory of the device meanwhile."""
+        """Capture the method; no object may free memory of the device meanwhile."""
         was_enabled = gc.isenabled()
         gc.collect()
         gc.disable()
         try:
             with torch.cuda.graph(graph, capture_error_mode='thread_local'):
-                self._function()
+                self._run()
         finally:
             if was_enabled:
                 gc.enable()

@@ -78,7 +78,7 @@ def imported(folder: Path) -> set[str]:
                 names |= {alias.name.partition('.')[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 names.add((node.module or '').partition('.')[0])
-    return names - set(sys.stdlib_module_names) - {'numba_cuda', 'cuda'}
+    return names - set(sys.stdlib_module_names)
 
 
 def manifest(path: Path) -> ElementTree.Element:

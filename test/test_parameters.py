@@ -166,20 +166,20 @@ def test_network_of_feature_settings_and_model_path_is_accepted():
 
 
 @pytest.mark.parametrize(
-    ('operation', 'backend', 'why_not', 'why', 'extraction', 'matching'),
+    ('operation', 'backend', 'has_cuda', 'why', 'extraction', 'matching'),
     [
-        ('localization', 'auto', '', ' (CUDA is available)', 'cuda', 'cuda'),
-        ('loop_closure', 'auto', '', ' (CUDA is available)', 'cuda', 'cpu'),
-        ('localization', 'cpu', '', '', 'cpu', 'cpu'),
-        ('localization', 'auto', 'no device', ' (no device)', 'cpu', 'cpu'),
+        ('localization', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cuda'),
+        ('loop_closure', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cpu'),
+        ('localization', 'cpu', True, '', 'cpu', 'cpu'),
+        ('localization', 'auto', False, ' (torch finds no CUDA device)', 'cpu', 'cpu'),
     ],
 )
 def test_backend_summary_names_device_of_each_stage(
-    monkeypatch, operation, backend, why_not, why, extraction, matching
+    monkeypatch, operation, backend, has_cuda, why, extraction, matching
 ):
-    module, available = 'stavpr_ros.pipeline.settings', 'cpu' if why_not else 'cuda'
+    module, available = 'stavpr_ros.pipeline.settings', 'cuda' if has_cuda else 'cpu'
     monkeypatch.setattr(f'{module}.choose_backend', {'auto': available, 'cpu': 'cpu'}.get)
-    monkeypatch.setattr(f'{module}.why_no_cuda', lambda: why_not)
+    monkeypatch.setattr(f'{module}.torch_has_cuda', lambda: has_cuda)
     settings = PipelineSettings(backend=backend)
     assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
     extracting = f'backend {backend}{why}: networks on {extraction}'

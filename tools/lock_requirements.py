@@ -5,9 +5,9 @@ Write requirements/locked/NAME.txt: every package with its version and the hashe
 
 Usage: ``python3 tools/lock_requirements.py python3.11 python3.12 python3.13``
 
-Each Python resolves requirements/NAME.txt for itself. torch and the extra ``cuda`` are not locked:
-their builds depend on the package index and on the driver. ``base.txt`` is always
-installed; the files of the extras list the additional packages.
+Each Python resolves requirements/NAME.txt for itself. torch is not locked: its builds
+depend on the package index. ``base.txt`` is always installed; the files of the extras list the
+additional packages.
 """
 
 import json

@@ -30,12 +30,11 @@ LAST_LINES = 25  # of the log of a failed command
 
 # Names of files requirements/NAME.txt. tools/lock_requirements.py makes requirements/locked of
 # them: base.txt, and a file for each extra. Those are installed, and their hashes compared.
-# torch and cuda are not locked: their builds depend on the index and on the driver.
+# torch is not locked: its builds depend on the index.
 BASE = ('runtime', 'ros', 'build')
 LOCKED_EXTRAS = (
     'onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench', 'dev', 'docs',
 )  # fmt: skip
-EXTRAS = (*LOCKED_EXTRAS, 'cuda')
 
 # The files that a package is built from, in build order: each depends on those before.
 SOURCES = {
@@ -193,13 +192,12 @@ def install(extras: list, torch_index: str) -> None:
         'folder': str(venv),
         'torch_index': torch_index or before.get('torch_index', ''),
     }
-    extras = [name for name in EXTRAS if name in extras or name in before.get('extras', [])]
+    extras = [name for name in LOCKED_EXTRAS if name in extras or name in before.get('extras', [])]
     requirements = ROOT / 'requirements'
-    locked = ['base', *(name for name in extras if name in LOCKED_EXTRAS)]
+    locked = ['base', *extras]
     files = [requirements / 'locked' / f'{name}.txt' for name in locked]
-    unlocked = [requirements / f'{name}.txt' for name in ('torch', 'cuda')]
-    unlocked = unlocked if 'cuda' in extras else unlocked[:1]
-    wanted = {**place, 'extras': extras, 'files': digest([*files, *unlocked])}
+    torch = requirements / 'torch.txt'
+    wanted = {**place, 'extras': extras, 'files': digest([*files, torch])}
     if before == wanted:
         return
     problems = machine_problems()
@@ -217,14 +215,11 @@ def install(extras: list, torch_index: str) -> None:
             run_logged('venv', 'Creating .venv', command)
         index = ['--index-url', place['torch_index']] if place['torch_index'] else []
         title = ' '.join(['Installing torch', *(['from', place['torch_index']] if index else [])])
-        run_logged('torch', title, [*pip, *index, '-r', unlocked[0]])
+        run_logged('torch', title, [*pip, *index, '-r', torch])
         options = [part for file in files for part in ('-r', file)]
         title = f'Installing {", ".join(locked)}: a few minutes the first time'
         # The files name every package; pip before 24 takes NAME[EXTRA] from outside them.
         run_logged('pip', title, [*pip, '--require-hashes', '--no-deps', *options])
-        if unlocked[1:]:
-            constraints = ['-c', requirements / 'constraints.txt']
-            run_logged('cuda', 'Installing cuda', [*pip, '-r', unlocked[1], *constraints])
     except SetupError:
         if not is_new:
             # pip rolls a failed installation back.
@@ -276,7 +271,9 @@ def main(arguments: list) -> int:
         commands = parser.add_subparsers(dest='command', required=True)
         for name, text in (('setup', 'make .venv'), ('build', 'the same, and build the packages')):
             command = commands.add_parser(name, help=text)
-            command.add_argument('--with', dest='extras', nargs='*', default=[], choices=EXTRAS)
+            command.add_argument(
+                '--with', dest='extras', nargs='*', default=[], choices=LOCKED_EXTRAS
+            )
             command.add_argument('--torch-index', default='', metavar='URL')
         command = commands.add_parser('run', help='run a command with the built packages')
         command.add_argument('argv', nargs=argparse.REMAINDER, metavar='COMMAND')

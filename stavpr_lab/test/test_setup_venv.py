@@ -14,7 +14,7 @@ import pytest
 import setup_venv
 
 ROOT = Path(__file__).resolve().parents[2]
-GROUPS = ('torch', 'cuda', *(f'locked/{name}' for name in ('base', *setup_venv.LOCKED_EXTRAS)))
+GROUPS = ('torch', *(f'locked/{name}' for name in ('base', *setup_venv.LOCKED_EXTRAS)))
 LOCKED = setup_venv.LOCKED_EXTRAS
 EXACT = re.compile(r'^([\w.-]+)(?:\[\w+\])?==([\w.]+)', re.MULTILINE)
 
@@ -115,7 +115,6 @@ def test_extras_are_added_and_kept(recorder):
     assert '--require-hashes --no-deps' in recorder.commands['pip']
     installed = re.findall(r'locked/(\w+)\.txt', recorder.commands['pip'])
     assert installed == ['base', 'onnx', 'dev']
-    assert recorder.run('build', '--with', 'cuda') == ['torch', 'pip', 'cuda']
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
 
 
@@ -221,7 +220,7 @@ def test_failed_command_shows_the_end_of_its_log(checkout):
 # The files of the repository
 
 
-@pytest.mark.parametrize('name', ['torch', 'cuda', *setup_venv.BASE, *LOCKED, 'constraints'])
+@pytest.mark.parametrize('name', ['torch', *setup_venv.BASE, *LOCKED, 'constraints'])
 def test_requirements_are_pinned_exactly(name):
     text = (ROOT / 'requirements' / f'{name}.txt').read_text(encoding='utf-8')
     pins = re.sub('#.*', '', text).split()
