@@ -32,6 +32,7 @@ from stavpr_ros.prepare.prepared_map import PreparedMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 STRIPS, DIMENSION = 7, 224
 DISTINCT = 100_000  # places of the map that are not copies
@@ -50,9 +51,17 @@ class Counter(TorchDispatchMode):
         result = func(*args, **(kwargs or {}))
         if not func.is_view and 'empty' not in str(func):
             self.operations += 1
-            tensors = torch.utils._pytree.tree_leaves((args, kwargs, result))
-            self.bytes += sum(_bytes(each) for each in tensors if isinstance(each, torch.Tensor))
+            moved = (args, result)  # an argument ``out`` is the result
+            if any(name in str(func) for name in ('index', 'take', 'gather')):
+                # of the first argument only what is copied from it or to it
+                copied = args[-1] if func._schema.name.endswith('_') else result
+                moved = (args[1:], copied)
+            self.bytes += sum(map(_bytes, _tensors(moved)))
         return result
+
+
+def _tensors(arguments: Any) -> list[torch.Tensor]:
+    return [each for each in tree_leaves(arguments) if isinstance(each, torch.Tensor)]
 
 
 def _bytes(tensor: torch.Tensor) -> int:

@@ -171,7 +171,7 @@ def test_network_of_feature_settings_and_model_path_is_accepted():
         ('localization', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cuda'),
         ('loop_closure', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cpu'),
         ('localization', 'cpu', True, '', 'cpu', 'cpu'),
-        ('localization', 'auto', False, ' (torch finds no CUDA device)', 'cpu', 'cpu'),
+        ('localization', 'auto', False, ' (torch finds no CUDA device here)', 'cpu', 'cpu'),
     ],
 )
 def test_backend_summary_names_device_of_each_stage(
