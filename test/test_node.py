@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node over ROS: images in, matches out; parameters that change meanwhile."""
 
-from dataclasses import replace
-
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from robot import image_message, LENGTH, SECOND
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.mapping import save_map
 from stavpr_ros.pipeline.view_bank import warped
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.ros import output
@@ -44,7 +41,7 @@ def same_match(message, core):
 
 
 def test_node_publishes_the_matches_of_the_library(robot, start, small_map, route):
-    """Every field of ~/match, candidates of every window, plain topics for accepted matches."""
+    """And candidates of every window, plain topics for accepted matches."""
     start(**PAPER, candidates=3)
     places = robot.listen(Int32, '/stavpr/place_index')
     distances = robot.listen(Float32, '/stavpr/distance')
@@ -53,17 +50,13 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
     rng = np.random.default_rng(0)
     images = route[20:34] + [rng.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(6)]
     cores = recognize(small_map, images)
-    stamps, windows, matches = [], [], []
+    windows, matches = [], []
     for image, core in zip(images, cores, strict=True):
         bgr = image_message(image, encoding='bgr8')
         message = robot.show(bgr, SECOND + 7)
-        stamps.append(robot.stamp)
         same_match(message, core)
-        assert message.threshold == pytest.approx(THRESHOLD)
         if core.sequence is not None:
             windows.append(message)
-            window = message.window_first, message.window_middle, message.window_last
-            assert [nanoseconds(t) for t in window] == [stamps[-5], stamps[-3], stamps[-1]]
         if message.status == PlaceMatch.MATCH:
             matches.append(message)
     assert 10 <= len(matches) < len(images) - LENGTH + 1
@@ -71,24 +64,7 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
     assert [place.data for place in places] == [match.place_index for match in matches]
     assert [distance.data for distance in distances] == [match.distance for match in matches]
     robot.until(lambda: len(candidates) == len(windows), 'the candidates')
-    for listed, match in zip(candidates, windows, strict=True):
-        assert (listed.header, listed.threshold) == (match.header, match.threshold)
-        assert len(listed.candidates) == 3
-        best, second = listed.candidates[:2]
-        assert (best.place_index, best.distance) == (match.sequence_middle, match.distance)
-        assert second.place_index == match.second_best_index
-
-
-@pytest.mark.parametrize(('given', 'applied'), [({}, 0.3), ({'threshold': 0.1}, 0.1)])
-def test_node_takes_the_threshold_of_the_map_unless_it_is_set(
-    robot, start, small_map, route, tmp_path, given, applied
-):
-    save_map(replace(small_map, threshold=0.3), tmp_path / 'route.stavpr')
-    start(map_path=str(tmp_path / 'route.stavpr'), mode='paper', **given)
-    for image in route[20 : 20 + LENGTH]:
-        message = robot.show(image_message(image), SECOND)
-    assert message.status == PlaceMatch.MATCH
-    assert message.threshold == pytest.approx(applied)
+    assert {len(listed.candidates) for listed in candidates} == {3}
 
 
 def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):

@@ -94,22 +94,6 @@ def closing(robot, start, route):
     return drive
 
 
-def test_closures_without_camera_info_are_aligned(closing):
-    matches, closures = closing()
-    assert [c.header.stamp for c in closures] == [m.header.stamp for m in matches]
-    for match, closure in zip(matches, closures, strict=True):
-        edge = closure.relative_pose
-        assert closure.has_relative_pose
-        assert edge.source == RelativePose.ALIGNED
-        assert 'the intrinsics of the camera are unknown' in edge.reason
-        assert (edge.query_index, edge.place_index) == (closure.query_index, closure.place_index)
-        assert (edge.query_stamp, edge.place_stamp) == (closure.query_stamp, closure.place_stamp)
-        assert edge.frame == closure.pose_child_frame
-        assert match.relative_pose.source == RelativePose.ALIGNED
-        assert match.relative_pose.pose == edge.pose
-    assert closures[0].relative_pose.is_independent
-
-
 def test_verifier_replaces_and_refutes_edges(closing, monkeypatch):
     """It refutes each second one, closures of late matches included."""
     module, seen = ModuleType('own_verification'), []

@@ -62,34 +62,6 @@ def test_localization_returns_the_matches_of_the_recognizer(
     assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
 
 
-def test_threshold_is_the_limit_that_applied(map_file, route):
-    """Before the window is full, .9 is needed; at rest where the map lacks the place, as well."""
-    pipeline, stop = localizing(map_file), route_images(4, seed=9)[0]
-    first, *early = process(pipeline, route[20 : 20 + LENGTH - 1])
-    later = process(pipeline, route[24:31], first=4)
-    at_rest = process(pipeline, [stop] * 8, first=11)[-1]
-    assert (first.status, first.threshold) == (Status.WARMING_UP, 1 - MIN_PROBABILITY)
-    for matches, status, threshold in (
-        (early, Status.MATCH, 0.1),
-        (later, Status.MATCH, 1 - MIN_PROBABILITY),
-        ([at_rest], Status.NO_MATCH, 0.1),
-    ):
-        assert {match.status for match in matches} == {status}
-        assert [match.threshold for match in matches] == pytest.approx(
-            [threshold] * len(matches), abs=1e-3
-        )
-
-
-def test_threshold_is_zero_until_the_path_of_a_closure_is_confirmed(route):
-    pipeline = recorded(route, 'loop_closure')
-    waiting, confirmed = [], []
-    for match in process(pipeline, route[:15], first=30, poses=True):
-        unconfirmed = 'not confirmed' in match.reason
-        (waiting if unconfirmed else confirmed if match.accepted else []).append(match)
-    assert {(match.status, match.threshold) for match in waiting} == {(Status.NO_MATCH, 0.0)}
-    assert {match.threshold for match in confirmed} == {1 - MIN_PROBABILITY}
-
-
 def test_missing_map_or_threshold_is_the_reason(map_file, route):
     pipeline = Pipeline(settings_of(mode='paper'))
     assert (pipeline.map_state, pipeline.places, pipeline.window_fill) == ('none', None, 0)

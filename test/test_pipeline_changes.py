@@ -222,35 +222,7 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     assert matches[-1].match.path[-1].tolist() == [4, 8]
 
 
-def test_relocalize_returns_the_match_of_the_window(map_file, route):
-    pipeline = localizing(map_file, candidates=2)
-    for i in range(2):
-        with pytest.raises(InputError, match=f'{i} of 5 images in the window'):
-            pipeline.relocalize(3)
-        process(pipeline, route[i : i + 1], first=i)
-    last = process(pipeline, route[2:LENGTH], first=2)[-1]
-    pipeline.process(message(np.zeros((0, 0, 3), np.uint8)), 0)  # invalid: the window is unchanged
-    match = pipeline.relocalize(4)
-    assert (match.status, match.match) == (Status.MATCH, last.match)
-    assert (len(match.candidates), match.candidates[:2]) == (4, last.candidates)
-    assert pipeline.relocalize(0).candidates == ()
-    pipeline.reset()
-    with pytest.raises(InputError, match='0 of 5'):
-        pipeline.relocalize(3)
-
-
 # ------------------------------------------------ saving
-
-
-@pytest.mark.parametrize(
-    ('operation', 'words'),
-    [('loop_closure', 'threshold'), ('localization', 'map_path'), ('mapping', 'no places')],
-)
-def test_saving_nothing_is_an_error(operation, words, tmp_path):
-    pipeline = Pipeline(settings_of(mode='paper'), operation)
-    with pytest.raises(InputError, match=words):
-        save(pipeline, tmp_path / 'map.stavpr', overwrite=True)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_saving_that_fails_leaves_places_unsaved_and_the_file_unchanged(route, tmp_path):

@@ -6,7 +6,6 @@
 from dataclasses import replace
 import json
 from pathlib import Path
-import re
 import sys
 
 import cv2
@@ -14,18 +13,14 @@ from evaluation_commands import write_images
 from fixtures import route_images
 import numpy as np
 import pytest
-from scipy.spatial.distance import cosine
-from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.prepare.centering import norms_of, unit_norm
+from stavpr_ros.prepare.centering import unit_norm
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
-import city
 import data
-import lower_bounds
-from lower_bounds import Peaks, Sizes, Work
+from lower_bounds import Peaks
 import matching
 import off_map
 import off_map_page
@@ -34,10 +29,7 @@ import protocol
 import report
 import results
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
-from stavpr_ros.recognition.match import Match, Status
 from stavpr_ros.sources import open_source
 
 PEAKS = Peaks(1e9, 1e10)
@@ -143,31 +135,6 @@ def test_table_of_synthetic_route_has_every_section(monkeypatch):
         assert f'\n| {row}' in text
 
 
-def test_detours_begin_at_each_place_or_at_random_on_long_routes():
-    truth = GroundTruth.identity(1100, 1100)
-    short, long = (
-        off_map.stretches(off_map.Pair('route', range(n), range(n), truth), coarser)
-        for n, coarser in ((100, 1), (1100, 2))
-    )
-    assert [first for first, _ in short] == list(range(81))
-    assert {last - first for first, last in short[:61]} >= {20, 30, 40}
-    assert all(20 <= last - first <= 40 and last <= 100 for first, last in short)
-    assert len(long) == len(set(long)) == 50
-    assert len({first % 10 for first, _ in long}) == 10
-
-
-def test_first_right_match_counts_images_since_start():
-    truth = GroundTruth.identity(6, 6)
-
-    def match(status, place):
-        return Match(status, '', 1.0, SequenceMatch(place, place, place, 0.5, -1, np.nan))
-
-    matches = [Match(Status.WARMING_UP, '', 1.0)] * 3
-    matches += [match(Status.MATCH, 5), match(Status.NO_MATCH, 2), match(Status.MATCH, 3)]
-    assert off_map.first_right(matches, truth, 4) == 6  # windows of 4: image 3 is the middle
-    assert off_map.first_right(matches[:5], truth, 4) is None
-
-
 # ------------------------------------------------ the protocol
 
 
@@ -193,41 +160,3 @@ def test_protocol_of_folders_has_all_methods_and_leaves_stops_out(monkeypatch, t
 
 
 # ------------------------------------------------ the city
-
-
-def test_simulated_places_have_mean_and_neighbors_of_real_ones():
-    """Of places of which each resembles the one before, and all their mean."""
-    strips = data.make_features(60, 16, 7, 0).strips + 0.3
-    strips[:, 1:] += strips[:, :-1].copy()
-    unit = unit_norm(strips)
-    weights = np.full((7, 60), 7**-0.5, np.float32)
-    real = LocalFeatures(unit, weights, FeatureSettings('synthetic', None))
-    strips = np.concatenate(list(city.simulated(real, 5000, seed=0)), axis=1)
-    np.testing.assert_allclose(
-        norms_of(strips), np.ones((7, 5000), np.float32), rtol=1e-5, atol=1e-5
-    )
-    mean, expected = strips.mean(axis=1), unit.mean(axis=1)
-    assert 1 - cosine(mean.ravel(), expected.ravel()) > 0.99
-    change = 1 - (strips[:, 1:] * strips[:, :-1]).sum(axis=2).mean()
-    of_real = 1 - (unit[:, 1:] * unit[:, :-1]).sum(axis=2).mean()
-    assert 0.5 < float(change / of_real) < 2
-    features, first = city.city(real, 500, seed=0)
-    np.testing.assert_allclose(features[first : first + 60].strips, unit, atol=1e-3, rtol=0)
-    assert len(features) == 500
-
-
-def test_bounds_of_boards_follow_from_costs_and_peaks():
-    page, sizes = (BENCHMARKS / 'results/boards.md').read_text(), Sizes(100_000, 224)
-    alignment = lower_bounds.spatial_alignment(sizes)
-    parts = alignment, lower_bounds.filter_update(sizes, FilterSettings())
-    product = lower_bounds.product(sizes, 'float32')
-    row = r'^\| [^|]+ \| ([\d.]+) \| ([\d,]+), ([\d,]+|-) \| ([\d.]+)[^|]* \| ([\d.]+)'
-    found = re.findall(row, page, re.M)
-    assert len(found) == 4
-    for texts in found:
-        numbers = (float(text.replace(',', '').replace('-', 'inf')) for text in texts)
-        bandwidth, peak, int8_peak, *bounds = numbers
-        read = Work(sizes.n * sizes.W * (sizes.d + 4), product.operations * peak / int8_peak)
-        peaks_ = Peaks(1e9 * bandwidth, 1e9 * peak)
-        expected = [lower_bounds.bound_seconds([each, *parts], peaks_) for each in (product, read)]
-        assert bounds == pytest.approx([1e3 * seconds for seconds in expected], rel=0.02)

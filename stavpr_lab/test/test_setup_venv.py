@@ -3,7 +3,6 @@
 """Tests of the set-up behind the Makefile; none of them needs a network."""
 
 import ast
-import json
 import os
 from pathlib import Path
 import platform
@@ -146,36 +145,6 @@ def test_lock_has_every_requirement_of_every_python_with_a_hash():
     }
 
 
-def test_changed_source_builds_its_package_from_nothing(recorder, checkout):
-    recorder.run('build')
-    (checkout / 'stavpr_ros' / 'x.py').touch()
-    stale = [checkout / folder / 'stavpr_ros' / 'stale' for folder in ('build', 'install')]
-    for folder in stale:
-        folder.mkdir(parents=True)
-    assert recorder.run('build') == ['stavpr_ros']
-    assert not any(folder.exists() for folder in stale)
-
-
-def test_torch_index_is_for_torch_alone_and_is_kept(recorder):
-    recorder.run('build')
-    steps = ['venv', 'torch', 'pip']
-    assert recorder.run('build', '--torch-index', 'file:///cpu') == steps
-    command = recorder.commands['torch']
-    assert '--index-url file:///cpu' in command
-    assert re.findall(r'(\w+)\.txt', command) == ['torch']
-    assert '--index-url' not in recorder.commands['pip']
-    assert recorder.run('build') == []
-
-
-@pytest.mark.parametrize('changed', ['python', 'prefix', 'folder'])
-def test_changed_interpreter_or_folder_starts_anew(recorder, checkout, changed):
-    recorder.run('setup')
-    stamp = checkout / '.venv' / 'setup.json'
-    stamp.write_text(json.dumps(json.loads(stamp.read_text()) | {changed: 'other'}))
-    assert recorder.run('setup') == ['venv', 'torch', 'pip']
-    assert '--clear' in recorder.commands['venv']
-
-
 @pytest.mark.parametrize('step', ['venv', 'pip'])
 def test_interrupted_installation_starts_anew(recorder, checkout, step):
     recorder.run('setup')
@@ -210,11 +179,6 @@ def test_environment_has_no_other_ros(checkout, monkeypatch):
         'PIP_USER': '0',
         **dict.fromkeys(('VIRTUAL_ENV', 'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH'), venv),
     }
-
-
-def test_failed_command_shows_the_end_of_its_log(checkout):
-    with pytest.raises(setup_venv.SetupError, match=r'pip failed with status 1.*\n  \| no wheel'):
-        setup_venv.run_logged('pip', 'title', [sys.executable, '-c', 'exit("no wheel")'])
 
 
 # The files of the repository
