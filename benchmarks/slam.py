@@ -40,7 +40,7 @@ WRONG_PAIRS = 200  # of each world
 FAR = 30.0  # meters: a pair of wrong places
 PASSES = 4.0  # meters: images of two laps whose relative position is compared
 ONLINE = 60  # images after the first closure behind a break that are watched
-LEAST_ATE = 2.5  # meters: of a carried robot
+MIN_ATE = 2.5  # meters: of a carried robot
 OTHER_DRAWS = 2  # of each world, with two sessions and with a carried robot
 
 
@@ -207,7 +207,7 @@ def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
             missing = np.full(7, np.nan)
             now = np.array([missing if pose is None else pose for pose in known])
             errors.append(ate(drive, now, i + 1))
-    above = np.flatnonzero(np.array(errors) > LEAST_ATE)
+    above = np.flatnonzero(np.array(errors) > MIN_ATE)
     return {
         'before': ate(drive, odometry),
         'after': ate(drive, poses),

@@ -29,9 +29,9 @@ from stavpr_ros.recognition.loop_closer import (
     AROUND,
     CERTAIN,
     EVICTED,
-    LEAST_PLACES,
     LONGEST_GAP,
     LoopCloser,
+    MIN_PLACES,
 )
 from stavpr_ros.recognition.match import Limits, WindowMatch
 from stavpr_ros.recognition.recognizer import Verdict
@@ -94,7 +94,7 @@ class PlainCloser:
     def add(self, image, first, last):
         """Return the sequence of an image that may be matched with places first..last-1."""
         row = np.full(len(self.all), np.inf, np.float32)
-        if last - first >= LEAST_PLACES:
+        if last - first >= MIN_PLACES:
             strips, weights = self.all.strips[:, image], self.all.weights[:, image]
             matcher = CpuMatcher(self.all[:last], self.settings.spatial)
             row[first:last] = matcher.distances(strips, weights)[first:]

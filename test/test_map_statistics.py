@@ -29,7 +29,7 @@ SETTINGS = RecognizerSettings(mode='robust')
 @pytest.fixture(autouse=True)
 def small_maps(monkeypatch):
     """Keep the statistics of small maps, too."""
-    monkeypatch.setattr(prepared_map, 'LEAST_PLACES', 1)
+    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
 
 
 @pytest.fixture(scope='module')
@@ -99,7 +99,7 @@ def test_changes_are_those_of_neighbors_up_to_five_places_apart(place_map):
 
 
 def test_small_map_keeps_none(place_map, monkeypatch):
-    monkeypatch.setattr(prepared_map, 'LEAST_PLACES', 601)
+    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 601)
     assert statistics_of_map(place_map) is None
 
 

@@ -19,10 +19,10 @@ from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.ros import edges
-from stavpr_ros.ros.edges import EdgePublisher, MOST_WAITING, WaitingClosure
+from stavpr_ros.ros.edges import EdgePublisher, MAX_WAITING, WaitingClosure
 from stavpr_ros.ros.messages import camera_of
 
-LAST = MOST_WAITING + 3  # of so many closures that three are dropped
+LAST = MAX_WAITING + 3  # of so many closures that three are dropped
 MOUNT = '0.1 0 1.2 -1.5708 0 -1.5708'
 
 
@@ -205,10 +205,10 @@ def test_oldest_closures_are_dropped_in_order_while_too_many_wait(queue):
     assert sources[:5] == [RelativePose.PNP, *dropped, RelativePose.PNP]
     assert set(sources[5:]) == {RelativePose.PNP}
     found = queue.published[1]
-    reason = f'PnP: dropped, {MOST_WAITING + 2} newer closures are waiting'
+    reason = f'PnP: dropped, {MAX_WAITING + 2} newer closures are waiting'
     assert found.relative_pose.reason == reason
     assert not found.has_relative_pose
-    assert queue.statistics.counts().edges.total == {'pnp': MOST_WAITING + 1, 'dropped': 3}
+    assert queue.statistics.counts().edges.total == {'pnp': MAX_WAITING + 1, 'dropped': 3}
 
 
 @pytest.mark.parametrize(('seconds', 'source'), [(60.0, Source.PNP), (0.0, Source.DROPPED)])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.camera import Camera, FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View
-from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, solve_pnp
+from stavpr_ros.relative_pose.pnp import MIN_INLIERS, solve_pnp
 
 SIZE = 320, 240
 CAMERA = Camera(*SIZE, (200.0, 200.0), (159.5, 119.5))
@@ -119,4 +119,4 @@ def test_pnp_counts_each_keypoint_once_and_rejects_other_points():
     few = replace(landmarks, points=landmarks.points[:11], descriptors=landmarks.descriptors[:11])
     assert solve_pnp(query, [few, few]).matrix is None
     other = np.random.default_rng(3).permutation(landmarks.points)
-    assert solve_pnp(query, [replace(landmarks, points=other)]).inliers < LEAST_INLIERS
+    assert solve_pnp(query, [replace(landmarks, points=other)]).inliers < MIN_INLIERS

@@ -17,8 +17,8 @@ from stavpr_ros.relative_pose import landmarks
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
 from stavpr_ros.relative_pose.odometry import align
-from stavpr_ros.relative_pose.pair import AROUND, MatchedPair
-from stavpr_ros.relative_pose.pnp import LEAST_INLIERS
+from stavpr_ros.relative_pose.pair import MatchedPair, TRIANGULATION_RADIUS
+from stavpr_ros.relative_pose.pnp import MIN_INLIERS
 from test_pnp import CAMERA, in_camera, points_ahead, pose, SIZE
 
 SPACING = 1.0  # meters between places
@@ -60,7 +60,7 @@ def scene(camera, query, seed=0):
     points = np.add(points_ahead(260, seed), [PLACE * SPACING - 5, 0, 0])
     textures = rng.integers(0, 255, (len(points), 12, 12, 3), dtype=np.uint8)
     poses = np.array([pose(i * SPACING) for i in range(PLACES)])
-    near = range(PLACE - AROUND, PLACE + AROUND + 1)
+    near = range(PLACE - TRIANGULATION_RADIUS, PLACE + TRIANGULATION_RADIUS + 1)
     thumbnails = {i: encode_thumbnail(render(points, textures, poses[i], camera)) for i in near}
     true = matrices(poses[PLACE]) @ matrices(query)
     image = thumbnail_of(render(points, textures, to_poses(true), camera))
@@ -86,7 +86,7 @@ def test_edge_of_images_is_the_pose_between_the_bases(camera):
     pair = scene(camera, query)
     edge = EdgeEstimator().estimate(pair, camera, camera)
     assert (edge.source, edge.reason) == (Source.PNP, '')
-    assert edge.inliers >= LEAST_INLIERS
+    assert edge.inliers >= MIN_INLIERS
     assert 0 < edge.error < 2
     np.testing.assert_allclose(edge.pose[:3], query[:3], atol=0.12)
     turn = Rotation.from_quat(edge.pose[3:]).inv() * Rotation.from_quat(query[3:])
@@ -111,9 +111,9 @@ def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, monkeypatch):
 
 
 def test_edge_that_keypoints_do_not_determine_has_no_pose(monkeypatch):
-    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.MOST_DEVIATION', 0.02)
+    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.MAX_DEVIATION', 0.02)
     edge = EdgeEstimator().estimate(scene(CAMERA, pose(0.5)), CAMERA, CAMERA)
-    assert (edge.source, edge.has_pose, edge.inliers >= LEAST_INLIERS) == (
+    assert (edge.source, edge.has_pose, edge.inliers >= MIN_INLIERS) == (
         Source.REFUTED, False, True,
     )  # fmt: skip
     assert 'determine the position to 0.0 m only' in edge.reason
@@ -133,7 +133,7 @@ def test_estimator_keeps_landmarks_of_places_until_the_map_changes(monkeypatch):
     detected, view_of = [], landmarks.view_of
     module = 'stavpr_ros.relative_pose.estimator'
     monkeypatch.setattr(f'{module}.view_of', lambda *of: detected.append(of) or view_of(*of))
-    estimator, views = EdgeEstimator(), 2 * AROUND + 2
+    estimator, views = EdgeEstimator(), 2 * TRIANGULATION_RADIUS + 2
     for source, count in ((pair.source, views), (pair.source, 1), (object(), views)):
         detected.clear()
         estimator.estimate(replace(pair, source=source), CAMERA, CAMERA)
@@ -161,7 +161,10 @@ NO_POSES = {'poses': np.full((PLACES, 7), np.nan)}
 )  # fmt: skip
 def test_edge_without_what_pnp_needs_names_it(changes, cameras, source, words):
     flat = np.zeros((144, 192, 3), np.uint8)
-    thumbnails = {PLACE + i: encode_thumbnail(flat) for i in range(-AROUND, AROUND + 1)}
+    thumbnails = {
+        PLACE + i: encode_thumbnail(flat)
+        for i in range(-TRIANGULATION_RADIUS, TRIANGULATION_RADIUS + 1)
+    }
     poses = np.array([pose(i * SPACING) for i in range(PLACES)])
     pair = MatchedPair(object(), PLACE, flat, *driven(), 0, poses, thumbnails)
     edge = EdgeEstimator().estimate(replace(pair, **changes), *cameras)

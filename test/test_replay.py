@@ -21,7 +21,7 @@ from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
 from stavpr_ros.commands.replay import main
 from stavpr_ros.ros import process
 from stavpr_ros.ros.qos import LATCHED
-from stavpr_ros.ros.receipts import MOST_BEHIND
+from stavpr_ros.ros.receipts import MAX_BEHIND
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_playback import spinning
@@ -155,7 +155,7 @@ def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path, repla
         node.create_timer(0.05, close)
         assert replay(bag, '--lossless')[0] == 0
     assert len(backlog) == 40
-    assert max(backlog) <= MOST_BEHIND + 2
+    assert max(backlog) <= MAX_BEHIND + 2
 
 
 def test_replay_lossless_without_a_match_sends_the_image_again(tmp_path, subscribe, replay):

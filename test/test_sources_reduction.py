@@ -13,7 +13,7 @@ from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.sources.encodings import decode_image, decode_message
 from stavpr_ros.sources.files import reduction
 
-LEAST = (224, 224)
+MIN_SIZE = (224, 224)
 
 
 def as_nv12(rgb):
@@ -62,18 +62,18 @@ def compressed(image, suffix):
 @pytest.mark.parametrize(
     ('size', 'least', 'divisor'),
     [
-        ((480, 640), LEAST, 1),
-        ((768, 1024), LEAST, 1),  # not large
-        ((960, 1280), LEAST, 2),
-        ((720, 1280), LEAST, 2),
-        ((1080, 1920), LEAST, 4),
+        ((480, 640), MIN_SIZE, 1),
+        ((768, 1024), MIN_SIZE, 1),  # not large
+        ((960, 1280), MIN_SIZE, 2),
+        ((720, 1280), MIN_SIZE, 2),
+        ((1080, 1920), MIN_SIZE, 4),
         ((1080, 1920), (224, 480), 4),
         ((1080, 1920), (224, 481), 2),
         ((1080, 1920), (271, 271), 2),
         ((1080, 1920), None, 1),
-        ((1081, 1920), LEAST, 1),
-        ((1080, 1918), LEAST, 2),
-        ((2160, 3840), LEAST, 8),
+        ((1081, 1920), MIN_SIZE, 1),
+        ((1080, 1918), MIN_SIZE, 2),
+        ((2160, 3840), MIN_SIZE, 8),
     ],
 )
 def test_reduction_keeps_needed_size_and_whole_pixels(size, least, divisor):
@@ -84,7 +84,7 @@ def test_reduction_keeps_needed_size_and_whole_pixels(size, least, divisor):
     ('encoding', 'padding'), [*zip(ENCODERS, [0, 7, 7, 7, 7], strict=True), ('nv12', 0)]
 )
 def test_decode_of_large_raw_image_averages_blocks(image, encoding, padding):
-    reduced = decode_message(raw(image, encoding, padding), LEAST)
+    reduced = decode_message(raw(image, encoding, padding), MIN_SIZE)
     whole = decode_message(raw(image, encoding, padding))
     assert (whole.shape, reduced.shape) == ((1080, 1920, 3), (270, 480, 3))
     assert np.abs(reduced - block_means(whole, 4)).max() <= 1  # rounded twice
@@ -93,7 +93,7 @@ def test_decode_of_large_raw_image_averages_blocks(image, encoding, padding):
 
 @pytest.mark.parametrize(('suffix', 'tolerance'), [('.png', 1), ('.jpg', 4)])
 def test_decode_of_large_compressed_image_averages_blocks(image, suffix, tolerance):
-    reduced = decode_message(compressed(image, suffix), LEAST)
+    reduced = decode_message(compressed(image, suffix), MIN_SIZE)
     whole = decode_message(compressed(image, suffix))
     assert reduced.shape == (270, 480, 3)
     assert np.abs(reduced - block_means(whole, 4)).max() <= tolerance
@@ -102,18 +102,18 @@ def test_decode_of_large_compressed_image_averages_blocks(image, suffix, toleran
 def test_decode_of_small_image_is_unchanged(image):
     small = image[:768, :1024]
     for message in (raw(small), compressed(small, '.jpg')):
-        np.testing.assert_array_equal(decode_message(message, LEAST), decode_message(message))
-    assert not np.shares_memory(decode_message(raw(small), LEAST), small)
+        np.testing.assert_array_equal(decode_message(message, MIN_SIZE), decode_message(message))
+    assert not np.shares_memory(decode_message(raw(small), MIN_SIZE), small)
 
 
 def test_decode_of_large_image_cut_off_is_rejected(image):
     message = raw(image)
     with pytest.raises(ImageError, match='cut off'):
-        decode_image(1080, 1920, 'rgb8', False, 5760, message.data[:-1], LEAST)
+        decode_image(1080, 1920, 'rgb8', False, 5760, message.data[:-1], MIN_SIZE)
     message = compressed(image, '.jpg')
     message.data = message.data[:-30]
     with pytest.raises(ImageError, match='cut off'):
-        decode_message(message, LEAST)
+        decode_message(message, MIN_SIZE)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ EVERY = 5  # images between lookups
 NEAREST = 64  # places of an image that vote
 HISTORY = 60  # latest images that the filter runs over again
 LIKELY = 8  # most probable places whose neighborhoods are kept
-LEAST = 1e-3  # their least probability
+MIN_PROBABILITY = 1e-3  # their least probability
 TIMEOUT = 0.25  # seconds that an image waits for a lookup
 
 
@@ -276,7 +276,7 @@ class FleetRecognizer(SequenceRecognizer):
             self._filter_window.filter.places_of_states()
         )
         top = np.argsort(-probabilities)[:LIKELY]
-        return self._places[self._order][top[probabilities[top] > LEAST]]
+        return self._places[self._order][top[probabilities[top] > MIN_PROBABILITY]]
 
     def _take(self, lookup: _Lookup) -> bool:
         """Put fetched places into the slots that were wanted longest ago."""

@@ -19,7 +19,7 @@ from stavpr_ros.prepare.centering import evenly, MeanCentering, normalize
 
 RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places
 GROUPS = 3  # of strips in a place's vector
-MOST_PLACES = 2**31 - 1
+MAX_PLACES = 2**31 - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,8 @@ class MapIndex:
     map_id: str = ''
 
     def __post_init__(self) -> None:
-        if not 0 < self.places <= MOST_PLACES:
-            raise FleetError(f'a map of {self.places} places: expected 1 to {MOST_PLACES}')
+        if not 0 < self.places <= MAX_PLACES:
+            raise FleetError(f'a map of {self.places} places: expected 1 to {MAX_PLACES}')
         if len(self.sample) != len(sample_places(self.places)):
             raise FleetError(
                 f'the sample of the map has {len(self.sample)} places: expected '

@@ -114,7 +114,7 @@ def traverses(tmp_path_factory):
     write_images(folder / 'map', first)
     write_images(folder / 'query', [image.astype(np.uint8) for image in second])
     place_map = build_map(open_source(folder / 'map'), FeatureExtractor(), progress=False)
-    with patch.object(prepared_map, 'LEAST_PLACES', 1):
+    with patch.object(prepared_map, 'MIN_PLACES', 1):
         learned = prepared_map.statistics_of_map(place_map, 'float16')
         learned = prepared_map.with_codes(learned, place_map, 'float16')
     save_map(place_map, folder / 'route.stavpr', 'float16', statistics=learned)
@@ -127,7 +127,7 @@ def command(traverses, tmp_path, monkeypatch, capsys):
     path, run = tmp_path / 'route.stavpr', runner(evaluate, monkeypatch, capsys)
     path.write_bytes((traverses / 'route.stavpr').read_bytes())
     pair = ['--map', path, '--query', traverses / 'query', '--truth', 'identity']
-    monkeypatch.setattr(prepared_map, 'LEAST_PLACES', 1)
+    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
     return path, lambda *options: run(*pair, '--sequence-length', 5, *options)
 
 

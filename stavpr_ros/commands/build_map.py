@@ -36,7 +36,7 @@ RULES = {  # fields of KeyframeSettings
     'angle': ('DEG', 'degrees from the last place; needs --odometry or --poses'),
     'change': ('C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
 }
-MOST_SUGGESTED = 20_000  # places of a map that a threshold of mode paper is suggested for
+MAX_SUGGESTED = 20_000  # places of a map that a threshold of mode paper is suggested for
 
 EPILOG = """
 examples:
@@ -262,7 +262,7 @@ def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float |
     from stavpr_ros.errors import InputError
     from stavpr_ros.recognition.threshold import suggest_threshold
 
-    if len(place_map) > MOST_SUGGESTED:
+    if len(place_map) > MAX_SUGGESTED:
         return None  # it would take the whole map into memory
     model = getattr(arguments, f'{place_map.settings.kind}_model', None) or ''
     try:

@@ -19,7 +19,7 @@ from stavpr_ros.errors import SettingsError, UnavailableError
 if TYPE_CHECKING:
     import numpy as np
 
-MOST_PIXELS = 4096  # on a side of the resized image
+MAX_SIDE = 4096  # pixels of a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
 POOLINGS = ('flatten', 'mean', 'gem')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
@@ -60,7 +60,7 @@ class GradientSettings:
 
     def __post_init__(self) -> None:
         require_choice('resize', self.resize, RESIZE_METHODS)
-        require_between('size', self.size, 1, MOST_PIXELS, 'pixels')
+        require_between('size', self.size, 1, MAX_SIDE, 'pixels')
         if self.cell < 2 or self.size < 2 * self.cell or self.size % self.cell:
             raise SettingsError(
                 f'size {self.size} and cell {self.cell}: size must be a multiple of cell, at '
@@ -78,7 +78,7 @@ class GradientSettings:
 class NetworkSettings:
     """Settings that all networks share."""
 
-    LEAST_SIZE: ClassVar[int] = 8
+    MIN_SIZE: ClassVar[int] = 8
     BEFORE: ClassVar[dict[str, Any]] = {'pooling': 'flatten'}
 
     model: str = setting(help='file of the network', identity=False)
@@ -93,7 +93,7 @@ class NetworkSettings:
 
     def __post_init__(self) -> None:
         require_choice('resize', self.resize, RESIZE_METHODS)
-        require_between('size', self.size, self.LEAST_SIZE, MOST_PIXELS, 'pixels')
+        require_between('size', self.size, self.MIN_SIZE, MAX_SIDE, 'pixels')
         require_choice('pooling', self.pooling, POOLINGS)
         if self.sha256 and (len(self.sha256) != 64 or set(self.sha256) - set('0123456789abcdef')):
             raise SettingsError(f'sha256 = {self.sha256!r} must be empty or 64 digits 0-9 a-f')

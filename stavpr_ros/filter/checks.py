@@ -33,7 +33,7 @@ from stavpr_ros.compilation import kernel
 EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share of its mean
 UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
 NEWEST = 0.7  # share of both that the newest images of a window may have
-LEAST_PLACES = 3  # of a path whose deviation is meaningful
+MIN_PLACES = 3  # of a path whose deviation is meaningful
 SURE_AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
 EXCESS, EXCESS_WEIGHT = 0.04, 30.0  # of right paths at most, and its weight in the odds beyond
 
@@ -81,7 +81,7 @@ def unevenness(path: np.ndarray, z: np.ndarray, part: float = 1.0) -> float:
                 place, nearest[count] = path[i], np.inf
                 count += 1
             nearest[count - 1] = min(nearest[count - 1], z[i])
-    if count < LEAST_PLACES:
+    if count < MIN_PLACES:
         return 0.0
     nearest = nearest[:count]
     mean = nearest.sum() / count

@@ -4,8 +4,8 @@
 
 import numpy as np
 
-MOST_PIXELS = 2**24  # of a thumbnail: 50 MB when it is decoded
-MOST_SEGMENTS = 64  # before the frame header
+MAX_THUMBNAIL_PIXELS = 2**24  # of a thumbnail: 50 MB when it is decoded
+MAX_SEGMENTS = 64  # before the frame header
 FIRST_FRAME, LAST_FRAME = 0xC0, 0xC2  # markers: baseline, extended, progressive
 FRAME_BYTES = 10  # marker, length, precision, height, width, components
 
@@ -24,7 +24,7 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
     left = np.flatnonzero(ends - starts >= 2 + FRAME_BYTES)
     left = left[(padded[starts[left]] == 0xFF) & (padded[starts[left] + 1] == 0xD8)]
     at = starts[left] + 2
-    for _ in range(MOST_SEGMENTS):
+    for _ in range(MAX_SEGMENTS):
         inside = at + FRAME_BYTES <= ends[left]
         left, at = left[inside], at[inside]
         if not len(left):
@@ -43,6 +43,6 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def is_thumbnail(content: bytes) -> bool:
-    """Whether this is a JPEG of 1 to :data:`MOST_PIXELS` pixels, by its header."""
+    """Whether this is a JPEG of 1 to :data:`MAX_THUMBNAIL_PIXELS` pixels, by its header."""
     data = np.frombuffer(content, np.uint8)
-    return 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MOST_PIXELS
+    return 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MAX_THUMBNAIL_PIXELS

@@ -15,7 +15,7 @@ from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.error_risks import ErrorRisks
-from stavpr_ros.mapping.jpeg import jpeg_pixels, MOST_PIXELS
+from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_schema import (
     Check,
@@ -242,8 +242,8 @@ def require_jpegs(content: np.ndarray, ends: np.ndarray, first: int = 0) -> None
     :raises InputError: names the place.
     """
     pixels = jpeg_pixels(content, ends)
-    bad = np.flatnonzero((pixels < 0) | (pixels > MOST_PIXELS))
+    bad = np.flatnonzero((pixels < 0) | (pixels > MAX_THUMBNAIL_PIXELS))
     if len(bad):
-        found = pixels[bad[0]]
-        what = f'has {found} pixels, at most {MOST_PIXELS}' if found > 0 else 'is no JPEG image'
+        count, limit = pixels[bad[0]], MAX_THUMBNAIL_PIXELS
+        what = f'has {count} pixels, at most {limit}' if count > 0 else 'is no JPEG image'
         raise InputError(f'the thumbnail of place {first + bad[0]} {what}')

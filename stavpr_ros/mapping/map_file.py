@@ -18,7 +18,7 @@ from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
 from stavpr_ros.mapping.map_schema import identity_fields
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
-from stavpr_ros.mapping.map_version2 import MOST_HEADER, read_header, write_parts
+from stavpr_ros.mapping.map_version2 import MAX_HEADER, read_header, write_parts
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.output_file import atomic_output, Force, MAP
@@ -199,4 +199,4 @@ def is_map(path: str | Path) -> bool:
             start = file.read(9)
     except OSError:
         return False
-    return int.from_bytes(start[:8], 'little') <= MOST_HEADER and start[8:] == b'{'
+    return int.from_bytes(start[:8], 'little') <= MAX_HEADER and start[8:] == b'{'

@@ -13,12 +13,12 @@ from stavpr_ros.mapping.map_container import DTYPES, MapFile, Part, PIECE, read_
 from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, text
 
 FORMAT, VERSION = 'stavpr-map', 2
-MOST_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
+MAX_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 # name: highest known version
 KNOWN_SECTIONS = dict.fromkeys(
     ('error_risks', 'intrinsics', 'same_places', 'statistics', 'threshold'), 1
 )
-_METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MOST_HEADER)))
+_METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MAX_HEADER)))
 _TENSOR = record(
     {
         'dtype': text(8),
@@ -37,7 +37,7 @@ def read_header(file: MapFile) -> None:
     """
     head = file.bytes_at(0, min(8, file.size))
     length = int.from_bytes(head, 'little')
-    if file.size < 8 or not 2 <= length <= min(MOST_HEADER, file.size - 8):
+    if file.size < 8 or not 2 <= length <= min(MAX_HEADER, file.size - 8):
         raise file.foreign(f'its header would have {length} of {file.size} bytes')
     content = file.bytes_at(8, length)
     try:
@@ -117,9 +117,9 @@ def write_parts(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, Part
     names = sorted(parts, key=lambda n: (-np.dtype(DTYPES[parts[n].dtype]).itemsize, n))
     parts = {name: parts[name] for name in names}
     length = len(_header(manifest, parts, {n: ['0' * 64] * parts[n].pieces for n in names})[0])
-    if length > 8 + MOST_HEADER:
+    if length > 8 + MAX_HEADER:
         raise MapFileError(
-            f'the manifest has {length} bytes, at most {MOST_HEADER} can be read: make two maps'
+            f'the manifest has {length} bytes, at most {MAX_HEADER} can be read: make two maps'
         )
     file.write(bytes(length))
     hashes = {name: _write(file, part.content) for name, part in parts.items()}

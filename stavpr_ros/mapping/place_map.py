@@ -15,11 +15,11 @@ from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.error_risks import ErrorRisks
-from stavpr_ros.mapping.jpeg import is_thumbnail, MOST_PIXELS
+from stavpr_ros.mapping.jpeg import is_thumbnail, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.units import SECOND
 
 THUMBNAIL_WIDTH = 192  # pixels
-MOST_SECONDS = 2**31  # of a stamp, since 1970: those of ROS messages
+MAX_SECONDS = 2**31  # of a stamp, since 1970: those of ROS messages
 LONGEST_ID = 4096  # characters
 
 
@@ -111,7 +111,7 @@ class PlaceMap:
                 f'{len(self.thumbnails)} thumbnails for {n} places: expected all or none'
             )
         seconds = self.stamps // SECOND
-        if n and not -MOST_SECONDS <= seconds.min() <= seconds.max() < MOST_SECONDS:
+        if n and not -MAX_SECONDS <= seconds.min() <= seconds.max() < MAX_SECONDS:
             raise InputError('a stamp is out of range: expected ns of at most 2**31 seconds')
         _require_texts(self.ids)
         _require_sessions(self.sessions, self.session_index, n)
@@ -268,7 +268,7 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
     :param image: RGB (h, w, 3) uint8.
     :param width: pixels; narrower images keep their size.
     """
-    most = math.sqrt(MOST_PIXELS / 2 / (image.shape[0] * image.shape[1]))
+    most = math.sqrt(MAX_THUMBNAIL_PIXELS / 2 / (image.shape[0] * image.shape[1]))
     scale = min(1.0, width / image.shape[1], most)
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

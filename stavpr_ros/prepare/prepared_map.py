@@ -23,7 +23,7 @@ from stavpr_ros.prepare.int8_features import Int8Features, rounded
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {MAX_LAG}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
-LEAST_PLACES = 1000  # of a map whose statistics are kept: as large as 70 places
+MIN_PLACES = 1000  # of a map whose statistics are kept: as large as 70 places
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +135,7 @@ def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics |
     :param storage: of the features in the file; '' = as :func:`stavpr_ros.mapping.save_map` does.
     :returns: None for a small map, whose file they would lengthen much.
     """
-    if len(place_map) < LEAST_PLACES:
+    if len(place_map) < MIN_PLACES:
         return None
     features = place_map.features
     stored = features.storage if isinstance(features, StoredFeatures) else 'float32'

@@ -28,7 +28,7 @@ AROUND = 30  # places whose mean distance is subtracted: a route has been throug
 # passes no earlier place: its model has fewer speeds, and comes to the map less.
 SPEEDS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
 ROUTE_MODEL = replace(MODEL, speeds=SPEEDS, enter=0.003, speed_weight=0)
-LEAST_PLACES = 5  # fewer distances have no meaningful mean and deviation
+MIN_PLACES = 5  # fewer distances have no meaningful mean and deviation
 CERTAIN = 0.95  # probability above which half a window of matches confirms their path
 LONGEST_GAP = 3  # images from a match to the one that continues it, at most
 LONGEST_WAIT = 3  # windows; so many matches of a path wait for its confirmation, at most
@@ -246,7 +246,7 @@ class LoopCloser(SequenceRecognizer):
 
     def _distances(self) -> np.ndarray:
         """Return the distances of the newest image to its places; none if they are too few."""
-        if self._places < LEAST_PLACES:
+        if self._places < MIN_PLACES:
             return np.empty(0, np.float32)
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
 

@@ -23,7 +23,7 @@ FEATURES = 1000  # most keypoints of an image
 RATIO = 0.9  # of the distances to the nearest and the second nearest descriptor
 WIDTH = 320  # pixels, which images are brought to before
 PIXELS = 2.0  # how far a match may lie off the geometry, at that width
-LEAST_MATCHES = 8  # a fundamental matrix fits any seven
+MIN_MATCHES = 8  # a fundamental matrix fits any seven
 ITERATIONS = 2000
 CONFIDENCE = 0.999
 LOWEST = 32  # rows of an image below which keypoints have no room, and certain detectors fail
@@ -32,7 +32,7 @@ IMPROBABLE, CERTAIN = 0.1, 0.99  # probabilities between which a match is checke
 EACH = 10  # of so many certain matches one is checked
 WRONG_PASSED = 0.1  # share of wrong pairs that pass: doubtful ones look alike
 PRIOR_PASSED, PRIOR_CHECKED = 1.0, 4.0  # right pairs before the first is checked
-LEAST_PASSED = 0.3  # r of a pair that has passed: right pairs do pass on this drive
+MIN_PASS_RATE = 0.3  # r of a pair that has passed: right pairs do pass on this drive
 CACHED = 256  # places whose keypoints are kept, about 40 kB each
 
 
@@ -50,7 +50,7 @@ class GeometricSettings:
 
     def __post_init__(self) -> None:
         require_choice('method', self.method, METHODS)
-        require_at_least('min_inliers', self.min_inliers, LEAST_MATCHES)
+        require_at_least('min_inliers', self.min_inliers, MIN_MATCHES)
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,10 @@ class PlaceVerifier:
         return self._query[1]
 
     def _common(self, query: Keypoints, place: Keypoints) -> int:
-        if min(len(query.points), len(place.points)) < LEAST_MATCHES:
+        if min(len(query.points), len(place.points)) < MIN_MATCHES:
             return 0
         mine, theirs = mutual_matches(query.descriptors, place.descriptors, RATIO)
-        if len(mine) < LEAST_MATCHES:
+        if len(mine) < MIN_MATCHES:
             return 0
         return _explained(query.points[mine], place.points[theirs])
 
@@ -201,7 +201,7 @@ class GeometricEvidence:
             return probability
         right, wrong = self._passed / self._checked, WRONG_PASSED
         if passed:
-            factor = max(right, LEAST_PASSED) / wrong
+            factor = max(right, MIN_PASS_RATE) / wrong
         else:
             factor = min((1 - right) / (1 - wrong), 1.0)
         odds = probability / (1 - probability) * factor

@@ -16,8 +16,8 @@ from stavpr_ros.mapping.transforms import cross, inverse
 # Deviations of a step of the odometry: of the translation, m and share of it; of the rotation, rad
 # per square root of a meter.
 SHIFT, TURN = (0.02, 0.02), 0.01
-LEAST_LENGTH = 0.05  # meters that a step counts at least
-LEAST_SHARE = 1 / 500  # least inverse depth, 1/m: everything beyond is at infinity
+MIN_LENGTH = 0.05  # meters of a step
+MIN_INVERSE_DEPTH = 1 / 500  # 1/m: everything beyond is at infinity
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Observations:
         known = np.maximum(information, 1e-12)
         common = [np.bincount(self.keypoint, weight * each, k) for each in a.T]
         variance = 1 / known + np.sum(np.square(common), axis=0) / known**2
-        return np.maximum(rho / known, LEAST_SHARE), information, variance
+        return np.maximum(rho / known, MIN_INVERSE_DEPTH), information, variance
 
     def residuals(self, motions: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far observations are off, (m, 2), and whether they are ahead, (m,)."""
@@ -116,7 +116,7 @@ class Observations:
         for motion, change in zip(result, step.reshape(-1, 6), strict=True):
             motion[:3, 3] += change[:3]
             motion[:3, :3] = cv2.Rodrigues(change[3:])[0] @ motion[:3, :3]
-        return result, np.maximum(deeper, LEAST_SHARE)
+        return result, np.maximum(deeper, MIN_INVERSE_DEPTH)
 
 
 def _moved(motions: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -140,7 +140,7 @@ def odometry_information(motions: np.ndarray, before: int) -> np.ndarray:
         for position, number in enumerate(side):
             own = motions[number]
             step = own @ inverse(last)
-            length = max(float(np.linalg.norm(step[:3, 3])), LEAST_LENGTH)
+            length = max(float(np.linalg.norm(step[:3, 3])), MIN_LENGTH)
             variances = [(SHIFT[0] + SHIFT[1] * length) ** 2] * 3 + [TURN**2 * length] * 3
             farther = list(side)[position:]
             effect = np.zeros((len(farther), 6, 6))

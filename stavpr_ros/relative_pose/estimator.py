@@ -18,19 +18,19 @@ from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
 from stavpr_ros.relative_pose.odometry import align
-from stavpr_ros.relative_pose.pair import BESIDE, MatchedPair, NEIGHBORS
-from stavpr_ros.relative_pose.pnp import LEAST_INLIERS, PnpPose, solve_pnp
+from stavpr_ros.relative_pose.pair import LANDMARK_RADIUS, MatchedPair, NEIGHBORS
+from stavpr_ros.relative_pose.pnp import MIN_INLIERS, PnpPose, solve_pnp
 from stavpr_ros.relative_pose.verification import verified_edge, Verifier
 
 METHODS = ('auto', 'none', 'aligned', 'pnp')
 VIEWS, LANDMARKS = 64, 32  # places kept: about 300 kB and 100 kB each
-LEAST_BASELINE = 0.05  # meters between the place and a neighbor
+MIN_BASELINE = 0.05  # meters between the place and a neighbor
 # Places between independent edges: their errors have views, or odometry, in common.
 APART = {Source.PNP: 5, Source.ALIGNED: 10}
 REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
 # Meters: with a larger deviation of the position, keypoints do not determine it. Wrong places that
-# reached LEAST_INLIERS had 4 m and more; 2 of 1,741 right ones had more than 1 m.
-MOST_DEVIATION = 1.0
+# reached MIN_INLIERS had 4 m and more; 2 of 1,741 right ones had more than 1 m.
+MAX_DEVIATION = 1.0
 # The deviation of a keypoint in pixels; and what is added in position (m) and rotation (rad), for
 # what all landmarks of a place have in common, such as errors of the motions between its views.
 NOISE, SHIFT, TURN = 0.8, 0.03, math.radians(0.05)
@@ -124,13 +124,13 @@ class EdgeEstimator:
         query, landmarks, reach = self._seen(pair, query_camera, place_camera)
         found = solve_pnp(query, landmarks)
         if found.matrix is None:
-            reason = f'PnP: {found.inliers} inliers are fewer than {LEAST_INLIERS}'
+            reason = f'PnP: {found.inliers} inliers are fewer than {MIN_INLIERS}'
         elif np.linalg.norm(found.matrix[:3, 3]) > reach:
             reason = f'PnP: more than {reach:.1f} m from the place'
         else:
             edge = _edge(found, query_camera, place_camera)
             deviation = math.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1])
-            if deviation <= MOST_DEVIATION:
+            if deviation <= MAX_DEVIATION:
                 return edge
             reason = f'PnP: the keypoints determine the position to {deviation:.1f} m only'
         return Edge(Source.REFUTED, reason, inliers=found.inliers)
@@ -152,7 +152,7 @@ class EdgeEstimator:
         own, reach, neighbors = self._landmarks_of(pair, pair.place, place_camera)
         landmarks = [own]
         for motion, index in zip(own.motions, neighbors, strict=True):
-            if abs(index - pair.place) <= BESIDE:
+            if abs(index - pair.place) <= LANDMARK_RADIUS:
                 beside, _, _ = self._landmarks_of(pair, index, place_camera)
                 landmarks.append(beside.seen_from(inverse(motion)))
         return self._view(pair.query, query_camera), landmarks, reach
@@ -181,7 +181,7 @@ class EdgeEstimator:
                 continue
             motion = inverse(matrices(pose) @ mount) @ own @ mount
             baseline = float(np.linalg.norm(motion[:3, 3]))
-            if baseline > LEAST_BASELINE:
+            if baseline > MIN_BASELINE:
                 neighbors.append((view, motion))
                 indices.append(index)
                 reach = max(reach, REACH * baseline)

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.recognition.verification import mutual_matches
-from stavpr_ros.relative_pose.bundle import LEAST_SHARE, Observations, odometry_information
+from stavpr_ros.relative_pose.bundle import MIN_INVERSE_DEPTH, Observations, odometry_information
 
 RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor
 FEATURES = 600  # most keypoints of a thumbnail
 CONTRAST = 0.02  # of SIFT; thumbnails are small, so that weaker keypoints count
 PIXELS = (6.0, 4.0, 3.0, 2.0)  # how far an observation may be off its landmark, round by round
 STEPS = 2  # of the bundle adjustment in each round but the last
-MOST_SHIFT = 2.0  # deviation of a landmark in an image one meter away, pixels
+MAX_SHIFT = 2.0  # deviation of a landmark in an image one meter away, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def triangulate(
     prior = motions = np.array([motion for _, motion in neighbors])
     trust = odometry_information(prior, before)
     use = np.ones(len(observed.keypoint), bool)
-    rho = np.full(len(place.rays), LEAST_SHARE)
+    rho = np.full(len(place.rays), MIN_INVERSE_DEPTH)
     for limit in PIXELS:
         for _ in range(2):
             rho, information, variance = observed.depths(motions, rho, use)
@@ -105,7 +105,7 @@ def triangulate(
             used = observed.chosen(use)
             for _ in range(STEPS):
                 motions, rho = used.refined(motions, rho, prior, trust, place.focal)
-    good = information * MOST_SHIFT**2 > 1
+    good = information * MAX_SHIFT**2 > 1
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
     points = rays[good] / rho[good, None]
     deviations = np.sqrt(variance[good]) / (place.focal * rho[good])

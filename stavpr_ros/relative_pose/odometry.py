@@ -12,10 +12,10 @@ from stavpr_ros.relative_pose.pair import MatchedPair
 
 FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
 NEAR = 0.5  # of the least sum: where a parabola is fitted, places
-LEAST_IMAGES = 3
-LEAST_STEP = 0.01  # meters
+MIN_IMAGES = 3
+MIN_STEP = 0.01  # meters
 # Deviations: along the track, in places, and at least (m); across it (m); of the rotation (rad).
-ALONG, LEAST_ALONG, ACROSS, TURN = 0.5, 0.1, 1.25, math.radians(3)
+ALONG, MIN_ALONG, ACROSS, TURN = 0.5, 0.1, 1.25, math.radians(3)
 
 
 def align(pair: MatchedPair) -> Edge:
@@ -35,8 +35,8 @@ def align(pair: MatchedPair) -> Edge:
     from scipy.interpolate import CubicSpline
 
     known, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
-    apart = known[np.diff(track[known], prepend=-1) > LEAST_STEP]  # not where the robot stood
-    if min(len(images), len(apart)) < LEAST_IMAGES or not pair.spacing > 0:
+    apart = known[np.diff(track[known], prepend=-1) > MIN_STEP]  # not where the robot stood
+    if min(len(images), len(apart)) < MIN_IMAGES or not pair.spacing > 0:
         reason = 'the odometry of query or places has gaps, or no motion, in the window'
         return Edge(Source.NONE, reason)
     offsets = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * pair.spacing
@@ -53,7 +53,7 @@ def align(pair: MatchedPair) -> Edge:
     place = matrices(pair.pose(pair.place))
     pose = to_poses(inverse(place) @ matrices(_on_track(pair.poses[known], track[known], at)))
     direction = _direction(pair, place)
-    along = max(ALONG * pair.spacing, LEAST_ALONG)
+    along = max(ALONG * pair.spacing, MIN_ALONG)
     covariance = np.diag([ACROSS**2] * 3 + [TURN**2] * 3)
     covariance[:3, :3] += (along**2 - ACROSS**2) * np.outer(direction, direction)
     return Edge(Source.ALIGNED, '', pose, covariance)

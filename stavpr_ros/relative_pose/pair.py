@@ -12,8 +12,8 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.recognition import Match
 
 NEIGHBORS = 4  # places before and after a place that its keypoints are triangulated with
-BESIDE = 1  # places before and after the place whose landmarks are used as well
-AROUND = NEIGHBORS + BESIDE
+LANDMARK_RADIUS = 1  # places before and after the place whose landmarks are used as well
+TRIANGULATION_RADIUS = NEIGHBORS + LANDMARK_RADIUS
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +32,8 @@ class MatchedPair:
         compared. Empty where alignment by odometry is impossible or not wanted.
     :param first: index of the first of the places around it.
     :param poses: of the base at those places, shape (k, 7); NaN = unknown.
-    :param thumbnails: of those of them that are at most ``AROUND`` away, and of the same
-        session, by index: JPEG images, empty = none.
+    :param thumbnails: of places of the same session at most ``TRIANGULATION_RADIUS`` away, by
+        index: JPEG images, empty = none.
     """
 
     source: PlaceMap | GrowingMap
@@ -81,8 +81,8 @@ def matched_pair(
     """
     start = places.first if isinstance(places, GrowingMap) else 0
     low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
-    low = max(start, min(low, place) - AROUND)
-    high = min(start + len(places), max(high, place) + AROUND + 1)
+    low = max(start, min(low, place) - TRIANGULATION_RADIUS)
+    high = min(start + len(places), max(high, place) + TRIANGULATION_RADIUS + 1)
     poses = np.full((high - low, 7), np.nan)
     if places.poses is not None:
         poses[:] = places.poses[low - start : high - start]
@@ -91,9 +91,9 @@ def matched_pair(
     if distances_to is not None and has_poses:
         distances = distances_to(np.arange(low, high))
     session = places.place(place).session
-    thumbnails = {}
+    thumbnails, radius = {}, TRIANGULATION_RADIUS
     if len(places.thumbnails):
-        for index in range(max(low, place - AROUND), min(high, place + AROUND + 1)):
+        for index in range(max(low, place - radius), min(high, place + radius + 1)):
             if places.place(index).session == session:
                 thumbnails[index] = _thumbnail(places, index - start)
     return MatchedPair(

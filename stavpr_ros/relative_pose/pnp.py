@@ -11,12 +11,12 @@ from stavpr_ros.mapping.transforms import cross, inverse
 from stavpr_ros.recognition.verification import mutual_matches
 from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
 
-LEAST_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most
+MIN_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most
 PIXELS = 2.5  # of an inlier, off its landmark
 ITERATIONS, CONFIDENCE = 500, 0.999
 STEPS = 6  # of Gauss and Newton
-LEAST_SCALE = 0.05  # of an inverse depth, relative to the triangulated one
-LEAST_DEPTH = 0.05  # meters
+MIN_SCALE = 0.05  # of an inverse depth, relative to the triangulated one
+MIN_DEPTH = 0.05  # meters
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class PnpPose:
     """
     The pose of a query's camera in the optical frame of a place.
 
-    :param matrix: (4, 4); None = fewer than ``LEAST_INLIERS``, or not near the place.
+    :param matrix: (4, 4); None = fewer than ``MIN_INLIERS``, or not near the place.
     :param covariance: of the position and the rotation about the fixed axes of the place, for a
         noise of one pixel in the query and in the views of the landmarks, shape (6, 6).
     :param inliers: matches that the pose explains.
@@ -48,7 +48,7 @@ def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
         them have is an inlier once.
     """
     matches = _matched(query, landmarks)
-    if matches.count < LEAST_INLIERS:
+    if matches.count < MIN_INLIERS:
         return NOTHING
     matrix = np.diag([query.focal, query.focal, 1.0])
     try:
@@ -73,7 +73,7 @@ def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
         distances = np.linalg.norm(off, axis=1)
         chosen = np.flatnonzero(ahead & (distances < PIXELS))
         count = matches.chosen(chosen).count
-        if count < LEAST_INLIERS:
+        if count < MIN_INLIERS:
             return PnpPose(None, NOTHING.covariance, count, np.nan)
     pose = inverse(motion)
     error = float(np.sqrt(np.mean(distances[chosen] ** 2)))
@@ -146,10 +146,10 @@ def _refined(used: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """
     shift = np.zeros(len(used.points))  # of inverse depths, in deviations
     for _ in range(STEPS):
-        scale = np.maximum(1 + shift * used.deviations, LEAST_SCALE)
+        scale = np.maximum(1 + shift * used.deviations, MIN_SCALE)
         points = used.points + used.rays * (1 / scale - 1)[:, None]
         x, y, z = moved = (points @ motion[:3, :3].T + motion[:3, 3]).T
-        z = np.maximum(z, LEAST_DEPTH)
+        z = np.maximum(z, MIN_DEPTH)
         off = used.focal * np.stack([x / z, y / z], axis=1) - used.pixels
         zero = np.zeros_like(z)
         projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])

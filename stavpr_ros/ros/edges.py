@@ -31,7 +31,7 @@ from stavpr_ros.ros.worker import Worker
 from stavpr_ros.signals import time_left
 from std_msgs.msg import Header
 
-MOST_WAITING = 40  # closures; while there are more, the oldest goes without a relative pose
+MAX_WAITING = 40  # closures; while there are more, the oldest goes without a relative pose
 UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
 NO_POSE = 'the place has no pose: record maps and routes with odometry'
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
@@ -151,7 +151,7 @@ class EdgePublisher:
         return self._worker.stop()
 
     def _complete(self, closure: WaitingClosure, obstacle: str = '') -> None:
-        if (waiting := self._worker.waiting) >= MOST_WAITING:
+        if (waiting := self._worker.waiting) >= MAX_WAITING:
             obstacle = f'dropped, {waiting} newer closures are waiting'
         try:
             edge = self._estimator.estimate(

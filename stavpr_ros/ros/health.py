@@ -11,7 +11,7 @@ from stavpr_msgs.msg import MapInfo
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.pipeline import NOT_A_KEYFRAME
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
-from stavpr_ros.ros.edges import MOST_WAITING
+from stavpr_ros.ros.edges import MAX_WAITING
 from stavpr_ros.ros.input import InputStatus
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -256,7 +256,7 @@ def _edge_faults(health: Health) -> Iterator[Finding]:
     edges = health.counts.edges.recent
     if dropped := edges['dropped']:
         text = f'{dropped} of {_of(edges.total(), "loop closure")} without a relative pose'
-        why = f'PnP is slower than they come, more than {MOST_WAITING} waited'
+        why = f'PnP is slower than they come, more than {MAX_WAITING} waited'
         remedy = 'set max_rate or keyframe_distance, or free a processor core'
         yield WARN, f'{text} {RECENTLY}: {why}; {remedy}'
 

@@ -12,7 +12,7 @@ from stavpr_ros.ros.qos import LATCHED
 from std_msgs.msg import Header
 
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-MOST_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
+MAX_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
 
 
@@ -52,7 +52,7 @@ class Receipts:
 
     def closures_follow(self) -> bool:
         """Return whether a node in operation loop_closure keeps up with its edges."""
-        return not self.expects_closures or self._matches - self._closures <= MOST_BEHIND
+        return not self.expects_closures or self._matches - self._closures <= MAX_BEHIND
 
     def settled(self) -> bool:
         """Return whether no more results are expected."""

@@ -19,7 +19,7 @@ RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
-LEAST_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
+MIN_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
 Item = TypeVar('Item')
 
 
@@ -51,7 +51,7 @@ class BagSource:
         self.topic = _choose(self.path, topics, topic)
         self.message_type, self._count = topics[self.topic]
         files = self.path.iterdir() if self.path.is_dir() else [self.path]
-        self._most = sum(file.stat().st_size for file in files) // LEAST_MESSAGE
+        self._most = sum(file.stat().st_size for file in files) // MIN_MESSAGE
 
     def __len__(self) -> int:
         """

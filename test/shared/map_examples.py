@@ -45,7 +45,7 @@ def example_files(folder: Path) -> list[bytes]:
     save_map(example_map(), folder / 'float32')
     risks = ErrorRisks('robust', 3, (0.2, 0.9), (1.5, 0.0))
     projected = dataclasses.replace(example_map(projection=16), error_risks=risks)
-    with patch.object(prepared_map, 'LEAST_PLACES', 1):
+    with patch.object(prepared_map, 'MIN_PLACES', 1):
         statistics = prepared_map.statistics_of_map(projected, 'float16')
         assert statistics is not None
         statistics = prepared_map.with_codes(statistics, projected, 'float16')

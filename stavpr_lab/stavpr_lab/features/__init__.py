@@ -19,7 +19,7 @@ HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a 
 class PublishedSettings(NetworkSettings):
     """Settings of a network with published weights; its input is normalized as for ImageNet."""
 
-    LEAST_SIZE: ClassVar[int] = 32
+    MIN_SIZE: ClassVar[int] = 32
 
     model: str = setting(
         CACHED,
@@ -33,7 +33,7 @@ class PublishedSettings(NetworkSettings):
 class NetVladSettings(NetworkSettings):
     """Settings of NetVLAD; how its input is normalized is in the file, or as for ImageNet."""
 
-    LEAST_SIZE: ClassVar[int] = 32
+    MIN_SIZE: ClassVar[int] = 32
 
     model: str = setting(help='file of the weights, .mat or .pth.tar', identity=False)
     size: int = setting(480, help='images are resized to size x size pixels')

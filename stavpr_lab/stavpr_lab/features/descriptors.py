@@ -22,7 +22,7 @@ from stavpr_ros.regular_file import require_regular
 
 _PATH = re.compile(r'(?P<file>.*\.(npy|npz|csv|mat))(:(?P<name>.+))?', re.IGNORECASE)
 _NUMERIC = ('double', 'single', *(f'{u}int{bits}' for u in ('', 'u') for bits in (8, 16, 32, 64)))
-MOST_STRIPS = 1024
+MAX_STRIPS = 1024
 AT_ONCE = 1024  # images converted together
 MAPPED = 2**26  # bytes of a .npy file from which on it is not read as a whole
 
@@ -70,8 +70,8 @@ def read_descriptors(path: str, source: str = '', bits: bool = False) -> LocalFe
             'number, with --descriptors-bits true, and another type, such as float32, for numbers'
         )
     n, W = len(array), 1 if array.ndim == 2 else array.shape[1]
-    if W > MOST_STRIPS:
-        raise SourceError(f'descriptors {path}: W = {W} strips, at most {MOST_STRIPS}')
+    if W > MAX_STRIPS:
+        raise SourceError(f'descriptors {path}: W = {W} strips, at most {MAX_STRIPS}')
     dimension = array.shape[-1] * (8 if bits else 1)
     strips, weights = np.empty((W, n, dimension), np.float32), np.empty((W, n), np.float32)
     for low in range(0, n, AT_ONCE):  # it may be in its file

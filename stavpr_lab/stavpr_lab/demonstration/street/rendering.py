@@ -23,13 +23,13 @@ from stavpr_ros.compilation import kernel
 
 # Rays per pixel, one above the other: most lines lean, and upright ones need no smoothing.
 SAMPLES = 2
-MOST_WALLS = 8  # walls kept per column; each is higher in the image than the one before
+MAX_WALLS = 8  # walls kept per column; each is higher in the image than the one before
 BLOCK_DEPTH = 14.0  # meters from a building's front to its back
 EYE = 1.55  # height of the camera, meters
 FOCAL = 0.62  # focal length over the width of the image: 78 degrees
 HORIZON = 0.56  # height of the horizon over the height of the image
 FAR = 1e4
-LEAST_TOWARDS = 0.1  # cosine of a ray and the street from which a bend hides the rest
+MIN_TOWARDS = 0.1  # cosine of a ray and the street from which a bend hides the rest
 
 # Columns of the table of walls that a column of samples meets.
 WALL_DEPTH, WALL_TOP, WALL_LOT, WALL_ALONG, WALL_FRONT, WALL_ROW, WALL_AHEAD = range(7)
@@ -112,7 +112,7 @@ def _find_walls(lots, lot_of, line, along, across, slope, eye, walls):
         ahead1 = (first + 1 + step) * CELL - along
         forward, right, sine, cosine = line[step]
         towards = cosine + slope * sine
-        if towards < LEAST_TOWARDS:
+        if towards < MIN_TOWARDS:
             break
         z1 = (forward * cosine + (right - across) * sine) / towards
         u1 = (across + slope * z1 - right) * cosine - (z1 - forward) * sine
@@ -213,7 +213,7 @@ def _draw_scene(color, depth, lots, lot_of, line, seed, camera, light):
     """Fill the samples with sky, ground and walls, and their depths."""
     along, across, eye, focal, horizon, yaw, heading = camera
     rows, columns = depth.shape
-    walls = np.empty((MOST_WALLS, 7))
+    walls = np.empty((MAX_WALLS, 7))
     sun_rise = light[SUN_UP] / max(0.1, hypot(light[SUN_RIGHT], light[SUN_AHEAD]))
     cloud_seed = int(light[SKY_SEED])
     for x in range(columns):
