@@ -21,9 +21,9 @@ class SpatialSettings:
     :param sigma: how strongly the viewpoint change raises ``a = sqrt(1 + sigma |I_c - c|)``; >= 0.
     :param xi: restricted alignment: strips i and j with ``|i - j| >= xi`` are never aligned;
         1 <= xi <= W, None = no restriction.
-    :param vertical: the distance of two strips is that of their cells, aligned from top to bottom
-        by the same alignment (the paper's remark on drones), instead of their cosine distance;
-        ``adaptive``, ``vanilla``.
+    :param vertical: the distance of two strips is the distance of their cells, aligned from top to
+        bottom by the same alignment (the paper's remark on drones), instead of their cosine
+        distance; ``adaptive``, ``vanilla``.
     """
 
     strategy: str = 'adaptive'

@@ -21,7 +21,7 @@ def strip_distances(query: np.ndarray, reference: np.ndarray) -> np.ndarray:
     A zero feature has the distance 1 to everything.
 
     :param query: unit-norm local features of one image, shape (W, d), float32.
-    :param reference: those of the map, strip-major, shape (W, n, d), float32.
+    :param reference: features of the map, strip-major, shape (W, n, d), float32.
     :returns: shape (W, W, n), float32; d[i, j, y] is query strip i
         against strip j of map image y. Not clipped: after a random projection slightly outside [0,
         1].
@@ -66,7 +66,7 @@ def holistic_distances(
     W, n, _ = reference.shape
     require_shape('query weights', query_weights, f'{W}')
     require_shape('reference weights', reference_weights, f'{W} {n}')
-    weighted = query * query_weights[:, None]
-    similarity = (reference @ weighted[:, :, None])[:, :, 0]
+    weighted_query = query * query_weights[:, None]
+    similarity = (reference @ weighted_query[:, :, None])[:, :, 0]
     distances: np.ndarray = 1 - (similarity * reference_weights).sum(axis=0)
     return distances

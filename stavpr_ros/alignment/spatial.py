@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Spatial alignment: the distance of two images from those of their strips (section 2)."""
+"""Spatial alignment: the distance of two images from the distances of their strips (section 2)."""
 
 import numpy as np
 from stavpr_ros.alignment.settings import SpatialSettings

@@ -3,8 +3,8 @@
 """
 Bundle adjustment of a place and its neighbors, with the odometry between them as a prior.
 
-The single steps of an odometry are off by more than keypoints are. What several views see in
-common corrects their rotations and directions; the lengths remain those of the odometry.
+The errors of single steps of odometry are larger than the errors of keypoints. Points that several
+views have in common correct rotations and directions; odometry alone determines the lengths.
 """
 
 from dataclasses import dataclass
@@ -54,10 +54,10 @@ class Observations:
         weight, k = use / depth**2, len(rho)
         information = np.bincount(self.keypoint, weight * (a * a).sum(axis=1), k)
         rho = np.bincount(self.keypoint, weight * (a * b).sum(axis=1), k)
-        known = np.maximum(information, 1e-12)
+        precision = np.maximum(information, 1e-12)
         common = [np.bincount(self.keypoint, weight * each, k) for each in a.T]
-        variance = 1 / known + np.sum(np.square(common), axis=0) / known**2
-        return np.maximum(rho / known, MIN_INVERSE_DEPTH), information, variance
+        variance = 1 / precision + np.sum(np.square(common), axis=0) / precision**2
+        return np.maximum(rho / precision, MIN_INVERSE_DEPTH), information, variance
 
     def residuals(self, motions: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far observations are off, (m, 2), and whether they are ahead, (m,)."""
@@ -84,16 +84,16 @@ class Observations:
         :param prior: the motions by odometry, shape (n, 4, 4), and ``information`` of them.
         """
         count, keypoints = len(motions), len(rho)
-        turned = self._turned(motions)
+        directions = self._turned(motions)
         slope = motions[self.neighbor, :3, 3]
-        x, y, z = (turned + rho[self.keypoint, None] * slope).T
+        x, y, z = (directions + rho[self.keypoint, None] * slope).T
         z = np.maximum(z, 1e-6)
         off = focal * (np.stack([x / z, y / z], axis=1) - self.observed)
         zero = np.zeros_like(z)
         projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
         projection = focal * projection.transpose(2, 0, 1)
         by_motion = np.concatenate(
-            [projection * rho[self.keypoint, None, None], -projection @ cross(turned)],
+            [projection * rho[self.keypoint, None, None], -projection @ cross(directions)],
             axis=2,
         )
         by_depth = np.einsum('mij,mj->mi', projection, slope)
@@ -103,15 +103,17 @@ class Observations:
         shared = np.zeros((count, keypoints, 6))
         both = weight[:, None] * np.einsum('mij,mi->mj', by_motion, by_depth)
         np.add.at(shared, (self.neighbor, self.keypoint), both)
-        mixed = shared.transpose(0, 2, 1).reshape(6 * count, keypoints)
-        normal, right = information.copy(), information @ _moved(motions, prior)
+        coupling = shared.transpose(0, 2, 1).reshape(6 * count, keypoints)
+        normal, right = information.copy(), information @ _motion_difference(motions, prior)
         for number in range(count):
             mine, part = self.neighbor == number, slice(6 * number, 6 * number + 6)
             rows, weights = by_motion[mine].reshape(-1, 6), np.repeat(weight[mine], 2)
             normal[part, part] += rows.T @ (weights[:, None] * rows)
             right[part] += rows.T @ (weights * off[mine].ravel())
-        step = -np.linalg.solve(normal - (mixed / own) @ mixed.T, right - mixed @ (pull / own))
-        deeper = rho - (pull + mixed.T @ step) / own
+        step = -np.linalg.solve(
+            normal - (coupling / own) @ coupling.T, right - coupling @ (pull / own)
+        )
+        deeper = rho - (pull + coupling.T @ step) / own
         result = motions.copy()
         for motion, change in zip(result, step.reshape(-1, 6), strict=True):
             motion[:3, 3] += change[:3]
@@ -119,10 +121,10 @@ class Observations:
         return result, np.maximum(deeper, MIN_INVERSE_DEPTH)
 
 
-def _moved(motions: np.ndarray, prior: np.ndarray) -> np.ndarray:
+def _motion_difference(motions: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Return translations and rotations from the prior to motions, one after the other, (6n,)."""
-    turned = motions[:, :3, :3] @ prior[:, :3, :3].transpose(0, 2, 1)
-    turns = [cv2.Rodrigues(each)[0].ravel() for each in turned]
+    rotations = motions[:, :3, :3] @ prior[:, :3, :3].transpose(0, 2, 1)
+    turns = [cv2.Rodrigues(each)[0].ravel() for each in rotations]
     return np.column_stack([motions[:, :3, 3] - prior[:, :3, 3], turns]).ravel()
 
 
@@ -131,7 +133,7 @@ def odometry_information(motions: np.ndarray, before: int) -> np.ndarray:
     Return the information of motions by odometry: the errors of its steps are independent.
 
     :param motions: from the place to its neighbors, in the order of the drive, shape (n, 4, 4).
-    :param before: the number of those before the place.
+    :param before: the number of neighbors before the place.
     :returns: of translations and rotations, in the axes of the neighbors, shape (6n, 6n).
     """
     covariance = np.zeros((len(motions), 6, len(motions), 6))

@@ -75,8 +75,12 @@ class EdgeEstimator:
             return Edge(Source.DROPPED, f'verifier: {obstacle}')
         edge = self._estimated(pair, query_camera, place_camera, obstacle)
         if self.verifier is not None and self.method != 'none':
-            refuted = Edge(Source.REFUTED, 'the verifier did not confirm it', inliers=edge.inliers)
-            edge = verified_edge(self.verifier, pair, query_camera, place_camera, edge) or refuted
+            refutation = Edge(
+                Source.REFUTED, 'the verifier did not confirm it', inliers=edge.inliers
+            )
+            edge = (
+                verified_edge(self.verifier, pair, query_camera, place_camera, edge) or refutation
+            )
         return replace(edge, independent=self._is_independent(pair, edge))
 
     def _is_independent(self, pair: MatchedPair, edge: Edge) -> bool:
@@ -86,8 +90,8 @@ class EdgeEstimator:
         base = matrices(pair.pose(pair.place)) @ matrices(edge.pose)
         last = self._last
         if last is not None and last[0] is pair.source:
-            moved = float(np.linalg.norm(base[:3, 3] - last[1]))
-            if moved < (APART[edge.source] - 0.5) * pair.spacing:
+            distance = float(np.linalg.norm(base[:3, 3] - last[1]))
+            if distance < (APART[edge.source] - 0.5) * pair.spacing:
                 return False
         self._last = pair.source, base[:3, 3]
         return True
@@ -121,21 +125,21 @@ class EdgeEstimator:
 
         :raises InputError: the images or their surroundings do not permit PnP.
         """
-        query, landmarks, reach = self._seen(pair, query_camera, place_camera)
-        found = solve_pnp(query, landmarks)
-        if found.matrix is None:
-            reason = f'PnP: {found.inliers} inliers are fewer than {MIN_INLIERS}'
-        elif np.linalg.norm(found.matrix[:3, 3]) > reach:
+        query, landmarks, reach = self._query_and_landmarks(pair, query_camera, place_camera)
+        result = solve_pnp(query, landmarks)
+        if result.matrix is None:
+            reason = f'PnP: {result.inliers} inliers are fewer than {MIN_INLIERS}'
+        elif np.linalg.norm(result.matrix[:3, 3]) > reach:
             reason = f'PnP: more than {reach:.1f} m from the place'
         else:
-            edge = _edge(found, query_camera, place_camera)
+            edge = _edge(result, query_camera, place_camera)
             deviation = math.sqrt(np.linalg.eigvalsh(edge.covariance[:3, :3])[-1])
             if deviation <= MAX_DEVIATION:
                 return edge
             reason = f'PnP: the keypoints determine the position to {deviation:.1f} m only'
-        return Edge(Source.REFUTED, reason, inliers=found.inliers)
+        return Edge(Source.REFUTED, reason, inliers=result.inliers)
 
-    def _seen(
+    def _query_and_landmarks(
         self, pair: MatchedPair, query_camera: Camera, place_camera: Camera
     ) -> tuple[View, list[Landmarks], float]:
         """
@@ -161,7 +165,7 @@ class EdgeEstimator:
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
         make = partial(self._triangulated, pair, place, camera)
-        return _kept(self._landmarks, place, LANDMARKS, make)
+        return _cached(self._landmarks, place, LANDMARKS, make)
 
     def _view(self, image: np.ndarray, camera: Camera) -> View:
         camera.require_fitting(image.shape[1], image.shape[0])
@@ -198,7 +202,7 @@ class EdgeEstimator:
             image = decode_thumbnail(pair.thumbnails[index])
             return None if image is None else self._view(image, camera)
 
-        return _kept(self._views, index, VIEWS, make)
+        return _cached(self._views, index, VIEWS, make)
 
 
 def needed_by_pnp(
@@ -219,10 +223,10 @@ def needed_by_pnp(
     return query_camera, place_camera
 
 
-def _kept(
+def _cached(
     values: OrderedDict[int, Value], key: int, most: int, make: Callable[[], Value]
 ) -> Value:
-    """Return the value of a key, made if it is not kept; the least recently used one goes."""
+    """Return the value of a key, made if it is missing; the least recently used one goes."""
     if key not in values:
         values[key] = make()
         if len(values) > most:
@@ -231,17 +235,17 @@ def _kept(
     return values[key]
 
 
-def _edge(found: PnpPose, query_camera: Camera, place_camera: Camera) -> Edge:
+def _edge(result: PnpPose, query_camera: Camera, place_camera: Camera) -> Edge:
     """Return the edge between the bases of the cameras."""
-    assert found.matrix is not None
+    assert result.matrix is not None
     place_mount = matrices(np.array(place_camera.mount))
     to_base = inverse(matrices(np.array(query_camera.mount)))
     turn = place_mount[:3, :3]
-    lever = found.matrix[:3, :3] @ to_base[:3, 3]  # from the query's camera to its base
+    lever = result.matrix[:3, :3] @ to_base[:3, 3]  # from the query's camera to its base
     change = np.zeros((6, 6))
     change[:3, :3] = change[3:, 3:] = turn
     change[:3, 3:] = -turn @ cross(lever[None])[0]
-    covariance = NOISE**2 * change @ found.covariance @ change.T
+    covariance = NOISE**2 * change @ result.covariance @ change.T
     covariance += np.diag([SHIFT**2] * 3 + [TURN**2] * 3)
-    pose = to_poses(place_mount @ found.matrix @ to_base)
-    return Edge(Source.PNP, '', pose, covariance, found.inliers, found.error)
+    pose = to_poses(place_mount @ result.matrix @ to_base)
+    return Edge(Source.PNP, '', pose, covariance, result.inliers, result.error)

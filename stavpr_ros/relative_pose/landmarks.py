@@ -44,7 +44,7 @@ class Landmarks:
     :param rays: from the camera of the place to the points, shape (m, 3), meters.
     :param deviations: of their inverse depths, relative to these, for a noise of one pixel, (m,).
     :param descriptors: of the place's keypoints, shape (m, 128), float32.
-    :param motions: from that frame to those of the neighbors, refined, shape (neighbors, 4, 4).
+    :param motions: from that frame to the neighbors' frames, refined, shape (neighbors, 4, 4).
     """
 
     points: np.ndarray
@@ -88,23 +88,23 @@ def triangulate(
     of odometry; they are refined together with the inverse depths (:mod:`.bundle`).
 
     :param neighbors: other views in the order of the drive, each with the transform (4, 4) from
-        the optical frame of the place to that of the view, meters.
-    :param before: the number of those before the place.
+        the optical frame of the place to the optical frame of the view, meters.
+    :param before: the number of views before the place.
     """
-    observed = _observed(place, neighbors)
+    observations = _observations(place, neighbors)
     prior = motions = np.array([motion for _, motion in neighbors])
     trust = odometry_information(prior, before)
-    use = np.ones(len(observed.keypoint), bool)
+    use = np.ones(len(observations.keypoint), bool)
     rho = np.full(len(place.rays), MIN_INVERSE_DEPTH)
     for limit in PIXELS:
         for _ in range(2):
-            rho, information, variance = observed.depths(motions, rho, use)
-            off, ahead = observed.residuals(motions, rho)
+            rho, information, variance = observations.depths(motions, rho, use)
+            off, ahead = observations.residuals(motions, rho)
             use = ahead & (np.linalg.norm(off, axis=1) * place.focal < limit)
         if limit != PIXELS[-1]:
-            used = observed.chosen(use)
+            inliers = observations.chosen(use)
             for _ in range(STEPS):
-                motions, rho = used.refined(motions, rho, prior, trust, place.focal)
+                motions, rho = inliers.refined(motions, rho, prior, trust, place.focal)
     good = information * MAX_SHIFT**2 > 1
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
     points = rays[good] / rho[good, None]
@@ -112,11 +112,11 @@ def triangulate(
     return Landmarks(points, points, deviations, place.descriptors[good], motions)
 
 
-def _observed(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Observations:
+def _observations(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Observations:
     """Match the place with each neighbor."""
     pairs = [mutual_matches(place.descriptors, view.descriptors, RATIO) for view, _ in neighbors]
     keypoint = np.concatenate([mine for mine, _ in pairs]).astype(np.intp)
     neighbor = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
-    observed = [view.rays[rows] for (_, rows), (view, _) in zip(pairs, neighbors, strict=True)]
-    return Observations(keypoint, neighbor, rays[keypoint], np.concatenate(observed))
+    view_rays = [view.rays[rows] for (_, rows), (view, _) in zip(pairs, neighbors, strict=True)]
+    return Observations(keypoint, neighbor, rays[keypoint], np.concatenate(view_rays))

@@ -34,8 +34,8 @@ def align(pair: MatchedPair) -> Edge:
     track, driven = _lengths(pair.poses), _lengths(pair.query_poses)
     from scipy.interpolate import CubicSpline
 
-    known, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
-    apart = known[np.diff(track[known], prepend=-1) > MIN_STEP]  # not where the robot stood
+    places, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
+    apart = places[np.diff(track[places], prepend=-1) > MIN_STEP]  # not where the robot stood
     if min(len(images), len(apart)) < MIN_IMAGES or not pair.spacing > 0:
         reason = 'the odometry of query or places has gaps, or no motion, in the window'
         return Edge(Source.NONE, reason)
@@ -51,7 +51,7 @@ def align(pair: MatchedPair) -> Edge:
         total += np.interp(at, grid, smooth[:, column])
     at = start + _least(offsets, total)
     place = matrices(pair.pose(pair.place))
-    pose = to_poses(inverse(place) @ matrices(_on_track(pair.poses[known], track[known], at)))
+    pose = to_poses(inverse(place) @ matrices(_on_track(pair.poses[places], track[places], at)))
     direction = _direction(pair, place)
     along = max(ALONG * pair.spacing, MIN_ALONG)
     covariance = np.diag([ACROSS**2] * 3 + [TURN**2] * 3)
@@ -61,9 +61,9 @@ def align(pair: MatchedPair) -> Edge:
 
 def _finite(row: np.ndarray) -> np.ndarray:
     """Return distances (k,); places that are not compared are as far as the farthest."""
-    compared = np.isfinite(row)
-    farthest = float(row[compared].max()) if compared.any() else 0.0
-    return np.where(compared, row, farthest)
+    is_compared = np.isfinite(row)
+    farthest = float(row[is_compared].max()) if is_compared.any() else 0.0
+    return np.where(is_compared, row, farthest)
 
 
 def _least(offsets: np.ndarray, total: np.ndarray) -> float:
@@ -79,10 +79,10 @@ def _least(offsets: np.ndarray, total: np.ndarray) -> float:
 
 def _lengths(poses: np.ndarray) -> np.ndarray:
     """Return the distance driven until each pose (m, 7); NaN where a pose is unknown."""
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    indices = np.flatnonzero(np.isfinite(poses[:, 0]))
     lengths = np.full(len(poses), np.nan)
-    steps = np.linalg.norm(np.diff(poses[known, :3], axis=0), axis=1)
-    lengths[known] = np.concatenate([[0.0], np.cumsum(steps)])[: len(known)]
+    steps = np.linalg.norm(np.diff(poses[indices, :3], axis=0), axis=1)
+    lengths[indices] = np.concatenate([[0.0], np.cumsum(steps)])[: len(indices)]
     return lengths
 
 
@@ -96,8 +96,8 @@ def _on_track(poses: np.ndarray, track: np.ndarray, at: float) -> np.ndarray:
 
 def _direction(pair: MatchedPair, place: np.ndarray) -> np.ndarray:
     """Return the direction of the track at the place, in the base of the place, (3,)."""
-    known = pair.poses[np.isfinite(pair.poses[:, 0]), :3]
-    nearest = int(np.argmin(np.linalg.norm(known - place[:3, 3], axis=1)))
-    ahead = known[min(nearest + 1, len(known) - 1)] - known[max(nearest - 1, 0)]
+    positions = pair.poses[np.isfinite(pair.poses[:, 0]), :3]
+    nearest = int(np.argmin(np.linalg.norm(positions - place[:3, 3], axis=1)))
+    ahead = positions[min(nearest + 1, len(positions) - 1)] - positions[max(nearest - 1, 0)]
     length = float(np.linalg.norm(ahead))
     return place[:3, :3].T @ ahead / length if length > 0 else np.array([1.0, 0, 0])

@@ -52,34 +52,34 @@ def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
         return NOTHING
     matrix = np.diag([query.focal, query.focal, 1.0])
     try:
-        found, turn, shift, inliers = cv2.solvePnPRansac(
+        success, turn, shift, inliers = cv2.solvePnPRansac(
             matches.points, matches.pixels, matrix, None, iterationsCount=ITERATIONS,
             reprojectionError=PIXELS, confidence=CONFIDENCE, flags=cv2.SOLVEPNP_EPNP,
         )  # fmt: skip
     except cv2.error:  # points in a line
         return NOTHING
-    if not found or inliers is None:
+    if not success or inliers is None:
         return NOTHING
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    chosen = inliers.ravel()
+    indices = inliers.ravel()
     for _ in range(2):  # the second time with the inliers of the refined pose
-        used = matches.chosen(chosen)
+        pairs = matches.chosen(indices)
         try:
-            motion, covariance = _refined(used, motion)
+            motion, covariance = _refined(pairs, motion)
         except np.linalg.LinAlgError:  # the landmarks do not determine a pose
             return NOTHING
         off, ahead = matches.residuals(motion)
         distances = np.linalg.norm(off, axis=1)
-        chosen = np.flatnonzero(ahead & (distances < PIXELS))
-        count = matches.chosen(chosen).count
+        indices = np.flatnonzero(ahead & (distances < PIXELS))
+        count = matches.chosen(indices).count
         if count < MIN_INLIERS:
             return PnpPose(None, NOTHING.covariance, count, np.nan)
     pose = inverse(motion)
-    error = float(np.sqrt(np.mean(distances[chosen] ** 2)))
+    error = float(np.sqrt(np.mean(distances[indices] ** 2)))
     axes = np.kron(np.eye(2), pose[:3, :3])
     # observations of one keypoint are not independent
-    covariance *= len(used.keypoint) / used.count
+    covariance *= len(pairs.keypoint) / pairs.count
     return PnpPose(pose, axes @ covariance @ axes.T, count, error)
 
 
@@ -132,40 +132,40 @@ def _matched(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
     return _Matches(mine, pixels, points, rays, deviations, query.focal)
 
 
-def _refined(used: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _refined(pairs: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Refine a pose together with the inverse depths of its landmarks: maximum likelihood.
 
     With the landmarks as they were triangulated, the errors of their depths would shorten the
     motion (regression dilution). Residuals, of depths as well, have Cauchy's weights.
 
-    :param motion: from the frame of the landmarks to that of the query, (4, 4).
+    :param motion: from the frame of the landmarks to the query's frame, (4, 4).
     :returns: the motion, and the covariance of its translation and rotation (6, 6), for a noise of
         one pixel.
     :raises LinAlgError: the landmarks do not determine it.
     """
-    shift = np.zeros(len(used.points))  # of inverse depths, in deviations
+    shift = np.zeros(len(pairs.points))  # of inverse depths, in deviations
     for _ in range(STEPS):
-        scale = np.maximum(1 + shift * used.deviations, MIN_SCALE)
-        points = used.points + used.rays * (1 / scale - 1)[:, None]
-        x, y, z = moved = (points @ motion[:3, :3].T + motion[:3, 3]).T
+        scale = np.maximum(1 + shift * pairs.deviations, MIN_SCALE)
+        points = pairs.points + pairs.rays * (1 / scale - 1)[:, None]
+        x, y, z = in_query = (points @ motion[:3, :3].T + motion[:3, 3]).T
         z = np.maximum(z, MIN_DEPTH)
-        off = used.focal * np.stack([x / z, y / z], axis=1) - used.pixels
+        off = pairs.focal * np.stack([x / z, y / z], axis=1) - pairs.pixels
         zero = np.zeros_like(z)
         projection = np.array([[1 / z, zero, -x / z**2], [zero, 1 / z, -y / z**2]])
-        projection = used.focal * projection.transpose(2, 0, 1)
-        by_pose = np.concatenate([projection, -projection @ cross(moved.T)], axis=2)
-        slope = -used.rays * (used.deviations / scale**2)[:, None] @ motion[:3, :3].T
+        projection = pairs.focal * projection.transpose(2, 0, 1)
+        by_pose = np.concatenate([projection, -projection @ cross(in_query.T)], axis=2)
+        slope = -pairs.rays * (pairs.deviations / scale**2)[:, None] @ motion[:3, :3].T
         by_depth = np.einsum('mij,mj->mi', projection, slope)
         weight = 1 / (1 + (off**2).sum(axis=1) + shift**2)
         own = weight * ((by_depth**2).sum(axis=1) + 1)
         pull = weight * ((by_depth * off).sum(axis=1) + shift)
-        mixed = weight[:, None] * np.einsum('mij,mi->mj', by_pose, by_depth)
+        coupling = weight[:, None] * np.einsum('mij,mi->mj', by_pose, by_depth)
         normal = np.einsum('m,mij,mik->jk', weight, by_pose, by_pose)
-        normal -= (mixed / own[:, None]).T @ mixed  # Schur complement
-        right = np.einsum('m,mij,mi->j', weight, by_pose, off) - mixed.T @ (pull / own)
+        normal -= (coupling / own[:, None]).T @ coupling  # Schur complement
+        right = np.einsum('m,mij,mi->j', weight, by_pose, off) - coupling.T @ (pull / own)
         step = -np.linalg.solve(normal, right)
-        shift -= (pull + mixed @ step) / own
+        shift -= (pull + coupling @ step) / own
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
         motion = change @ motion

@@ -102,18 +102,18 @@ class BagSource:
     ) -> Iterator[Item]:
         with open_bag(self.path) as bag:
             index = -1
-            wanted = [each for each in bag.connections if each.topic == self.topic]
-            messages = bag.messages(wanted, start, duration)
+            connections = [each for each in bag.connections if each.topic == self.topic]
+            messages = bag.messages(connections, start, duration)
             for index, (_, time_ns, raw) in enumerate(messages):
                 try:
                     item = finish(index, time_ns, self._message(bag, raw))
                 except ImageError as error:
-                    named = ImageError(
+                    image_error = ImageError(
                         f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind
                     )
                     if self.on_error is None:
-                        raise named from error
-                    self.on_error(named)
+                        raise image_error from error
+                    self.on_error(image_error)
                     continue
                 yield item
             if (start, duration) == (0, math.inf) and index + 1 < self._count:
@@ -149,7 +149,7 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
 
 def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
     """Return the requested topic, or the only one; an error lists the topics."""
-    images = {name: found for name, found in topics.items() if found[0] in {RAW, COMPRESSED}}
+    images = {name: info for name, info in topics.items() if info[0] in {RAW, COMPRESSED}}
     if topic is not None:
         name = next((name for name in topics if name.lstrip('/') == topic.lstrip('/')), None)
         if name in images:
@@ -162,12 +162,12 @@ def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -
         raise SourceError(
             f'topic {topic!r} {where} {path}: expected one of {_listed(images or topics)}'
         )
-    filled = {name: found for name, found in images.items() if found[1]}
-    if len(filled) == 1:
-        return next(iter(filled))
-    if filled:
+    nonempty = {name: info for name, info in images.items() if info[1]}
+    if len(nonempty) == 1:
+        return next(iter(nonempty))
+    if nonempty:
         raise SourceError(
-            f'{path} has {len(filled)} image topics, choose one (--topic): {_listed(filled)}'
+            f'{path} has {len(nonempty)} image topics, choose one (--topic): {_listed(nonempty)}'
         )
     raise SourceError(
         f'{path} has no images (expected {RAW} or {COMPRESSED}): there are {_listed(topics)}'
@@ -212,8 +212,8 @@ def _connections(bag: OpenBag, path: Path, topic: str) -> list[Any]:
     if name is not None and topics[name][0] == ODOMETRY:
         return [each for each in bag.connections if each.topic == name]
     where = 'is not in' if name is None else f'is of type {topics[name][0]}, not {ODOMETRY}, in'
-    listed = ', '.join(other for other in topics if topics[other][0] == ODOMETRY) or 'none'
-    raise SourceError(f'odometry topic {topic!r} {where} {path}: topics of that type are {listed}')
+    others = ', '.join(other for other in topics if topics[other][0] == ODOMETRY) or 'none'
+    raise SourceError(f'odometry topic {topic!r} {where} {path}: topics of that type are {others}')
 
 
 def _require_one_run(stamps: np.ndarray, name: str) -> None:

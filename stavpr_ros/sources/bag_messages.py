@@ -46,16 +46,16 @@ def read_messages(
     :raises SourceError: the bag is damaged, or a message cannot be converted.
     """
     with open_bag(path) as bag:
-        wanted = [each for each in bag.connections if each.topic in topics]
+        connections = [each for each in bag.connections if each.topic in topics]
         convert = _Ros1() if isinstance(bag.reader, Ros1Reader) else None
-        for connection, time_ns, raw in bag.messages(wanted, start, duration):
+        for connection, time_ns, raw in bag.messages(connections, start, duration):
             kind = message_type(connection)
             content = raw if convert is None else convert(kind, raw)
             yield MessageRecord(time_ns, connection.topic, bytes(content))
 
 
 class _Ros1:
-    """Converts serialized messages of ROS 1 to those of ROS 2."""
+    """Converts serialized messages of ROS 1 to messages of ROS 2."""
 
     def __init__(self) -> None:
         self._old, self._new = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)

@@ -178,11 +178,11 @@ def decode_image(
     rows = height + int(height * layout.chroma_rows)
     _check_header(height, width, encoding, step, row)
     flat = files.flat_bytes(data)
-    needed = (rows - 1) * step + row
-    if flat.size < needed:
+    min_size = (rows - 1) * step + row
+    if flat.size < min_size:
         raise ImageError(
             f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: '
-            f'expected {needed} or more; the image is cut off',
+            f'expected {min_size} or more; the image is cut off',
             kind='cut off',
         )
     if width * height > files.MAX_PIXELS:  # last: a wrong header fails the checks above
@@ -253,13 +253,13 @@ def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
     """
     Find the Bayer mosaic in a format such as ``bayer_rggb8; png compressed``.
 
-    After ``compressed`` follows the encoding before compression: nothing or the same mosaic if it
+    After ``keyword`` follows the encoding before compression: nothing or the same mosaic if it
     was not converted, ``mono8`` or ``bgr8`` if it is no mosaic any more.
     """
     original, _, rest = transport.partition(';')
-    _, compressed, target = rest.partition('compressed')
+    _, keyword, target = rest.partition('compressed')
     layout = ENCODINGS.get(original.strip()) if original.startswith('bayer_') else None
-    if layout is None or not compressed or target.strip() not in {'', original.strip()}:
+    if layout is None or not keyword or target.strip() not in {'', original.strip()}:
         return None
     return layout.to_rgb
 

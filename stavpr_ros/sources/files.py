@@ -156,9 +156,9 @@ def _check_end_of_jpeg(data: bytes) -> None:
     """Reject an incomplete image: OpenCV before version 5 fills the rest with gray."""
     # segment by segment: a thumbnail or a video in the file may contain the same two bytes
     at = 2
-    while found := JPEG_MARKER.search(data, at):
-        at = found.end()
-        if found[0] == END_OF_JPEG:
+    while marker := JPEG_MARKER.search(data, at):
+        at = marker.end()
+        if marker[0] == END_OF_JPEG:
             return
         at += int.from_bytes(data[at : at + 2], 'big')
     raise ImageError(

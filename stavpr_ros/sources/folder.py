@@ -112,11 +112,11 @@ def _images_below(folder: Path) -> list[Path]:
     def fail(error: OSError) -> None:
         raise error
 
-    found = []
+    images = []
     for name, folders, files in os.walk(folder, onerror=fail):
         folders[:] = [each for each in folders if not each.startswith('.')]
-        found += [file for file in (Path(name, each) for each in files) if _is_image(file)]
-    return found
+        images += [file for file in (Path(name, each) for each in files) if _is_image(file)]
+    return images
 
 
 def _is_image(file: Path) -> bool:

@@ -29,7 +29,7 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
     poses = np.array(rows)
     if not np.isfinite(poses).all():
         raise SourceError(f'poses {path}: expected finite numbers')
-    oriented = poses.shape[1] == 7
-    if not oriented:
+    has_rotations = poses.shape[1] == 7
+    if not has_rotations:
         poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])
-    return poses, oriented
+    return poses, has_rotations

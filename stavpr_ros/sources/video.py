@@ -92,9 +92,9 @@ class VideoSource:
                 f'{path} cannot be read: {error.strerror}; check its name and permissions'
             ) from error
         with _Decoder(self.path, fps) as decoder:
-            stated, rate = decoder.facts()
+            frame_count, rate = decoder.facts()
         most = self.path.stat().st_size  # no frame is smaller than a byte
-        self._stated = min(stated, most) if stated > 0 else 0
+        self._stated = min(frame_count, most) if frame_count > 0 else 0
         self._rate = rate if 0 < rate < math.inf else fps
 
     def __len__(self) -> int:
@@ -194,8 +194,8 @@ class _Decoder:
             content, reason = bytearray(), str(error)
         if not content:
             raise SourceError(f'{self._path} {reason}; {REMEDY}')
-        stated, rate = FACTS.unpack(content)
-        return stated, rate
+        frame_count, rate = FACTS.unpack(content)
+        return frame_count, rate
 
     def read(self, size: int) -> bytearray:
         """Return the next bytes, or none at the end; raise _DecoderError if it is not in time."""

@@ -68,7 +68,7 @@ def cosine_distances(features, queries, out):
     Distances 1 - <x, y> of images that are one vector each (W = 1).
 
     :param features: the map's unit-norm vectors, shape (n, d), float32.
-    :param queries: those of Q images, shape (Q, d), float32.
+    :param queries: unit-norm vectors of Q images, shape (Q, d), float32.
     :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
     """
     n = out.shape[1]
@@ -107,7 +107,7 @@ def strip_distances(features, query, d):
     Distances d[i, j, y] = 1 - <x_i, y_j>.
 
     :param features: the map's unit-norm local features, shape (W, n, d), float32.
-    :param query: those of one image, shape (R, d), float32; R is W rounded up to whole TILEs,
+    :param query: features of one image, shape (R, d), float32; R is W rounded up to whole TILEs,
         zeros there.
     :param d: shape (R, W, n), written.
     """
@@ -124,8 +124,8 @@ def _align_block(features, queries, x, first, count, weights, xi, d, edge, lanes
     W, stride = d.shape[1], d.shape[2]
     _block_distances(features, queries, x, first, count, d)
     for at in range(0, count, LANES):
-        aligned = align_lanes(d.reshape(-1), at, W * stride, stride, weights, xi, edge)
-        store(lanes, at, aligned)
+        distances = align_lanes(d.reshape(-1), at, W * stride, stride, weights, xi, edge)
+        store(lanes, at, distances)
 
 
 @parallel_kernel
@@ -135,7 +135,7 @@ def image_distances(features, queries, weights, xi, out):
 
     :param features: as in :func:`strip_distances`, or in int8, of
         :meth:`stavpr_ros.alignment.cpu.int8.Int8Strips.kernel_arguments`.
-    :param queries: those of Q images, shape (Q, R, d), likewise; or int8, of
+    :param queries: features of Q images, shape (Q, R, d), likewise; or int8, of
         :func:`stavpr_ros.alignment.cpu.int8.tiled`.
     :param weights, xi: as in :func:`stavpr_ros.alignment.cpu.dtw.align_lanes`.
     :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
@@ -176,11 +176,11 @@ def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
     """
     Image distances from strip distances that are themselves aligned.
 
-    The distance of two strips is that of their cells, aligned from top to bottom.
+    The distance of two strips is the distance of their cells, aligned from top to bottom.
 
     :param features: unit-norm cells of the map, shape (W H, n, c), strip by strip, each from the
         top; float32.
-    :param queries: those of Q images, shape (Q, R, c), float32; R is W H rounded up to whole
+    :param queries: cells of Q images, shape (Q, R, c), float32; R is W H rounded up to whole
         TILEs.
     :param cell_weights: a for each ``|I_c - c|`` of the H cells, shape (H,).
     :param weights, xi: of the W strips, as in :func:`image_distances`.
@@ -206,8 +206,8 @@ def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
                             cells, corner, rows * FEW_IMAGES, FEW_IMAGES, cell_weights, H, edge
                         )
                         store(flat, (i * W + j) * FEW_IMAGES + at, distance)
-                aligned = align_lanes(flat, at, W * FEW_IMAGES, FEW_IMAGES, weights, xi, edge)
-                store(lanes, at, aligned)
+                distances = align_lanes(flat, at, W * FEW_IMAGES, FEW_IMAGES, weights, xi, edge)
+                store(lanes, at, distances)
             out[x, first : first + count] = lanes[:count]
 
 

@@ -43,8 +43,8 @@ def step(
     sideways = horizontal < vertical
     straight = select(sideways, horizontal, vertical)
     cost = select(sideways, C_horizontal, C_vertical) + one
-    slanted = diagonal < straight
-    return select(slanted, diagonal, straight), select(slanted, C + diagonal_cost, cost)
+    is_diagonal = diagonal < straight
+    return select(is_diagonal, diagonal, straight), select(is_diagonal, C + diagonal_cost, cost)
 
 
 @kernel
@@ -208,8 +208,8 @@ def backtrack(step, row, column, path):
         count += 1
         if row == 0 and column == 0:
             return count
-        taken = step[row, column]
-        if taken != HORIZONTAL:
+        move = step[row, column]
+        if move != HORIZONTAL:
             row -= 1
-        if taken != VERTICAL:
+        if move != VERTICAL:
             column -= 1

@@ -56,8 +56,8 @@ def choose_instruction(features: str, lanes: int) -> str:
     available = set(features.split(','))
     return next(
         name
-        for name, required, fitting, _ in INSTRUCTIONS
-        if required <= available and fitting == lanes
+        for name, cpu_features, fitting, _ in INSTRUCTIONS
+        if cpu_features <= available and fitting == lanes
     )
 
 
@@ -269,8 +269,8 @@ class Int8Strips:
     def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> np.ndarray:
         """Return strips of places, [:, places], float32, of unit norm again."""
         places = np.arange(self.shape[1])[index[1]]
-        rounded = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
-        strips = rounded.reshape(len(places), len(self), -1)[:, :, : self.shape[2]]
+        codes = self.values[:, places // LANES, :, places % LANES]  # (m, W, quads, QUAD)
+        strips = codes.reshape(len(places), len(self), -1)[:, :, : self.shape[2]]
         return np.ascontiguousarray(strips.transpose(1, 0, 2) * self.reciprocals[:, places, None])
 
     def rounded(self) -> np.ndarray:
@@ -292,10 +292,10 @@ def rounded_queries(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     :returns: int8, (Q, W, d); 1 / length of each rounded strip, (Q, W), float32.
     """
     W, Q, d = queries.shape
-    rounded, reciprocals = np.empty((Q, W, d), np.int8), np.empty((Q, W), np.float32)
+    codes, reciprocals = np.empty((Q, W, d), np.int8), np.empty((Q, W), np.float32)
     strips = np.ascontiguousarray(queries.transpose(1, 0, 2))
-    _round_queries(strips, _longest(d), np.float32(QUERY_PEAK), rounded, reciprocals)
-    return rounded, reciprocals
+    _round_queries(strips, _longest(d), np.float32(QUERY_PEAK), codes, reciprocals)
+    return codes, reciprocals
 
 
 def tiled(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -308,11 +308,11 @@ def tiled(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     W, Q, d = queries.shape
     tiles, quads = -(-W // TILE), -(-d // QUAD)
-    rounded: np.ndarray = np.zeros((Q, tiles * TILE, quads * QUAD), np.int8)
+    codes: np.ndarray = np.zeros((Q, tiles * TILE, quads * QUAD), np.int8)
     reciprocals: np.ndarray = np.zeros((Q, tiles * TILE), np.float32)
-    rounded[:, :W, :d], reciprocals[:, :W] = rounded_queries(queries)
-    packed = rounded.view(np.int32).reshape(Q, tiles, TILE, quads).transpose(0, 1, 3, 2)
-    sums = rounded.sum(axis=2, dtype=np.int32)
+    codes[:, :W, :d], reciprocals[:, :W] = rounded_queries(queries)
+    packed = codes.view(np.int32).reshape(Q, tiles, TILE, quads).transpose(0, 1, 3, 2)
+    sums = codes.sum(axis=2, dtype=np.int32)
     return np.ascontiguousarray(packed), reciprocals, sums
 
 
@@ -388,7 +388,7 @@ def strip_distances(features, queries, x, d):
 @parallel_kernel
 def cosine_distances(features, queries, out):
     """
-    Distances of images that are one vector each (W = 1), equal to those of the other kernels.
+    Distances of images that are one vector each (W = 1), equal to the other kernels' results.
 
     :param features, queries: as in :func:`block_distances`.
     :param out: shape (Q, m), written; m <= n: only so many places are looked at.
