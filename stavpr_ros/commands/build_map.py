@@ -183,12 +183,12 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
         return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
     if not arguments.poses:
         return None
-    poses, oriented = read_poses(Path(arguments.poses))
+    poses, has_orientations = read_poses(Path(arguments.poses))
     if len(poses) != images and not is_video(arguments.input):  # whose number is an estimate
         raise SourceError(
             f'poses {arguments.poses} has {len(poses)} lines for {images} images: give one each'
         )
-    if arguments.keyframe_angle and not oriented:
+    if arguments.keyframe_angle and not has_orientations:
         raise SettingsError(
             f'--keyframe-angle: {arguments.poses} has no orientations, leave it out'
         )
@@ -245,16 +245,16 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
 
 def _source_of(arguments: argparse.Namespace) -> str:
     """Describe the images and the options: only the same are continued after an interruption."""
-    given = vars(arguments) | {'input': str(Path(arguments.input).resolve())}
+    options = vars(arguments) | {'input': str(Path(arguments.input).resolve())}
     # places of a journal without skipped images are also the first ones with skipping
-    decisive = given.keys() - {'output', 'force', 'skip_bad_images'}
-    return json.dumps({name: given[name] for name in sorted(decisive)})
+    decisive = options.keys() - {'output', 'force', 'skip_bad_images'}
+    return json.dumps({name: options[name] for name in sorted(decisive)})
 
 
 def _known_poses(place_map: 'PlaceMap') -> str:
     """Return the number of places with a pose, in words; '' if none has."""
-    known = sum(place_map.pose(place) is not None for place in range(len(place_map)))
-    return f', {known} of them with a pose' if known else ''
+    count = sum(place_map.pose(place) is not None for place in range(len(place_map)))
+    return f', {count} of them with a pose' if count else ''
 
 
 def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float | None':

@@ -44,15 +44,15 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     add('--projection', type=int, metavar='D', help=projection)
     add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
     add('--device', default='auto', choices=DEVICES, help='where features are computed')
-    listed = argparse.ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
+    hidden_parser = argparse.ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
     for kind in kinds():
-        shown = listed.add_argument_group(f'features {kind}')
+        group_of_kind = hidden_parser.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
             required = row.default is dataclasses.MISSING
             example = '' if required else row.default
             default_text = 'required' if required else str(example).strip('()') or 'none'
             text = f'{row.metadata["help"]} ({default_text})'.replace('%', '%%')
-            for group, words in ((parser, argparse.SUPPRESS), (shown, text)):
+            for group, words in ((parser, argparse.SUPPRESS), (group_of_kind, text)):
                 group.add_argument(
                     _option(kind, row.name),
                     type=CONVERTERS.get(type(example), type(example)),
@@ -60,7 +60,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
                     help=words,
                 )
     more = 'show the options of each kind of features, as of networks, and exit'
-    add('--help-features', action='version', version=listed.format_help(), help=more)
+    add('--help-features', action='version', version=hidden_parser.format_help(), help=more)
 
 
 def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
@@ -100,7 +100,7 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
 
     :raises SettingsError: an option of this kind is missing, or one of another kind was given.
     """
-    kind, given = arguments.features, {}
+    kind, values = arguments.features, {}
     for other in kinds():
         for row in dataclasses.fields(settings_class(other)):
             value = getattr(arguments, f'{other}_{row.name}')
@@ -110,12 +110,12 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
                     f'--features {other}'
                 )
             if value is not None:
-                given[row.name] = value
+                values[row.name] = value
     missing = [
         _option(kind, row.name)
         for row in dataclasses.fields(settings_class(kind))
-        if row.default is dataclasses.MISSING and row.name not in given
+        if row.default is dataclasses.MISSING and row.name not in values
     ]
     if missing:
         raise SettingsError(f'--features {kind} needs {" and ".join(missing)}')
-    return settings_class(kind)(**given)
+    return settings_class(kind)(**values)

@@ -58,7 +58,7 @@ def add_job_options(parser: argparse.ArgumentParser) -> None:
 
 def job_names(inputs: Sequence[str]) -> list[str]:
     """
-    Return the names of inputs: those of their files without suffix.
+    Return the names of inputs: their files' names without suffix.
 
     :raises SettingsError: two have the same name.
     """
@@ -70,7 +70,7 @@ def job_names(inputs: Sequence[str]) -> list[str]:
 
 
 def other_arguments(args: Sequence[str], *several: str) -> list[str]:
-    """Return the arguments of a command line except these options, and those of the jobs."""
+    """Return the arguments of a command line except these options and the options of the jobs."""
     parser = argparse.ArgumentParser(add_help=False)
     for option in several:
         parser.add_argument(option, nargs='+')
@@ -85,7 +85,7 @@ def run_jobs(jobs: Sequence[Job], processes: int | None, ray: str | None) -> int
 
     :param processes: at a time; None = one for each processor.
     :param ray: address of a cluster, None = processes of this machine.
-    :returns: exit code, that of the worst job.
+    :returns: exit code of the worst job.
     :raises SettingsError: invalid options.
     :raises UnavailableError: no Ray, or no cluster there.
     """
@@ -119,7 +119,7 @@ def _processes(count: int) -> Iterator[Callable[[Job], Future[Result]]]:
     environment = {'OMP_NUM_THREADS': threads, 'NUMBA_NUM_THREADS': threads} | os.environ
 
     def run(job: Job) -> Result:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, '-m', job.command, *job.arguments],
             env=environment,
             stdout=subprocess.PIPE,
@@ -127,9 +127,9 @@ def _processes(count: int) -> Iterator[Callable[[Job], Future[Result]]]:
             text=True,
             check=False,
         )
-        if done.returncode < 0:
-            raise ChildProcessError(f'{done.stdout}killed by signal {-done.returncode}')
-        return done.returncode, done.stdout
+        if process.returncode < 0:
+            raise ChildProcessError(f'{process.stdout}killed by signal {-process.returncode}')
+        return process.returncode, process.stdout
 
     with ThreadPoolExecutor(count) as pool:
         yield lambda job: pool.submit(run, job)

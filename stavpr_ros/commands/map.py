@@ -128,9 +128,9 @@ def _parser() -> argparse.ArgumentParser:
     add_storage(action, '', halves)
     text = 'Write selected sessions of a map to another map.'
     action = add('sessions', _sessions, text, 'map', 'output', force=force)
-    chosen = action.add_mutually_exclusive_group(required=True)
-    chosen.add_argument('--keep', metavar='ID', help='only the places of this session')
-    chosen.add_argument('--remove', metavar='ID', help='all places except those of this session')
+    group = action.add_mutually_exclusive_group(required=True)
+    group.add_argument('--keep', metavar='ID', help='only the places of this session')
+    group.add_argument('--remove', metavar='ID', help='all places except those of this session')
     text = 'Write a map to the home of a fleet, docs/fleet.md.'
     action = add('upload', _upload, text, 'map', force='replace the map that is there')
     action.add_argument(
@@ -181,12 +181,12 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
     features, settings, n = place_map.features, place_map.settings, len(place_map)
     risks = place_map.error_risks
     assert isinstance(features, StoredFeatures)
-    posed = sum(place_map.pose(place) is not None for place in range(n))
-    known = place_map.stamps[place_map.stamps != 0]
+    count = sum(place_map.pose(place) is not None for place in range(n))
+    stamps = place_map.stamps[place_map.stamps != 0]
     rows = {
         'file': f'{path}, {path.stat().st_size / 1e6:.1f} MB, format version {VERSION}',
         'id': place_map.map_id,
-        'places': f'{n}, {posed} with a pose, {sum(map(bool, place_map.ids))} with an identifier, '
+        'places': f'{n}, {count} with a pose, {sum(map(bool, place_map.ids))} with an identifier, '
         f'{"with" if len(place_map.thumbnails) else "without"} thumbnails',
         'features': f'{settings.kind}, version {settings.feature_version}: {settings.strips} '
         f'strips of {place_map.dimension} dimensions, {features.storage}',
@@ -201,11 +201,11 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         'error rate': 'none'
         if risks is None
         else f'at least {risks.bounds[-1]:.3g}, kept by {risks.units} blocks: {risks.method}',
-        'stamps': f'{_time(int(known.min()))} to {_time(int(known.max()))}'
-        if len(known)
+        'stamps': f'{_time(int(stamps.min()))} to {_time(int(stamps.max()))}'
+        if len(stamps)
         else 'unknown',
     }
-    if posed and place_map.poses is not None:
+    if count and place_map.poses is not None:
         positions = place_map.poses[~np.isnan(place_map.poses[:, 0]), :3]
         length = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
         rows['poses'] = f'a route of {length:.0f} m'
@@ -213,13 +213,13 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
     for number, session in enumerate(place_map.sessions):
         assert place_map.session_index is not None
         places = np.count_nonzero(place_map.session_index == number)
-        named = ''.join(f', {text}' for text in (session.name, session.robot) if text)
+        names = ''.join(f', {text}' for text in (session.name, session.robot) if text)
         start = f', {_time(session.start)}' if session.start else ''
         same = ''
         if place_map.same_as is not None:
             own = np.flatnonzero(place_map.session_index == number)
             same = f', {np.count_nonzero(place_map.same_as[own] != own)} of them in earlier ones'
-        lines.append(f'session    {session.id}{named}: {places} places{same}{start}')
+        lines.append(f'session    {session.id}{names}: {places} places{same}{start}')
     return '\n'.join(map(printable, lines))
 
 
@@ -259,7 +259,7 @@ def _compact(arguments: argparse.Namespace) -> None:
 
     place_map = _verified(arguments.map)
     assert isinstance(place_map.features, StoredFeatures)
-    stored, n = place_map.features.storage, len(place_map)
+    storage, n = place_map.features.storage, len(place_map)
     if arguments.drop_duplicates:
         place_map = without_duplicates(place_map)
         print(f'{n - len(place_map)} of {n} places dropped: they show what the one before shows')
@@ -270,8 +270,8 @@ def _compact(arguments: argparse.Namespace) -> None:
         size = sum(map(len, place_map.thumbnails)) / 1e6
         place_map = replace(place_map, thumbnails=())
         print(f'thumbnails of {size:.1f} MB dropped')
-    if arguments.storage != stored:
-        print(f'features: {stored} becomes {arguments.storage}')
+    if arguments.storage != storage:
+        print(f'features: {storage} becomes {arguments.storage}')
     _write(place_map, arguments)
 
 
@@ -301,10 +301,10 @@ def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
     from stavpr_ros.prepare.prepared_map import statistics_of_map, with_codes
 
     storage = getattr(arguments, 'storage', '')
-    learned = statistics_of_map(place_map, storage)
-    if learned is not None and getattr(arguments, 'codes', False):
-        learned = with_codes(learned, place_map, storage)
-    map_id = save_map(place_map, arguments.output, storage, arguments.force, learned)
+    statistics = statistics_of_map(place_map, storage)
+    if statistics is not None and getattr(arguments, 'codes', False):
+        statistics = with_codes(statistics, place_map, storage)
+    map_id = save_map(place_map, arguments.output, storage, arguments.force, statistics)
     size = Path(arguments.output).stat().st_size / 1e6
     print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
 
@@ -324,10 +324,10 @@ def _recover(arguments: argparse.Namespace) -> int:
     journal = arguments.journal
     if arguments.output is None and not journal.endswith(SUFFIX):
         raise SourceError(f'{journal} does not end with {SUFFIX}: name the map, --output')
-    found = recover(journal, arguments.output)
-    print(f'{found.path}: {found.places} places, {found.recorded} of them from {journal}')
-    print(*found.problems, sep='\n', end='\n' if found.problems else '')
-    return int(bool(found.problems))
+    recovery = recover(journal, arguments.output)
+    print(f'{recovery.path}: {recovery.places} places, {recovery.recorded} of them from {journal}')
+    print(*recovery.problems, sep='\n', end='\n' if recovery.problems else '')
+    return int(bool(recovery.problems))
 
 
 def _upload(arguments: argparse.Namespace) -> None:

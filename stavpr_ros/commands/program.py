@@ -26,8 +26,8 @@ class _Help(argparse.RawDescriptionHelpFormatter):
     def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: str | None = None) -> None:
         """Leave out the options; argparse takes an empty prefix for the names of subcommands."""
         if prefix != '':
-            required = [each for each in actions if each.required or not each.option_strings]
-            actions = [*required, argparse.Action((), 'option', '?', metavar='OPTION ...')]
+            requirements = [each for each in actions if each.required or not each.option_strings]
+            actions = [*requirements, argparse.Action((), 'option', '?', metavar='OPTION ...')]
         super().add_usage(usage, actions, (), prefix)
 
 
@@ -37,10 +37,10 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Reject unknown options here, where a subcommand knows its own."""
         self._given: Sequence[str] = sys.argv[1:] if args is None else args
-        found, unknown = super().parse_known_args(args, namespace)
+        result, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f'unrecognized arguments: {" ".join(unknown)}')
-        return found, unknown
+        return result, unknown
 
     def error(self, message: str) -> NoReturn:
         """Print the usage, the error and a suggestion, and exit."""
@@ -83,7 +83,7 @@ def add_parameter(group: Any, name: str, text: str, **changes: Any) -> None:
 
     :param group: of options, or a parser.
     :param text: help of the option; ``%(default)s`` is its default.
-    :param changes: other arguments of ``add_argument`` than those of the table.
+    :param changes: arguments of ``add_argument`` that replace the table's.
     """
     row = BY_NAME[name]
     if isinstance(row.default, bool):
@@ -127,8 +127,8 @@ def run_program(
         return work() or DONE
     except StavprError as error:
         print(f'{name}: {error}', file=sys.stderr)
-        known: dict[type[StavprError], int] = {SettingsError: BAD_USAGE, **codes}
-        return next((code for kind, code in known.items() if isinstance(error, kind)), FAILED)
+        exit_codes: dict[type[StavprError], int] = {SettingsError: BAD_USAGE, **codes}
+        return next((code for kind, code in exit_codes.items() if isinstance(error, kind)), FAILED)
     except BaseException as error:
         # an interrupt within a foreign library comes out as another exception
         if not (isinstance(error, KeyboardInterrupt) or interrupted()):

@@ -73,15 +73,15 @@ def main(args: list[str] | None = None) -> int:
     return run_program('record', lambda: _run(sys.argv[1:] if args is None else args))
 
 
-def _run(given: list[str]) -> None:
+def _run(args: list[str]) -> None:
     from stavpr_ros.ros.process import own_arguments
 
-    arguments = _parser().parse_args(own_arguments(given))
+    arguments = _parser().parse_args(own_arguments(args))
     with atomic_output(arguments.output, RECORDING, arguments.force) as file:
-        written = _write_messages(arguments, file, given)
-        if not written and os.path.exists(arguments.output):
+        count = _write_messages(arguments, file, args)
+        if not count and os.path.exists(arguments.output):
             file.abandon()  # an earlier recording is replaced by the first message
-    print(f'{written} {arguments.kind} written to {arguments.output}')
+    print(f'{count} {arguments.kind} written to {arguments.output}')
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -116,7 +116,7 @@ def _write_messages(
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
-    written = 0
+    count = 0
     kinds: dict[str, Any] = {
         MATCHES: (PlaceMatch, match_record),
         LOOP_CLOSURES: (LoopClosure, loop_closure_record),
@@ -124,7 +124,7 @@ def _write_messages(
     message_type, record_of = kinds[arguments.kind]
 
     def write(message: Any) -> None:
-        nonlocal written
+        nonlocal count
         line = json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n'
         size = os.fstat(file.fileno()).st_size
         try:
@@ -132,13 +132,13 @@ def _write_messages(
             file.flush() if file.committed else file.commit()
         except OSError as error:
             os.ftruncate(file.fileno(), size)
-            content = f'it has {written} {arguments.kind}, all of them whole'
+            content = f'it has {count} {arguments.kind}, all of them whole'
             raise OutputError(
                 f'{arguments.output} cannot be written ({error.strerror}); '
                 f'{content if file.committed else "what was there is untouched"}: free space, and '
                 'record again'
             ) from error
-        written += 1
+        count += 1
 
     try:
         with ros_node(lambda: rclpy.create_node('stavpr_record'), ros_arguments) as node:
@@ -154,7 +154,7 @@ def _write_messages(
             spin_until(node)
     except KeyboardInterrupt:
         pass  # the usual end
-    return written
+    return count
 
 
 if __name__ == '__main__':

@@ -29,9 +29,9 @@ from stavpr_ros.sources.video import VideoSource
 from tqdm import tqdm
 
 Source = FolderSource | VideoSource | BagSource
-NO_SUBSCRIBER, NO_RESULT = 3, 4  # exit codes, besides those of every command
+NO_SUBSCRIBER, NO_RESULT = 3, 4  # exit codes, besides the ones that all commands have
 FOLDER_FPS = 10.0
-CLOCK_RATE = 40.0  # that of `ros2 bag play`
+CLOCK_RATE = 40.0  # Hz, as `ros2 bag play`
 ONLY = ''  # --odometry without a topic
 
 EPILOG = """\
@@ -67,15 +67,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Run the command.
 
     :param arguments: without the program's name; the process's own if None.
-    :returns: exit code, one of those in ``--help``.
+    :returns: exit code, see ``--help``.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    args = list(sys.argv[1:] if arguments is None else arguments)
     codes: dict[type[StavprError], int] = {
         NoSubscriberError: NO_SUBSCRIBER,
         NoResultError: NO_RESULT,
     }
     return run_program(
-        'replay', lambda: _run(_parser().parse_args(own_arguments(given)), given), codes=codes
+        'replay', lambda: _run(_parser().parse_args(own_arguments(args)), args), codes=codes
     )
 
 
@@ -132,21 +132,21 @@ def _others(
     topics = list_topics(source.path)
 
     def find(name: str, of_type: str = '') -> RecordedTopic:
-        found = [
+        matches = [
             topic
             for topic in topics.values()
             if of_type in {'', topic.message_type}
             and name.strip('/') in {'', topic.name.strip('/')}
         ]
-        if len(found) != 1:
-            listed = ', '.join(f'{each.name} ({each.message_type})' for each in topics.values())
+        if len(matches) != 1:
+            choices = ', '.join(f'{each.name} ({each.message_type})' for each in topics.values())
             raise SourceError(
-                f'{len(found)} topics {name} {of_type} with messages in {source.path}: expected '
-                f'one of {listed}'
+                f'{len(matches)} topics {name} {of_type} with messages in {source.path}: expected '
+                f'one of {choices}'
             )
-        return found[0]
+        return matches[0]
 
-    requested = [find(name) for name in options.also or ()]
+    selection = [find(name) for name in options.also or ()]
     if options.also == []:
         for topic in topics.values():
             try:
@@ -154,8 +154,8 @@ def _others(
             except UnavailableError as error:
                 notify(f'{topic.name} is left out: {error}')
             else:
-                requested.append(topic)
-    others = {topic: topic.name for topic in requested if topic.name != source.topic}
+                selection.append(topic)
+    others = {topic: topic.name for topic in selection if topic.name != source.topic}
     if options.odometry is not None:
         others[find(options.odometry, ODOMETRY)] = 'odom'
     return others

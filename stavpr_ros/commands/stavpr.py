@@ -29,11 +29,11 @@ PACKAGES = {
 
 def all_commands() -> dict[str, Command]:
     """Return the commands of this package and of all others that are installed."""
-    found = dict(COMMANDS)
+    commands = dict(COMMANDS)
     for table in plugins.load(plugins.COMMANDS).values():
         for name, command in table.items():
-            found.setdefault(name, command)
-    return found
+            commands.setdefault(name, command)
+    return commands
 
 
 def usage() -> str:
@@ -64,7 +64,7 @@ def main(args: list[str] | None = None) -> int:
     """
     Run a command.
 
-    :param args: arguments without the program name; None takes those of the process.
+    :param args: arguments without the program name; None takes the arguments of the process.
     :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
     """
     forget_requirements()

@@ -17,8 +17,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     text = 'Compile the kernels of all operations into the cache, where they are missing.'
     parser = make_parser('warm', text, EPILOG)
-    given = sys.argv[1:] if arguments is None else arguments
-    return run_program('warm', lambda: _run(parser.parse_args(given)))
+    args = sys.argv[1:] if arguments is None else arguments
+    return run_program('warm', lambda: _run(parser.parse_args(args)))
 
 
 def _run(_: object) -> None:
