@@ -50,7 +50,7 @@ def _is_writable(folder: Path) -> bool:
     return True
 
 
-def _temporary_folder(filled: Path | None) -> Path | None:
+def _temporary_folder(template: Path | None) -> Path | None:
     """
     Return the user's temporary folder of kernels, at first a copy of a filled one; None = none.
 
@@ -60,8 +60,8 @@ def _temporary_folder(filled: Path | None) -> Path | None:
         folder = Path(tempfile.gettempdir()) / f'stavpr_kernels_{os.getuid()}'
         if not folder.exists():
             copy = Path(tempfile.mkdtemp())
-            if filled is not None:
-                shutil.copytree(filled, copy, dirs_exist_ok=True)
+            if template is not None:
+                shutil.copytree(template, copy, dirs_exist_ok=True)
             copy.chmod(0o700)
             copy.rename(folder)
         status = folder.lstat()
@@ -78,23 +78,23 @@ def cache_folder() -> Path | None:
     NUMBA_CACHE_DIR, or else the first that can be written of the package's and the user's cache;
     otherwise a temporary one, which is logged.
     """
-    if given := os.environ.get('NUMBA_CACHE_DIR'):
-        folders = [Path(given)]
+    if environment := os.environ.get('NUMBA_CACHE_DIR'):
+        folders = [Path(environment)]
     else:
         user = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
         folders = [Path(__file__).parent / '__pycache__' / 'kernels', Path(user) / 'stavpr']
     for folder in folders:
         if folder.is_absolute() and _is_writable(folder):
             return folder
-    found = _temporary_folder(next(filter(Path.is_dir, folders), None))
+    temporary = _temporary_folder(next(filter(Path.is_dir, folders), None))
     if multiprocessing.parent_process() is None:
         logging.getLogger('stavpr_ros').warning(
             'no cache folder of kernels can be written (%s): %s; set NUMBA_CACHE_DIR to a folder '
             'that can be, and run `stavpr warm` once',
             ', '.join(map(str, folders)),
-            f'{found} is used' if found else 'they are compiled at each start',
+            f'{temporary} is used' if temporary else 'they are compiled at each start',
         )
-    return found
+    return temporary
 
 
 class _Progress(event.Listener):
@@ -139,12 +139,12 @@ CACHE = cache_folder()
 
 if CACHE is not None:
     nb.config.CACHE_DIR = str(CACHE)
-_cached = CACHE is not None
+_can_cache = CACHE is not None
 
-kernel = nb.njit(cache=_cached, nogil=True, error_model='numpy')
-parallel_kernel = nb.njit(cache=_cached, nogil=True, parallel=True, error_model='numpy')
+kernel = nb.njit(cache=_can_cache, nogil=True, error_model='numpy')
+parallel_kernel = nb.njit(cache=_can_cache, nogil=True, parallel=True, error_model='numpy')
 # Sums in any order, products fused into them: dot products over lanes. Infinities and NaN stay as
 # they are.
 reassociating_kernel = nb.njit(
-    cache=_cached, nogil=True, error_model='numpy', fastmath={'reassoc', 'contract', 'nsz'}
+    cache=_can_cache, nogil=True, error_model='numpy', fastmath={'reassoc', 'contract', 'nsz'}
 )

@@ -147,12 +147,12 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
                 f'{path} exists already: expected a new folder; remove it or choose another name'
             )
         temporary, lock = create_temporary(target, is_folder=True)
-        made = temporary / target.name
+        new = temporary / target.name
         try:
-            yield made
-            for each in (*made.iterdir(), made):
+            yield new
+            for each in (*new.iterdir(), new):
                 sync_folder(each)
-            os.rename(made, target)  # fails where a file, or a folder with content, came meanwhile
+            os.rename(new, target)  # fails where a file, or a folder with content, came meanwhile
             sync_folder(target.parent)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -213,7 +213,7 @@ def create_temporary(target: Path, is_folder: bool = False) -> tuple[Path, int]:
     """
     Create the temporary file, or folder, of a target, locked as long as it is open.
 
-    A killed writer leaves one without a lock: those in the same folder are deleted.
+    A killed writer leaves one without a lock; such files in the same folder are deleted.
 
     :returns: its path, and its descriptor.
     :raises OutputTakenError: another program writes the target.
@@ -236,7 +236,7 @@ def create_temporary(target: Path, is_folder: bool = False) -> tuple[Path, int]:
 
 
 def _delete_stale(folder: Path) -> None:
-    """Delete the temporaries of killed writers: those without a lock."""
+    """Delete the temporaries of killed writers: temporaries without a lock."""
     for path in folder.glob('.stavpr-' + '[0-9a-f]' * 12):
         with suppress(OSError):  # locked, gone, or of another user
             file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -266,8 +266,8 @@ def write_at(file: int, content: bytes | memoryview, offset: int) -> None:
     """Write all bytes at an offset of an open file; the system may take them in parts."""
     rest = memoryview(content)
     while rest:
-        written = os.pwrite(file, rest, offset)
-        rest, offset = rest[written:], offset + written
+        count = os.pwrite(file, rest, offset)
+        rest, offset = rest[count:], offset + count
 
 
 def sync_folder(folder: Path) -> None:

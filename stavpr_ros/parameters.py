@@ -41,8 +41,8 @@ class NodeParameter:
     @property
     def constraints(self) -> str:
         """Return the choices, and when the parameter can be set."""
-        allowed = ['one of: ' + ', '.join(self.choices)] if self.choices else []
-        return '; '.join([*allowed, f'can be set {WHEN[self.when]}'])
+        rules = ['one of: ' + ', '.join(self.choices)] if self.choices else []
+        return '; '.join([*rules, f'can be set {WHEN[self.when]}'])
 
     @property
     def range(self) -> str:

@@ -36,10 +36,10 @@ def load(group: str) -> dict[str, Any]:
     :returns: the objects by the names of their entry points; one that cannot be imported is named
         in a warning and skipped.
     """
-    found = {}
+    objects = {}
     for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
         try:
-            found[entry.name] = entry.load()
+            objects[entry.name] = entry.load()
         except Exception as error:  # whatever a module of another package raises
             logging.getLogger('stavpr_ros').warning(
                 'skipped the plug-in %s of %s (%s): %s: %s',
@@ -49,4 +49,4 @@ def load(group: str) -> dict[str, Any]:
                 type(error).__name__,
                 error,
             )
-    return found
+    return objects

@@ -31,7 +31,7 @@ def limit_threads(count: int) -> None:
     """
     Limit numba, OpenCV, and torch where it is loaded, to so many threads.
 
-    OpenCV's limit is that of the process, the others' for the calling thread.
+    OpenCV's limit is for the process, the others' for the calling thread.
 
     :param count: 0 = as many as they take of themselves.
     """

@@ -145,21 +145,21 @@ class FeatureExtractor:
             backbone = settings_class(kind)()
         self._backbone: Backbone = backbone_class(kind)(backbone, device)
         self.projection: Projection | None = None
-        tried = None
+        test_maps = None
         if isinstance(backbone, NetworkSettings) or isinstance(projection, int):
             image = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
-            tried = self._backbone.feature_maps([image])
-            if not np.isfinite(tried).all():
+            test_maps = self._backbone.feature_maps([image])
+            if not np.isfinite(test_maps).all():
                 raise SettingsError(
                     f'features {kind} of a test image are not finite: the network is damaged, or '
                     f'its input out of range; its settings are {self._backbone.settings}'
                 )
         if strips is None:
-            strips = 1 if tried is not None and tried.ndim == 2 else STRIPS
+            strips = 1 if test_maps is not None and test_maps.ndim == 2 else STRIPS
         plain = FeatureSettings(kind, self._backbone.settings, strips)
         self.settings = plain
-        if tried is not None:
-            dimension = self._cut(tried)[0].shape[2]
+        if test_maps is not None:
+            dimension = self._cut(test_maps)[0].shape[2]
         if isinstance(projection, int):
             projection = Projection.gaussian(dimension, projection, seed)
         if projection is not None:
@@ -267,18 +267,18 @@ def cut_strips(feature_maps: np.ndarray, W: int, pooling: str = 'flatten') -> np
             f'feature maps are Wf = {Wf} columns wide: they cannot be cut into W = {W} strips'
         )
     width = Wf // W
-    left = (Wf % W) // 2
-    kept = np.asarray(feature_maps[..., left : left + W * width], np.float32)
-    strips = kept.reshape(n, channels, height, W, width).transpose(3, 0, 1, 2, 4)
+    margin = (Wf % W) // 2
+    maps = np.asarray(feature_maps[..., margin : margin + W * width], np.float32)
+    strips = maps.reshape(n, channels, height, W, width).transpose(3, 0, 1, 2, 4)
     if pooling == 'flatten':
         return strips.reshape(W, n, channels * height * width)
     cells = strips.reshape(W, n, channels, height * width)
-    pooled: np.ndarray = (
+    values: np.ndarray = (
         cells.mean(3)
         if pooling == 'mean'
         else np.cbrt((np.maximum(cells, 1e-6) ** GEM_EXPONENT).mean(3))
     )
-    return pooled
+    return values
 
 
 def normalize(strips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

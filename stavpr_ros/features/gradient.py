@@ -6,8 +6,8 @@ Oriented-gradient features: no weights, no training, the default.
 Histograms of gradient orientation on a regular grid of overlapping cells, each normalized by the
 four 2 x 2 blocks around it (after Dalal and Triggs, "Histograms of Oriented Gradients for Human
 Detection", CVPR 2005; one channel an orientation, the mean over the four normalizations). The
-gradients are those of log(1 + 32 I), intensity I in 0..1: contrast ratios, which a change of light
-leaves as they are. A compiled kernel computes them image by image; there is none for GPUs.
+gradients are computed from log(1 + 32 I), intensity I in 0..1: contrast ratios, which a change of
+light leaves as they are. A compiled kernel computes them image by image; there is none for GPUs.
 
 The kernel's arithmetic on pixels runs over rows in SIMD lanes: without look-up and scatter. A
 pixel's share in every orientation is computed, also where it is zero: that is a subtraction and a

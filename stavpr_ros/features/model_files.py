@@ -23,17 +23,17 @@ def models_folder() -> Path:
     return Path(os.environ.get('STAVPR_MODELS') or Path(share) / 'stavpr_ros' / 'models')
 
 
-def find_model(sha256: str, stated: str) -> Path:
+def find_model(sha256: str, path: str) -> Path:
     """
     Find the model of a map, which is known by its hash only.
 
-    :param stated: a file, which is returned; or a folder to look in; '' = the models folder and
+    :param path: a file, which is returned; or a folder to look in; '' = the models folder and
         the cache of downloads.
     :raises UnavailableError: none of the files there has this hash.
     """
-    if stated and not Path(stated).is_dir():
-        return Path(stated)
-    folders = [Path(stated)] if stated else [models_folder(), cache_folder()]
+    if path and not Path(path).is_dir():
+        return Path(path)
+    folders = [Path(path)] if path else [models_folder(), cache_folder()]
     files = [file for folder in folders if folder.is_dir() for file in sorted(folder.iterdir())]
     for file in sorted(files, key=lambda file: sha256[:8] not in file.name):
         if file.is_file() and os.access(file, os.R_OK):
@@ -58,12 +58,12 @@ def open_model(path: Path) -> io.BufferedReader:
         raise UnavailableError(f'model {str(path)!r} cannot be read: {error}') from error
 
 
-def read_model(path: Path, expected: str = '', required: str = '') -> tuple[BinaryIO, str]:
+def read_model(path: Path, expected: str = '', map_hash: str = '') -> tuple[BinaryIO, str]:
     """
     Read a model into memory and check its hash: what is checked is what is used.
 
     :param expected: its hash, '' for any.
-    :param required: the hash that a map states, '' for any.
+    :param map_hash: the hash that a map states, '' for any.
     :returns: its content, as a file, and its sha256.
     :raises UnavailableError: it cannot be read, or is damaged.
     :raises FeatureMismatchError: it is another file than the required one.
@@ -79,9 +79,9 @@ def read_model(path: Path, expected: str = '', required: str = '') -> tuple[Bina
             f'{path} has sha256 {digest[:16]}, expected {expected[:16]}: it is damaged or '
             'another file; delete it and get it again'
         )
-    if required and digest != required:
+    if map_hash and digest != map_hash:
         raise FeatureMismatchError(
-            f'model {path} has sha256 {digest[:16]}, the settings require {required[:16]}: '
+            f'model {path} has sha256 {digest[:16]}, the settings require {map_hash[:16]}: '
             'give the file that the map was built with'
         )
     return io.BytesIO(content), digest

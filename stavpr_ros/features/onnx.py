@@ -61,7 +61,7 @@ class Onnx:
 
     def __init__(self, settings: OnnxSettings, device: str = 'cpu') -> None:
         onnx, onnxruntime = import_onnx()
-        file, digest = read_model(Path(settings.model), required=settings.sha256)
+        file, digest = read_model(Path(settings.model), map_hash=settings.sha256)
         with file:
             content = file.read()
         self.settings = replace(settings, sha256=digest)
@@ -70,8 +70,8 @@ class Onnx:
         properties = {row.key: row.value for row in model.metadata_props}
         # whether images go through the network alone; None = not known yet
         self._one_by_one = True if properties.get(BATCH) == '1' else None
-        offered = onnxruntime.get_available_providers()
-        gpu = [name for name in ON_GPU if name in offered][: self._device == 'cuda']
+        providers = onnxruntime.get_available_providers()
+        gpu = [name for name in ON_GPU if name in providers][: self._device == 'cuda']
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = thread_limit()  # 0 = as many as there are cores
         options.log_severity_level = 4  # errors are raised
@@ -90,9 +90,9 @@ class Onnx:
 
     def _check_provider(self, device: str) -> None:
         """Reject a session on the CPU if ``cuda`` was requested; else log where it computes."""
-        chosen = self._session.get_providers()[0]  # onnxruntime leaves out what it cannot load
-        if chosen in ON_GPU:
-            _log.info('features onnx: %s', chosen)
+        provider = self._session.get_providers()[0]  # onnxruntime leaves out what it cannot load
+        if provider in ON_GPU:
+            _log.info('features onnx: %s', provider)
             return
         reason = (
             "onnxruntime computes features 'onnx' on the CPU: its providers of CUDA and TensorRT "
@@ -116,9 +116,9 @@ class Onnx:
         layers = [output for node in model.graph.node for output in node.output]
         if layer not in layers:
             outputs = [value.name for value in model.graph.output]
-            named = outputs + [each for each in layers if each not in outputs]
-            shown = ', '.join(named[:60]) + (', ...' if len(named) > 60 else '')
-            raise SettingsError(f'{name} has no layer {layer!r}: its layers are {shown}')
+            names = outputs + [each for each in layers if each not in outputs]
+            text = ', '.join(names[:60]) + (', ...' if len(names) > 60 else '')
+            raise SettingsError(f'{name} has no layer {layer!r}: its layers are {text}')
         weights = {tensor.name for tensor in model.graph.initializer}
         inputs = [value for value in model.graph.input if value.name not in weights]
         if len(inputs) != 1:
@@ -140,8 +140,8 @@ class Onnx:
                 f'{FLOAT} (float32) or {FLOAT16} (float16): export it without its conversion'
             )
         shape = [dim.dim_value for dim in tensor.shape.dim]  # 0 = any
-        wanted = (3, size, size)
-        if len(shape) == 4 and all(a in (0, b) for a, b in zip(shape[1:], wanted, strict=True)):
+        image = (3, size, size)
+        if len(shape) == 4 and all(a in (0, b) for a, b in zip(shape[1:], image, strict=True)):
             return
         square = len(shape) == 4 and shape[1] in (0, 3) and shape[2] == shape[3]
         raise SettingsError(
@@ -205,8 +205,8 @@ class Onnx:
                 f'layer {self.settings.layer!r} of {self.settings.model} returns {output.shape} '
                 f'for {len(images)} images: expected as many rows; name another layer'
             )
-        converted: np.ndarray = output.astype(np.float32, copy=False)
-        return converted
+        values: np.ndarray = output.astype(np.float32, copy=False)
+        return values
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""
@@ -221,13 +221,13 @@ class Onnx:
 
 def _prune(graph: Any, layer: str) -> None:
     """Remove the nodes that a layer does not depend on: onnxruntime would compute them as well."""
-    needed, kept = {layer}, []
+    names, nodes = {layer}, []
     for node in reversed(graph.node):
-        if needed.intersection(node.output):
-            needed |= _inputs(node)
-            kept.append(node)
+        if names.intersection(node.output):
+            names |= _inputs(node)
+            nodes.append(node)
     del graph.node[:]
-    graph.node.extend(reversed(kept))
+    graph.node.extend(reversed(nodes))
 
 
 def _inputs(node: Any) -> set[str]:

@@ -22,9 +22,9 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:
     """
     shape = tuple(getattr(output, 'shape', ()))
     if len(shape) not in (2, 3, 4) or shape[0] != images or 0 in shape:
-        returned = shape if shape else f'type {type(output).__name__}'
+        form = shape if shape else f'type {type(output).__name__}'
         raise SettingsError(
-            f'{name} returns {returned} for {images} images: expected maps (n, C, H, W), tokens '
+            f'{name} returns {form} for {images} images: expected maps (n, C, H, W), tokens '
             '(n, T, C) or vectors (n, D); name another layer'
         )
     if shape[2:] == (1, 1):  # of a pooling over the whole map

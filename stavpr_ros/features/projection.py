@@ -53,5 +53,5 @@ class Projection:
         :raises InputError: another d than the matrix has rows.
         """
         require_shape('local features', strips, f'W n {len(self.matrix)}')
-        projected: np.ndarray = strips @ self.matrix
-        return projected
+        result: np.ndarray = strips @ self.matrix
+        return result

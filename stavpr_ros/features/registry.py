@@ -208,13 +208,13 @@ def settings_class(kind: str) -> Any:
 
 
 def _kind(name: str) -> Kind:
-    found = KINDS.get(name) or _all().get(name)
-    if found is None:
+    kind = KINDS.get(name) or _all().get(name)
+    if kind is None:
         remedy = f'take one of {", ".join(kinds())}'
         if name in LAB:
             remedy = 'they are in the package stavpr_lab, which is not installed'
         raise SettingsError(f'features {name!r} are unknown: {remedy}')
-    return found
+    return kind
 
 
 def backbone_class(kind: str) -> Any:
@@ -243,14 +243,14 @@ def settings_from_json(kind: str, text: str, model: str = '') -> Any:
     cls = settings_class(kind)
     fields = dataclasses.fields(cls)
     names = [field.name for field in fields]
-    required = [field.name for field in fields if field.default is dataclasses.MISSING]
+    required_names = [field.name for field in fields if field.default is dataclasses.MISSING]
     try:
         values = json.loads(text)
         if not isinstance(values, dict):
             raise TypeError('expected an object, {"name": value}')
         if model and 'model' in names:
             values['model'] = model
-        if missing := [name for name in required if name not in values]:
+        if missing := [name for name in required_names if name not in values]:
             raise TypeError(f'{" and ".join(missing)} missing')
         return cls(**values)
     except (ValueError, TypeError, RecursionError) as error:
