@@ -48,11 +48,11 @@ def _draw_route(axes: Axes, place_map: PlaceMap) -> None:
     for name, places in _runs(place_map):
         x, y = place_map.poses[places, :2].T
         (line,) = axes.plot(x, y, '.-', ms=3, lw=1, label=name)
-        known = np.flatnonzero(np.isfinite(x))
-        if not len(known):
+        with_pose = np.flatnonzero(np.isfinite(x))
+        if not len(with_pose):
             continue
-        axes.plot(x[known[0]], y[known[0]], 'o', ms=7, mfc='white', color=line.get_color())
-        for place in known[evenly(len(known), 6)[1:]].tolist():
+        axes.plot(x[with_pose[0]], y[with_pose[0]], 'o', ms=7, mfc='white', color=line.get_color())
+        for place in with_pose[evenly(len(with_pose), 6)[1:]].tolist():
             at = (float(x[place]), float(y[place]))
             axes.annotate(str(places[place]), at, fontsize=8.5, color=QUIET)
     axes.set_aspect('equal', adjustable='datalim')

@@ -170,9 +170,9 @@ def _run(arguments: argparse.Namespace) -> None:
     began = time.monotonic()
     folder = Path(arguments.output)
     for name in ('map', 'query', 'loop', 'truth'):
-        given = getattr(arguments, name)
-        if given and folder.resolve() in Path(given).resolve().parents:
-            raise SettingsError(f'--{name} {given} is in {folder}: give another --output')
+        input_path = getattr(arguments, name)
+        if input_path and folder.resolve() in Path(input_path).resolve().parents:
+            raise SettingsError(f'--{name} {input_path} is in {folder}: give another --output')
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _remove_earlier(folder)
@@ -187,15 +187,15 @@ def _run(arguments: argparse.Namespace) -> None:
         else:
             _loop_closure(arguments, folder)
     finally:
-        written = sorted(path.name for path in set(folder.iterdir()) - others)
-        (folder / WRITTEN).write_text('\n'.join(written))
+        names = sorted(path.name for path in set(folder.iterdir()) - others)
+        (folder / WRITTEN).write_text('\n'.join(names))
     _print(f'   {time.monotonic() - began:.0f} s in all')
 
 
 def _remove_earlier(folder: Path) -> None:
     """Remove the files of an earlier demonstration, which it has listed, and no others."""
-    listed = folder / WRITTEN
-    names = listed.read_text().splitlines() if listed.exists() else []
+    manifest = folder / WRITTEN
+    names = manifest.read_text().splitlines() if manifest.exists() else []
     for path in [path for path in folder.iterdir() if path.name in names]:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -374,8 +374,8 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
         ['--odometry', '--also', slam.CAMERA_INFO, '--timeout', '120'], fetch,
     )  # fmt: skip
     values, edges = result[0]
-    found = slam.evaluate_drive(drive, folder / 'optimized.tum', values)
-    _report('3', found.summary(), slam.write_result(found, drive, edges, folder))
+    evaluation = slam.evaluate_drive(drive, folder / 'optimized.tum', values)
+    _report('3', evaluation.summary(), slam.write_result(evaluation, drive, edges, folder))
 
 
 def _report(number: str, summary: str, plot: Path) -> None:

@@ -392,10 +392,10 @@ def _run_each(
     jobs = []
     for name, query in zip(job_names(arguments.query), arguments.query, strict=True):
         own = folder / name
-        written = ('--output', str(own), '--json', f'{own}.json')
+        outputs = ('--output', str(own), '--json', f'{own}.json')
         is_new = not (own.exists() or Path(f'{own}.json').exists())
-        given = ('--query', query, *written, *others)
-        jobs.append(Job(name, 'stavpr_lab.commands.evaluate', given, is_new))
+        job_arguments = ('--query', query, *outputs, *others)
+        jobs.append(Job(name, 'stavpr_lab.commands.evaluate', job_arguments, is_new))
     folder.mkdir(parents=True, exist_ok=True)
     return run_jobs(jobs, arguments.processes, arguments.ray)
 
@@ -406,8 +406,8 @@ def main(args: list[str] | None = None) -> int:
     def work() -> int | None:
         parser = _parser()
         # None = not given: a saved map decides these then
-        given = argparse.Namespace(features=None, strips=None, seed=None)
-        arguments = parser.parse_args(args, given)
+        namespace = argparse.Namespace(features=None, strips=None, seed=None)
+        arguments = parser.parse_args(args, namespace)
         if arguments.query is not None and len(arguments.query) > 1:
             return _run_each(parser, arguments, sys.argv[1:] if args is None else args)
         arguments.query = arguments.query[0] if arguments.query else None

@@ -24,7 +24,7 @@ from stavpr_ros.recognition import PlaceRecognizer
 from stavpr_ros.recognition.error_rate import ERRORS, least_probability
 from tqdm import tqdm
 
-WINDOWS = 2  # of a block: as many images as that of the bootstrap has
+WINDOWS = 2  # of a block: as many images as a block of the bootstrap has
 OTHERS = (
     *('loop_closure', 'dataset', 'unknown', 'odometry', 'json', 'output', 'export', 'window'),
     *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'max_error'),
@@ -81,8 +81,8 @@ def _print(risks: ErrorRisks) -> None:
     print(f'{"max_error":>9}  matched above')
     least = risks.bounds[-1]
     for rate in ERRORS.tolist():
-        needed = math.ceil(1 / rate - 1e-9) - 1
-        why = f'{needed} blocks are needed' if needed > risks.units else 'too many wrong matches'
+        count = math.ceil(1 / rate - 1e-9) - 1
+        why = f'{count} blocks are needed' if count > risks.units else 'too many wrong matches'
         note = '' if least <= rate else f'not calibrated: {why}'
         print(f'{rate:9g}  {least_probability(rate, risks):<13.4g}  {note}'.rstrip())
     print(

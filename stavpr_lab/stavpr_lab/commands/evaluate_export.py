@@ -38,7 +38,7 @@ def require_exportable(arguments: argparse.Namespace) -> None:
 def export(
     arguments: argparse.Namespace, report: 'Report', settings: 'RecognizerSettings'
 ) -> None:
-    """Write the files of a format; ``settings`` are those of the recognizer."""
+    """Write the files of a format; ``settings`` are the recognizer's."""
     folder, force = Path(arguments.export), arguments.force
     if arguments.export_format == 'vpr_tutorial':
         _write_matrices(report, settings, folder, force)
@@ -84,10 +84,10 @@ def _positions(arguments: argparse.Namespace, report: 'Report') -> list[np.ndarr
     """Return x and y of places and images that express the ground truth; None = unknown."""
     from stavpr_ros.sources.pose_file import read_poses
 
-    kept = report.drive.places, report.drive.images
+    indices = report.drive.places, report.drive.images
     if arguments.truth == 'identity':
         spacing = RADIUS / (report.settings['tolerance'] + 0.5)
-        return [np.outer(index, (0, spacing)) for index in kept]
+        return [np.outer(index, (0, spacing)) for index in indices]
     if arguments.truth != 'poses':
         return [None, None]
     paths, traverses = (
@@ -96,7 +96,7 @@ def _positions(arguments: argparse.Namespace, report: 'Report') -> list[np.ndarr
     )
     return [
         (read_poses(Path(path))[0][index] if path else np.asarray(traverse.poses))[:, :2]
-        for path, traverse, index in zip(paths, traverses, kept, strict=True)
+        for path, traverse, index in zip(paths, traverses, indices, strict=True)
     ]
 
 
@@ -109,8 +109,8 @@ def _link_images(files: list[Path], positions: np.ndarray | None, folder: Path) 
         names.append(f'{utm}@@@@@{i:06d}@@@@@@@@{file.suffix.lower()}')
         (folder / names[-1]).unlink(missing_ok=True)
         (folder / names[-1]).symlink_to(file.resolve())
-    listed = folder.with_name(f'{folder.name}_images_paths.txt')
-    write_output(listed, '\n'.join(names) + '\n', ANY, force=True)
+    list_file = folder.with_name(f'{folder.name}_images_paths.txt')
+    write_output(list_file, '\n'.join(names) + '\n', ANY, force=True)
 
 
 def _write_matrices(

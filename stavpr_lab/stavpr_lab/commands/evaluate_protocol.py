@@ -33,7 +33,7 @@ def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace)
             parser.error(f'--protocol: leave --{name.replace("_", "-")} out')
     if not (arguments.dataset or arguments.truth):
         parser.error('--protocol needs --truth identity|poses|FILE')
-    arguments.tolerance = 0  # those of the table are added to it
+    arguments.tolerance = 0  # the tolerances of the table are added to it
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
     settings = recognizer_settings(arguments)
@@ -51,8 +51,8 @@ def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace)
                 columns = f'{text(row.recall_at_1)}  {text(row.recall_at_100_precision)}'
                 print(f'{row.method:12}{row.length:6}{row.f1:7.3f}  {columns}')
     if arguments.json:
-        found = [asdict(row) for row in rows]
-        document = {'settings': settings_json(arguments, sequences), 'protocol': found}
+        table = [asdict(row) for row in rows]
+        document = {'settings': settings_json(arguments, sequences), 'protocol': table}
         numbers = json.dumps(jsonable(document), indent=2) + '\n'
         write_output(arguments.json, numbers, JSON, arguments.force)
         print(f'numbers: {arguments.json}')

@@ -126,7 +126,7 @@ def _decides_features(item: tuple[str, str | None]) -> int:
 
 
 class _Loader:
-    """Extracts the same features of all inputs: those of the first saved map, or the options'."""
+    """Extracts the same features of all inputs, as of the first saved map or by the options."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         self._arguments = arguments
@@ -152,11 +152,9 @@ class _Loader:
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
         """Extract the features of a source, cropped as the options state."""
-        given, extractor = self._arguments, self._chosen()
+        args, extractor = self._arguments, self._chosen()
         # unknown places are cropped as the query is
-        source = cropped(
-            source, *((0, given.crop_map) if name == 'map' else (given.crop_query, 0))
-        )
+        source = cropped(source, *((0, args.crop_map) if name == 'map' else (args.crop_query, 0)))
         began = time.perf_counter()
         extracted = build_map(source, extractor)
         milliseconds = (time.perf_counter() - began) * 1e3
@@ -188,37 +186,37 @@ class _Loader:
 
     def _load_map(self, path: str) -> PlaceMap:
         """Load a saved map, and refuse options that contradict its features."""
-        found = load_map(path)
-        given = self._arguments
+        place_map = load_map(path)
+        args = self._arguments
         first = self._extractor if self._saved is None else self._saved
         if first is not None:
-            found.features.require_same_settings(first.settings, 'the first sequence')
-            return found
-        own = {'features': found.settings.kind, 'strips': found.settings.strips}
+            place_map.features.require_same_settings(first.settings, 'the first sequence')
+            return place_map
+        own = {'features': place_map.settings.kind, 'strips': place_map.settings.strips}
         for name, present in own.items():
-            requested = getattr(given, name)
+            requested = getattr(args, name)
             if requested is not None and requested != present:
                 raise SettingsError(
                     f'--{name} {requested}: the map {path} was made with {present}; leave it out'
                 )
         # a map does not state where its model is
-        usable = f'--{found.settings.kind}-model'
-        options = {'--projection': given.projection, '--seed': given.seed, **kind_options(given)}
+        usable = f'--{place_map.settings.kind}-model'
+        options = {'--projection': args.projection, '--seed': args.seed, **kind_options(args)}
         for option, value in options.items():
             if value is not None and option != usable:
                 raise SettingsError(f'{option}: the map {path} has its own or none; leave it out')
-        self._saved = found
-        return found
+        self._saved = place_map
+        return place_map
 
     def _chosen(self) -> FeatureExtractor:
         if self._extractor is None:
-            given = self._arguments
+            args = self._arguments
             if self._saved is not None:
-                model = getattr(given, f'{self._saved.settings.kind}_model', None)
-                self._extractor = self._saved.extractor(given.device, model or '')
+                model = getattr(args, f'{self._saved.settings.kind}_model', None)
+                self._extractor = self._saved.extractor(args.device, model or '')
             else:
-                chosen = {name: value for name, value in vars(given).items() if value is not None}
-                options = argparse.Namespace(**(vars(given) | DEFAULTS | chosen))
+                values = {name: value for name, value in vars(args).items() if value is not None}
+                options = argparse.Namespace(**(vars(args) | DEFAULTS | values))
                 self._extractor = make_extractor(options)
         return self._extractor
 
@@ -227,13 +225,13 @@ def _of_dataset(arguments: argparse.Namespace, loader: _Loader) -> Sequences:
     name, separator, root = arguments.dataset.partition('=')
     if not separator:
         raise SettingsError(f'--dataset {arguments.dataset}: expected NAME=FOLDER')
-    found = open_dataset(name, root, arguments.tolerance)
+    data_set = open_dataset(name, root, arguments.tolerance)
     return Sequences(
-        reference=loader.extract('map', found.map),
-        query=loader.extract('query', found.query),
+        reference=loader.extract('map', data_set.map),
+        query=loader.extract('query', data_set.query),
         unknown=loader.load('unknown', arguments.unknown) if arguments.unknown else None,
-        drive=DriveChanges().apply(found.ground_truth),
-        tolerance=found.tolerance,
+        drive=DriveChanges().apply(data_set.ground_truth),
+        tolerance=data_set.tolerance,
         title=name.replace('_', ' '),
         times=loader.times,
     )
@@ -283,8 +281,8 @@ def _ground_truth(
     queries = poses_of(arguments.query_poses, query, 'query', arguments.degrees)
     path = arguments.query_poses if same else arguments.map_poses
     places = poses_of(path, reference, 'map', arguments.degrees)
-    found = GroundTruth.from_poses(queries, places, arguments.meters, arguments.degrees)
-    return found.widened(tolerance)
+    truth = GroundTruth.from_poses(queries, places, arguments.meters, arguments.degrees)
+    return truth.widened(tolerance)
 
 
 def poses_of(

@@ -95,25 +95,25 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError
     from stavpr_lab.evaluation.paper.datasets import FIELD, open_dataset
     from stavpr_lab.evaluation.paper.published import F1
 
-    found: dict[str, Dataset | SourceError] = {}
+    datasets: dict[str, Dataset | SourceError] = {}
     if arguments.datasets:
         for entry in arguments.datasets:
             name, _, folder = entry.partition('=')
             if not (folder or arguments.data):
                 raise SettingsError(f'data set {name}: give NAME=FOLDER, or --data')
-            found[name] = open_dataset(name, folder or arguments.data)
-        return found
+            datasets[name] = open_dataset(name, folder or arguments.data)
+        return datasets
     if not arguments.data:
         raise SettingsError('give --data FOLDER, or --datasets NAME=FOLDER')
     names = FIELD if arguments.experiment == 'field' else tuple(F1)
     for name in names:
         try:
-            found[name] = open_dataset(name, arguments.data)
+            datasets[name] = open_dataset(name, arguments.data)
         except SourceError as error:
-            found[name] = error
-    if all(isinstance(each, SourceError) for each in found.values()):
+            datasets[name] = error
+    if all(isinstance(each, SourceError) for each in datasets.values()):
         raise SourceError(f'none of the data sets {", ".join(names)} is in {arguments.data}')
-    return found
+    return datasets
 
 
 def _check(options: argparse.Namespace) -> dict[str, str]:
@@ -128,13 +128,13 @@ def _check(options: argparse.Namespace) -> dict[str, str]:
         raise SettingsError('--descriptors and --ssm-layers go with the experiment paper')
     if options.ssm_layers and options.features != 'onnx':
         raise SettingsError('--ssm-layers: give --features onnx')
-    known = [row.name for row in PRESETS['paper'] if row.baseline == 'descriptors']
+    columns = [row.name for row in PRESETS['paper'] if row.baseline == 'descriptors']
     folders = {}
     for entry in options.descriptors:
         column, _, folder = entry.partition('=')
-        if column not in known or not folder or not Path(folder).is_dir():
+        if column not in columns or not folder or not Path(folder).is_dir():
             raise SettingsError(
-                f'--descriptors {entry}: expected {" or ".join(known)}, = and a folder'
+                f'--descriptors {entry}: expected {" or ".join(columns)}, = and a folder'
             )
         folders[column] = folder
     return folders
@@ -172,12 +172,12 @@ def _run_row(
     experiment = DatasetExperiment(
         dataset, features.kind, features.backbone, options.mode, options.device, inputs
     )
-    found: dict[str, Metrics | None] = {}
+    metrics: dict[str, Metrics | None] = {}
     title = f'{name}, {features.kind}'
     for column in tqdm(columns, desc=title, unit='column', disable=None):
         too_short = len(dataset.query) < column.sequence.length
-        found[column.name] = None if too_short else experiment.evaluate(column)
-    return found
+        metrics[column.name] = None if too_short else experiment.evaluate(column)
+    return metrics
 
 
 def _reason(name: str, dataset: 'Dataset', column: 'Configuration') -> str:
@@ -265,8 +265,8 @@ def _run(arguments: argparse.Namespace) -> None:
         published_rows = _published(name, columns) if metric == 'f1' else {}
         for backbone, published in published_rows.items():
             rows.append(['', f'published, {backbone}', *map(_number, published)])
-            named = dict(zip([column.name for column in columns], published, strict=True))
-            results.append({'dataset': name, 'published': backbone, 'f1': named})
+            scores = dict(zip([column.name for column in columns], published, strict=True))
+            results.append({'dataset': name, 'published': backbone, 'f1': scores})
     mode = f', mode {arguments.mode}' if metric == 'f1' else ''  # the field's table has both
     print(f'{arguments.experiment}{mode}: {metric}')
     print(_table(rows))

@@ -92,13 +92,13 @@ def _export(arguments: argparse.Namespace) -> 'Exported':
     import torch
 
     torch.backends.mha.set_fastpath_enabled(False)  # its operator is not in the ONNX standard
-    given, module, maps = dict(arguments.argument), arguments.map_module, arguments.map
+    hub_arguments, module, maps = dict(arguments.argument), arguments.map_module, arguments.map
     if maps is None:
         maps = '0' if module else ''
-    network = load_hub(arguments.repository, arguments.commit, arguments.entry, given)
+    network = load_hub(arguments.repository, arguments.commit, arguments.entry, hub_arguments)
     print(f'license of {arguments.repository}: {_license(arguments)}')
-    chosen = Chosen(network, arguments.vector, module, maps, arguments.prefix_tokens)
-    return export_network(chosen, arguments.size)
+    outputs = Chosen(network, arguments.vector, module, maps, arguments.prefix_tokens)
+    return export_network(outputs, arguments.size)
 
 
 def _license(arguments: argparse.Namespace) -> str:

@@ -33,8 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: without the program's name; the process's own if None.
     :returns: exit code, see ``--help``.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    return run_program('monitor', lambda: _run(_parser().parse_args(own_arguments(given)), given))
+    args = list(sys.argv[1:] if arguments is None else arguments)
+    return run_program('monitor', lambda: _run(_parser().parse_args(own_arguments(args)), args))
 
 
 def _run(options: argparse.Namespace, ros_arguments: list[str]) -> None:

@@ -90,10 +90,10 @@ def run_live(
 
     def complete() -> bool:
         """Return whether all images have a match, and accepted ones their loop closure."""
-        found = _records(matches)
-        accepted = sum(match['status'] == 'MATCH' for match in found)
+        records = _records(matches)
+        accepted = sum(match['status'] == 'MATCH' for match in records)
         enough = len(recorders) == 1 or len(_records(closures)) >= accepted
-        return len(found) >= images and enough
+        return len(records) >= images and enough
 
     def size() -> int:
         return sum(file.stat().st_size for file in (matches, closures) if file.exists())
@@ -104,8 +104,8 @@ def run_live(
             running = _running(command, folder / f'{name}.log', environment)
             processes[name] = stack.enter_context(running)
 
-        def wait_until(done: Callable[[], bool], seconds: float, event: str) -> None:
-            _wait_until(done, processes, folder, seconds, event)
+        def wait_until(condition: Callable[[], bool], seconds: float, event: str) -> None:
+            _wait_until(condition, processes, folder, seconds, event)
 
         for name in recorders:
             log = folder / f'{name}.log'
@@ -115,13 +115,13 @@ def run_live(
         if player.returncode != 0:
             raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')
         while not complete():  # a slow processor still completes loop closures
-            grown = partial(lambda known: complete() or size() > known, size())
+            grown = partial(lambda last_size: complete() or size() > last_size, size())
             wait_until(grown, END_TIMEOUT, 'the last record')
         at_end(_records(closures), environment)
-    found = _records(matches)
-    if len(found) != images:
-        raise StavprError(f'{len(found)} matches of {images} images, see the logs in {folder}')
-    return found, _records(closures)
+    records = _records(matches)
+    if len(records) != images:
+        raise StavprError(f'{len(records)} matches of {images} images, see the logs in {folder}')
+    return records, _records(closures)
 
 
 @contextmanager
@@ -149,7 +149,7 @@ def _running(
 
 
 def _wait_until(
-    done: Callable[[], bool],
+    condition: Callable[[], bool],
     processes: dict[str, Process],
     folder: Path,
     seconds: float,
@@ -157,7 +157,7 @@ def _wait_until(
 ) -> None:
     """Wait for an event while the processes run."""
     end = time.monotonic() + seconds
-    while not done():
+    while not condition():
         for name, process in processes.items():
             if process.poll() is not None:
                 raise StavprError(

@@ -110,11 +110,11 @@ def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
     """
     good = np.arange(count) if correct is None else np.flatnonzero(correct)
     bad = np.setdiff1d(np.arange(count), good)
-    chosen: set[int] = set()
+    selection: set[int] = set()
     for indices, most in ((bad, SHOWN if not len(good) else SHOWN // 4), (good, SHOWN)):
-        room = min(most, SHOWN - len(chosen))
-        chosen |= set(indices[evenly(len(indices), room)].tolist())
-    return sorted(chosen)
+        room = min(most, SHOWN - len(selection))
+        selection |= set(indices[evenly(len(indices), room)].tolist())
+    return sorted(selection)
 
 
 def _pairs(result: LoopResult, place_map: PlaceMap) -> list[MatchPair]:

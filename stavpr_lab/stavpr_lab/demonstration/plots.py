@@ -48,13 +48,13 @@ def choose_images(outcomes: np.ndarray) -> list[int]:
     """Choose one image of each outcome, and others of the most frequent, far from each other."""
     kinds, counts = np.unique(outcomes, return_counts=True)
     groups = [np.flatnonzero(outcomes == kind) for kind in kinds]
-    chosen = [int(same[len(same) // 2]) for same in groups]
+    selection = [int(same[len(same) // 2]) for same in groups]
     common = groups[counts.argmax()]
-    while len(chosen) < min(SHOWN, len(outcomes)):
-        others = np.array([0, len(outcomes), *chosen])
+    while len(selection) < min(SHOWN, len(outcomes)):
+        others = np.array([0, len(outcomes), *selection])
         gaps = np.abs(common[:, None] - others).min(axis=1)
-        chosen.append(int(common[gaps.argmax()]))
-    return sorted(set(chosen))[:SHOWN]
+        selection.append(int(common[gaps.argmax()]))
+    return sorted(set(selection))[:SHOWN]
 
 
 def _pair(
@@ -65,9 +65,9 @@ def _pair(
         raise InputError('the map of the query has no thumbnails')
     place, distance = int(result.matched[image]), result.matches.distances[image]
     match = f'place {place}' if place >= 0 else 'no match'
-    found = f'{match}, distance {distance:.3f}' if np.isfinite(distance) else 'no window'
+    text = f'{match}, distance {distance:.3f}' if np.isfinite(distance) else 'no window'
     right = place_map.thumbnail(place) if place >= 0 else None
-    return MatchPair(left, right, f'query image {image}: {found}', outcome)
+    return MatchPair(left, right, f'query image {image}: {text}', outcome)
 
 
 def demo_sheet(

@@ -100,11 +100,11 @@ def evaluate_drive(drive: LapDrive, trajectory: Path, values: dict[str, str]) ->
     """
     rows = [line.split() for line in trajectory.read_text().splitlines() if line[:1] != '#']
     stamps = np.array([int(row[0].replace('.', '')) for row in rows])
-    found = np.array([row[1:] for row in rows], float)
+    poses_after = np.array([row[1:] for row in rows], float)
     at = np.searchsorted(drive.stamps, stamps).clip(max=len(drive) - 1)
     truth, before = planar_poses(drive.truth)[at], planar_poses(drive.odometry)[at]
-    (ate_before, rpe_before, moved_before), (ate_after, rpe_after, moved) = (
-        trajectory_errors(stamps, poses, truth) for poses in (before, found)
+    (ate_before, rpe_before, aligned_before), (ate_after, rpe_after, aligned_after) = (
+        trajectory_errors(stamps, poses, truth) for poses in (before, poses_after)
     )
     numbers = {
         'ate_before': ate_before,
@@ -120,7 +120,7 @@ def evaluate_drive(drive: LapDrive, trajectory: Path, values: dict[str, str]) ->
         'sessions': int(values['sessions']),
         'odometry_error_factor': float(values['odometry_error_factor']),
     }
-    return SlamResult(moved, moved_before, truth, found, numbers)
+    return SlamResult(aligned_after, aligned_before, truth, poses_after, numbers)
 
 
 def trajectory_errors(
@@ -153,13 +153,13 @@ def trajectory_errors(
         metrics.PoseRelation.translation_part, RPE_METERS, metrics.Unit.meters, all_pairs=True
     )
     relative.process_data((reference, estimate))
-    moved = np.column_stack(
+    aligned = np.column_stack(
         [estimate.positions_xyz, estimate.orientations_quat_wxyz[:, [1, 2, 3, 0]]]
     )
     errors = [
         float(each.get_statistic(metrics.StatisticsType.rmse)) for each in (absolute, relative)
     ]
-    return errors[0], errors[1], moved
+    return errors[0], errors[1], aligned
 
 
 def write_result(

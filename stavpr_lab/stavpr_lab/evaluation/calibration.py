@@ -74,19 +74,19 @@ def calibrate(
     :param has_match: the query's place is in the map, shape (N,), bool.
     :returns: None if none is declared.
     """
-    known = np.isfinite(probabilities)
-    if not known.any():
+    is_known = np.isfinite(probabilities)
+    if not is_known.any():
         return None
-    bins = np.digitize(probabilities[known], EDGES[1:-1])
+    bins = np.digitize(probabilities[is_known], EDGES[1:-1])
 
     def in_bins(weights: np.ndarray | None = None) -> np.ndarray:
         return np.bincount(bins, weights, minlength=len(EDGES) - 1)
 
     images = in_bins()
     with np.errstate(invalid='ignore'):
-        declared = in_bins(probabilities[known]) / images
-        right = in_bins(correct[known].astype(float)) / images
-    counts = sweep(np.where(known, 1 - probabilities, np.inf), correct, has_match)
+        declared = in_bins(probabilities[is_known]) / images
+        right = in_bins(correct[is_known].astype(float)) / images
+    counts = sweep(np.where(is_known, 1 - probabilities, np.inf), correct, has_match)
     levels = {
         level: accepted_counts(probabilities >= level, correct, has_match) for level in LEVELS
     }

@@ -92,8 +92,8 @@ class DriveChanges:
         """
         if name in ('vary', VARYING):
             return cls(speed=VARYING)
-        known = {'same': '1x', 'stop': f'stop {STOP}'}
-        kind, _, value = known.get(name, name).rpartition(' ')
+        aliases = {'same': '1x', 'stop': f'stop {STOP}'}
+        kind, _, value = aliases.get(name, name).rpartition(' ')
         try:
             number = float(value.removesuffix('x'))
         except ValueError as error:
@@ -124,8 +124,8 @@ class DriveChanges:
             images = images[::-1]
         numbers = np.arange(len(images))
         if self.drop:
-            left = np.random.default_rng(self.seed).random(len(images)) >= self.drop
-            images, numbers = images[left], numbers[left]
+            remains = np.random.default_rng(self.seed).random(len(images)) >= self.drop
+            images, numbers = images[remains], numbers[remains]
         if not len(images):
             raise SettingsError(f'drop = {self.drop} leaves none of {n} images')
         return images, numbers
@@ -136,19 +136,19 @@ class DriveChanges:
 
         :raises SettingsError: stretches outside the map, that overlap, or that leave no place.
         """
-        kept = np.ones(n, bool)
+        remains = np.ones(n, bool)
         for first, last in self.removed:
             if not 0 <= first < last <= n:
                 raise SettingsError(
                     f'removed places {first}:{last}: expected 0 <= FIRST < LAST <= {n}, the '
                     'number of places of the map'
                 )
-            if not kept[first:last].all():
+            if not remains[first:last].all():
                 raise SettingsError(f'removed places {first}:{last} overlap with others')
-            kept[first:last] = False
-        if not kept.any():
+            remains[first:last] = False
+        if not remains.any():
             raise SettingsError(f'all {n} places of the map are removed: keep at least one')
-        return np.flatnonzero(kept)
+        return np.flatnonzero(remains)
 
     def apply(self, ground_truth: GroundTruth) -> 'Drive':
         """

@@ -205,7 +205,7 @@ def recognize_traverse(
     :param online: with an empty window.
     :param features: of N images.
     :param places: largest number of places n that a row of distances may have.
-    :param settings: those of ``online``.
+    :param settings: the settings of ``online``.
     :param shown: images whose windows' distances are kept in any case.
     :param progress: label of the progress bar; none without.
     :param odometry: poses of the images, (N, 7), NaN = unknown; None = of all.
@@ -222,7 +222,7 @@ def recognize_traverse(
     rows: deque[np.ndarray] = deque(maxlen=length)
     reduced = _BlockMinimum(count, places)
     windows: list[WindowDistances] = []
-    every = -(-count // WINDOWS)
+    interval = -(-count // WINDOWS)
     for i in tqdm(range(count), desc=progress, unit='image', disable=None if progress else True):
         began = time.perf_counter()
         pose = None if odometry is None or np.isnan(odometry[i]).any() else odometry[i]
@@ -238,15 +238,15 @@ def recognize_traverse(
             single.places[i, : len(nearest)], single.scores[i] = nearest, row[nearest[0]]
         if match.sequence is not None and is_full(match, length):
             image = i - (length - 1) + middle
-            found = np.asarray(online.candidates(ranks)[0])
-            candidates[image, : len(found)] = found
-            if i % every == 0 or image in shown:
+            places_of_window = np.asarray(online.candidates(ranks)[0])
+            candidates[image, : len(places_of_window)] = places_of_window
+            if i % interval == 0 or image in shown:
                 windows.append(_window_distances(image, i, length, rows, match.path))
     matched = image_matches(matches, length, late)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
-    sequence, kept = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
+    sequence, distances = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
-        sequence, single, seconds, *kept, matched.accepted, matched.probabilities
+        sequence, single, seconds, *distances, matched.accepted, matched.probabilities
     )
 
 
@@ -272,7 +272,7 @@ def evaluate_on_map(
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
-    :param odometry: poses of the query's images, (N, 7), compared with those of the places.
+    :param odometry: poses of the query's images, (N, 7), compared with the poses of the places.
     :param stamps: of the query's images, ns, (N,), int64, 0 = unknown; None = of all.
     :raises InputError: fewer images than one window, or ground truth of another length.
     """
@@ -291,9 +291,9 @@ def evaluate_on_map(
         )
 
     centered_images(len(query), settings.sequence.length)
-    known = results(query, 'recognizing', odometry, stamps)
+    recorded = results(query, 'recognizing', odometry, stamps)
     elsewhere = None if unknown is None else results(unknown, 'false alarms')
-    return evaluate_traverse(known, ground_truth, settings.sequence.length, elsewhere)
+    return evaluate_traverse(recorded, ground_truth, settings.sequence.length, elsewhere)
 
 
 def evaluate_loop_closures(

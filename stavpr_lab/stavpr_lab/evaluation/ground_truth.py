@@ -97,14 +97,14 @@ class GroundTruth:
           query i. For loop closures, where both are one traverse, see :meth:`loop_closures`.
 
         :raises SourceError: the file cannot be read, or contains objects (pickles).
-        :raises InputError: it is that of other images: wrong size, or indices outside.
+        :raises InputError: it is of other images: wrong size, or indices outside.
         """
         queries, places = read_pairs(Path(path), N, n)
         try:
-            found = cls.from_pairs(queries, places, N, n, tolerance)
+            truth = cls.from_pairs(queries, places, N, n, tolerance)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
-        return replace(found, kind=text_of(Path(path).name))
+        return replace(truth, kind=text_of(Path(path).name))
 
     @classmethod
     def from_poses(
@@ -122,28 +122,28 @@ class GroundTruth:
         query, place = _checked_poses(queries, 'query'), _checked_poses(places, 'map')
         unknown = np.flatnonzero(np.isnan(query[:, 0]))
         if len(unknown):
-            listed = ', '.join(map(str, unknown[:LISTED])) + (
+            names = ', '.join(map(str, unknown[:LISTED])) + (
                 ' ...' if len(unknown) > LISTED else ''
             )
             raise InputError(
-                f'{len(unknown)} of {len(query)} query images have no pose ({listed}): give poses '
+                f'{len(unknown)} of {len(query)} query images have no pose ({names}): give poses '
                 'of all, or leave these images out'
             )
         if not meters >= 0 or (degrees is not None and not degrees >= 0):
             raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
-        known = np.flatnonzero(~np.isnan(place[:, 0]))
-        near = KDTree(place[known, :3]).query_ball_point(query[:, :3], meters)
-        queries = np.repeat(np.arange(len(query)), [len(found) for found in near])
-        places = known[np.concatenate(near).astype(np.int64)]
+        with_pose = np.flatnonzero(~np.isnan(place[:, 0]))
+        near = KDTree(place[with_pose, :3]).query_ball_point(query[:, :3], meters)
+        queries = np.repeat(np.arange(len(query)), [len(each) for each in near])
+        places = with_pose[np.concatenate(near).astype(np.int64)]
         if degrees is not None:
             # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|
             cosines = np.abs(np.sum(query[queries, 3:] * place[places, 3:], axis=1))
             angles = 2 * np.degrees(np.arccos(np.minimum(cosines, 1)))
             similar = angles <= degrees + 1e-5  # acos is inexact near 1
             queries, places = queries[similar], places[similar]
-        found = cls.from_pairs(queries, places, len(query), len(place))
+        truth = cls.from_pairs(queries, places, len(query), len(place))
         limit = '' if degrees is None else f' and {degrees:g} degrees'
-        return replace(found, kind=f'poses within {meters:g} m{limit}')
+        return replace(truth, kind=f'poses within {meters:g} m{limit}')
 
     @property
     def pairs(self) -> np.ndarray:
@@ -158,11 +158,11 @@ class GroundTruth:
     @cached_property
     def middles(self) -> np.ndarray:
         """Return the middle one of each query's accepted places, shape (N,), int64; -1 = none."""
-        found = np.full(self.N, -1, np.int64)
+        middles = np.full(self.N, -1, np.int64)
         ends = np.cumsum(self._counts)
         at = (2 * ends - self._counts - 1) // 2
-        found[self.has_match] = self.keys[at[self.has_match]] % self.n
-        return found
+        middles[self.has_match] = self.keys[at[self.has_match]] % self.n
+        return middles
 
     @cached_property
     def _counts(self) -> np.ndarray:
@@ -190,9 +190,9 @@ class GroundTruth:
         if not self.keys.size:
             return np.zeros(places.shape, bool)
         queries = np.arange(self.N).reshape(-1, *[1] * (places.ndim - 1))
-        wanted = queries * self.n + places
-        at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
-        return (self.keys[at] == wanted) & (places >= 0)
+        keys = queries * self.n + places
+        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return (self.keys[at] == keys) & (places >= 0)
 
     def widened(self, tolerance: int) -> Self:
         """
@@ -218,22 +218,22 @@ class GroundTruth:
         """
         counts = self._counts[indices]
         firsts = np.searchsorted(self.keys, indices.astype(np.int64) * self.n)
-        # position of each pair in keys: that of its query's first pair, plus its rank in the query
+        # position of a pair in keys: position of its query's first pair, plus its rank there
         at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
         rows = np.repeat(np.arange(len(indices)), counts)
         return replace(self, N=len(indices), keys=rows * self.n + self.keys[at] % self.n)
 
     def on_places(self, places: np.ndarray) -> Self:
         """
-        Return the ground truth on a map that keeps only the given places.
+        Return the ground truth on a map of selected places only.
 
-        :param places: those that are kept, ascending, shape (k,); they become 0 .. k - 1.
+        :param places: ascending, shape (k,); they become 0 .. k - 1.
         """
         number = np.full(self.n, -1, np.int64)
         number[places] = np.arange(len(places))
-        queries, found = self.keys // self.n, number[self.keys % self.n]
-        kept = found >= 0
-        return replace(self, n=len(places), keys=queries[kept] * len(places) + found[kept])
+        queries, numbers = self.keys // self.n, number[self.keys % self.n]
+        remains = numbers >= 0
+        return replace(self, n=len(places), keys=queries[remains] * len(places) + numbers[remains])
 
     def loop_closures(self, exclude: int = 0) -> Self:
         """
@@ -260,11 +260,11 @@ def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:
     """Return poses with quaternions of norm 1; unknown poses stay rows of NaN."""
     poses = np.array(poses, np.float64)
     require_shape(f'{name} poses', poses, 'N 7')
-    known = ~np.isnan(poses).all(axis=1)
+    is_known = ~np.isnan(poses).all(axis=1)
     lengths = np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    if not np.isfinite(poses[known]).all() or not lengths.all():
+    if not np.isfinite(poses[is_known]).all() or not lengths.all():
         raise InputError(f'{name} poses: expected finite numbers and quaternions other than 0')
-    if not known.any():
+    if not is_known.any():
         raise InputError(f'{name} poses: none of {len(poses)} is known; give others')
     poses[:, 3:] /= lengths
     return poses

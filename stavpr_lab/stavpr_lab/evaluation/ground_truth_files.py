@@ -26,9 +26,9 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
     """
     Read accepted pairs; see :meth:`stavpr_lab.evaluation.ground_truth.GroundTruth.from_file`.
 
-    :returns: queries and places, shape (M,), int64; those of text and pairs may exceed N and n.
+    :returns: queries and places, shape (M,), int64; from text and pairs, they may exceed N and n.
     :raises SourceError: the file cannot be read.
-    :raises InputError: its size is not that of N queries and n places, or it accepts nothing.
+    :raises InputError: its size does not fit N queries and n places, or it accepts nothing.
     """
     suffix = path.suffix.lower()
     if suffix in TEXT:
@@ -66,13 +66,13 @@ def _is_number(cell: str) -> bool:
 def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | None, int]:
     """Return the columns of query and place; None = the query is the line's number."""
     if names is not None:
-        found = []
+        positions = []
         for words in (QUERY_WORDS, PLACE_WORDS):
             columns = [
                 i for i, name in enumerate(names) if any(word in name.casefold() for word in words)
             ]
-            found.append(columns[0] if len(columns) == 1 else None)
-        query, place = found
+            positions.append(columns[0] if len(columns) == 1 else None)
+        query, place = positions
         if place is not None and query != place:
             return query, place
     if width == 1:
@@ -145,9 +145,9 @@ def _load(path: Path) -> np.ndarray:
             if TRANSPOSED in names:
                 return loaded[TRANSPOSED].T
             if len(names) == 1 or NAME in names:
-                found = loaded[names[0] if len(names) == 1 else NAME]
-                if isinstance(found, np.ndarray):  # other files are returned as bytes
-                    return found
+                array = loaded[names[0] if len(names) == 1 else NAME]
+                if isinstance(array, np.ndarray):  # other files are returned as bytes
+                    return array
     except Exception as error:  # damage raises errors of any type, of NumPy, zipfile and tokenize
         if 'pickle' in str(error):
             raise SourceError(
@@ -176,8 +176,8 @@ def _from_array(array: np.ndarray, path: Path, N: int, n: int) -> Pairs:
     if array.dtype.kind == 'b' or not (whole == array).all():
         raise InputError(_wrong_shape(array.shape, path, N, n))
     if array.ndim == 2 and array.shape[1] == 2:
-        listed = whole[whole[:, 1] != -1]
-        return listed[:, 0], listed[:, 1]
+        pairs = whole[whole[:, 1] != -1]
+        return pairs[:, 0], pairs[:, 1]
     if array.shape == (N,):
         queries = np.nonzero(whole != -1)[0]
         return queries, whole[queries]

@@ -111,8 +111,8 @@ class ImageMatches:
         :param true_places: shape (N,); -1 = not in the map.
         """
         true_places = np.asarray(true_places)
-        known = (self.places >= 0) & (true_places >= 0)
-        return known & (np.abs(self.places - true_places) <= tolerance)
+        both = (self.places >= 0) & (true_places >= 0)
+        return both & (np.abs(self.places - true_places) <= tolerance)
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def sweep(
     """
     Count at every threshold that changes the counts, from rejecting all to accepting all.
 
-    The parameters are those of :func:`counts_at`.
+    Parameters: see :func:`counts_at`.
     """
     finite = np.unique(distances[np.isfinite(distances)])
     thresholds = (
@@ -235,15 +235,15 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     """
     Assign the matches of windows to images: each to the image in the middle of its window.
 
-    Images before the middle of the first matched window or after that of the last one take their
-    place from that window's warping path, with its distance. Windows that are not full do not
-    count.
+    Images before the middle of the first matched window or after the middle of the last one take
+    their place from that window's warping path, with its distance. Windows that are not full do
+    not count.
 
-    :param matches: one an image, in order: that of the window that ends with the image.
+    :param matches: one an image, in order: the match of the window that ends with the image.
     :param length: images in a window, l.
     :param late: images without a match of their own take their late one, where they have it.
     """
-    found = ImageMatches.none(len(matches))
+    result = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
     found_at = (end for end, match in enumerate(matches) if match.sequence is not None)
     ends = [end for end in found_at if is_full(matches[end], length)]
@@ -252,8 +252,8 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
         image = end - (length - 1) + position
         if image >= 0:
             match = matches[end].at(position)
-            found.places[image], found.distances[image] = place, match.score
-            found.accepted[image], found.probabilities[image] = match.accepted, match.probability
+            result.places[image], result.distances[image] = place, match.score
+            result.accepted[image], result.probabilities[image] = match.accepted, match.probability
 
     for end in ends:
         assign(end, middle, matches[end].sequence.middle)  # type: ignore[union-attr]
@@ -264,9 +264,9 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
             assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
     for each in chain.from_iterable(match.late for match in matches if late):
         image = each.first_image_index + each.position
-        found.places[image], found.distances[image] = each.place_index, each.score
-        found.accepted[image], found.probabilities[image] = True, each.probability
-    return found
+        result.places[image], result.distances[image] = each.place_index, each.score
+        result.accepted[image], result.probabilities[image] = True, each.probability
+    return result
 
 
 def evaluate_ranking(
@@ -314,8 +314,8 @@ def smallest_indices(row: np.ndarray, k: int) -> np.ndarray:
 
 def _recall_at(k: int, correct: np.ndarray, has_match: np.ndarray) -> float:
     """Return the share of queries with a place in the map; NaN where none has one."""
-    found = correct[has_match, :k].any(axis=1)
-    return float(np.mean(found)) if has_match.any() else float('nan')
+    is_hit = correct[has_match, :k].any(axis=1)
+    return float(np.mean(is_hit)) if has_match.any() else float('nan')
 
 
 def _sklearn_metrics(scores: np.ndarray, correct: np.ndarray) -> tuple[float, float, float]:

@@ -311,9 +311,9 @@ def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: 
         _draw_pair(axes, pair)
     for axes in grid.flat:
         axes.set_axis_off()
-    shown = [outcome for outcome in COLORS if any(pair.outcome == outcome for pair in pairs)]
-    keys = [Line2D([], [], color=COLORS[outcome], lw=3) for outcome in shown]
-    names = [MEANING[outcome] for outcome in shown]
+    present = [outcome for outcome in COLORS if any(pair.outcome == outcome for pair in pairs)]
+    keys = [Line2D([], [], color=COLORS[outcome], lw=3) for outcome in present]
+    names = [MEANING[outcome] for outcome in present]
     figure.suptitle(' ', fontsize=10)  # keeps room for the legend, which must not widen the grid
     legend = figure.legend(
         keys, names, loc='upper left', ncols=4, handlelength=1.2, borderaxespad=0.3

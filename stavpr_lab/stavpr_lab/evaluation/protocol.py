@@ -87,8 +87,8 @@ def error_rate_and_recall(
 
 def _with_interval(values: np.ndarray) -> Estimate:
     """Return the first of the values, and the interval of the others."""
-    known = values[1:][~np.isnan(values[1:])]
-    interval = np.quantile(known, INTERVAL) if len(known) else (np.nan, np.nan)
+    finite = values[1:][~np.isnan(values[1:])]
+    interval = np.quantile(finite, INTERVAL) if len(finite) else (np.nan, np.nan)
     return float(values[0]), float(interval[0]), float(interval[1])
 
 
@@ -110,15 +110,15 @@ def recalls(
 
 
 def evaluate_matches(
-    method: str, found: Iterable[tuple[int, Ranking]], truths: Mapping[int, GroundTruth]
+    method: str, rankings: Iterable[tuple[int, Ranking]], truths: Mapping[int, GroundTruth]
 ) -> Iterator[Recalls]:
     """
     Compare matches with the ground truth at each tolerance.
 
-    :param found: length of the sequences and matches.
+    :param rankings: length of the sequences and matches.
     :param truths: of the same queries, by tolerance.
     """
-    for length, ranking in found:
+    for length, ranking in rankings:
         images = block_samples(len(ranking))
         for tolerance, truth in truths.items():
             f1 = evaluate_ranking(ranking, truth).best.f1
@@ -190,12 +190,12 @@ def evaluate_protocol(
     for method in methods:
         if method in MODES:
             one = replace(settings or RecognizerSettings(), mode=method)
-            found = _recognized(place_map, query, one, lengths, backend)
+            rankings = _recognized(place_map, query, one, lengths, backend)
         else:
             traverses = query, place_map.features
             queries, places = (image_vectors(each, method == 'centered') for each in traverses)
-            found = match_sequences(1 - queries @ places.T, method, lengths)
-        yield from evaluate_matches(method, found, truths)
+            rankings = match_sequences(1 - queries @ places.T, method, lengths)
+        yield from evaluate_matches(method, rankings, truths)
 
 
 def _recognized(
@@ -211,5 +211,5 @@ def _recognized(
             window = replace(settings.sequence, length=max(2, length))
             one = replace(settings, sequence=window)
             recognizer = PlaceRecognizer(place_map, one, *backend)
-            found = recognize_traverse(recognizer, query, len(place_map), one)
-            yield length, found.single if length == 1 else found.sequence
+            results = recognize_traverse(recognizer, query, len(place_map), one)
+            yield length, results.single if length == 1 else results.sequence

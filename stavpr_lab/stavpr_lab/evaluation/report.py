@@ -63,8 +63,8 @@ class Report:
         """
         Return which matches a robot would get, shape (N,), bool.
 
-        Those that the recognizer accepts by default; in mode paper, which has no default, those
-        below the threshold of the best F1.
+        Matches that the recognizer accepts by default; in mode paper, which has no default,
+        matches below the threshold of the best F1.
         """
         if self.default_threshold is None:
             return self.evaluation.best_accepted
@@ -151,7 +151,7 @@ def jsonable(value: Any) -> Any:
 
 def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
     """
-    Choose wrong matches: those a window off or more first, then by distance, half a window apart.
+    Choose wrong matches, a window off or more first, then by distance, half a window apart.
 
     :returns: up to ``count`` images, the worst first; none without ground truth.
     """
@@ -161,18 +161,18 @@ def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
     wrong = ~evaluation.correct & np.isfinite(matches.scores)
     near = (true >= 0) & (np.abs(matches.best - true) < evaluation.sequence_length)
     apart = evaluation.sequence_length // 2
-    chosen: list[int] = []
+    images: list[int] = []
     for image in np.lexsort((matches.scores, near)).tolist():
-        if wrong[image] and all(abs(image - other) > apart for other in chosen):
-            chosen.append(image)
-            if len(chosen) == count:
+        if wrong[image] and all(abs(image - other) > apart for other in images):
+            images.append(image)
+            if len(images) == count:
                 break
-    return chosen
+    return images
 
 
 def chosen_window(evaluation: Evaluation, image: int | None) -> WindowDistances | None:
     """
-    Return the window around an image, by default that of the worst mistake or the middle one.
+    Return the window around an image, by default around the worst mistake, or the middle one.
 
     :raises SettingsError: no window is centered on that image.
     """
@@ -188,5 +188,5 @@ def chosen_window(evaluation: Evaluation, image: int | None) -> WindowDistances 
     if not windows:
         return None
     mistakes = worst_mistakes(evaluation, 1)
-    wanted = mistakes[0] if mistakes else windows[len(windows) // 2].image
-    return min(windows, key=lambda window: abs(window.image - wanted))
+    middle = mistakes[0] if mistakes else windows[len(windows) // 2].image
+    return min(windows, key=lambda window: abs(window.image - middle))

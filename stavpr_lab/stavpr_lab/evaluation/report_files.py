@@ -161,5 +161,5 @@ def _draw_matrix(report: Report, path: Path) -> Box:
     matches = {'right': pairs[accepted & correct], 'wrong': pairs[accepted & ~correct]}
     if not report.has_truth:
         matches = {'match': pairs[report.accepted]}
-    known = true_blocks if report.has_truth else None
-    return plots.reduced_matrix(path, reduced.values, (truth.N, truth.n), known, matches)
+    truth_blocks = true_blocks if report.has_truth else None
+    return plots.reduced_matrix(path, reduced.values, (truth.N, truth.n), truth_blocks, matches)

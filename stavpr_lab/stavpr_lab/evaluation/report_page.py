@@ -142,16 +142,18 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
     """Return the data of the page's script."""
     evaluation = report.evaluation
     windows = evaluation.results.windows
-    kept = set(evenly(len(windows), VIEWS).tolist())
-    shown = [window for i, window in enumerate(windows) if i in kept or window.image in mistakes]
-    views = [_view(report, window) for window in shown]
+    indices = set(evenly(len(windows), VIEWS).tolist())
+    sample = [
+        window for i, window in enumerate(windows) if i in indices or window.image in mistakes
+    ]
+    views = [_view(report, window) for window in sample]
     places = {view[name] for view in views for name in ('place', 'true')}
     curves = {'sequences': evaluation.sequence.curve, 'single images': evaluation.single.curve}
     return {
         'images': len(report.query),
         'views': views,
         'start': mistakes[0] if mistakes else len(report.query) // 2,
-        'queries': {window.image: _image(report.query, window.image) for window in shown},
+        'queries': {window.image: _image(report.query, window.image) for window in sample},
         'places': {place: _image(report.reference, place) for place in sorted(places)},
         'curves': {name: _points(curve) for name, curve in curves.items()},
     }

@@ -55,10 +55,10 @@ def measured_risks(
     units = max(1, len(driven[0][0].images) // block)
     wrong, matched, images = np.zeros((3, units, len(PROBABILITIES)))
     on_map = np.zeros((units, 1), bool)
-    for drive, found in driven:
-        has_match, correct = drive.truth.has_match, drive.truth.accepts(found.places)
+    for drive, matches in driven:
+        has_match, correct = drive.truth.has_match, drive.truth.accepts(matches.places)
         counted = np.any([has_match | ~drive.recorded.has_match, *drive.unseen()], axis=0)
-        above = (found.probabilities[:, None] > PROBABILITIES) & counted[:, None]
+        above = (matches.probabilities[:, None] > PROBABILITIES) & counted[:, None]
         unit = np.minimum(drive.images // block, units - 1)
         np.add.at(matched, unit, above)
         np.add.at(wrong, unit, above & ~correct[:, None])

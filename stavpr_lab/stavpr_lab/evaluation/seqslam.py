@@ -78,7 +78,7 @@ def match_differences(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndar
     Match each query image with the map from the differences of the images, contrast enhanced.
 
     :param D: differences, shape (N, n), finite, float32 or float64; row = query image, in order.
-    :returns: those of :func:`match_lines`.
+    :returns: see :func:`match_lines`.
     """
     return match_lines(enhance_contrast(D, settings.contrast_window), settings)
 
@@ -110,12 +110,12 @@ def match_lines(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, n
     rows, starts = np.arange(windows), totals.min(axis=0).argmin(axis=1)
     speeds = totals[:, rows, starts].argmin(axis=0)  # the slowest on a tie
     lines = settings.lines[speeds] + starts[:, None]
-    found = totals[speeds, rows, starts] / settings.length
+    means = totals[speeds, rows, starts] / settings.length
     middle = settings.middle
     places[middle : middle + windows] = lines[:, middle]
-    scores[middle : middle + windows] = found
-    places[:middle], scores[:middle] = lines[0, :middle], found[0]
-    places[middle + windows :], scores[middle + windows :] = lines[-1, middle + 1 :], found[-1]
+    scores[middle : middle + windows] = means
+    places[:middle], scores[:middle] = lines[0, :middle], means[0]
+    places[middle + windows :], scores[middle + windows :] = lines[-1, middle + 1 :], means[-1]
     return places, scores
 
 
@@ -156,7 +156,7 @@ def differences(queries: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
     """
-    Normalize each difference by those of the places around it: (D - mean) / deviation.
+    Normalize each difference by the differences of places around it: (D - mean) / deviation.
 
     :param D: shape (N, n).
     :param window: half of it before the place and half after; less at the map's ends.

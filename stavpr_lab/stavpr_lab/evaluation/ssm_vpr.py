@@ -89,8 +89,8 @@ class PcaWhitening:
         self._mean = samples.mean(dim=0)
         centered = samples - self._mean
         values, vectors = torch.linalg.eigh((centered @ centered.T).double())
-        kept = min(dimension, int((values > values[-1] * 1e-9).sum()))
-        values, vectors = values[-kept:].flip(0), vectors[:, -kept:].flip(1)
+        rank = min(dimension, int((values > values[-1] * 1e-9).sum()))
+        values, vectors = values[-rank:].flip(0), vectors[:, -rank:].flip(1)
         axes = centered.T @ (vectors / values.sqrt()).float()  # unit norm, (D, kept)
         self._matrix = axes / (values / (len(samples) - 1)).sqrt().float()
 
@@ -106,9 +106,9 @@ def learn_whitening(maps: torch.Tensor, side: int, dimension: int) -> PcaWhiteni
     rng = np.random.default_rng(0)
     samples = []
     for i in evenly(n, SAMPLE):
-        found = cubes(maps[i : i + 1], side)[0]
-        chosen = rng.choice(len(found), min(per_image, len(found)), replace=False)
-        samples.append(found[torch.from_numpy(chosen)])
+        vectors = cubes(maps[i : i + 1], side)[0]
+        indices = rng.choice(len(vectors), min(per_image, len(vectors)), replace=False)
+        samples.append(vectors[torch.from_numpy(indices)])
     return PcaWhitening(torch.cat(samples), dimension)
 
 
@@ -131,8 +131,8 @@ class SpatialReranker:
         self._own = self.agreement(np.arange(self.side**2)[None])[0]
 
     def _anchors(self, one: torch.Tensor) -> torch.Tensor:
-        found = self._whitening(cubes(one[None], self._settings.small)[0])
-        return normalize(found, dim=1)
+        vectors = self._whitening(cubes(one[None], self._settings.small)[0])
+        return normalize(vectors, dim=1)
 
     def scores(self, query: torch.Tensor, candidates: np.ndarray) -> np.ndarray:
         """
@@ -159,12 +159,12 @@ class SpatialReranker:
         down = rows - np.arange(side)[:, None]
         right = columns - np.arange(side)
         # one number a displacement; their range is -side .. side
-        moved = (down * (4 * side) + right).astype(np.int32)
-        total = np.zeros(len(moved), np.int64)
+        displacement = (down * (4 * side) + right).astype(np.int32)
+        total = np.zeros(len(displacement), np.int64)
         for u in range(reach + 1):
             for v in range(-reach if u else 0, reach + 1):
-                one = moved[:, : side - u, max(0, -v) : side - max(0, v)]
-                other = moved[:, u:, max(0, v) : side - max(0, -v)]
+                one = displacement[:, : side - u, max(0, -v) : side - max(0, v)]
+                other = displacement[:, u:, max(0, v) : side - max(0, -v)]
                 equal = (one == other).sum(axis=(1, 2))
                 total += equal if u == v == 0 else 2 * equal  # the pair counts in both orders
         return total
@@ -187,9 +187,9 @@ class SsmVpr:
         settings = self.settings
         self.reranker = SpatialReranker(self.second, settings)
         self._whitening = learn_whitening(self.first, settings.large, settings.large_dimension)
-        found = [self._whitening(cubes(each[None], settings.large)[0]) for each in self.first]
-        self._image = np.repeat(np.arange(len(found)), len(found[0]))
-        self._cubes = torch.cat(found)
+        vectors = [self._whitening(cubes(each[None], settings.large)[0]) for each in self.first]
+        self._image = np.repeat(np.arange(len(vectors)), len(vectors[0]))
+        self._cubes = torch.cat(vectors)
         self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory)
 
     def candidates(self, query: torch.Tensor) -> np.ndarray:

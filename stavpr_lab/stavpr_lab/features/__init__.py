@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Kinds of features beyond those of stavpr_ros: networks of the paper and of its baselines.
+Kinds of features that stavpr_ros does not have: networks of the paper and of its baselines.
 
 Imports no torch: :mod:`stavpr_ros.features.registry` loads this module for the settings.
 """

@@ -37,7 +37,7 @@ def read_descriptors(path: str, source: str = '', bits: bool = False) -> LocalFe
     Read the descriptors of a traverse.
 
     :param path: ``FILE`` (.npy, .npz, .csv, .mat), or ``FILE:NAME`` for one of several arrays.
-    :param source: what computed them; those of map and query must be equal.
+    :param source: what computed them; map and query must have the same.
     :param bits: the array is uint8, and each bit a dimension, -1 or 1: the cosine distance is
         2 / d times the Hamming distance. The most significant bit is the first.
     :returns: unit-norm features (W, n, d); W = 1 for an array (n, D); d = D, or 8 D of bits.
@@ -102,7 +102,7 @@ def _float32(rows: np.ndarray, path: str, first: int) -> np.ndarray:
 
 def require_comparable(features: LocalFeatures, settings: FeatureSettings, dimension: int) -> None:
     """
-    Reject descriptors that are not comparable with those of a map.
+    Reject descriptors that are not comparable with a map's.
 
     :raises FeatureMismatchError: another source or W.
     :raises SourceError: another dimension.
@@ -169,7 +169,7 @@ def _from_hdf5(file: Path, name: str) -> np.ndarray:
 
 
 def _chosen(file: Path, name: str, shapes: dict[str, tuple[int, ...]]) -> str:
-    """Return the name of the array to read: that given, or the only one that can be meant."""
+    """Return the name of the array to read: the requested or the only possible one."""
     able = [each for each, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 1]
     if not name and len(able if len(shapes) > 1 else shapes) == 1:
         return (able or list(shapes))[0]

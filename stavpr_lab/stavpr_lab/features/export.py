@@ -105,7 +105,7 @@ class Chosen(nn.Module):
         super().__init__()
         if not vector and not map:
             raise SettingsError('neither a vector nor a map is chosen: name one of the outputs')
-        self.names = [name for name, kept in ((GLOBAL, vector), (MAP, map)) if kept]
+        self.names = [name for name, output in ((GLOBAL, vector), (MAP, map)) if output]
         self.network = network.eval().float()
         self._vector, self._module, self._map, self._prefix = vector, module, map, prefix_tokens
         self._kept: list[Any] = []
@@ -126,28 +126,28 @@ class Chosen(nn.Module):
 
         :raises SettingsError: the network has no such outputs, or of another shape.
         """
-        found = []
+        outputs = []
         self._kept.clear()
-        returned = self.network(images)
+        results = self.network(images)
         if self._vector:
-            vector = one_of(returned, self._vector, 'the network')
+            vector = one_of(results, self._vector, 'the network')
             if not isinstance(vector, torch.Tensor) or vector.ndim != 2:
                 shape = getattr(vector, 'shape', type(vector).__name__)
                 raise SettingsError(
                     f'output {self._vector!r} of the network is {shape}: expected a vector (n, D)'
                 )
-            found.append(vector)
+            outputs.append(vector)
         if self._map:
             if self._module and not self._kept:
                 raise SettingsError(f'module {self._module!r} is not called by the network')
-            owner = self._kept[-1] if self._module else returned
+            owner = self._kept[-1] if self._module else results
             output = one_of(owner, self._map, self._module or 'the network')
             name = f'module {self._module!r}' if self._module else f'output {self._map!r}'
             maps = as_maps(output, len(images), self._prefix, name)
             if maps.ndim != 4:
                 raise SettingsError(f'{name} returns vectors {tuple(maps.shape)}: expected a map')
-            found.append(maps)
-        return tuple(found)
+            outputs.append(maps)
+        return tuple(outputs)
 
 
 def one_of(output: Any, which: str, name: str) -> Any:
@@ -170,7 +170,7 @@ def one_of(output: Any, which: str, name: str) -> Any:
     return outputs[which]
 
 
-def export_network(chosen: Chosen, size: int) -> Exported:
+def export_network(outputs: Chosen, size: int) -> Exported:
     """
     Record a network as an ONNX file, and verify it on random images.
 
@@ -181,7 +181,7 @@ def export_network(chosen: Chosen, size: int) -> Exported:
     :raises SettingsError: the network has no such outputs.
     :raises UnavailableError: it cannot be recorded, or the file computes something else.
     """
-    weights = sum(value.nbytes for value in chosen.state_dict().values())
+    weights = sum(value.nbytes for value in outputs.state_dict().values())
     if weights >= LARGEST:
         raise UnavailableError(
             f'the network has {weights / 1e9:.1f} GB of weights, the limit of an ONNX file '
@@ -189,20 +189,20 @@ def export_network(chosen: Chosen, size: int) -> Exported:
         )
     images = torch.randn(CHECKED, 3, size, size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        singles = [chosen(image[None]) for image in images]
+        singles = [outputs(image[None]) for image in images]
     references = [torch.cat(parts).numpy() for parts in zip(*singles, strict=True)]
     if not all(np.isfinite(reference).all() for reference in references):
         raise UnavailableError('the network returns NaN or infinite numbers for random images')
     reasons = []
     for batch, step in ((2, CHECKED), (1, 1)):  # recorded with two images; else with one
         try:
-            content = _recorded(chosen, images[:batch], alone=step == 1)
+            content = _recorded(outputs, images[:batch], alone=step == 1)
             difference = _difference(content, images.numpy(), references, step)
         except Exception as error:  # of the network, the recorder and the runtime
             reasons.append(last_line(error))
             continue
         if difference <= TOLERANCE:
-            shapes = {n: (1, *r.shape[1:]) for n, r in zip(chosen.names, references, strict=True)}
+            shapes = {n: (1, *r.shape[1:]) for n, r in zip(outputs.names, references, strict=True)}
             return Exported(content, shapes, difference, step > 1)
         reasons.append(f'its outputs differ by {difference:.2g}')
     raise UnavailableError(
@@ -211,9 +211,9 @@ def export_network(chosen: Chosen, size: int) -> Exported:
     )
 
 
-def _recorded(chosen: Chosen, images: torch.Tensor, alone: bool) -> bytes:
+def _recorded(outputs: Chosen, images: torch.Tensor, alone: bool) -> bytes:
     onnx, _ = import_onnx()
-    batched = {name: {0: 'batch'} for name in ('image', *chosen.names)}
+    batched = {name: {0: 'batch'} for name in ('image', *outputs.names)}
     with (
         tempfile.TemporaryDirectory() as folder,
         warnings.catch_warnings(),
@@ -223,11 +223,11 @@ def _recorded(chosen: Chosen, images: torch.Tensor, alone: bool) -> bytes:
         path = Path(folder) / 'recorded.onnx'
         warnings.simplefilter('ignore')  # of recording sizes as constants: the result is verified
         torch.onnx.export(
-            chosen,
+            outputs,
             (images,),
             path,
             input_names=['image'],
-            output_names=chosen.names,
+            output_names=outputs.names,
             dynamic_axes=None if alone else batched,
             opset_version=OPSET,
             dynamo=False,
@@ -246,8 +246,8 @@ def _difference(
     session = onnxruntime.InferenceSession(content, providers=[ON_CPU])
     largest = 0.0
     for first in range(0, len(images), step):
-        found = session.run(None, {'image': images[first : first + step]})
-        for output, reference in zip(found, references, strict=True):
+        results = session.run(None, {'image': images[first : first + step]})
+        for output, reference in zip(results, references, strict=True):
             expected = reference[first : first + step]
             if output.shape != expected.shape:
                 raise UnavailableError(f'shape {output.shape}, expected {expected.shape}')

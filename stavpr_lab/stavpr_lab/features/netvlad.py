@@ -11,7 +11,7 @@ norm (intra-normalization), then all together; PCA whitening, and unit norm agai
 Two layouts of files are read, recognized by their content; nothing in them is executed:
 
 * MATLAB (.mat) of the authors' networks as structures (uzh-rpg/netvlad_tf_open,
-  net_class2struct.m; also those of hloc): kernels (3, 3, in, out), assignment and centers (D, K),
+  net_class2struct.m; hloc's as well): kernels (3, 3, in, out), assignment and centers (D, K),
   the centers negated, V flattened with k running fastest; input in 0..255 less the mean in it.
 * PyTorch (.pth.tar) of Nanne/pytorch-NetVlad and QVPR/Patch-NetVLAD: assignment and centers
   (K, D), V flattened with d running fastest, whitening WPCA; input standardized as for ImageNet.
@@ -74,24 +74,26 @@ class NetVlad:
         path = Path(settings.model)
         file, digest = read_model(path, expected_hash(path), settings.sha256)
         with file:
-            found = read_parameters(file, str(path))
+            model = read_parameters(file, str(path))
         self.settings = replace(settings, sha256=digest)
-        if settings.whitening and found.whitening is None:
+        if settings.whitening and model.whitening is None:
             raise SettingsError(
                 f'{path} has no PCA whitening: set whitening to false for vectors of '
-                f'{found.centers.numel()} dimensions, or take a file with it'
+                f'{model.centers.numel()} dimensions, or take a file with it'
             )
         self._device = torch.device(choose_device(device))
         self._convolutions = [
-            tuple(value.to(self._device) for value in pair) for pair in found.convolutions
+            tuple(value.to(self._device) for value in pair) for pair in model.convolutions
         ]
-        weight, bias = found.assignment
+        weight, bias = model.assignment
         self._assignment = weight.to(self._device), None if bias is None else bias.to(self._device)
-        self._centers = found.centers.to(self._device)
-        self._k_fastest = found.k_fastest
-        kept = found.whitening if settings.whitening else None
-        self._whitening = None if kept is None else [part.to(self._device) for part in kept]
-        standard: dict[str, Any] = {'scale': found.scale, 'mean': found.mean, 'std': found.std}
+        self._centers = model.centers.to(self._device)
+        self._k_fastest = model.k_fastest
+        whitening = model.whitening if settings.whitening else None
+        self._whitening = (
+            None if whitening is None else [part.to(self._device) for part in whitening]
+        )
+        standard: dict[str, Any] = {'scale': model.scale, 'mean': model.mean, 'std': model.std}
         self._batch = BatchMaker(settings.size, settings.resize, self._device, **standard)
 
     def feature_maps(self, images: Sequence[np.ndarray]) -> np.ndarray:
@@ -138,32 +140,32 @@ def read_parameters(file: BinaryIO, name: str) -> NetVladParameters:
     """
     matlab = file.read(6) == b'MATLAB'
     file.seek(0)
-    found = _from_matlab(file, name) if matlab else _from_torch(file, name)
-    _require_fitting(found, name)
-    return found
+    model = _from_matlab(file, name) if matlab else _from_torch(file, name)
+    _require_fitting(model, name)
+    return model
 
 
-def _require_fitting(found: NetVladParameters, name: str) -> None:
+def _require_fitting(model: NetVladParameters, name: str) -> None:
     wrong = f'{name} is no file of weights of NetVLAD'
-    K, D = found.centers.shape
+    K, D = model.centers.shape
     channels = 3
-    for i, (kernel, bias) in enumerate(found.convolutions):
+    for i, (kernel, bias) in enumerate(model.convolutions):
         expected = (len(kernel), channels, 3, 3)
         if tuple(kernel.shape) != expected or len(bias) != len(kernel):
             raise UnavailableError(
                 f'{wrong}: convolution {i} has shape {tuple(kernel.shape)}, expected {expected}'
             )
         channels = len(kernel)
-    if channels != D or tuple(found.assignment[0].shape) != (K, D):
+    if channels != D or tuple(model.assignment[0].shape) != (K, D):
         raise UnavailableError(
-            f'{wrong}: {channels} channels, assignment {tuple(found.assignment[0].shape)}, '
+            f'{wrong}: {channels} channels, assignment {tuple(model.assignment[0].shape)}, '
             f'centers {(K, D)}: expected (K, D) with D channels'
         )
-    if found.whitening is not None and found.whitening[0].shape[1] != K * D:
+    if model.whitening is not None and model.whitening[0].shape[1] != K * D:
         raise UnavailableError(
-            f'{wrong}: its whitening takes {found.whitening[0].shape[1]} numbers, expected {K * D}'
+            f'{wrong}: its whitening takes {model.whitening[0].shape[1]} numbers, expected {K * D}'
         )
-    if not all(bool(torch.isfinite(value).all()) for value in found.tensors()):
+    if not all(bool(torch.isfinite(value).all()) for value in model.tensors()):
         raise UnavailableError(f'{name} is damaged: it contains NaN or infinite numbers')
 
 

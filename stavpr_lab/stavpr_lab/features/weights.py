@@ -143,7 +143,7 @@ def _numbers_of_numpy() -> AbstractContextManager[None]:
 
 
 def last_line(error: Exception) -> str:
-    """Return the last line of an error of torch: those before it are a trace of the program."""
+    """Return the last line of an error of torch: the lines before are a trace of the program."""
     return str(error).strip().split('\n')[-1] or type(error).__name__
 
 
@@ -161,15 +161,15 @@ def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], 
     """
     state = network.state_dict()
     expected = {key: value for key, value in state.items() if not key.endswith(COUNTER)}
-    given = {key: value for key, value in parameters.items() if not key.endswith(COUNTER)}
+    weights = {key: value for key, value in parameters.items() if not key.endswith(COUNTER)}
     wrong = f'{name} is no file of weights of {type(network).__name__}'
-    missing, unknown = sorted(expected.keys() - given), sorted(given.keys() - expected)
+    missing, unknown = sorted(expected.keys() - weights), sorted(weights.keys() - expected)
     if missing:
         raise UnavailableError(f'{wrong}: it lacks {_listed(missing)}')
     if unknown:
         raise UnavailableError(f'{wrong}: it has {_listed(unknown)}, unknown to the network')
     floats: dict[str, torch.Tensor] = {}
-    for key, value in given.items():
+    for key, value in weights.items():
         if value.shape != expected[key].shape:
             raise UnavailableError(
                 f'{wrong}: {key} has shape {tuple(value.shape)}, expected '

@@ -188,9 +188,9 @@ class Monitor:
     def _response(self, client: Client, request: Any) -> Any:
         if not client.service_is_ready():
             raise StavprError(f'{self._full_name} is not running: no service {client.srv_name}')
-        done, future = threading.Event(), client.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(TIMEOUT):
+        event, future = threading.Event(), client.call_async(request)
+        future.add_done_callback(lambda _: event.set())
+        if not event.wait(TIMEOUT):
             client.remove_pending_request(future)
             raise StavprError(f'{client.srv_name} did not respond within {TIMEOUT:g} s')
         return future.result()

@@ -131,17 +131,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _is_allowed(self) -> bool:
         """Refuse pages of other sites, and foreign names of this host, which they may use."""
-        given, origin = self.headers.get('Host', ''), self.headers.get('Origin')
+        host, origin = self.headers.get('Host', ''), self.headers.get('Origin')
         try:
-            name = urlsplit(f'//{given}').hostname or ''
+            name = urlsplit(f'//{host}').hostname or ''
             allowed = name in NAMES or bool(ipaddress.ip_address(name))
         except ValueError:
             allowed = False
-        if origin is not None and origin.partition('://')[2] != given:
-            allowed, given = False, f'{given}, from {origin}'
+        if origin is not None and origin.partition('://')[2] != host:
+            allowed, host = False, f'{host}, from {origin}'
         if not allowed:
             self.close_connection = True
-            text = f'unknown host {given!r}: use the address of this machine'
+            text = f'unknown host {host!r}: use the address of this machine'
             self._send(HTTPStatus.FORBIDDEN, 'text/plain', text.encode())
         return allowed
 

@@ -204,14 +204,14 @@ def drive_laps(
     truth = np.concatenate([true_poses(world, lap) for lap in laps])
     truth[:, 2] = np.unwrap(truth[:, 2])
     images = np.array([(i, k) for i, lap in enumerate(laps) for k in range(len(lap))])
-    kept = np.ones(len(truth), bool)
-    kept[CARRIED] = not carried
-    truth, images = truth[kept], images[kept]
+    is_recorded = np.ones(len(truth), bool)
+    is_recorded[CARRIED] = not carried
+    truth, images = truth[is_recorded], images[is_recorded]
     session = (images[:, 0] == 2).astype(int) * (sessions - 1)
     stamps = EPOCH + np.arange(len(truth), dtype=np.int64) * round(1e9 / RATE)
-    moved = np.ones(len(truth), bool)
-    moved[CARRIED.start] = not carried
-    odometry = drifted(truth, moved, np.random.default_rng([seed, draw]), drift)
+    is_driven = np.ones(len(truth), bool)
+    is_driven[CARRIED.start] = not carried
+    odometry = drifted(truth, is_driven, np.random.default_rng([seed, draw]), drift)
     for number in range(1, sessions):
         own = session == number
         odometry[own] = relative_poses(odometry[own][0], odometry[own])

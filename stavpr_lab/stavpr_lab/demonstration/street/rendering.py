@@ -87,10 +87,10 @@ def center_line_ahead(street: Street, along: float) -> np.ndarray:
     first = int(along / CELL)
     steps = min(int(VIEW / CELL) - 2, len(street.curvature) - first - 2)
     if not street.rigid:
-        turned = np.cumsum(street.curvature[first : first + steps]) * CELL
+        heading = np.cumsum(street.curvature[first : first + steps]) * CELL
         ahead = (first + 1 + np.arange(steps)) * CELL - along
         zero = np.zeros(steps)
-        return np.column_stack([ahead, np.cumsum(turned) * CELL, zero, zero + 1])
+        return np.column_stack([ahead, np.cumsum(heading) * CELL, zero, zero + 1])
     directions = street.headings[first : first + steps + 1] - street.headings[first]
     middle = (directions[1:] + directions[:-1]) / 2
     lengths = np.full(steps, CELL)

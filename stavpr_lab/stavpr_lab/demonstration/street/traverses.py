@@ -115,7 +115,7 @@ class Traverse:
     :param epoch: stamp of the first image, ns.
     :param size: width and height of the images.
     :param lanes: of each image, meters to the right of the center line, shape (images,); None =
-        that of the conditions.
+        the lane of the conditions.
 
     ``position`` is in meters along the street of the first traverse; NaN in the detour.
     """

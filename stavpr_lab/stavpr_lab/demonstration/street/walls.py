@@ -227,7 +227,7 @@ def _shop(along, height, top, x, seed, own, door, wall_color, sign_color, lamps)
 
     :param top: height of the ground floor.
     :param x: place within the bay, 0 to 1.
-    :param own: seed of the bay; `seed` is that of the building.
+    :param own: seed of the bay; `seed` is the building's.
     """
     r, g, b = wall_color
     sr, sg, sb = sign_color

@@ -30,7 +30,7 @@ class Layout:
 
     :param folders: names, or their first parts, of the data set's folder.
     :param map_names: names of the folder of the map.
-    :param query_names: names of that of the query.
+    :param query_names: names of the folder of the query.
     :param tolerance: the paper's or the field's, places.
     :param paired: the same index is the ground truth where both have equally many images; else a
         file is needed.
@@ -93,7 +93,7 @@ class Dataset:
     :param map: images of the map, in the order of the route.
     :param query: images of the query.
     :param ground_truth: of the query's images, tolerance included.
-    :param tolerance: that of the data set or the requested one, places.
+    :param tolerance: the data set's or the requested one, places.
     """
 
     map: FrameSource
@@ -114,7 +114,7 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
 
     :param name: one of ``NAMES``; ``synth_`` before a name crops both traverses as synth-Nord.
     :param root: its own folder, or a folder around it.
-    :param tolerance: places; None = that of the data set.
+    :param tolerance: places; None = the data set's.
     :raises SettingsError: an unknown name.
     :raises SourceError: it is not found; names the folders that were searched.
     """
@@ -150,8 +150,8 @@ def _images(folder: Path) -> FolderSource:
     """Return the images of a traverse, those that the list beside it names where there is one."""
     images, names = FolderSource(folder), folder.parent / KEPT
     if names.is_file():
-        kept = set(names.read_text(encoding='utf-8', errors='replace').split())
-        images.files = [file for file in images.files if file.name in kept]
+        selection = set(names.read_text(encoding='utf-8', errors='replace').split())
+        images.files = [file for file in images.files if file.name in selection]
         if not images.files:
             raise SourceError(
                 f'{folder} has none of the images that {names} lists; remove the list'
@@ -196,11 +196,11 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
-    """Return the folders of data set, map and query, those nearest to the root."""
+    """Return the folders of data set, map and query that are nearest to the root."""
     level, searched = [root], []
     for _ in range(DEPTH):
         searched += level
-        hits = [(path, *found) for path in level if (found := _traverses(path, layout))]
+        hits = [(path, *folders) for path in level if (folders := _traverses(path, layout))]
         if len(hits) > 1:
             several = ', '.join(str(path) for path, *_ in hits)
             raise SourceError(
@@ -227,17 +227,17 @@ def _find(name: str, layout: Layout, root: Path) -> tuple[Path, Path, Path]:
 def _traverses(path: Path, layout: Layout) -> tuple[Path, Path] | None:
     traverses = []
     for names in (layout.map_names, layout.query_names):
-        found = [
+        folders = [
             folder for folder in _folders(path) if _traverse_name(folder.name, layout) in names
         ]
-        if not found:
+        if not folders:
             return None
-        if len(found) > 1:
-            several = ', '.join(folder.name for folder in found)
+        if len(folders) > 1:
+            several = ', '.join(folder.name for folder in folders)
             raise SourceError(
                 f'{path} has several folders for one traverse: {several}; leave one of them'
             )
-        traverses.append(found[0])
+        traverses.append(folders[0])
     return traverses[0], traverses[1]
 
 
@@ -248,14 +248,14 @@ def _ground_truth_file(name: str, folder: Path, queries: int, places: int) -> Pa
         if _letters(file.stem) in GROUND_TRUTHS and file.is_file()
     ]
     for suffixes in (TEXT, ARRAYS, tuple(SUFFIXES)):  # text first: the least ambiguous
-        found = [file for file in files if file.suffix.lower() in suffixes]
-        if len(found) > 1:
-            several = ', '.join(file.name for file in found)
+        candidates = [file for file in files if file.suffix.lower() in suffixes]
+        if len(candidates) > 1:
+            several = ', '.join(file.name for file in candidates)
             raise SourceError(
                 f'data set {name} in {folder} has several ground truths: {several}; leave one'
             )
-        if found:
-            return found[0]
+        if candidates:
+            return candidates[0]
     raise SourceError(
         f'data set {name} in {folder} has {queries} query images for {places} places and no '
         f'ground truth: searched for a file called {_or(GROUND_TRUTHS)}, text, array or image, '

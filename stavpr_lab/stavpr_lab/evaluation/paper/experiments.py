@@ -37,7 +37,7 @@ class Configuration:
     :param temporal: sequences; False = single images.
     :param strips: W.
     :param projection: dimensions of a random projection, None without.
-    :param robust_options: of the recognizer; None = those of the mode.
+    :param robust_options: of the recognizer; None = the options of the mode.
     :param baseline: run that instead: ``seqslam``, with the length of the sequence settings;
         ``ssm_vpr``, with two layers of the network; ``descriptors``, single images by the arrays
         of this name.
@@ -122,19 +122,19 @@ def sweep_configurations(
     Return one configuration a value of a parameter, all others at their defaults.
 
     :param parameter: l, beta, xi, sigma or W.
-    :param values: those of ``SWEEPS`` if none are given.
+    :param values: by default the values of ``SWEEPS``.
     :raises SettingsError: no such parameter, or a value out of its range.
     """
     if parameter not in SWEEPS:
         raise SettingsError(f'parameter {parameter!r} is unknown: take one of {", ".join(SWEEPS)}')
-    found = []
+    result = []
     for value in values or SWEEPS[parameter]:
         whole = parameter in ('l', 'xi', 'W')
         if whole and not float(value).is_integer():
             raise SettingsError(f'{parameter} = {value} must be a whole number')
         title = f'{parameter} = {value:g}'
-        found.append(_changed(Configuration(f'{parameter}_{value:g}', title), parameter, value))
-    return tuple(found)
+        result.append(_changed(Configuration(f'{parameter}_{value:g}', title), parameter, value))
+    return tuple(result)
 
 
 def _changed(plain: Configuration, parameter: str, value: float) -> Configuration:
@@ -211,11 +211,11 @@ class DatasetExperiment:
             return None
         reference, query = (read_descriptors(path) for path in self._inputs.arrays[name])
         require_comparable(query, reference.settings, reference.dimension)
-        found = len(reference), len(query)
+        counts = len(reference), len(query)
         expected = len(self._dataset.map), len(self._dataset.query)
-        if found != expected:
+        if counts != expected:
             raise SourceError(
-                f'descriptors {" and ".join(self._inputs.arrays[name])} are of {found} images: '
+                f'descriptors {" and ".join(self._inputs.arrays[name])} are of {counts} images: '
                 f'expected {expected}'
             )
         settings = RecognizerSettings(mode='paper', spatial=NO_ALIGNMENT)
@@ -242,9 +242,9 @@ class DatasetExperiment:
         coarse, fine = maps(self._dataset.map)
         ssm = SsmVpr(coarse, fine)
         pairs = zip(*maps(self._dataset.query), strict=True)
-        found = [ssm.recognize(first, second) for first, second in pairs]
-        places = np.array([ranked[0] for ranked, _ in found])
-        scores = np.array([1 - ranked[0] for _, ranked in found])  # lower is better
+        rankings = [ssm.recognize(first, second) for first, second in pairs]
+        places = np.array([ranked[0] for ranked, _ in rankings])
+        scores = np.array([1 - ranked[0] for _, ranked in rankings])  # lower is better
         return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.ground_truth)
 
     def _evaluate_seqslam(self, configuration: Configuration) -> Metrics:

@@ -81,12 +81,14 @@ def robotcar(folder: Path) -> PosedTraverse:
     times = np.array([int(row['timestamp']) for row in rows])
     coordinates = ([float(row[name]) for row in rows] for name in ('easting', 'northing'))
     positions = np.stack([np.interp(stamps, times, each) for each in coordinates], axis=1)
-    kept: list[int] = []
+    numbers: list[int] = []
     for i in np.flatnonzero((stamps >= times[0]) & (stamps <= times[-1])).tolist():
-        if not kept or np.hypot(*(positions[i] - positions[kept[-1]])) >= SPACING:
-            kept.append(i)
-    images.files = [images.files[i] for i in kept]
-    return PosedTraverse(Demosaiced(images), _poses(positions[kept]), np.ones(len(kept), bool))
+        if not numbers or np.hypot(*(positions[i] - positions[numbers[-1]])) >= SPACING:
+            numbers.append(i)
+    images.files = [images.files[i] for i in numbers]
+    return PosedTraverse(
+        Demosaiced(images), _poses(positions[numbers]), np.ones(len(numbers), bool)
+    )
 
 
 class Demosaiced:
