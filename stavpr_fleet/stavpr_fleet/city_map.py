@@ -70,7 +70,7 @@ class CityMap(PlaceMap):
         session_index = None
         if sessions:
             session_index = np.repeat(of_runs, np.diff(index.firsts, append=n))
-        made = cls(
+        city = cls(
             features=RemoteFeatures(store),
             projection=sample.projection,
             stamps=np.zeros(n, np.int64),
@@ -82,8 +82,8 @@ class CityMap(PlaceMap):
             map_id=index.map_id,
             store=store,
         )
-        made.remember(sample_places(n), sample)
-        return made
+        city.remember(sample_places(n), sample)
+        return city
 
     def remember(self, places: np.ndarray, fetched: PlaceMap) -> None:
         """Keep stamps, poses and identifiers of places that were fetched."""

@@ -31,7 +31,7 @@ def _faiss() -> Any:
 
 
 def _index_path(path: str | Path, map_id: str) -> Path:
-    """Return the file of a map's index: that of another map has another name."""
+    """Return the file of a map's index; the index of another map has another name."""
     return Path(f'{path}.{map_id}.faiss')
 
 

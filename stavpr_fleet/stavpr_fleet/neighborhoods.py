@@ -23,30 +23,30 @@ class Votes:
         self._found: deque[tuple[int, np.ndarray]] = deque(maxlen=images)
         self._speeds = tuple(speeds)
 
-    def add(self, image: int, found: np.ndarray) -> None:
+    def add(self, image: int, places: np.ndarray) -> None:
         """
         Let an image vote.
 
         :param image: its number.
-        :param found: places, nearest first, int64; negative ones do not count.
+        :param places: places, nearest first, int64; negative ones do not count.
         """
-        self._found.append((image, found))
+        self._found.append((image, places))
 
     def best(self, count: int) -> np.ndarray:
         """
         Return where the newest image may be, best first, at most ``count`` places.
 
         With the place p of an image t images ago, it is at p + v t at speed v. Each image has one
-        vote in a bin of ``BIN`` places: that of its nearest place there.
+        vote in a bin of ``BIN`` places, for its nearest place there.
         """
         if not self._found:
             return np.empty(0, np.int64)
         newest = self._found[-1][0]
-        places = np.concatenate([found for _, found in self._found])
-        ages = np.concatenate([np.full(len(found), newest - i) for i, found in self._found])
-        votes = np.concatenate([1 / (RANKED + np.arange(len(found))) for _, found in self._found])
-        known = places >= 0
-        places, ages, votes = places[known], ages[known], votes[known]
+        places = np.concatenate([near for _, near in self._found])
+        ages = np.concatenate([np.full(len(near), newest - i) for i, near in self._found])
+        votes = np.concatenate([1 / (RANKED + np.arange(len(near))) for _, near in self._found])
+        is_place = places >= 0
+        places, ages, votes = places[is_place], ages[is_place], votes[is_place]
         scores: dict[int, float] = {}
         for speed in self._speeds:
             bins = (places + np.rint(speed * ages).astype(np.int64)) // BIN

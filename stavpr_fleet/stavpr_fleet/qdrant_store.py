@@ -116,24 +116,24 @@ class ServerPoints:
 
     def upsert(self, points: list[Point]) -> None:
         """See :class:`Points`."""
-        made = [
+        records = [
             self._models.PointStruct(id=number, vector=vector, payload=payload)
             for number, vector, payload in points
         ]
-        self._call('upsert', points=made, wait=True)
+        self._call('upsert', points=records, wait=True)
 
     def nearest(self, vectors: np.ndarray, count: int) -> list[list[int]]:
         """See :class:`Points`."""
         requests = [
             self._models.QueryRequest(query=vector.tolist(), limit=count) for vector in vectors
         ]
-        found = self._call('query_batch_points', requests=requests)
-        return [[point.id for point in one.points] for one in found]
+        responses = self._call('query_batch_points', requests=requests)
+        return [[point.id for point in one.points] for one in responses]
 
     def payloads(self, ids: list[int]) -> dict[int, dict[str, Any]]:
         """See :class:`Points`."""
-        found = self._call('retrieve', ids=ids, with_payload=True)
-        return {point.id: point.payload for point in found}
+        records = self._call('retrieve', ids=ids, with_payload=True)
+        return {point.id: point.payload for point in records}
 
 
 class EdgePoints:
@@ -187,8 +187,8 @@ class EdgePoints:
 
     def upsert(self, points: list[Point]) -> None:
         """See :class:`Points`."""
-        made = [self._edge.Point(*point) for point in points]
-        self._call(self._shard.update, self._edge.UpdateOperation.upsert_points(made))
+        records = [self._edge.Point(*point) for point in points]
+        self._call(self._shard.update, self._edge.UpdateOperation.upsert_points(records))
         self._call(self._shard.flush)
 
     def nearest(self, vectors: np.ndarray, count: int) -> list[list[int]]:
@@ -198,13 +198,13 @@ class EdgePoints:
             edge.QueryRequest(limit=count, query=edge.Query.Nearest(vector.tolist()))
             for vector in vectors
         ]
-        found = self._call(self._opened().query_batch, edge.QueryBatchRequest(requests))
-        return [[point.id for point in one] for one in found]
+        responses = self._call(self._opened().query_batch, edge.QueryBatchRequest(requests))
+        return [[point.id for point in one] for one in responses]
 
     def payloads(self, ids: list[int]) -> dict[int, dict[str, Any]]:
         """See :class:`Points`."""
-        found = self._call(self._opened().retrieve, ids, True, False)
-        return {point.id: point.payload for point in found}
+        records = self._call(self._opened().retrieve, ids, True, False)
+        return {point.id: point.payload for point in records}
 
 
 class QdrantStore:
@@ -224,9 +224,9 @@ class QdrantStore:
 
     def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
         """See :class:`stavpr_fleet.store.PlaceStore`."""
-        found = self._points.nearest(vectors, count + 1)  # the point of the index may be found
+        rows = self._points.nearest(vectors, count + 1)  # the point of the index may be found
         out = np.full((len(vectors), count), -1, np.int64)
-        for row, ids in zip(out, found, strict=True):
+        for row, ids in zip(out, rows, strict=True):
             places = [i for i in ids if 0 <= i < self.index.places][:count]
             row[: len(places)] = places
         return out

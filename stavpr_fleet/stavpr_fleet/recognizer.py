@@ -91,9 +91,9 @@ class _Image:
 
 
 class _Lookup(NamedTuple):
-    """Chunks that are wanted, and the places fetched of those that were not loaded."""
+    """Chunks to load, and the fetched places of chunks that were not loaded."""
 
-    wanted: list[int]
+    chunks: list[int]
     places: np.ndarray
     fetched: PlaceMap | None
     same_as: np.ndarray
@@ -106,8 +106,8 @@ class FleetRecognizer(SequenceRecognizer):
     :param city: the map.
     :param settings: mode robust with all its options.
     :param timeout: seconds that an image waits for the lookup of neighborhoods; it goes on with
-        those loaded, and they are used when they have arrived.
-    :raises SettingsError: other settings than those of mode robust, or vertical alignment.
+        the loaded ones, and new ones are used when they have arrived.
+    :raises SettingsError: settings of another mode than robust, or vertical alignment.
 
     ``problem`` is why the last lookup failed, '' = it did not.
     """
@@ -140,7 +140,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._learned = ImageChange(self._sampled, MODEL)
         self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
-        self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that wanted it last
+        self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that requested it last
         self._places = np.full(CHUNKS * CHUNK, -1)
         self._same_as = self._places.copy()
         self._from_before = np.ones(len(self._places), np.float32)
@@ -210,9 +210,9 @@ class FleetRecognizer(SequenceRecognizer):
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """See :meth:`SequenceRecognizer.window_columns`; +inf for places that are not loaded."""
-        loaded = self._places[self._order]
-        here = np.isin(places, loaded)
-        rows = super().window_columns(loaded.searchsorted(places[here]))
+        places_in_order = self._places[self._order]
+        here = np.isin(places, places_in_order)
+        rows = super().window_columns(places_in_order.searchsorted(places[here]))
         columns = np.full((len(rows), len(places)), np.inf, np.float32)
         columns[:, here] = rows
         return columns
@@ -224,12 +224,12 @@ class FleetRecognizer(SequenceRecognizer):
         if self._pending is None:
             if len(self._order) and len(self._unasked) < EVERY:
                 return False
-            asked = list(self._unasked)
+            queries = list(self._unasked)
             self._unasked.clear()
             loaded, likely = set(self._chunks.tolist()), self._likely()
             votes = self._votes  # of this query, if it is reset meanwhile
             self._pending = call_on_thread(
-                lambda: self._look_up(asked, votes, loaded, likely), 'neighborhoods'
+                lambda: self._look_up(queries, votes, loaded, likely), 'neighborhoods'
             )
             wait([self._pending], 0 if self.problem else self._timeout)
         if not self._pending.done():
@@ -245,28 +245,28 @@ class FleetRecognizer(SequenceRecognizer):
 
     def _look_up(
         self,
-        asked: list[tuple[int, np.ndarray]],
+        queries: list[tuple[int, np.ndarray]],
         votes: Votes,
         loaded: set[int],
         likely: np.ndarray,
     ) -> _Lookup:
         """Return the neighborhoods of images; on a thread of its own, without this object's."""
         store = self._city.store
-        vectors = np.concatenate([vector for _, vector in asked])
-        for (number, _), found in zip(asked, store.nearest(vectors, NEAREST), strict=True):
-            votes.add(number, found)
+        vectors = np.concatenate([vector for _, vector in queries])
+        for (number, _), nearest in zip(queries, store.nearest(vectors, NEAREST), strict=True):
+            votes.add(number, nearest)
         last = (len(self._city) - 1) // CHUNK
-        wanted: dict[int, None] = {}
+        candidates: dict[int, None] = {}
         for place in np.concatenate([likely, votes.best(NEIGHBORHOODS)]).tolist():
             low, high = max(place - BEHIND, 0) // CHUNK, (place + AHEAD) // CHUNK
-            wanted |= dict.fromkeys(range(low, min(high, last) + 1))
-        chosen = list(wanted)[:CHUNKS]
-        chunks = sorted(set(chosen) - loaded)
+            candidates |= dict.fromkeys(range(low, min(high, last) + 1))
+        selection = list(candidates)[:CHUNKS]
+        chunks = sorted(set(selection) - loaded)
         if not chunks:
-            return _Lookup(chosen, np.empty(0, np.int64), None, np.empty(0, np.int64))
+            return _Lookup(selection, np.empty(0, np.int64), None, np.empty(0, np.int64))
         places = (np.array(chunks)[:, None] * CHUNK + np.arange(CHUNK)).ravel()
         places = places[places < len(self._city)]
-        return _Lookup(chosen, places, *store.fetch(places))
+        return _Lookup(selection, places, *store.fetch(places))
 
     def _likely(self) -> np.ndarray:
         """Return the places that are most probable now."""
@@ -279,8 +279,8 @@ class FleetRecognizer(SequenceRecognizer):
         return self._places[self._order][top[probabilities[top] > MIN_PROBABILITY]]
 
     def _take(self, lookup: _Lookup) -> bool:
-        """Put fetched places into the slots that were wanted longest ago."""
-        self._wanted[np.isin(self._chunks, lookup.wanted)] = self._count
+        """Put fetched places into the slots that were requested longest ago."""
+        self._wanted[np.isin(self._chunks, lookup.chunks)] = self._count
         if lookup.fetched is None:
             return False
         self._city.remember(lookup.places, lookup.fetched)
