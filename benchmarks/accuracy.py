@@ -124,18 +124,18 @@ def extractors(feature: str, folder: Path) -> dict[str, FeatureExtractor]:
 
 def numbers(evaluation: Evaluation, mode: str) -> dict[str, Any]:
     """Return the numbers of a row; mode paper has no default threshold."""
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: {k: v for k, v in metrics.to_json().items() if isinstance(v, int | float)}
         for name, metrics in (('sequence', evaluation.sequence), ('single', evaluation.single))
     }
     if mode == 'robust':
         accepted, has_match = evaluation.results.accepted, evaluation.ground_truth.has_match
         counts = accepted_counts(accepted, evaluation.correct, has_match)
-        found['at_default'] = {
+        values['at_default'] = {
             'threshold': 1 - RecognizerSettings.min_probability,
             'precision': counts.precision, 'recall': counts.recall,
         }  # fmt: skip
-    return found
+    return values
 
 
 def evaluate_case(
@@ -167,8 +167,10 @@ def evaluate_hallway(
         truth = GroundTruth.from_file(file, len(route), len(route), 0).loop_closures(EXCLUDED - 1)
         settings = RecognizerSettings(mode=mode)
         for row, late in ('same', True), ('on time', False):
-            found = evaluate_loop_closures(route.features, truth, settings, EXCLUDED, late=late)
-            yield f'hallway/{feature}/{mode}/{row}', numbers(found, mode)
+            evaluation = evaluate_loop_closures(
+                route.features, truth, settings, EXCLUDED, late=late
+            )
+            yield f'hallway/{feature}/{mode}/{row}', numbers(evaluation, mode)
 
 
 def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict[str, Any]:
@@ -182,9 +184,9 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
         for query in floors:
             if query is not place_map:
                 recognizer = PlaceRecognizer(place_map, settings)
-                found = recognize_traverse(recognizer, query.features, len(place_map), settings)
+                results = recognize_traverse(recognizer, query.features, len(place_map), settings)
                 images += len(query)
-                matched += int(np.count_nonzero(found.accepted))
+                matched += int(np.count_nonzero(results.accepted))
     return {'images': images, 'matched': matched}
 
 
@@ -232,13 +234,13 @@ def changes(old: Results, new: Results) -> tuple[list[str], bool]:
 
 def _flat(values: dict[str, Any]) -> dict[str, float]:
     """Return nested numbers by dotted names."""
-    found = {}
+    flat = {}
     for name, value in values.items():
         if isinstance(value, dict):
-            found |= {f'{name}.{inner}': number for inner, number in _flat(value).items()}
+            flat |= {f'{name}.{inner}': number for inner, number in _flat(value).items()}
         else:
-            found[name] = value
-    return found
+            flat[name] = value
+    return flat
 
 
 def _is_worse(name: str, before: float, after: float) -> bool:

@@ -132,18 +132,18 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
     extractor = FeatureExtractor()
     real = extract_features(open_source(folder / reference), extractor, progress=False)
     query = extract_features(open_source(folder / query_folder), extractor, progress=False)
-    shown = DriveChanges.named(speed, len(query)).images(len(query))
-    shown = shown[:images]
-    query = query[shown]
+    indices = DriveChanges.named(speed, len(query)).images(len(query))
+    indices = indices[:images]
+    query = query[indices]
     features, first = city(real, n, seed)
     if save is not None:
         save_map(descriptor_map(features), save, force=True)
     exact, stage = (
-        drive(features, query, first + shown, tolerance, budget) for budget in (0, ALWAYS)
+        drive(features, query, first + indices, tolerance, budget) for budget in (0, ALWAYS)
     )
     answers = exact.pop('answers'), stage.pop('answers')
     changed = (answers[0] < 0) != (answers[1] < 0)
-    moved = (~changed) & (np.abs(answers[0] - answers[1]) > tolerance)
+    is_elsewhere = (~changed) & (np.abs(answers[0] - answers[1]) > tolerance)
     return {
         'case': name,
         'places': n,
@@ -155,14 +155,14 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
         'exact': exact,
         'first_stage': stage,
         'statuses_changed': int(changed.sum()),
-        'places_moved': int(moved.sum()),
+        'places_moved': int(is_elsewhere.sum()),
     }
 
 
-def lines(found: list[dict[str, Any]]) -> list[str]:
+def lines(results: list[dict[str, Any]]) -> list[str]:
     """Return the table of the results."""
     rows = []
-    for one in found:
+    for one in results:
         both = one['exact'], one['first_stage']
         rows.append([
             *(one['case'], f'{one["places"]:,}'),
@@ -175,11 +175,11 @@ def lines(found: list[dict[str, Any]]) -> list[str]:
     return table((*head, 'exact ms', 'first stage ms', 'threads', 'load'), rows)
 
 
-def merged(path: Path, found: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add results to those of a file, each case and size once, the newest last; return all."""
+def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add results to a file, each case and size once, the newest last; return all."""
     before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
-    of_cases = {(one['case'], one['places']): one for one in (*before, *found)}
-    if found:
+    of_cases = {(one['case'], one['places']): one for one in (*before, *new)}
+    if new:
         write_json(path, [*of_cases.values()])
     return list(of_cases.values())
 
@@ -202,18 +202,18 @@ def node_lines(folder: Path) -> list[str]:
     return table(head, rows) if rows else []
 
 
-def write_page(found: list[dict[str, Any]], page: Path) -> None:
+def write_page(results: list[dict[str, Any]], page: Path) -> None:
     """Write the tables to a page."""
     cases = list(CASES)
-    found = sorted(found, key=lambda one: (one['places'], cases.index(one['case'])))
-    shown = [*lines(found), '', *node_lines(RESULTS)]
-    written_between(page, BEGIN, END, shown)
+    results = sorted(results, key=lambda one: (one['places'], cases.index(one['case'])))
+    lines_of_page = [*lines(results), '', *node_lines(RESULTS)]
+    written_between(page, BEGIN, END, lines_of_page)
 
 
-def written_between(page: Path, begin: str, end: str, shown: list[str]) -> None:
+def written_between(page: Path, begin: str, end: str, content: list[str]) -> None:
     """Replace the text between two marks of a page."""
     before, rest = page.read_text(encoding='utf-8').split(begin)
-    text = '\n'.join(['', '', *shown]).rstrip()
+    text = '\n'.join(['', '', *content]).rstrip()
     page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')
 
 
@@ -227,15 +227,15 @@ def main() -> None:
     parser.add_argument('--save-map', type=Path, help='of the last case, for soak.py --map')
     parser.add_argument('--output', type=Path, default=RESULTS / 'city.json', help='JSON file')
     arguments = parser.parse_args()
-    found = merged(arguments.output, [])
+    rows = merged(arguments.output, [])
     for n in arguments.places:
         for case in arguments.cases:
             one = measure(case, n, arguments.images, arguments.seed, arguments.save_map)
-            found = merged(arguments.output, [one])
+            rows = merged(arguments.output, [one])
             print('\n'.join(lines([one])[2:3]), flush=True)
-    print('\n'.join(lines(found)))
+    print('\n'.join(lines(rows)))
     if arguments.output == RESULTS / 'city.json':
-        write_page(found, PAGE)
+        write_page(rows, PAGE)
 
 
 if __name__ == '__main__':

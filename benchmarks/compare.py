@@ -77,13 +77,13 @@ def serve(driver: str) -> None:
             queries = np.split(random_strips(QUERIES, d, seed + 1), QUERIES, axis=1)
             call, following = make(*places, request['mode'], request['precision']), cycle(queries)
             request['frames'] = LENGTH
-        taken, results = [], []
+        seconds, results = [], []
         for _ in range(request['frames']):
             strips = next(following).copy()
             began = time.perf_counter()
             results.append(call(strips, weights[:, :1].copy()))
-            taken.append(time.perf_counter() - began)
-        print(json.dumps({'seconds': taken, 'results': results}), flush=True)
+            seconds.append(time.perf_counter() - began)
+        print(json.dumps({'seconds': seconds, 'results': results}), flush=True)
 
 
 class Checkout:
@@ -166,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
         serve(options.driver)
         return 0
     this, other = Checkout(ROOT), Checkout(options.checkout.resolve(), options.driver)
-    found = []
+    results = []
     head = ('mode', 'n', 'precision', 'this ms', 'other ms', 'ratio')
     print('{:8}{:>9} {:10}{:>9}{:>10}{:>7}  quartiles    results'.format(*head))
     for mode, n, precision in product(('robust', 'paper'), options.sizes, options.precisions):
@@ -180,15 +180,15 @@ def main(arguments: list[str] | None = None) -> int:
             f'{"equal" if result["equal_results"] else "DIFFERENT"}',
             flush=True,
         )
-        found.append(result)
+        results.append(result)
     this.close()
     other.close()
     if options.output:
         from results import environment, write_json
 
-        document = environment() | {'other': str(options.checkout.name), 'results': found}
+        document = environment() | {'other': str(options.checkout.name), 'results': results}
         write_json(options.output, document)
-    worse = any(r['ratio'] > options.allowed or not r['equal_results'] for r in found)
+    worse = any(r['ratio'] > options.allowed or not r['equal_results'] for r in results)
     return 1 if worse else 0
 
 

@@ -47,5 +47,5 @@ def free_bytes(device: str) -> int:
 
         return int(torch.cuda.mem_get_info()[0])
     with open('/proc/meminfo', encoding='ascii') as lines:
-        found = dict(line.split(':') for line in lines)
-    return int(found['MemAvailable'].split()[0]) * 1024
+        sizes = dict(line.split(':') for line in lines)
+    return int(sizes['MemAvailable'].split()[0]) * 1024

@@ -118,8 +118,8 @@ def main() -> None:
     for count in arguments.places:
         for name, driven in ROUTES.items():
             whole, first = city(opened[name], [opened[one] for one in DISTRACTORS], count)
-            given = opened[driven].features, opened[OFF_THE_MAP].features, first
-            exact = run(PlaceRecognizer(whole, SETTINGS), *given)
+            inputs = opened[driven].features, opened[OFF_THE_MAP].features, first
+            exact = run(PlaceRecognizer(whole, SETTINGS), *inputs)
             print(f'| {driven} | {count:,} | exact | {exact} | |', flush=True)
             for home in arguments.homes:
                 with tempfile.TemporaryDirectory() as folder:
@@ -128,8 +128,8 @@ def main() -> None:
                     upload(whole, address)
                     place_map = open_city_map(address)
                     spent = time.perf_counter() - began
-                    found = run(FleetRecognizer(place_map, SETTINGS, timeout=60), *given)
-                print(f'| {driven} | {count:,} | {home} | {found} | {spent:.1f} |', flush=True)
+                    result = run(FleetRecognizer(place_map, SETTINGS, timeout=60), *inputs)
+                print(f'| {driven} | {count:,} | {home} | {result} | {spent:.1f} |', flush=True)
 
 
 if __name__ == '__main__':

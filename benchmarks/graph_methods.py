@@ -79,9 +79,9 @@ class Drive:
 
     def error(self, poses: np.ndarray) -> float:
         """Return the absolute trajectory error of poses (N, 7), m."""
-        known = np.isfinite(poses[:, 0])
-        truth = planar_poses(self.truth)[known]
-        return float(trajectory_errors(self.stamps[known], poses[known], truth)[0])
+        is_known = np.isfinite(poses[:, 0])
+        truth = planar_poses(self.truth)[is_known]
+        return float(trajectory_errors(self.stamps[is_known], poses[is_known], truth)[0])
 
     def only_right(self) -> 'Drive':
         """Return the drive with its right closures alone."""
@@ -114,16 +114,16 @@ def worlds(seed: int, draw: int, folder: Path) -> Iterator[Drive]:
     for name, (drift, special) in DRIVES.items():
         drive = drive_laps(seed, draw, drift, **special)
         path = folder / f'pairs-{seed}-{draw}-{name.replace(" ", "-")}.pkl'
-        found = with_edges(drive, recognized(drive, images, path), SharedViews())
+        pairs = with_edges(drive, recognized(drive, images, path), SharedViews())
         for false in TRIED[name]:
             share, coherent, images_of_run = FALSE[false]
             with patch.object(false_places, 'RUN', images_of_run):
                 places = false_places.FalsePlaces(share, coherent, 100 * seed + draw)
-                known: set[int] = set()
+                used: set[int] = set()
                 closures, ends = [], []
-                for each in (each for each in found if each.closure is not None):
-                    known |= {each.query, each.place}
-                    place = places.place(each.place, known)
+                for each in (each for each in pairs if each.closure is not None):
+                    used |= {each.query, each.place}
+                    place = places.place(each.place, used)
                     closures.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
                     ends.append((each.query, place, each.place))
             query, place, measured = np.array(ends).T
@@ -165,7 +165,7 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
         length = max(float(np.linalg.norm(T[i + 1, :3, 3] - T[i, :3, 3])), 0.05)
         model = gtsam.noiseModel.Diagonal.Sigmas(deviations * np.sqrt(length))
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, a.between(b), model))
-    known = list(range(graph.size()))
+    indices = list(range(graph.size()))
     for each in drive.closures:
         Z = matrices(each.pose)
         model = gtsam.noiseModel.Gaussian.Covariance(body_covariance(each.covariance, Z))
@@ -176,7 +176,7 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
     if gnc:
         options = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
         options.setLossType(gtsam.GncLossType.TLS)
-        options.setKnownInliers(known)
+        options.setKnownInliers(indices)
         solved = gtsam.GncLMOptimizer(graph, values, options).optimize()
     else:
         solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
@@ -186,9 +186,9 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
 ESTIMATORS = gtsam.noiseModel.mEstimator
 
 
-def settings(**given: Any) -> GraphSettings:
+def settings(**options: Any) -> GraphSettings:
     """Return settings of the graph with other ones of the consistency."""
-    return GraphSettings(consistency=ConsistencySettings(**given))
+    return GraphSettings(consistency=ConsistencySettings(**options))
 
 
 Method = Callable[[Drive], np.ndarray]
@@ -272,14 +272,14 @@ def main() -> None:
     parser.add_argument('--jobs', type=int, default=1, help='processes (%(default)s)')
     parser.add_argument('--folder', type=Path, help='keeps images and pairs')
     parser.add_argument('--gnc', action='store_true', help='GNC on worlds as well: 20 s a drive')
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        folder = given.folder or Path(scratch)
+        folder = options.folder or Path(scratch)
         drives = [kitti(name, alpha) for name in KITTI for alpha in ('0.00', '0.30')]
-        for seed in given.seeds:
-            for draw in range(given.draws):
+        for seed in options.seeds:
+            for draw in range(options.draws):
                 drives += worlds(seed, draw, folder)
-    slow = {drive.name for drive in drives if drive.kind != 'KITTI' and not given.gnc}
+    slow = {drive.name for drive in drives if drive.kind != 'KITTI' and not options.gnc}
     jobs = [
         (drive, method)
         for method in METHODS
@@ -287,7 +287,7 @@ def main() -> None:
         if not (method.startswith('GNC') and drive.name in slow)
     ]
     context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(given.jobs, context) as pool:
+    with ProcessPoolExecutor(options.jobs, context) as pool:
         right = list(tqdm(pool.map(reference, drives), total=len(drives), unit='drive'))
         rows = list(tqdm(pool.map(measure, jobs), total=len(jobs), unit='solution'))
     lines = table(rows, right)

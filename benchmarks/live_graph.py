@@ -4,7 +4,7 @@
 The node of the pose graph as a process, with laps on a circle: what a controller receives.
 
 Delays are from the publication of an odometry to the corrected one, jumps are of the correction,
-at the robot, errors those of the newest corrected pose.
+at the robot, errors are of the newest corrected pose.
 """
 
 import argparse
@@ -57,8 +57,8 @@ class Drive:
     def _on_odometry(self, message: Odometry) -> None:
         self._received[message.header.stamp.sec - 1] = pose_array(message.pose.pose)
 
-    def wait(self, done) -> None:
-        while not done():
+    def wait(self, condition) -> None:
+        while not condition():
             self._executor.spin_once(timeout_sec=0.1)
 
     def wait_for_node(self) -> None:
@@ -99,11 +99,11 @@ class Drive:
     def jumps_and_errors(self) -> tuple[np.ndarray, np.ndarray]:
         """Return how far the correction moved the robot at each image, m, and its errors, m."""
         count = len(self._received)
-        found = matrices(np.array([self._received[i] for i in range(count)]))
+        received = matrices(np.array([self._received[i] for i in range(count)]))
         steps = inverse(matrices(self.poses[: count - 1])) @ matrices(self.poses[1:count])
-        jumps = np.linalg.norm((found[:-1] @ steps)[:, :3, 3] - found[1:, :3, 3], axis=1)
+        jumps = np.linalg.norm((received[:-1] @ steps)[:, :3, 3] - received[1:, :3, 3], axis=1)
         start = matrices(self.poses[0]) @ inverse(self.truth[0])
-        return jumps, np.linalg.norm((start @ self.truth[:count] - found)[:, :3, 3], axis=1)
+        return jumps, np.linalg.norm((start @ self.truth[:count] - received)[:, :3, 3], axis=1)
 
 
 def measure(nodes: int, drift: float, speed: float, period: float) -> str:
@@ -149,13 +149,13 @@ def main() -> None:
     parser.add_argument('--drift', type=float, default=0.3, help='of the odometry (%(default)s)')
     parser.add_argument('--speed', type=float, default=0.0, help='max_correction_speed, m/s')
     parser.add_argument('--period', type=float, default=0.01, help='s between two odometries')
-    given = parser.parse_args()
+    options = parser.parse_args()
     rclpy.init()
     print(f'{cpu_model()}, {commit()}: delays in ms, seconds, jumps and errors in m\n')
     print('| nodes | delay | most | solve all | most | SIGTERM | jump | above .5 | error |')
     print('|---|---|---|---|---|---|---|---|---|')
-    for nodes in given.nodes:
-        print(measure(nodes, given.drift, given.speed, given.period), flush=True)
+    for nodes in options.nodes:
+        print(measure(nodes, options.drift, options.speed, options.period), flush=True)
 
 
 if __name__ == '__main__':

@@ -4,7 +4,7 @@
 Map files: time to the first answer, and memory.
 
 Every start is a process of its own, after imports and a start on a tiny map, which loads compiled
-kernels. The times are those of ``open_map``, of the recognizer, and of its first match; *cold*:
+kernels. The times are of ``open_map``, of the recognizer, and of its first match; *cold*:
 the file was dropped from the page cache before. The floor is the time to read the bytes that the
 matcher keeps, or is made of, from the same file. ``PYTHONPATH=. python benchmarks/maps.py``.
 """
@@ -89,7 +89,7 @@ def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
     recognizer.update(tiny[:1])
     times.append(time.perf_counter())
     used = time.process_time() - used
-    taken = resident_bytes() - before
+    growth = resident_bytes() - before
     file = place_map.features.file
     part = file.parts['statistics/codes' if path.name == 'codes' else 'strips']
     content: np.ndarray = np.ones(part.size, np.uint8)  # pages that are in memory
@@ -102,18 +102,18 @@ def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
         'all': times[-1] - times[0],
         'processor': used,
         'read_once': read,
-        'megabytes': taken / 1e6,
+        'megabytes': growth / 1e6,
         'load': os.getloadavg()[0],
     }
 
 
 def measure(path: Path, case: Case, cache: str, runs: int) -> dict[str, Any]:
     """Return the run of the least time of several, each a process of its own."""
-    found = []
+    starts = []
     for _ in range(runs):
         with ProcessPoolExecutor(1, get_context('spawn')) as pool:
-            found.append(pool.submit(start, path, case.precision, cache).result())
-    best: dict[str, Any] = min(found, key=lambda one: one['all'])
+            starts.append(pool.submit(start, path, case.precision, cache).result())
+    best: dict[str, Any] = min(starts, key=lambda one: one['all'])
     return {'file': case.file, 'precision': case.precision, 'cache': cache, **best}
 
 
@@ -152,8 +152,8 @@ def main() -> None:
     print(', '.join(f'{name}: {size:.0f} MB' for name, size in sizes.items()))
     print('\n'.join(lines(rows)))
     if arguments.output:
-        found = {'processor': cpu_model(), 'places': arguments.places, 'megabytes': sizes}
-        write_json(arguments.output, found | {'starts': rows})
+        document = {'processor': cpu_model(), 'places': arguments.places, 'megabytes': sizes}
+        write_json(arguments.output, document | {'starts': rows})
 
 
 if __name__ == '__main__':

@@ -94,7 +94,7 @@ def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int
     Measure one case in a process of its own.
 
     :param operation: ``localization`` or ``loop_closure``.
-    :param n, d: places and dimensions; 0 = those of ``SIZES``.
+    :param n, d: places and dimensions; 0 = as in ``SIZES``.
     """
     from lower_bounds import ITEM_BYTES
 

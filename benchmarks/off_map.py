@@ -119,10 +119,10 @@ class Outcome:
 
     def calibration(self) -> dict[str, Any]:
         """Return declared probabilities beside the share of right matches."""
-        found = calibrate(self.probabilities, self.correct, self.has_match)
-        if found is None:
+        calibration = calibrate(self.probabilities, self.correct, self.has_match)
+        if calibration is None:
             return {'images': 0, 'bins': [], 'levels': []}
-        document = found.to_json()
+        document = calibration.to_json()
         return document | {'bins': [row for row in document['bins'] if row['images']]}
 
 
@@ -148,11 +148,11 @@ def outcome(
     :param unseen: images whose place was removed; None = none was.
     :param stamps: of the images, ns; None = unknown.
     """
-    found = image_matches(matches_of(place_map, features, stamps), SETTINGS.sequence.length)
+    matches = image_matches(matches_of(place_map, features, stamps), SETTINGS.sequence.length)
     return Outcome(
-        found.accepted,
-        found.probabilities,
-        truth.accepts(found.places),
+        matches.accepted,
+        matches.probabilities,
+        truth.accepts(matches.places),
         truth.has_match,
         np.zeros(len(features), bool) if unseen is None else unseen,
     )
@@ -165,14 +165,14 @@ def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> O
     :param images: of the changed drive that are shown.
     """
     drive = changes.apply(pair.truth)
-    shown = np.arange(len(drive.images))[images]
+    indices = np.arange(len(drive.images))[images]
     unseen = np.any([np.zeros(len(drive.images), bool), *drive.unseen()], axis=0)
     return outcome(
         select_places(pair.places, drive.places) if changes.removed else pair.places,
-        pair.query.features[drive.images[shown]],
-        drive.truth.select(shown),
-        unseen[shown],
-        drive.stamps[shown],
+        pair.query.features[drive.images[indices]],
+        drive.truth.select(indices),
+        unseen[indices],
+        drive.stamps[indices],
     )
 
 
@@ -189,8 +189,8 @@ def stretches(pair: Pair, coarser: int = 1) -> list[tuple[int, int]]:
 def detours(pair: Pair, coarser: int = 1) -> Iterator[Outcome]:
     """Yield the outcome of each stretch that the map lacks."""
     for first, last in stretches(pair, coarser):
-        shown = slice(max(0, first - BEFORE), last + AFTER) if pair.long else slice(None)
-        yield changed(pair, DriveChanges(removed=((first, last),)), shown)
+        stretch = slice(max(0, first - BEFORE), last + AFTER) if pair.long else slice(None)
+        yield changed(pair, DriveChanges(removed=((first, last),)), stretch)
 
 
 def drives(pair: Pair) -> Iterator[tuple[str, Outcome]]:
@@ -208,8 +208,8 @@ def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> in
     :param length: of a window whose images are not counted by stamps.
     """
     for count, match in enumerate(matches, 1):
-        shown = len(match.window_stamps) or length
-        image = count - shown + (shown - 1) // 2  # the middle of the window
+        window = len(match.window_stamps) or length
+        image = count - window + (window - 1) // 2  # the middle of the window
         if match.accepted and match.sequence is not None and image >= 0:
             places = np.full(truth.N, -1)
             places[image] = match.sequence.middle
@@ -228,18 +228,20 @@ def starts(pair: Pair, coarser: int = 1) -> Iterator[tuple[str, list[int | None]
         first = min(max(0, start - 5), len(pair.places) - SMALL_MAP)
         whole, before = (0, len(pair.places)), (start + n // 2) % (n - START_IMAGES)
         stretches = whole, (first, first + SMALL_MAP), whole
-        for (name, found), stretch in zip(counts.items(), stretches, strict=True):
-            kept = np.arange(*stretch)
-            truth = pair.truth.select(images).on_places(kept)
+        for (name, firsts), stretch in zip(counts.items(), stretches, strict=True):
+            places = np.arange(*stretch)
+            truth = pair.truth.select(images).on_places(places)
             if truth.has_match.any():
-                shown = images
+                selection = images
                 if name == JUMP:
-                    shown = np.append(np.arange(before, before + START_IMAGES), images)
-                matches = matches_of(select_places(pair.places, kept), pair.query.features[shown])
+                    selection = np.append(np.arange(before, before + START_IMAGES), images)
+                matches = matches_of(
+                    select_places(pair.places, places), pair.query.features[selection]
+                )
                 length = SETTINGS.sequence.length
-                found.append(first_right(matches[-START_IMAGES:], truth, length))
-    for name, found in counts.items():
-        yield f'{pair.name}/{name}', found
+                firsts.append(first_right(matches[-START_IMAGES:], truth, length))
+    for name, firsts in counts.items():
+        yield f'{pair.name}/{name}', firsts
 
 
 def start_numbers(counts: Sequence[int | None]) -> dict[str, Any]:
@@ -271,7 +273,7 @@ class Measurement:
     coarser: int = 1
     rows: Results = field(default_factory=dict)
     driven: list[Outcome] = field(default_factory=list)
-    left: list[Outcome] = field(default_factory=list)
+    off_map: list[Outcome] = field(default_factory=list)
 
     def add(self, section: str, name: str, values: dict[str, Any]) -> None:
         """Add a row."""
@@ -279,11 +281,11 @@ class Measurement:
 
     def pair(self, pair: Pair) -> None:
         """Add the rows of a pair."""
-        found = dict(drives(pair))
-        for name, each in found.items():
+        by_name = dict(drives(pair))
+        for name, each in by_name.items():
             self.add('drives', name, each.numbers())
-        pooled = [each for name, each in found.items() if not name.endswith(LONG_STOP)]
-        if len(found) > 1:
+        pooled = [each for name, each in by_name.items() if not name.endswith(LONG_STOP)]
+        if len(by_name) > 1:
             self.add('drives', f'{pair.name}/all', Outcome.pooled(pooled).numbers())
         self.driven += pooled
         if not pair.long:
@@ -293,13 +295,13 @@ class Measurement:
         shares = [one['unseen_matched'] / one['unseen'] for one in each if one['unseen']]
         values = Outcome.pooled(outcomes).numbers() | {'positions': len(each)}
         self.add('detours', pair.name, values | {'worst': max(shares, default=0.0)})
-        self.left += outcomes
+        self.off_map += outcomes
         for name, counts in starts(pair, self.coarser):
             self.add('start', name, start_numbers(counts))
 
     def floors(self, floors: dict[str, PlaceMap]) -> None:
         """Add the rows of floors on maps of other floors: each match is wrong."""
-        self.left += self._floors(TOWER, floors, floors)
+        self.off_map += self._floors(TOWER, floors, floors)
         standing = {name: with_standstill(place_map) for name, place_map in floors.items()}
         self._floors(f'{TOWER}, standstill', standing, floors)
 
@@ -307,28 +309,28 @@ class Measurement:
         self, name: str, maps: dict[str, PlaceMap], floors: dict[str, PlaceMap]
     ) -> list[Outcome]:
         pairs = [(a, b) for a in floors for b in floors if a != b][:: self.coarser]
-        shares, found = {}, []
+        shares, outcomes = {}, []
         for map_name, query_name in tqdm(pairs, desc='floors', leave=False):
             place_map, query = maps[map_name], floors[query_name]
             nothing = GroundTruth(len(query), len(place_map), np.zeros(0, np.int64))
             one = outcome(place_map, query.features, nothing)
             shares[f'{query_name} on {map_name}'] = float(one.accepted.mean())
-            found.append(one)
-        pooled = Outcome.pooled(found)
+            outcomes.append(one)
+        pooled = Outcome.pooled(outcomes)
         worst = max(shares, key=shares.__getitem__)
         matched = int(np.count_nonzero(pooled.accepted))
         values = {'images': len(pooled.accepted), 'matched': matched, 'pairs': len(pairs)}
         values['sure'] = int(np.count_nonzero(pooled.sure))
         self.add('floors', name, values | {'worst_pair': worst, 'worst': shares[worst]})
-        return found
+        return outcomes
 
     def finish(self) -> Results:
         """Add the pooled rows, and return all."""
         if self.driven:
             pooled = Outcome.pooled(self.driven)
             self.add('calibration', 'drives', pooled.calibration())
-        if self.left:
-            pooled = Outcome.pooled(self.driven + self.left)
+        if self.off_map:
+            pooled = Outcome.pooled(self.driven + self.off_map)
             self.add('calibration', 'with detours and floors', pooled.calibration())
         return self.rows
 
@@ -340,12 +342,12 @@ def extracted(source: Any, making: FeatureExtractor) -> PlaceMap:
 
 def pairs_of(folder: Path, feature: str, making: FeatureExtractor) -> Iterator[Pair]:
     """Yield the pairs of the data sets; the features of a source are extracted once."""
-    kept: dict[int, tuple[Any, PlaceMap]] = {}  # with its source, so that its id stays its own
+    pairs: dict[int, tuple[Any, PlaceMap]] = {}  # with its source, so that its id stays its own
 
     def features(source: Any) -> PlaceMap:
-        if id(source) not in kept:
-            kept[id(source)] = source, extracted(source, making)
-        return kept[id(source)][1]
+        if id(source) not in pairs:
+            pairs[id(source)] = source, extracted(source, making)
+        return pairs[id(source)][1]
 
     for case in (*short_cases(folder), *long_cases(folder, feature)):
         if case.name not in SETS:
@@ -354,10 +356,10 @@ def pairs_of(folder: Path, feature: str, making: FeatureExtractor) -> Iterator[P
         yield Pair(case.name, places, query, case.truth(len(query), len(places)))
 
 
-def measure(folder: Path, chosen: Sequence[str], coarser: int) -> Results:
+def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
     """Return all rows; report features that are left out."""
     results: Results = {}
-    for feature in chosen:
+    for feature in features:
         try:
             making = extractors(feature, folder)['robust']
         except UnavailableError as error:
@@ -380,8 +382,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
     options = parser.parse_args(arguments)
     about, began = environment(named_commit=options.commit), time.perf_counter()
-    chosen, steps = (('g',), COARSER) if options.quick else (options.features, 1)
-    results = measure(data_folder(), chosen, steps)
+    features, steps = (('g',), COARSER) if options.quick else (options.features, 1)
+    results = measure(data_folder(), features, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     step = 'each' if steps == 1 else f'every {steps}th'
     about |= {'stretches': STRETCHES.format(step=step, long=LONG_STRETCHES // steps)}

@@ -58,24 +58,24 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
         return f', {sum(counts)} declared {LEVEL} or more' if counts else ''
 
     g = feature == 'g'
-    found: dict[str, tuple[str, str]] = {}
-    left, driven, reverse = of('detours'), of('drives'), of('reverse')
+    cells: dict[str, tuple[str, str]] = {}
+    detours, driven, reverse = of('detours'), of('drives'), of('reverse')
     single = {k: v for k, v in driven.items() if not k.endswith('/all')}
-    if left:
-        text = percent(total(left, 'unseen_matched'), total(left, 'unseen'))
-        text += sure(left.values(), 'unseen_sure')
-        found['detours: unseen images matched'] = text, '<= 2 %' if g else '<= 3 %'
+    if detours:
+        text = percent(total(detours, 'unseen_matched'), total(detours, 'unseen'))
+        text += sure(detours.values(), 'unseen_sure')
+        cells['detours: unseen images matched'] = text, '<= 2 %' if g else '<= 3 %'
     for name, row in of('floors').items():
         text = f'{percent(row["matched"], row["images"])} (worst pair {row["worst"]:.1%})'
         text += sure([row])
         _, comma, kind = name.partition(', ')
         label = f'other floors{comma}{kind}: images matched'
-        found[label] = text, '<= 1 %' if g else '<= 2 %'
+        cells[label] = text, '<= 1 %' if g else '<= 2 %'
 
     def best(label: str, names: Sequence[str], aim: float, value: str = 'f1') -> None:
         values = [driven[name][value] for name in names if name in driven]
         if values:
-            found[label] = f'{min(values):.3f}', f'>= {aim}'
+            cells[label] = f'{min(values):.3f}', f'>= {aim}'
 
     best('day / night: best F1', [f'{NIGHT}/same'], 0.97 if g else 0.99)
     slow = [f'{NIGHT}/0.5x', f'{NIGHT}/varying']
@@ -85,26 +85,26 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
     if single:
         worst = min(single, key=lambda name: single[name]['precision'])
         text = f'{single[worst]["precision"]:.3f} ({worst})'
-        found['lowest precision at the default'] = text, '>= 0.95'
+        cells['lowest precision at the default'] = text, '>= 0.95'
     if reverse:
         text = percent(total(reverse, 'wrong'), total(reverse, 'images')) + sure(reverse.values())
-        found['reverse order: images matched wrongly'] = text, '<= 3 %'
+        cells['reverse order: images matched wrongly'] = text, '<= 3 %'
     label, value = 'recall at 100 % precision, all speeds', 'recall_at_100_precision'
     best(f'{label}, by day', [f'{DAY}/all'], 0.9 if g else 0.95, value)
     best(f'{label}, day / night', [f'{NIGHT}/all'], 0.7 if g else 0.9, value)
     for label, is_jump in (('start in the middle', False), (JUMP, True)):
         begun = {k: row for k, row in of('start').items() if k.endswith(JUMP) == is_jump}
         if begun:
-            found[f'{label}: right within 30 images'] = _begun(begun), f'{25 if g else 20} images'
+            cells[f'{label}: right within 30 images'] = _begun(begun), f'{25 if g else 20} images'
     for name, row in of('calibration').items():
         if row['images']:
             text = f'{row["expected_calibration_error"]:.3f}'
-            found[f'calibration: expected error, {name}'] = text, ''
+            cells[f'calibration: expected error, {name}'] = text, ''
             for level in row['levels']:
                 if level['probability'] == LEVEL and level['matched']:
                     label = f'precision where {LEVEL} or more is declared, {name}'
-                    found[label] = f'{level["precision"]:.3f}', '>= 0.93'
-    return found
+                    cells[label] = f'{level["precision"]:.3f}', '>= 0.93'
+    return cells
 
 
 def _begun(rows: dict[str, Any]) -> str:

@@ -31,7 +31,7 @@ from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import open_source
 import torch
 
-LONGEST = 20  # images in a window, our default; 5 and 10 are those of seqNet and of pySeqSLAM
+LONGEST = 20  # images in a window, our default; seqNet has 5, pySeqSLAM 10
 MARGIN = LONGEST // 2  # first and last images, in the middle of no window: not counted
 PLACES = 300  # of Nordland: seqNet takes a millisecond for each pair of windows of 20 images
 PROJECTION = 64  # dimensions of a strip of the network, for the same reason
@@ -74,10 +74,10 @@ def pyseqslam(folder: Path, D: np.ndarray, length: int) -> Matches:
     matching.ds, matching.Rwindow = Whole(length), Whole(matching.Rwindow)
     contrast.R = Whole(contrast.R)
     peer = load(folder / 'pyseqslam/seqslam.py').SeqSLAM(parameters)
-    found = peer.getMatches(peer.enhanceContrast(D).view(Matrix))
-    missing = np.isnan(found).any(axis=1)
-    places = np.where(missing, -1, np.nan_to_num(found[:, 0])).astype(np.int64)
-    return np.minimum(places, len(D) - 1), np.where(missing, np.inf, found[:, 1])
+    matches = peer.getMatches(peer.enhanceContrast(D).view(Matrix))
+    missing = np.isnan(matches).any(axis=1)
+    places = np.where(missing, -1, np.nan_to_num(matches[:, 0])).astype(np.int64)
+    return np.minimum(places, len(D) - 1), np.where(missing, np.inf, matches[:, 1])
 
 
 def seqmatch(folder: Path, places: np.ndarray, queries: np.ndarray, length: int) -> Matches:
@@ -141,7 +141,7 @@ def methods(
 
 
 def numbers(metrics: Any, matches: Matches, truth: GroundTruth) -> dict[str, float]:
-    """Return the metrics of matches by our functions and by those of VPR_Tutorial."""
+    """Return the metrics of matches by our functions and by VPR_Tutorial's."""
     counted, (places, scores) = slice(MARGIN, truth.N - MARGIN), matches
     ours = evaluate_ranking(
         Ranking(places[:, None].astype(np.int64), scores.astype(np.float64)), truth, counted
@@ -184,9 +184,9 @@ def measure(options: Any) -> Iterator[tuple[str, str, str, dict[str, float]]]:
             recorded = case.truth(len(query), len(place_map))
             for drive in ('same', '2x', 'vary') if case.warps else ('same',):
                 images = DriveChanges.named(drive, len(query)).images(len(query))
-                shown, truth = select_places(query, images), recorded.select(images)
+                part, truth = select_places(query, images), recorded.select(images)
                 name = case.name if drive == 'same' else f'{case.name} {drive}'
-                for method, matches in methods(options, place_map, shown, truth):
+                for method, matches in methods(options, place_map, part, truth):
                     yield feature, name, method, numbers(metrics, matches, truth)
 
 
@@ -198,8 +198,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # seqNet's products are too small for more
     about, rows = environment(named_commit=options.commit), []
-    for feature, case, method, found in measure(options):
-        rows.append({'features': feature, 'case': case, 'method': method} | found)
+    for feature, case, method, values in measure(options):
+        rows.append({'features': feature, 'case': case, 'method': method} | values)
         print(json.dumps(rows[-1]), flush=True)
     write_json(options.output / 'peers.json', about | {'rows': rows})
     return 0

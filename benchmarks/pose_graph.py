@@ -53,12 +53,12 @@ def main() -> None:
     parser.add_argument('--nodes', type=int, nargs='+', default=[1000, 3000, 10000])
     parser.add_argument('--updates', type=int, default=200, help='that are timed (%(default)s)')
     parser.add_argument('--drift', type=float, default=0.06, help='of the odometry (%(default)s)')
-    given = parser.parse_args()
+    options = parser.parse_args()
     print(f'{cpu_model()}, {commit()}: processor time of an update in ms\n')
     print('| nodes | edges | median | 90 % | 99 % | most |')
     print('|---|---|---|---|---|---|')
-    for nodes in given.nodes:
-        times, graph = measure(nodes, given.updates, given.drift)
+    for nodes in options.nodes:
+        times, graph = measure(nodes, options.updates, options.drift)
         p50, p90, p99, most = np.percentile(times, [50, 90, 99, 100])
         print(
             f'| {nodes} | {len(graph.used)} | {p50:.0f} | {p90:.0f} | {p99:.0f} | {most:.0f} |',

@@ -92,22 +92,22 @@ def rows(case: Case, kind: str, extractor: FeatureExtractor) -> Iterator[dict[st
         evaluation = evaluate_on_map(
             place_map, images, case.truth(len(query), n), settings, precision=precision
         )
-        found = numbers(evaluation, 'robust')
+        values = numbers(evaluation, 'robust')
         yield {
             'kind': kind,
             'dimension': places.dimension,
             'case': case.name,
             'column': name,
-            'f1': found['sequence']['f1'],
-            'precision': found['at_default']['precision'],
-            'recall': found['at_default']['recall'],
+            'f1': values['sequence']['f1'],
+            'precision': values['at_default']['precision'],
+            'recall': values['at_default']['recall'],
         }
 
 
-def lines(found: list[dict[str, Any]]) -> list[str]:
+def lines(results: list[dict[str, Any]]) -> list[str]:
     """Return a table of the lowest F1, precision and recall over the data sets."""
     of_cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for one in found:
+    for one in results:
         features = f'{one["kind"]}, {one["dimension"]}'
         of_cells.setdefault((features, one['column']), []).append(one)
 
@@ -116,8 +116,8 @@ def lines(found: list[dict[str, Any]]) -> list[str]:
         if not cases:
             return '-'
         numbers = [f'{min(one[key] for one in cases):.3f}' for key in NUMBERS]
-        every = len(of_cells[features, 'all'])
-        return ' '.join(numbers) + (f' ({len(cases)} of {every})' if len(cases) < every else '')
+        total = len(of_cells[features, 'all'])
+        return ' '.join(numbers) + (f' ({len(cases)} of {total})' if len(cases) < total else '')
 
     rows = dict.fromkeys(features for features, _ in of_cells)
     body = [[features, *(cell(features, column) for column in COLUMNS)] for features in rows]
@@ -131,7 +131,7 @@ def main() -> None:
     parser.add_argument('--quick', action='store_true', help='without Nordland')
     parser.add_argument('--output', type=Path, default=RESULTS / 'projection.json')
     arguments = parser.parse_args()
-    folder, found = data_folder(), []
+    folder, results = data_folder(), []
     for kind, extractor in kinds(folder).items():
         if arguments.kinds and kind not in arguments.kinds:
             continue
@@ -141,10 +141,10 @@ def main() -> None:
         for case in cases:
             new = [*rows(case, kind, extractor)]
             print(case.name, lines(new)[2], flush=True)
-            found += new
-    write_json(arguments.output, found)
+            results += new
+    write_json(arguments.output, results)
     if arguments.output == RESULTS / 'projection.json':
-        written_between(PAGE, BEGIN, END, lines(found))
+        written_between(PAGE, BEGIN, END, lines(results))
 
 
 if __name__ == '__main__':

@@ -69,12 +69,12 @@ def clean(*traverses: FrameSource) -> np.ndarray:
     :param traverses: N images each.
     :returns: shape (K,), int64, ascending.
     """
-    kept = np.ones(len(traverses[0]), bool)
+    is_usable = np.ones(len(traverses[0]), bool)
     for source in traverses:
         gray = np.stack([cv2.cvtColor(each.image, cv2.COLOR_RGB2GRAY) for each in source]) * 1.0
-        kept &= gray.std(axis=(1, 2)) >= DARK
-        kept[1:] &= np.abs(np.diff(gray, axis=0)).mean(axis=(1, 2)) >= STILL
-    return np.flatnonzero(kept)
+        is_usable &= gray.std(axis=(1, 2)) >= DARK
+        is_usable[1:] &= np.abs(np.diff(gray, axis=0)).mean(axis=(1, 2)) >= STILL
+    return np.flatnonzero(is_usable)
 
 
 @cache
@@ -84,28 +84,28 @@ def features(path: Path, making: FeatureExtractor) -> PlaceMap:
 
 
 def rows(
-    paths: Sequence[Path], kept: np.ndarray, making: dict[str, Any], lengths: Sequence[int]
+    paths: Sequence[Path], indices: np.ndarray, making: dict[str, Any], lengths: Sequence[int]
 ) -> Iterator[Recalls]:
     """
     Yield the numbers of all methods on a map and a query, in which image i shows place i.
 
     :param paths: of the map and of the query.
-    :param kept: the images of both that are used, shape (K,), int64.
+    :param indices: the images of both that are used, shape (K,), int64.
     :param making: the extractor of each mode; empty for SeqSLAM on its own patches.
     """
-    truths = {t: GroundTruth.identity(len(kept), len(kept), t) for t in TOLERANCES}
+    truths = {t: GroundTruth.identity(len(indices), len(indices), t) for t in TOLERANCES}
     if not making:
         frames = ((frame.image for frame in open_source(path)) for path in reversed(paths))
-        D = differences(*(preprocess(images, SeqSlamSettings())[kept] for images in frames))
+        D = differences(*(preprocess(images, SeqSlamSettings())[indices] for images in frames))
         yield from evaluate_matches('seqslam', match_sequences(D, 'seqslam', lengths), truths)
     for method in METHODS if making else ():
         extractor = making['paper' if method == 'paper' else 'robust']
-        places, query = (select_places(features(path, extractor), kept) for path in paths)
+        places, query = (select_places(features(path, extractor), indices) for path in paths)
         yield from evaluate_protocol(places, query.features, truths, None, (method,), lengths)
 
 
 def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[Row]]]:
-    """Yield key and rows of each data set with each kind of features; report those left out."""
+    """Yield key and rows of each data set and kind of features; report kinds that are left out."""
     for feature in ('g',) if quick else LABELS:
         try:
             making = extractors(feature, folder) if feature in FEATURES else {}
@@ -121,18 +121,18 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[Row]]]:
             variants = {name: np.arange(len(sources[0]))}
             if long:
                 variants[f'{name}_clean'] = clean(*sources)
-            for variant, kept in variants.items():
-                found = rows(paths, kept, making, FEW if costly else LENGTHS)
-                yield f'{variant}/{feature}', [asdict(row) for row in found]
+            for variant, indices in variants.items():
+                recalls = rows(paths, indices, making, FEW if costly else LENGTHS)
+                yield f'{variant}/{feature}', [asdict(row) for row in recalls]
 
 
 def excerpt(results: Results) -> list[str]:
     """Return the table of results/evaluation.md: recall@1, recall at 100 % precision."""
     lines: dict[tuple[str, str], list[str]] = {}
-    for column, (name, *wanted) in enumerate(EXCERPT):
+    for column, (name, *case) in enumerate(EXCERPT):
         for feature, label in LABELS.items():
             for row in results.get(f'{name}/{feature}', ()):
-                if [row['tolerance'], row['length']] == wanted:
+                if [row['tolerance'], row['length']] == case:
                     line = lines.setdefault((label, row['method']), ['-'] * len(EXCERPT))
                     full = row['recall_at_100_precision'][0]
                     line[column] = f'{text(row["recall_at_1"])}, {full:.3f}'
@@ -147,10 +147,10 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
     lines += excerpt(results)
     lines += ['Cells: best F1 / recall@1 / recall at 100 % precision, with 95 % intervals.', '']
     head = ['method', 'images', *(f'+-{t}' for t in TOLERANCES)]
-    for key, found in results.items():
+    for key, entries in results.items():
         name, feature = key.split('/')
         cells: dict[tuple[str, str], list[str]] = {}
-        for row in found:
+        for row in entries:
             estimates = text(row['recall_at_1']), text(row['recall_at_100_precision'])
             cell = ' / '.join([f'{row["f1"]:.3f}', *estimates])
             cells.setdefault((row['method'], str(row['length'])), []).append(cell)

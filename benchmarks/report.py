@@ -60,16 +60,16 @@ def stage_times(rows: Sequence[Row], frame: Row) -> list[float]:
 
 def targets(rows: Sequence[Row], device: str) -> list[dict[str, Any]]:
     """Return the targets of a device: sizes, name, value, limit, and whether it is reached."""
-    found = []
-    for (of_device, stage, mode, n, d), wanted in TARGETS.items():
+    results = []
+    for (of_device, stage, mode, n, d), limits in TARGETS.items():
         own = [r for r in rows if (r.stage, r.mode, r.n, r.d) == (stage, mode, n, d)]
         row = next((r for r in own if r.precision == 'float32'), None)
-        for name, limit in wanted if of_device == device else ():
+        for name, limit in limits if of_device == device else ():
             value, least = value_of(row, name) if row else None, name in AT_LEAST
             reached = None if value is None else value >= limit if least else value <= limit
             sizes = {'stage': stage, 'mode': mode, 'n': n, 'd': d, 'name': name, 'value': value}
-            found.append({**sizes, 'least': least, 'limit': limit, 'outcome': OUTCOME[reached]})
-    return found
+            results.append({**sizes, 'least': least, 'limit': limit, 'outcome': OUTCOME[reached]})
+    return results
 
 
 def report(about: dict[str, Any], run: Run, memory: Sequence[Memory]) -> list[str]:

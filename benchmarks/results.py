@@ -40,7 +40,7 @@ class Row:
     :param runs: number of runs.
     :param lower_bound_s: least time on this machine; 0 = none known.
     :param peers: the fields of each :class:`run.Peer` but its job, its median_s and spread_s from
-        the same interleaved run, and the ratio of its median to that of the stage.
+        the same interleaved run, and the ratio of its median to the stage's.
     :param extra: further values by name.
     """
 
@@ -77,8 +77,8 @@ def commit() -> str:
 
 
 def _cpu_info(pattern: str) -> str:
-    found = re.search(pattern, Path('/proc/cpuinfo').read_text(), re.MULTILINE)
-    return found[1].strip() if found else ''
+    match = re.search(pattern, Path('/proc/cpuinfo').read_text(), re.MULTILINE)
+    return match[1].strip() if match else ''
 
 
 def cpu_model() -> str:
@@ -90,11 +90,11 @@ def versions() -> dict[str, str]:
     """Return the versions of Python, of this package and of the packages that it computes with."""
     from stavpr_ros import __version__
 
-    found = {'python': platform.python_version(), 'stavpr_ros': __version__}
+    packages = {'python': platform.python_version(), 'stavpr_ros': __version__}
     for package in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[package] = importlib.metadata.version(package)
-    return found
+            packages[package] = importlib.metadata.version(package)
+    return packages
 
 
 def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:

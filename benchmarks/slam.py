@@ -56,12 +56,12 @@ def render(seed: int, folder: Path) -> np.ndarray:
     return np.load(path, mmap_mode='r')
 
 
-def falsified(drive: LapDrive, found: list[Found], kind: str, seed: int) -> list[Closure]:
+def falsified(drive: LapDrive, pairs: list[Found], kind: str, seed: int) -> list[Closure]:
     """Return the closures with a share of wrong places."""
-    false, known, result = FalsePlaces(*FALSE[kind], seed), set[int](), []
-    for each in found:
-        known |= {each.query, each.place}
-        place = false.place(each.place, known)
+    false, used, result = FalsePlaces(*FALSE[kind], seed), set[int](), []
+    for each in pairs:
+        used |= {each.query, each.place}
+        place = false.place(each.place, used)
         if each.closure is not None:
             result.append(replace(each.closure, place_stamp=int(drive.stamps[place])))
     return result
@@ -75,9 +75,9 @@ def relative(truth: np.ndarray, query: int, place: int) -> np.ndarray:
 
 def ate(drive: LapDrive, poses: np.ndarray, count: int | None = None) -> float:
     """Return the absolute trajectory error of poses (N, 7) of the first images, m."""
-    known = np.isfinite(poses[:count, 0])
-    stamps, truth = drive.stamps[:count][known], planar_poses(drive.truth[:count])[known]
-    return trajectory_errors(stamps, poses[:count][known], truth)[0]
+    is_known = np.isfinite(poses[:count, 0])
+    stamps, truth = drive.stamps[:count][is_known], planar_poses(drive.truth[:count])[is_known]
+    return trajectory_errors(stamps, poses[:count][is_known], truth)[0]
 
 
 def pass_errors(drive: LapDrive, poses: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ def pass_errors(drive: LapDrive, poses: np.ndarray) -> np.ndarray:
     return np.array(errors)
 
 
-def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[float]]]:
+def edge_errors(drive: LapDrive, pairs: list[Found]) -> dict[str, list[list[float]]]:
     """
     Return all edges that are published, by source, 5 numbers each.
 
@@ -103,7 +103,7 @@ def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[floa
     truly is (m).
     """
     rows: dict[str, list[list[float]]] = {'PNP': [], 'ALIGNED': []}
-    for each in found:
+    for each in pairs:
         true = relative(drive.truth, each.query, each.place)
         if not each.edge.has_pose:
             continue
@@ -115,10 +115,10 @@ def edge_errors(drive: LapDrive, found: list[Found]) -> dict[str, list[list[floa
     return rows
 
 
-def biases(drive: LapDrive, found: list[Found]) -> dict[str, list[float]]:
+def biases(drive: LapDrive, pairs: list[Found]) -> dict[str, list[float]]:
     """Return along the track, on the same lane, what the edge and the place are off, in places."""
     rows: dict[str, list[float]] = {'edge': [], 'place_index': [], 'late': []}
-    for each in found:
+    for each in pairs:
         laps = drive.images[[each.query, each.place], 0].tolist()
         true = relative(drive.truth, each.query, each.place)
         if laps != [2, 0] or np.hypot(*true[:2, 3]) > NEAR or abs(true[1, 3]) > 1:
@@ -130,12 +130,12 @@ def biases(drive: LapDrive, found: list[Found]) -> dict[str, list[float]]:
     return rows
 
 
-def wrong_pairs(drive: LapDrive, found: list[Found], seed: int) -> list[int]:
+def wrong_pairs(drive: LapDrive, pairs: list[Found], seed: int) -> list[int]:
     """Return which queries PnP accepts with places elsewhere, 0 or 1 each."""
     dice, estimator = np.random.default_rng(seed), EdgeEstimator('pnp')
     accepted: list[int] = []
     while len(accepted) < WRONG_PAIRS:
-        a, b = (found[i] for i in dice.integers(len(found), size=2))
+        a, b = (pairs[i] for i in dice.integers(len(pairs), size=2))
         if np.linalg.norm(drive.truth[a.query, :2] - drive.truth[b.place, :2]) < FAR:
             continue
         pair = replace(b.pair, query=a.pair.query, query_poses=a.pair.query_poses)
@@ -143,58 +143,58 @@ def wrong_pairs(drive: LapDrive, found: list[Found], seed: int) -> list[int]:
     return accepted
 
 
-def measure_drift(drive: LapDrive, found: list[Found], seed: int) -> dict[str, Any]:
+def measure_drift(drive: LapDrive, pairs: list[Found], seed: int) -> dict[str, Any]:
     """Return the errors of a drive, without and with false closures."""
     odometry = planar_poses(drive.odometry)
     began = time.thread_time()
-    poses, graph = optimize(drive.stamps, odometry, measured(found))
+    poses, graph = optimize(drive.stamps, odometry, measured(pairs))
     before = ate(drive, odometry)
     right = [
-        np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR for each in found
+        np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR for each in pairs
     ]
     row = {
         'before': before,
         'after': ate(drive, poses),
         'seconds': time.thread_time() - began,
-        'closures': len(found),
+        'closures': len(pairs),
         'right': int(np.sum(right)),
         'rejected': graph.rejected,
         'scale': graph.scale,
         'passes': pass_errors(drive, poses).tolist(),
-        'edges': edge_errors(drive, found),
-        'biases': biases(drive, found),
+        'edges': edge_errors(drive, pairs),
+        'biases': biases(drive, pairs),
         'pnp': sum(
-            each.edge.source is Source.PNP for each, ok in zip(found, right, strict=True) if ok
+            each.edge.source is Source.PNP for each, ok in zip(pairs, right, strict=True) if ok
         ),
     }
     for kind in FALSE:
-        closures = falsified(drive, found, kind, seed)
+        closures = falsified(drive, pairs, kind, seed)
         poses, graph = optimize(drive.stamps, odometry, closures)
         row[kind] = {'after': ate(drive, poses), 'accepted': graph.accepted}
     return row
 
 
-def measure_sessions(drive: LapDrive, found: list[Found], seed: int) -> dict[str, Any]:
+def measure_sessions(drive: LapDrive, pairs: list[Found], seed: int) -> dict[str, Any]:
     """Return the error of two sessions, without and with false closures."""
     odometry, row = planar_poses(drive.odometry), {}
     for kind in ('', 'random 30', 'coherent 30'):
-        closures = falsified(drive, found, kind, seed) if kind else measured(found)
+        closures = falsified(drive, pairs, kind, seed) if kind else measured(pairs)
         poses, _ = optimize(drive.stamps, odometry, closures)
         row[kind or 'after'] = ate(drive, poses)
     return row
 
 
-def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
+def measure_carried(drive: LapDrive, pairs: list[Found]) -> dict[str, Any]:
     """Return the error of a carried robot, and how soon it was small."""
     odometry = planar_poses(drive.odometry)
-    poses, final = optimize(drive.stamps, odometry, measured(found))
+    poses, final = optimize(drive.stamps, odometry, measured(pairs))
     behind = [
         each.known
-        for each in found
+        for each in pairs
         if each.query >= CARRIED.start
         and np.hypot(*relative(drive.truth, each.query, each.place)[:2, 3]) < NEAR
     ]
-    graph, waiting, first, errors = PoseGraph(), list(found), min(behind), []
+    graph, waiting, first, errors = PoseGraph(), list(pairs), min(behind), []
     for i in range(first + ONLINE + 1):
         graph.add_odometry(int(drive.stamps[i]), odometry[i])
         while waiting and waiting[0].known <= i:
@@ -203,9 +203,9 @@ def measure_carried(drive: LapDrive, found: list[Found]) -> dict[str, Any]:
         if i >= first or i % 20 == 0:
             graph.update()
         if i >= first:
-            known = [graph.at(stamp) for stamp in drive.stamps[: i + 1].tolist()]
+            poses_now = [graph.at(stamp) for stamp in drive.stamps[: i + 1].tolist()]
             missing = np.full(7, np.nan)
-            now = np.array([missing if pose is None else pose for pose in known])
+            now = np.array([missing if pose is None else pose for pose in poses_now])
             errors.append(ate(drive, now, i + 1))
     above = np.flatnonzero(np.array(errors) > MIN_ATE)
     return {
@@ -267,22 +267,22 @@ def main() -> None:
     parser.add_argument(
         '--folder', type=Path, help='keeps images, pairs and finished draws: a run continues there'
     )
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        folder = given.folder or Path(scratch)
+        folder = options.folder or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         context = multiprocessing.get_context('spawn')
-        with ProcessPoolExecutor(given.jobs, context) as pool:
+        with ProcessPoolExecutor(options.jobs, context) as pool:
             running = [
-                pool.submit(measure_world, seed, given.draws, folder, folder)
-                for seed in given.seeds
+                pool.submit(measure_world, seed, options.draws, folder, folder)
+                for seed in options.seeds
             ]
-            for done in tqdm(as_completed(running), total=len(running), unit='world'):
-                done.result()
+            for future in tqdm(as_completed(running), total=len(running), unit='world'):
+                future.result()
         rows = [
             json.loads((folder / f'slam-{seed}-{draw}.json').read_text())
-            for seed in given.seeds
-            for draw in range(given.draws)
+            for seed in options.seeds
+            for draw in range(options.draws)
         ]
     page = markdown(environment(), rows)
     write_lines(RESULTS / 'slam.md', page)

@@ -31,7 +31,7 @@ from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.simulated_odometry import drifted
 from tqdm import tqdm
 
-HALLWAY_LENGTH = 40.0  # meters of a lap; those of Gardens Point get that of the street
+HALLWAY_LENGTH = 40.0  # meters of a lap; laps of Gardens Point get the length of the street
 HALLWAY_EXCLUDED = 20  # latest images, as the ground truth has them
 FIRST = 10**9  # ns, the first stamp
 
@@ -86,13 +86,13 @@ def measure(
     images: list[np.ndarray], drive: LapDrive, exclude: int
 ) -> tuple[dict[str, Any], np.ndarray]:
     """Return the errors of a drive, and the optimized poses."""
-    found = with_edges(
+    pairs = with_edges(
         drive, recognize(drive, images, None, exclude), EdgeEstimator(), camera=None
     )
     odometry = planar_poses(drive.odometry)
-    poses, graph = optimize(drive.stamps, odometry, measured(found))
+    poses, graph = optimize(drive.stamps, odometry, measured(pairs))
     before, after = ate(drive, odometry), ate(drive, poses)
-    counts = {'closures': len(found), 'rejected': graph.rejected}
+    counts = {'closures': len(pairs), 'rejected': graph.rejected}
     return {'before': before, 'after': after, 'ratio': after / before, **counts}, poses
 
 
@@ -101,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seeds', type=int, nargs='+', default=[41, 42, 43, 44, 45])
     parser.add_argument('--draws', type=int, default=5, help='of the odometry (%(default)s)')
-    given = parser.parse_args()
+    options = parser.parse_args()
     folder = data_folder()
     sets = {
         'hallway': (hallway(folder), HALLWAY_EXCLUDED),
@@ -109,7 +109,7 @@ def main() -> None:
     }
     rows: list[dict[str, Any]] = []
     drawn: dict[str, tuple[LapDrive, np.ndarray]] = {}
-    cases = list(product(sets, DRIFTS, given.seeds, range(given.draws)))
+    cases = list(product(sets, DRIFTS, options.seeds, range(options.draws)))
     for name, drift, seed, draw in tqdm(cases, unit='drive'):
         (images, at, length), exclude = sets[name]
         drive = drive_of(at, length, seed, draw, DRIFTS[drift])
@@ -132,10 +132,10 @@ def main() -> None:
         ):
             axes.plot(*drive.truth[:, :2].T, color='black', lw=2.2, alpha=0.5, label='truth')
             odometry, truth = planar_poses(drive.odometry), planar_poses(drive.truth)
-            shown = (odometry, '#c44', 'odometry'), (poses, '#07a', 'optimized')
-            for trajectory, color, label in shown:
-                moved = trajectory_errors(drive.stamps, trajectory, truth)[2]
-                axes.plot(*moved[:, :2].T, color=color, lw=1.0, label=label)
+            trajectories = (odometry, '#c44', 'odometry'), (poses, '#07a', 'optimized')
+            for trajectory, color, label in trajectories:
+                aligned = trajectory_errors(drive.stamps, trajectory, truth)[2]
+                axes.plot(*aligned[:, :2].T, color=color, lw=1.0, label=label)
             axes.set_aspect('equal', adjustable='datalim')
             axes.set_title(title)
             axes.legend(loc='upper right')

@@ -54,9 +54,9 @@ def markdown(about: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _spread(values: Iterable[float], digits: int = 3, highest: bool = True) -> tuple[str, str]:
-    found = np.array(list(values))
-    worst = found.max() if highest else found.min()
-    return f'{np.median(found):.{digits}f}', f'{worst:.{digits}f}'
+    numbers = np.array(list(values))
+    worst = numbers.max() if highest else numbers.min()
+    return f'{np.median(numbers):.{digits}f}', f'{worst:.{digits}f}'
 
 
 def _drift_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
@@ -120,7 +120,7 @@ def _edge_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     add('PnP accepted', '90 %', (
         f'{100 * sum(row["pnp"] for row in own[name]) / right[name]:.1f} %' for name in drifts
     ))  # fmt: skip
-    wrong = [taken for row in own['small'] for taken in row.get('wrong', [])]
+    wrong = [errors for row in own['small'] for errors in row.get('wrong', [])]
     add('pairs of wrong places accepted', '0', ('', f'{sum(wrong)} of {len(wrong)}'))
     edges = {
         (name, source): np.concatenate(

@@ -79,7 +79,7 @@ def recognize(
     own = [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
     laps = np.array([0, *np.cumsum([drive.images[lap, 1].max() + 1 for lap in own])])
     pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
-    odometry, found = planar_poses(drive.odometry), []
+    odometry, pairs = planar_poses(drive.odometry), []
     image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
     route: Any = None  # pairs without their map can be kept in a file
     for i, (lap, number) in enumerate(drive.images.tolist()):
@@ -95,8 +95,8 @@ def recognize(
             changes = tuple(zip(window.window_stamps, window.window_changes, strict=True))
             changes = () if window.is_late else changes
             pair = replace(pair, source=route)
-            found.append(Matched(i, query, place, pair, changes, window.is_late))
-    return found
+            pairs.append(Matched(i, query, place, pair, changes, window.is_late))
+    return pairs
 
 
 def recognized(drive: LapDrive, images: np.ndarray, path: Path) -> list[Matched]:
@@ -105,13 +105,13 @@ def recognized(drive: LapDrive, images: np.ndarray, path: Path) -> list[Matched]
         part = path.with_suffix('.part')
         part.write_bytes(pickle.dumps(recognize(drive, images)))
         part.replace(path)
-    found: list[Matched] = pickle.loads(path.read_bytes())
-    return found
+    pairs: list[Matched] = pickle.loads(path.read_bytes())
+    return pairs
 
 
-def measured(found: list[Found]) -> list[Closure]:
+def measured(pairs: list[Found]) -> list[Closure]:
     """Return the closures that are edges of the graph."""
-    return [each.closure for each in found if each.closure is not None]
+    return [each.closure for each in pairs if each.closure is not None]
 
 
 def with_edges(
@@ -121,7 +121,7 @@ def with_edges(
     camera: Camera | None = CAMERA,
 ) -> list[Found]:
     """Return the closures of pairs, in their order."""
-    found = []
+    closures = []
     for each in pairs:
         began = time.thread_time()
         edge = estimator.estimate(each.pair, camera, camera)
@@ -131,7 +131,7 @@ def with_edges(
         closure = None
         if edge.source is not Source.REFUTED:
             closure = Closure(*stamps, *pose, edge.independent, changes=each.changes)
-        found.append(
+        closures.append(
             Found(each.known, each.query, each.place, each.pair, edge, closure, took, each.is_late)
         )
-    return found
+    return closures

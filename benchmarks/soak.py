@@ -117,10 +117,10 @@ def publish(
     from stavpr_msgs.msg import PlaceMatch
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
 
-    found = [Latencies() for _ in names]
+    nodes = [Latencies() for _ in names]
     total = round(arguments.seconds * arguments.rate)
     with ros_node(lambda: rclpy.create_node('camera'), []) as node:
-        for name, one in zip(names, found, strict=True):
+        for name, one in zip(names, nodes, strict=True):
             node.create_subscription(
                 PlaceMatch, f'/{name}/match', one.on_match, QoSProfile(depth=1000)
             )
@@ -135,21 +135,21 @@ def publish(
         def publish_next() -> None:
             message, now = next(messages), time.time_ns()
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
-            for one in found:
+            for one in nodes:
                 one.sent[now] = time.monotonic()
             publisher.publish(message)
 
         messages = islice(cycle(images), total)
         timer = node.create_timer(1 / arguments.rate, publish_next)
-        spin_until(node, lambda: len(found[0].sent) == total)
+        spin_until(node, lambda: len(nodes[0].sent) == total)
         rate = total / (time.monotonic() - began)
         node.destroy_timer(timer)
         end = time.monotonic() + SETTLED
         spin_until(
             node,
-            lambda: all(one.statuses.total() == total for one in found) or time.monotonic() > end,
+            lambda: all(one.statuses.total() == total for one in nodes) or time.monotonic() > end,
         )
-        return [one.figures(total, PlaceMatch.DROPPED) for one in found], rate
+        return [one.figures(total, PlaceMatch.DROPPED) for one in nodes], rate
 
 
 def about(load: float) -> dict[str, Any]:

@@ -52,12 +52,10 @@ Call = Callable[[], Any]
 
 def memory_problem(n: int, d: int, device: str, limit: float) -> str:
     """Return why a map does not fit into memory; empty if it fits."""
-    # features, the recognizer's own, those of a peer, blocks of strip distances
-    needed = 4 * n * d * STRIPS * 3.5 + 2 * 4 * FRAMES * STRIPS**2 * min(n, MATRIX_PLACES)
+    # features, the recognizer's copy, a peer's copy, blocks of strip distances
+    size = 4 * n * d * STRIPS * 3.5 + 2 * 4 * FRAMES * STRIPS**2 * min(n, MATRIX_PLACES)
     limit = min(limit, 0.9 * free_bytes(device))
-    return (
-        '' if needed <= limit else f'needs {needed / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
-    )
+    return '' if size <= limit else f'needs {size / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
 
 
 # ------------------------------------------------ on windows of distances, mode robust
@@ -90,8 +88,8 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
     )
 
     def belief() -> np.ndarray:
-        found = place_filter.belief(n, lag)
-        return place_filter.path(found.states[int(np.argmax(found.weights))], lag)
+        belief = place_filter.belief(n, lag)
+        return place_filter.path(belief.states[int(np.argmax(belief.weights))], lag)
 
     add('filter_belief', call=belief, works=[bounds.filter_belief(sizes)])
 
@@ -125,13 +123,13 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
 
 def sequence_peers(run: Run, window: np.ndarray, ours: SequenceDistances) -> list[Peer]:
     """Return the peers of LM-DTW on the same window; their results must be ours."""
-    found = [_prange_peer(window, ours)]
+    peers = [_prange_peer(window, ours)]
     try:
         from librosa.sequence import dtw  # type: ignore[import-not-found]
     except ImportError:
         run.skip('librosa', 0, 0, 'not installed (requirements/bench.txt)')
-        return found
-    return [*found, librosa_peer(window, dtw)]
+        return peers
+    return [*peers, librosa_peer(window, dtw)]
 
 
 def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
@@ -146,7 +144,7 @@ def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
 
 def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
     """
-    Return librosa as a peer; the sums that it accumulates must be those of plain loops.
+    Return librosa as a peer; the sums that it accumulates must equal the sums of plain loops.
 
     :param dtw: ``librosa.sequence.dtw``.
     """
@@ -289,18 +287,18 @@ def references(
     run: Run, places: LocalFeatures, query: LocalFeatures, precision: str
 ) -> list[Peer]:
     """Return the peers of one image's distances: torch's product, a search for the nearest."""
-    found = [product(run, places, query)]
+    stages = [product(run, places, query)]
     if run.device == 'cpu':
         images, image = (
             each.strips.transpose(1, 0, 2).reshape(len(each), -1) for each in (places, query)
         )
         search = faiss_peer if precision == 'float32' else usearch_peer
         try:
-            found.append(search(images, image))
+            stages.append(search(images, image))
         except ImportError as error:
             name = str(error.name).split('.', maxsplit=1)[0]
             run.skip(name, 0, 0, f'not installed (requirements/{SEARCHES[name]}.txt)')
-    return found
+    return stages
 
 
 def faiss_peer(images: np.ndarray, image: np.ndarray) -> Peer:

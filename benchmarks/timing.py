@@ -64,16 +64,16 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
                 break
         round_s += last
     rounds = max(MIN_RUNS, min(MAX_RUNS, math.ceil(seconds / max(round_s, 1e-9))))
-    taken: dict[str, list[float]] = {name: [] for name in jobs}
+    seconds_of: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(FEWEST_SLOW if round_s > SLOW_S else rounds):
         for name, job in jobs.items():
             first = job()
-            taken[name].append(job() if first < SHORT_S else first)
-    found = {}
-    for name, values in taken.items():
+            seconds_of[name].append(job() if first < SHORT_S else first)
+    timings = {}
+    for name, values in seconds_of.items():
         low, median, high = statistics.quantiles(values, n=4, method='inclusive')
-        found[name] = Timing(median, high - low, len(values))
-    return found
+        timings[name] = Timing(median, high - low, len(values))
+    return timings
 
 
 def best_seconds(call: Callable[[], Any], device: str, seconds: float) -> float:
@@ -81,7 +81,7 @@ def best_seconds(call: Callable[[], Any], device: str, seconds: float) -> float:
     job = timed(call, device)
     job()
     end = time.perf_counter() + seconds
-    taken = [job() for _ in range(3)]
+    durations = [job() for _ in range(3)]
     while time.perf_counter() < end:
-        taken.append(job())
-    return min(taken)
+        durations.append(job())
+    return min(durations)

@@ -60,12 +60,12 @@ def running(names: list[str], kind: str, map_path: Path) -> Iterator[None]:
 def row(result: dict[str, Any]) -> str:
     """Return a line of the table: the worse node of each figure."""
     figures = result['nodes']
-    lost = max(one['lost_in_transport'] for one in figures)
+    losses = max(one['lost_in_transport'] for one in figures)
     dropped = max(one['dropped'] for one in figures)
     p50, p99 = (max(one[f'latency_ms_{p}'] for one in figures) for p in ('p50', 'p99'))
     cells = [result['size'], result['kind'], result['reliability'], str(len(figures))]
     published = figures[0]['images_published']
-    cells += [f'{lost} of {published}', str(dropped), f'{p50:.0f}', f'{p99:.0f}']
+    cells += [f'{losses} of {published}', str(dropped), f'{p50:.0f}', f'{p99:.0f}']
     return f'| {" | ".join(cells)} |'
 
 

@@ -114,8 +114,8 @@ def compare(ours: Path, theirs: Path) -> bool:
 def run(root: Path, site: Path, qemu: str) -> bool:
     """Run everything; return whether all results agree and all tests pass."""
     shared = [str(ROOT), str(ROOT / 'test' / 'shared')]
-    found = os.environ.get('PYTHONPATH', '').split(os.pathsep)
-    native = os.environ | {'PYTHONPATH': os.pathsep.join(shared + found)}
+    paths = os.environ.get('PYTHONPATH', '').split(os.pathsep)
+    native = os.environ | {'PYTHONPATH': os.pathsep.join(shared + paths)}
     emulated = os.environ | {
         'PYTHONPATH': os.pathsep.join([*shared, str(site.absolute())]),
         'NUMBA_CACHE_DIR': str(OUTPUT / 'kernels'),

