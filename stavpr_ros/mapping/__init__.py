@@ -62,7 +62,7 @@ _MODULES = 'trajectory', 'keyframes', 'place_map', 'merging', 'growing_map', 'ma
 
 def __getattr__(name: str) -> Any:
     for module in _MODULES if name in __all__ else ():
-        found = import_module(f'{__name__}.{module}')
-        if hasattr(found, name):
-            return getattr(found, name)
+        owner = import_module(f'{__name__}.{module}')
+        if hasattr(owner, name):
+            return getattr(owner, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

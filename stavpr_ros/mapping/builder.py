@@ -76,18 +76,18 @@ def build_map(
     :raises InputError: no images, no places, poses that do not fit, or another type of argument.
     :raises SettingsError: a rule of motion without poses.
     """
-    given: object = frames
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise InputError(f'frames is {given!r}: expected open_source(path), or another sequence')
+    images: object = frames
+    if isinstance(images, str) or not isinstance(images, Iterable):
+        raise InputError(f'frames is {images!r}: expected open_source(path), or another sequence')
     require_type('extractor', extractor, FeatureExtractor, 'a FeatureExtractor(...)')
     features: list[LocalFeatures] = []
-    found: list[tuple[Place, bytes]] = []
+    rows_of_places: list[tuple[Place, bytes]] = []
     options = keyframes, thumbnail_width if thumbnails else None
     with closing(_extracted(frames, extractor, poses, *options, progress)) as batches:
         for batch, extracted in batches:
             features.append(extracted)
-            found += [(place.known, place.thumbnail) for place in batch]
-    places, encoded = zip(*found, strict=True)
+            rows_of_places += [(place.known, place.thumbnail) for place in batch]
+    places, encoded = zip(*rows_of_places, strict=True)
     rows = np.array([np.full(7, np.nan) if each.pose is None else each.pose for each in places])
     return PlaceMap(
         features=LocalFeatures.concatenate(features),
@@ -131,8 +131,8 @@ def build_journal(
                         features[:1], extractor.projection, np.zeros(1, np.int64), ('',)
                     )
                     writer = JournalWriter.create(target, Base(), template, _ignore, source)
-                for i, (number, _, known, thumbnail) in enumerate(batch):
-                    writer.append(JournalPlace(number, known, features[i : i + 1], thumbnail))
+                for i, (number, _, place, thumbnail) in enumerate(batch):
+                    writer.append(JournalPlace(number, place, features[i : i + 1], thumbnail))
                 if writer.failed:
                     raise JournalError(
                         f'{writer.path} cannot be written: make room, and run the same again: it '
@@ -237,9 +237,9 @@ def _places(
             selector.accept(frame.stamp, pose, frame.image)
         if number > last:
             places += 1
-            known = Place(frame.stamp, plain_text(frame.identifier), pose)
+            place = Place(frame.stamp, plain_text(frame.identifier), pose)
             thumbnail = encode_thumbnail(frame.image, thumbnail_width) if thumbnail_width else b''
-            yield _Place(number, frame.image, known, thumbnail)
+            yield _Place(number, frame.image, place, thumbnail)
     if not images:
         raise InputError('no images to build a map from: the source is empty')
     if not places:

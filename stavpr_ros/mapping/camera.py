@@ -13,7 +13,7 @@ from stavpr_ros.mapping.trajectory import checked_pose
 MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
 FORWARD = (0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5)
 """Pose in the base (x ahead, z up) of an optical frame (z ahead, y down) that looks ahead."""
-ASPECT = 0.02  # by which the proportions of an image may differ from those of the intrinsics
+ASPECT = 0.02  # by which the proportions of an image may differ from the intrinsics' image
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Camera:
         Return the directions in which points of an image are, without distortion.
 
         :param points: pixels (x, y), centers of pixels are whole numbers, shape (m, 2).
-        :param width, height: of the image, which may be smaller than that of the intrinsics.
+        :param width, height: of the image, which may be smaller than the intrinsics' image.
         :returns: x / z and y / z in the optical frame, shape (m, 2), float64.
         """
         if not len(points):

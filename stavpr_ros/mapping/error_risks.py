@@ -27,9 +27,9 @@ class ErrorRisks:
 
     def __post_init__(self) -> None:
         p, risks = np.array(self.probabilities, float), np.array(self.risks, float)
-        ordered = p.shape == risks.shape and (np.diff(p) > 0).all() and (np.diff(risks) <= 0).all()
+        valid = p.shape == risks.shape and (np.diff(p) > 0).all() and (np.diff(risks) <= 0).all()
         # compared so that NaN is rejected
-        if not (ordered and p.size and 0 < p[0] <= p[-1] < 1 and risks[-1] >= 0):
+        if not (valid and p.size and 0 < p[0] <= p[-1] < 1 and risks[-1] >= 0):
             raise InputError(
                 'error risks: expected ascending probabilities between 0 and 1, and as many '
                 'risks, at least 0, none above the one before'

@@ -32,13 +32,13 @@ class GrowingMap:
     :param projection: the random projection of the features, if they have one.
     :param limit: most places kept, at least 1.
     :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
-    :param held_features: returns the features of the places held, in memory of their own, where
-        another object is their owner; None = they are held here.
+    :param held_features: provider of the features of the places, copies, where another object is
+        their owner; None = this object is.
     :raises SettingsError: no room for a place.
-    :raises InputError: the projection is not that of the settings.
+    :raises InputError: the settings name another projection.
     """
 
-    map_id = ''  # that of a PlaceMap is of its file
+    map_id = ''  # a PlaceMap has the id of its file
 
     def __init__(
         self,
@@ -106,14 +106,14 @@ class GrowingMap:
         """
         Return the features of all places, strips (W, n, d): a view, valid until the map changes.
 
-        Where another object holds the features, a copy.
+        Where another object owns the features, a copy.
         """
         if self._held_features is not None:
             return self._held_features()
-        known = {name: rows[: self._count] for name, rows in self._rows.items()}
+        rows_of = {name: rows[: self._count] for name, rows in self._rows.items()}
         W = self.settings.strips
-        strips = known.get('strips', np.empty((0, W, 0), np.float32)).transpose(1, 0, 2)
-        weights = known.get('weights', np.empty((0, W), np.float32)).T
+        strips = rows_of.get('strips', np.empty((0, W, 0), np.float32)).transpose(1, 0, 2)
+        weights = rows_of.get('weights', np.empty((0, W), np.float32)).T
         return LocalFeatures(strips, weights, self.settings, self._cells)
 
     @property
@@ -130,8 +130,8 @@ class GrowingMap:
         """Return stamp, identifier and pose of a place; counted as by :meth:`add`."""
         i = index - self.first
         pose = self.poses[i]
-        known = pose.copy() if np.isfinite(pose).all() else None
-        return Place(int(self.stamps[i]), self.ids[i], known)
+        copy = pose.copy() if np.isfinite(pose).all() else None
+        return Place(int(self.stamps[i]), self.ids[i], copy)
 
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted likewise."""
@@ -148,7 +148,7 @@ class GrowingMap:
         """
         Add a place; an error changes nothing.
 
-        :param features: those of one image, strips (W, 1, d).
+        :param features: of one image, strips (W, 1, d).
         :param stamp: time of its image, ns; 0 = unknown.
         :param pose: x y z (meters) and quaternion x y z w, shape (7,); None = unknown.
         :param thumbnail: a small JPEG, see :func:`encode_thumbnail`.
@@ -213,16 +213,16 @@ class GrowingMap:
         )
 
     def _with_session(self) -> tuple[tuple[Session, ...], np.ndarray | None]:
-        """Return the sessions of a continued map, and one of the places added."""
+        """Return the sessions of a continued map, and a session of the added places."""
         index = self._session_index
         if index is None or len(index) == self._count:
             return self.sessions, index
-        taken = {session.id for session in self.sessions}
+        own_ids = {session.id for session in self.sessions}
         names = (f'recorded-{number}' for number in itertools.count(1))
-        name = next(name for name in names if name not in taken)
-        recorded = Session(name, start=max(int(self.stamps[len(index)]), 0))
+        name = next(name for name in names if name not in own_ids)
+        session_of_route = Session(name, start=max(int(self.stamps[len(index)]), 0))
         added = np.full(self._count - len(index), len(self.sessions), np.int32)
-        return (*self.sessions, recorded), np.concatenate([index, added])
+        return (*self.sessions, session_of_route), np.concatenate([index, added])
 
     def _checked(self, features: LocalFeatures) -> dict[str, np.ndarray]:
         """Return the rows of the features of an image that fits."""
@@ -243,13 +243,13 @@ class GrowingMap:
 
     def _make_room(self, room: int, rows: dict[str, np.ndarray]) -> None:
         """Reallocate every array with a capacity of ``room`` places, of such rows; all or none."""
-        made = {
+        larger = {
             name: np.empty((room, *one.shape[1:]), one.dtype)
             for name, one in (rows | self._rows).items()
         }
         for name, one in self._rows.items():
-            made[name][: self._count] = one[: self._count]
-        self._rows = made
+            larger[name][: self._count] = one[: self._count]
+        self._rows = larger
 
 
 def _rows_of(features: LocalFeatures) -> dict[str, np.ndarray]:

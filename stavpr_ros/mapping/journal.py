@@ -64,7 +64,7 @@ class JournalPlace(NamedTuple):
     """
     A place in a journal.
 
-    :param number: of its image, as the writer counts them; larger than that of the place before.
+    :param number: of its image, as the writer counts them; increases from place to place.
     :param features: of its image, strips (W, 1, d).
     :param thumbnail: a small JPEG, empty = none.
     """
@@ -154,9 +154,9 @@ class JournalReader:
     A journal that no one writes; it stays locked until it is closed.
 
     ``base`` is the map that it continues, ``source`` what it was made of, ``template`` a map of
-    one place with its settings (``template_content`` its file). ``start`` and ``end`` are those of
-    the content of the last whole record, in bytes; ``problem`` the first damage that was found so
-    far, '' = none.
+    one place with its settings (``template_content`` its file). ``start`` and ``end`` are where
+    the content of the last whole record is, in bytes; ``problem`` the first damage that was found
+    so far, '' = none.
 
     :raises JournalError: it cannot be read, or a living program writes it.
     """
@@ -252,8 +252,8 @@ class JournalReader:
             while at < self._size:
                 at = os.lseek(file, at, os.SEEK_DATA)
                 piece = os.pread(file, PIECE, at)
-                if (found := piece.find(MAGIC)) >= 0:
-                    return at + found
+                if (offset := piece.find(MAGIC)) >= 0:
+                    return at + offset
                 at += max(1, len(piece) - len(MAGIC) + 1)
         return self._size
 

@@ -105,8 +105,8 @@ def journals(target: str | Path) -> list[Path]:
     target = Path(target)
     name = re.compile(rf'{re.escape(target.stem)}(-\d+)*{re.escape(target.suffix + SUFFIX)}')
     try:
-        found = [path for path in target.parent.iterdir() if name.fullmatch(path.name)]
-        return sorted(found, key=lambda path: path.stat().st_mtime)
+        paths = [path for path in target.parent.iterdir() if name.fullmatch(path.name)]
+        return sorted(paths, key=lambda path: path.stat().st_mtime)
     except OSError:
         return []
 
@@ -138,8 +138,8 @@ def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
             problems.append(f'{target} lacks the map that the recording continued: {problem}')
         if reader.problem:
             names = numbered(journal.with_name(journal.name + DAMAGED))
-            kept = journal.rename(next(path for path in names if not path.exists()))
-            problems.append(f'{target} may lack places: {reader.problem}; {kept} is kept')
+            damaged = journal.rename(next(path for path in names if not path.exists()))
+            problems.append(f'{target} may lack places: {reader.problem}; {damaged} is kept')
         else:
             journal.unlink()
     places = len(place_map)
@@ -163,10 +163,10 @@ def _continued(base: PlaceMap, recorded: PlaceMap, count: int) -> PlaceMap:
     """Return a map with the recorded places behind it; ``count`` were there when it was opened."""
     growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
     # a map that was saved just before the end has the first places of its journal already
-    saved = base.stamps[count : count + n]
-    known = int(np.cumprod(saved == recorded.stamps[: len(saved)]).sum())
+    stamps = base.stamps[count : count + n]
+    first = int(np.cumprod(stamps == recorded.stamps[: len(stamps)]).sum())
     thumbnails = recorded.thumbnails or [b''] * n
-    for i in range(known, n):
+    for i in range(first, n):
         place = recorded.place(i)
         growing.add(
             recorded.features[i : i + 1], place.stamp, place.identifier, place.pose, thumbnails[i]

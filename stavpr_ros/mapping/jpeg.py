@@ -21,24 +21,24 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
     pixels = np.where(ends > starts, -1, 0)
     padded = np.append(content, np.zeros(FRAME_BYTES, np.uint8))
     # of the images whose header is not found yet: number, and position of the next marker
-    left = np.flatnonzero(ends - starts >= 2 + FRAME_BYTES)
-    left = left[(padded[starts[left]] == 0xFF) & (padded[starts[left] + 1] == 0xD8)]
-    at = starts[left] + 2
+    images = np.flatnonzero(ends - starts >= 2 + FRAME_BYTES)
+    images = images[(padded[starts[images]] == 0xFF) & (padded[starts[images] + 1] == 0xD8)]
+    at = starts[images] + 2
     for _ in range(MAX_SEGMENTS):
-        inside = at + FRAME_BYTES <= ends[left]
-        left, at = left[inside], at[inside]
-        if not len(left):
+        inside = at + FRAME_BYTES <= ends[images]
+        images, at = images[inside], at[inside]
+        if not len(images):
             break
         header = padded[at[:, None] + np.arange(FRAME_BYTES)].astype(np.int64)
         frame = (header[:, 1] >= FIRST_FRAME) & (header[:, 1] <= LAST_FRAME)
         frame &= header[:, 0] == 0xFF
         sizes = (header[:, 5] * 256 + header[:, 6]) * (header[:, 7] * 256 + header[:, 8])
-        pixels[left[frame]] = np.where(sizes[frame] > 0, sizes[frame], -1)
+        pixels[images[frame]] = np.where(sizes[frame] > 0, sizes[frame], -1)
         length = header[:, 2] * 256 + header[:, 3]
         # no frame header after the scan starts (0xDA) or the image ends (0xD9)
         go_on = (header[:, 0] == 0xFF) & (header[:, 1] >= 0xC0) & ~frame & (length >= 2)
         go_on &= (header[:, 1] != 0xDA) & (header[:, 1] != 0xD9)
-        left, at = left[go_on], (at + 2 + length)[go_on]
+        images, at = images[go_on], (at + 2 + length)[go_on]
     return pixels
 
 

@@ -108,7 +108,7 @@ class KeyframeSelector:
         Return why an image is no keyframe by the rules of time and motion.
 
         A rule is met if the stamp or pose of the last keyframe is unknown, or if the stamp is
-        0.1 s or more before that of the last keyframe: the clock has jumped back.
+        0.1 s or more before the last keyframe's: the clock has jumped back.
 
         :param stamp: nanoseconds; 0 = unknown.
         :param pose: where it was taken, shape (7,), see :class:`PlaceMap`; None = unknown.
@@ -119,10 +119,10 @@ class KeyframeSelector:
         if settings.needs_poses and pose is None:
             return 'no odometry for this image, and a minimum distance or angle is set'
         if settings.interval and stamp and self._stamp:
-            passed = stamp - self._stamp
-            if -OUT_OF_ORDER < passed < round(settings.interval * SECOND):
+            elapsed = stamp - self._stamp
+            if -OUT_OF_ORDER < elapsed < round(settings.interval * SECOND):
                 return (
-                    f'{passed / SECOND:.3f} s after the last keyframe: less than '
+                    f'{elapsed / SECOND:.3f} s after the last keyframe: less than '
                     f'{settings.interval:g} s'
                 )
         if settings.needs_poses and self._pose is not None and pose is not None:
@@ -156,19 +156,19 @@ class KeyframeSelector:
         """
         pose = None if pose is None else checked_pose(pose)
         # computed even if the rule is off: it may be on for the next image
-        known, self._compared = self._compared, None
-        gray = known[1] if known is not None and known[0] is image else small_gray(image)
+        last, self._compared = self._compared, None
+        gray = last[1] if last is not None and last[0] is image else small_gray(image)
         self._stamp, self._pose, self._gray = stamp, pose, gray
 
     def _not_moved(self, pose: np.ndarray, last: np.ndarray) -> str:
         rules = self.settings
-        moved, turned = distance(pose, last), rotation(pose, last)
-        far = rules.distance and moved >= rules.distance
-        if far or (rules.angle and turned >= rules.angle):
+        shift, turn = distance(pose, last), rotation(pose, last)
+        far = rules.distance and shift >= rules.distance
+        if far or (rules.angle and turn >= rules.angle):
             return ''
         words = []
         if rules.distance:
-            words.append(f'moved {moved:.3f} m of {rules.distance:g} m')
+            words.append(f'moved {shift:.3f} m of {rules.distance:g} m')
         if rules.angle:
-            words.append(f'turned {turned:.2f} of {rules.angle:g} degrees')
+            words.append(f'turned {turn:.2f} of {rules.angle:g} degrees')
         return ' and '.join(words) + ' since the last keyframe'

@@ -73,8 +73,8 @@ class MapFile:
 
     def __init__(self, file: io.FileIO, path: Path) -> None:
         self.path, self._file = path, file
-        opened = os.fstat(file.fileno())
-        self.size, self._written = opened.st_size, opened.st_mtime_ns
+        status = os.fstat(file.fileno())
+        self.size, self._written = status.st_size, status.st_mtime_ns
         self.map_id = ''
         self.manifest: dict[str, Any] = {}
         self.parts: dict[str, Part] = {}
@@ -215,10 +215,10 @@ def read_json(text: bytes, what: str) -> Any:
     """
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        if len(found) < len(pairs):
+        entries = dict(pairs)
+        if len(entries) < len(pairs):
             raise ValueError('a key is there twice')
-        return found
+        return entries
 
     def constant(name: str) -> None:
         raise ValueError(f'{name} is no number')

@@ -68,13 +68,13 @@ def map_content(file: MapFile) -> PlaceMap:
     settings = _settings(manifest['settings'])
     if 'vectors' in sections:
         _note_vectors(file.path)
-    known = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
-    described = {name: part for name, part in file.parts.items() if name in PARTS}
-    if STATISTICS not in known:
-        described = {n: part for n, part in described.items() if not n.startswith(STATISTICS)}
+    readable = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
+    parts = {name: part for name, part in file.parts.items() if name in PARTS}
+    if STATISTICS not in readable:
+        parts = {n: part for n, part in parts.items() if not n.startswith(STATISTICS)}
     _require_parts(file.parts, sections)
-    sizes = _sizes(described, settings)
-    arrays = {name: file.read(name) for name in described if name not in LARGE}
+    sizes = _sizes(parts, settings)
+    arrays = {name: file.read(name) for name in parts if name not in LARGE}
     if (manifest['projection'] is None) is ('projection' in arrays):
         raise ValueError('the manifest and the parts disagree on whether there is a projection')
     projection = None
@@ -93,12 +93,12 @@ def map_content(file: MapFile) -> PlaceMap:
         content = arrays['ids'].tobytes()
         ids = [content[a:b].decode() for a, b in zip([0, *ends], ends, strict=False)]
     features = StoredFeatures(file, weights, settings, cells)
-    if STATISTICS in known:
+    if STATISTICS in readable:
         features.statistics = statistics_of(file, arrays)
         features.has_stale_statistics = features.statistics is None
 
     def section(name: str, check: Check, make: Callable[..., T]) -> T | None:
-        if name not in known:
+        if name not in readable:
             return None
         check(data := sections[name]['data'], f'section {name}')
         return make(**{k: tuple(v) if type(v) is list else v for k, v in data.items()})
@@ -114,7 +114,7 @@ def map_content(file: MapFile) -> PlaceMap:
         session_index=arrays.get('session'),
         camera=section('intrinsics', INTRINSICS, Camera),
         same_as=arrays.get('same_places/same_as'),
-        threshold=_threshold(sections['threshold']['data']) if 'threshold' in known else None,
+        threshold=_threshold(sections['threshold']['data']) if 'threshold' in readable else None,
         map_id=file.map_id,
         error_risks=section('error_risks', ERROR_RISKS, ErrorRisks),
     )
@@ -141,8 +141,8 @@ def _settings(content: dict[str, Any]) -> FeatureSettings:
     record(rows)(values, f'settings of features {kind}')
     if 'sha256' in rows and not values['sha256']:
         raise ValueError(f'settings of features {kind} lack the sha256 of the model')
-    located = {row.name for row in fields(settings_class(kind))} & {'model'}
-    backbone = settings_class(kind)(**values, **dict.fromkeys(located, ''))
+    paths = {row.name for row in fields(settings_class(kind))} & {'model'}
+    backbone = settings_class(kind)(**values, **dict.fromkeys(paths, ''))
     return FeatureSettings(**{**content, 'backbone': backbone})
 
 
@@ -170,9 +170,9 @@ def _sizes(parts: dict[str, Part], settings: FeatureSettings) -> dict[str, int]:
                 f'part {name} is {dtype} {shape}: expected {" or ".join(types)} {axes}'
             )
         for axis, size in zip(axes, shape, strict=True):
-            known = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
-            if axis != 'bytes' and size != known:
-                raise ValueError(f'part {name} has shape {shape}: expected {known} for {axis}')
+            value = axis if isinstance(axis, int) else sizes.setdefault(axis, size)
+            if axis != 'bytes' and size != value:
+                raise ValueError(f'part {name} has shape {shape}: expected {value} for {axis}')
     if sizes['d'] < 1:
         raise ValueError('the strips have no dimensions')
     return sizes

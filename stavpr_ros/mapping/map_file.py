@@ -39,7 +39,7 @@ def save_map(
     """
     Write a map to a file, all of it or nothing.
 
-    :param storage: of the features, ``float32`` or ``float16``; '' = that of the file where they
+    :param storage: of the features, ``float32`` or ``float16``; '' = as in the file where they
         are, float32 in memory.
     :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
     :param statistics: learned by recognition from the features as they will be stored, see
@@ -87,9 +87,9 @@ def _part(name: str, array: np.ndarray, dtype: str = '') -> Part:
 
 def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
     features, projection, n = place_map.features, place_map.projection, len(place_map)
-    stored = features.storage if isinstance(features, StoredFeatures) else 'float32'
-    require_choice('storage', storage or stored, STORAGE)
-    dtype = STORAGE[storage or stored]
+    own_storage = features.storage if isinstance(features, StoredFeatures) else 'float32'
+    require_choice('storage', storage or own_storage, STORAGE)
+    dtype = STORAGE[storage or own_storage]
     shape = (place_map.settings.strips, n, features.dimension)
     strips = _strips(features, np.dtype(DTYPES[dtype]))
     parts = {'strips': Part(dtype, shape, content=strips)}
@@ -181,7 +181,7 @@ def map_of(file: MapFile) -> PlaceMap:
 
 def verify_map(place_map: PlaceMap, rest: Callable[[float], None] = lambda seconds: None) -> None:
     """
-    Compare all that an opened map left in its file with its hashes; nothing for one in memory.
+    Verify the hashes of the parts that are still on disk; of a map in memory, nothing.
 
     :param rest: called now and then with the seconds of work since; what it raises ends the work.
     :raises MapFileError: names the damaged part and where it is in the file.

@@ -23,9 +23,9 @@ def _rule(is_valid: Callable[[Any], bool], expected: str) -> Check:
     def check(value: Any, where: str) -> None:
         if not is_valid(value):
             size = f' of {len(value)}' if isinstance(value, (list, dict)) else ''
-            shown = f'a {type(value).__name__}{size}' if size else repr(value)[:80]
-            shown = ascii(value[:80]) if isinstance(value, str) else shown
-            raise ValueError(f'{where} is {shown}: expected {expected}')
+            words = f'a {type(value).__name__}{size}' if size else repr(value)[:80]
+            words = ascii(value[:80]) if isinstance(value, str) else words
+            raise ValueError(f'{where} is {words}: expected {expected}')
 
     return check
 
@@ -77,14 +77,14 @@ def nullable(item: Check) -> Check:
 
 def record(keys: dict[str, Check]) -> Check:
     """Take an object with exactly these keys."""
-    listed = ', '.join(keys)
-    is_object = _rule(lambda value: type(value) is dict, f'an object with {listed}')
+    names = ', '.join(keys)
+    is_object = _rule(lambda value: type(value) is dict, f'an object with {names}')
 
     def check(value: Any, where: str) -> None:
         is_object(value, where)
         for key in value.keys() ^ keys.keys():
             state = 'lacks' if key in keys else 'has the unknown'
-            raise ValueError(f'{where} {state} {key[:80]!r}: expected {listed}')
+            raise ValueError(f'{where} {state} {key[:80]!r}: expected {names}')
         for key, item in keys.items():
             item(value[key], f'{where}.{key}')
 

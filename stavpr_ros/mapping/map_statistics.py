@@ -59,7 +59,7 @@ def statistics_of(file: MapFile, arrays: dict[str, np.ndarray]) -> MapStatistics
     """
     data = file.manifest['sections'][STATISTICS]['data']
     DATA(data, f'section {STATISTICS}')
-    found = []
+    values = []
     for name, (least, most) in LIMITS.items():
         part = f'{STATISTICS}/{name}'
         if part not in arrays:
@@ -67,6 +67,6 @@ def statistics_of(file: MapFile, arrays: dict[str, np.ndarray]) -> MapStatistics
         array = arrays[part]
         if array.size and not (array.min() >= least and array.max() <= most):  # NaN included
             raise ValueError(f'part {part} is not between {least} and {most}')
-        found.append(array)
+        values.append(array)
     is_present = data['features'] == features_key(file.parts['strips'].hashes)
-    return MapStatistics(data['method'], *found) if is_present else None
+    return MapStatistics(data['method'], *values) if is_present else None

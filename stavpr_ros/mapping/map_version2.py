@@ -71,22 +71,22 @@ def read_header(file: MapFile) -> None:
 
 
 def features_key(hashes: Sequence[str]) -> str:
-    """Return the hash of features by those of their pieces."""
+    """Return the hash of features by the hashes of their pieces."""
     return hashlib.sha256(''.join(hashes).encode()).hexdigest()
 
 
 def _parts(
-    header: dict[str, Any], listed: dict[str, Any], begin: int, size: int
+    header: dict[str, Any], entries: dict[str, Any], begin: int, size: int
 ) -> dict[str, Part]:
-    """Check that the tensors are those of the manifest and fill the file without gaps."""
-    for name in header.keys() ^ listed.keys():
+    """Check that the tensors are as in the manifest and fill the file without gaps."""
+    for name in header.keys() ^ entries.keys():
         where = 'header, but not in the manifest' if name in header else 'manifest only'
         raise ValueError(f'tensor {name[:80]!r} is in the {where}')
     parts, end = {}, begin
     for name, tensor in header.items():
         _TENSOR(tensor, f'tensor {name}')
     for name in sorted(header, key=lambda name: header[name]['data_offsets']):
-        tensor, entry = header[name], listed[name]
+        tensor, entry = header[name], entries[name]
         if (tensor['dtype'], tensor['shape']) != (entry['dtype'], entry['shape']):
             raise ValueError(f'tensor {name} has another type or shape than in the manifest')
         if tensor['dtype'] not in DTYPES:
@@ -154,14 +154,14 @@ def _header(
 ) -> tuple[bytes, str]:
     """Return the first bytes of the file, a multiple of eight, and the id of the map."""
     header: dict[str, Any] = {}
-    listed: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     end = 0
     for name, part in parts.items():
         start, end = end, end + part.size
-        described = {'dtype': part.dtype, 'shape': part.shape}
-        header[name] = described | {'data_offsets': [start, end]}
-        listed[name] = described | {'sha256': hashes[name]}
-    content = _json({**manifest, 'parts': listed})
+        entry = {'dtype': part.dtype, 'shape': part.shape}
+        header[name] = entry | {'data_offsets': [start, end]}
+        entries[name] = entry | {'sha256': hashes[name]}
+    content = _json({**manifest, 'parts': entries})
     digest = hashlib.sha256(content.encode()).hexdigest()
     header['__metadata__'] = {
         'format': FORMAT,

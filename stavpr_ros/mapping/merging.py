@@ -60,7 +60,7 @@ def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
 
 def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> PlaceMap:
     """
-    Return the places of one session only, or those of all others.
+    Return the places of one session only, or of all others.
 
     :raises InputError: no such session, or nothing is left.
     """
@@ -69,11 +69,11 @@ def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> P
         raise InputError(f'session {session_id!r} is not in the map: it has {ids}')
     number = ids.index(session_id)
     assert place_map.session_index is not None
-    chosen = (place_map.session_index == number) == keep
-    if not chosen.any():
+    is_selected = (place_map.session_index == number) == keep
+    if not is_selected.any():
         raise InputError(f'without session {session_id!r} no place is left')
-    chosen_map = select_places(place_map, np.flatnonzero(chosen))
-    return replace(chosen_map, error_risks=None)  # those of drives on all sessions
+    chosen_map = select_places(place_map, np.flatnonzero(is_selected))
+    return replace(chosen_map, error_risks=None)  # they are of drives on all sessions
 
 
 def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
@@ -81,11 +81,11 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     Return a map of selected places.
 
     A place that is the same as one left out is the same as itself only. Threshold and error risks
-    stay: they are those of drives on the same route.
+    stay: they are of drives on the same route.
 
     :param places: ascending, (m,), int64.
     """
-    chosen, index, same_as = places.tolist(), place_map.session_index, place_map.same_as
+    indices, index, same_as = places.tolist(), place_map.session_index, place_map.same_as
     sessions = place_map.sessions
     if index is not None:
         numbers, index = np.unique(index[places], return_inverse=True)
@@ -99,9 +99,9 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
         place_map,
         features=place_map.features[places],
         stamps=place_map.stamps[places],
-        ids=tuple(place_map.ids[i] for i in chosen),
+        ids=tuple(place_map.ids[i] for i in indices),
         poses=None if place_map.poses is None else place_map.poses[places],
-        thumbnails=tuple(place_map.thumbnails[i] for i in chosen) if place_map.thumbnails else (),
+        thumbnails=tuple(place_map.thumbnails[i] for i in indices) if place_map.thumbnails else (),
         sessions=sessions,
         session_index=index,
         same_as=same_as,
@@ -109,19 +109,19 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     )
 
 
-def _free_id(wanted: str, sessions: list[Session]) -> str:
+def _free_id(base: str, sessions: list[Session]) -> str:
     """Return the id, or the first numbered one that no other session has."""
-    taken = {session.id for session in sessions}
-    names = (wanted if number == 1 else f'{wanted[:60]}-{number}' for number in count(1))
-    return next(name for name in names if name not in taken)
+    others = {session.id for session in sessions}
+    names = (base if number == 1 else f'{base[:60]}-{number}' for number in count(1))
+    return next(name for name in names if name not in others)
 
 
 def _joined_same_as(maps: Sequence[PlaceMap]) -> np.ndarray | None:
     if all(each.same_as is None for each in maps):
         return None
-    joined, first = [], 0
+    parts, first = [], 0
     for each in maps:
         own = np.arange(len(each)) if each.same_as is None else each.same_as
-        joined.append(own + first)
+        parts.append(own + first)
         first += len(each)
-    return np.concatenate(joined).astype(np.int32)
+    return np.concatenate(parts).astype(np.int32)

@@ -19,7 +19,7 @@ from stavpr_ros.mapping.jpeg import is_thumbnail, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.units import SECOND
 
 THUMBNAIL_WIDTH = 192  # pixels
-MAX_SECONDS = 2**31  # of a stamp, since 1970: those of ROS messages
+MAX_SECONDS = 2**31  # of a stamp, since 1970: the range of ROS messages
 LONGEST_ID = 4096  # characters
 
 
@@ -124,12 +124,12 @@ class PlaceMap:
         return len(self.features)
 
     def __repr__(self) -> str:
-        kept = {
+        parts = {
             'poses': self.has_poses,
             'thumbnails': len(self.thumbnails),
             'sessions': len(self.sessions),
         }
-        names = ''.join(f', {name}' for name, value in kept.items() if value)
+        names = ''.join(f', {name}' for name, value in parts.items() if value)
         return f'PlaceMap({len(self)} places, {self.features!r}{names})'
 
     @property
@@ -197,7 +197,7 @@ def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
     """
-    Reject another projection than that of the features.
+    Reject a projection that the settings of the features do not name.
 
     :raises InputError: names both.
     """
@@ -277,10 +277,10 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
 def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     """Return :func:`thumbnail_of` an image as a JPEG."""
     small = thumbnail_of(image, width)
-    done, encoded = cv2.imencode(
+    success, encoded = cv2.imencode(
         '.jpg', cv2.cvtColor(small, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85]
     )
-    if not done:
+    if not success:
         raise InputError(f'no JPEG could be made of an image of shape {image.shape}')
     return encoded.tobytes()
 

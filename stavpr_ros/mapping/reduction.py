@@ -10,7 +10,7 @@ from stavpr_ros.features import LocalFeatures, Projection
 from stavpr_ros.features.extractor import normalize
 from stavpr_ros.mapping.place_map import PlaceMap
 
-BLOCK_PLACES = 1024  # at a time: those of an opened map stay in its file
+BLOCK_PLACES = 1024  # at a time: features of an opened map stay in its file
 STRIPS_A_DIRECTION = 3  # of fewer, directions follow chance (docs/performance.md)
 
 
@@ -21,7 +21,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
     The directions are the same for all strips, and learned from all places. They stay as they are
     when the map grows: images are projected by the matrix of the map.
 
-    :param dimension: at least 1, below that of the features, and so small that the map has
+    :param dimension: at least 1, below the features' dimension, and so small that the map has
         ``STRIPS_A_DIRECTION`` strips for each.
     :raises SettingsError: another dimension.
     """
@@ -59,7 +59,7 @@ def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
 
 
 def _directions(features: LocalFeatures, d: int) -> np.ndarray:
-    """Return the principal directions, (d, m), float64, those of the largest variance last."""
+    """Return the principal directions, (d, m), float64, the largest variance last."""
     W, n = features.weights.shape
     if W * n < d:  # the products of fewer strips than dimensions
         strips = features[:].strips.astype(np.float64)

@@ -28,7 +28,7 @@ class Store:
 
 
 def schemes() -> list[str]:
-    """Return the schemes that have a store, and those of stavpr_fleet."""
+    """Return the schemes that have a store, and the schemes of stavpr_fleet."""
     return sorted({*FLEET, *plugins.load(plugins.STORES)})
 
 
@@ -46,8 +46,8 @@ def store_of(address: str) -> Store:
     :raises UnavailableError: stavpr_fleet has it, and is not installed.
     """
     if not is_address(address):
-        known = ', '.join(f'{name}:' for name in schemes())
-        raise SettingsError(f'{address} is no address: expected one that begins with {known}')
+        names = ', '.join(f'{name}:' for name in schemes())
+        raise SettingsError(f'{address} is no address: expected one that begins with {names}')
     scheme = address.partition(':')[0]
     stores = plugins.load(plugins.STORES)
     if scheme not in stores:

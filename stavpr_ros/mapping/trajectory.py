@@ -64,8 +64,8 @@ def interpolate(a: np.ndarray, b: np.ndarray, part: float) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     start, end = Rotation.from_quat(a[3:]), Rotation.from_quat(b[3:])
-    turned = start * (start.inv() * end) ** part  # scipy's Slerp is three times as slow for two
-    return np.concatenate([(1 - part) * a[:3] + part * b[:3], turned.as_quat()])
+    turn = start * (start.inv() * end) ** part  # scipy's Slerp is three times as slow for two
+    return np.concatenate([(1 - part) * a[:3] + part * b[:3], turn.as_quat()])
 
 
 class Trajectory:

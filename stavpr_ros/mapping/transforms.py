@@ -30,9 +30,9 @@ def to_poses(transforms: np.ndarray) -> np.ndarray:
 def inverse(transforms: np.ndarray) -> np.ndarray:
     """Return the inverses of rigid transforms (..., 4, 4)."""
     result = np.zeros_like(transforms)
-    turned = np.swapaxes(transforms[..., :3, :3], -1, -2)
-    result[..., :3, :3] = turned
-    result[..., :3, 3] = -(turned @ transforms[..., :3, 3, None])[..., 0]
+    R = np.swapaxes(transforms[..., :3, :3], -1, -2)
+    result[..., :3, :3] = R
+    result[..., :3, 3] = -(R @ transforms[..., :3, 3, None])[..., 0]
     result[..., 3, 3] = 1
     return result
 
