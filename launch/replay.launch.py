@@ -33,16 +33,16 @@ SWITCHES = {
 
 def _replay(context: LaunchContext) -> list[Node]:
     """Start the replay with the given options; it waits for the subscription of the node."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in (*OPTIONS, *SWITCHES)}
+    texts = {name: LaunchConfiguration(name).perform(context) for name in (*OPTIONS, *SWITCHES)}
 
     def is_set(name: str) -> bool:
         return LaunchConfiguration(name).perform(context) not in {'', '0', '0.0', 'false', 'False'}
 
     words = [LaunchConfiguration('bag')]
     for name in OPTIONS:
-        if given[name]:
-            words += [f'--{name.replace("_", "-")}', *given[name].split()]
-    if not given['odometry'] and (is_set('keyframe_distance') or is_set('keyframe_angle')):
+        if texts[name]:
+            words += [f'--{name.replace("_", "-")}', *texts[name].split()]
+    if not texts['odometry'] and (is_set('keyframe_distance') or is_set('keyframe_angle')):
         words.append('--odometry')
     for name in ('lossless', 'loop', 'start_paused'):
         if is_set(name):

@@ -20,7 +20,7 @@ class Votes:
     """
 
     def __init__(self, images: int, speeds: Iterable[float]) -> None:
-        self._found: deque[tuple[int, np.ndarray]] = deque(maxlen=images)
+        self._nearest: deque[tuple[int, np.ndarray]] = deque(maxlen=images)
         self._speeds = tuple(speeds)
 
     def add(self, image: int, places: np.ndarray) -> None:
@@ -30,7 +30,7 @@ class Votes:
         :param image: its number.
         :param places: places, nearest first, int64; negative ones do not count.
         """
-        self._found.append((image, places))
+        self._nearest.append((image, places))
 
     def best(self, count: int) -> np.ndarray:
         """
@@ -39,12 +39,12 @@ class Votes:
         With the place p of an image t images ago, it is at p + v t at speed v. Each image has one
         vote in a bin of ``BIN`` places, for its nearest place there.
         """
-        if not self._found:
+        if not self._nearest:
             return np.empty(0, np.int64)
-        newest = self._found[-1][0]
-        places = np.concatenate([near for _, near in self._found])
-        ages = np.concatenate([np.full(len(near), newest - i) for i, near in self._found])
-        votes = np.concatenate([1 / (RANKED + np.arange(len(near))) for _, near in self._found])
+        newest = self._nearest[-1][0]
+        places = np.concatenate([near for _, near in self._nearest])
+        ages = np.concatenate([np.full(len(near), newest - i) for i, near in self._nearest])
+        votes = np.concatenate([1 / (RANKED + np.arange(len(near))) for _, near in self._nearest])
         is_place = places >= 0
         places, ages, votes = places[is_place], ages[is_place], votes[is_place]
         scores: dict[int, float] = {}

@@ -140,7 +140,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._learned = ImageChange(self._sampled, MODEL)
         self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
-        self._wanted = np.zeros(CHUNKS, np.int64)  # number of the image that requested it last
+        self._last_use = np.zeros(CHUNKS, np.int64)  # number of the image that requested it last
         self._places = np.full(CHUNKS * CHUNK, -1)
         self._same_as = self._places.copy()
         self._from_before = np.ones(len(self._places), np.float32)
@@ -162,7 +162,7 @@ class FleetRecognizer(SequenceRecognizer):
         """Drop the images of the query; the loaded chunks stay."""
         self._centering.reset()
         self._images: deque[_Image] = deque(maxlen=HISTORY)
-        self._unasked: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
+        self._vectors: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
         self._votes = Votes(self._settings.sequence.length, MODEL.speeds)
         super().reset()
         self._rebuild()
@@ -188,7 +188,7 @@ class FleetRecognizer(SequenceRecognizer):
         image = _Image(strips, features.weights[:, 0], change, stamp, mean, deviation, z)
         self._images.append(image)
         self._count += 1
-        self._unasked.append((self._count, place_vectors(strips[:, None])))
+        self._vectors.append((self._count, place_vectors(strips[:, None])))
         if self._update_neighborhoods():
             self._rebuild()
         elif len(self._order):
@@ -222,10 +222,10 @@ class FleetRecognizer(SequenceRecognizer):
     def _update_neighborhoods(self) -> bool:
         """Look neighborhoods up if it is time; return whether other places are loaded."""
         if self._pending is None:
-            if len(self._order) and len(self._unasked) < EVERY:
+            if len(self._order) and len(self._vectors) < EVERY:
                 return False
-            queries = list(self._unasked)
-            self._unasked.clear()
+            queries = list(self._vectors)
+            self._vectors.clear()
             loaded, likely = set(self._chunks.tolist()), self._likely()
             votes = self._votes  # of this query, if it is reset meanwhile
             self._pending = call_on_thread(
@@ -280,7 +280,7 @@ class FleetRecognizer(SequenceRecognizer):
 
     def _take(self, lookup: _Lookup) -> bool:
         """Put fetched places into the slots that were requested longest ago."""
-        self._wanted[np.isin(self._chunks, lookup.chunks)] = self._count
+        self._last_use[np.isin(self._chunks, lookup.chunks)] = self._count
         if lookup.fetched is None:
             return False
         self._city.remember(lookup.places, lookup.fetched)
@@ -294,12 +294,12 @@ class FleetRecognizer(SequenceRecognizer):
             np.stack([image.weights for image in images], axis=1),
         )
         chunk_of = lookup.places // CHUNK
-        free = np.lexsort((self._wanted, self._chunks >= 0)).tolist()
+        free = np.lexsort((self._last_use, self._chunks >= 0)).tolist()
         for slot, chunk in zip(free, np.unique(chunk_of).tolist(), strict=False):
             here = np.flatnonzero(chunk_of == chunk)
             all_of_it = slice(slot * CHUNK, (slot + 1) * CHUNK)
             target = slice(slot * CHUNK, slot * CHUNK + len(here))
-            self._chunks[slot], self._wanted[slot] = chunk, self._count
+            self._chunks[slot], self._last_use[slot] = chunk, self._count
             self._places[all_of_it] = -1
             self._places[target] = lookup.places[here]
             self._same_as[target] = lookup.same_as[here]

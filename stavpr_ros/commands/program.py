@@ -36,7 +36,7 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Reject unknown options here, where a subcommand knows its own."""
-        self._given: Sequence[str] = sys.argv[1:] if args is None else args
+        self._arguments: Sequence[str] = sys.argv[1:] if args is None else args
         result, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f'unrecognized arguments: {" ".join(unknown)}')
@@ -45,7 +45,7 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the usage, the error and a suggestion, and exit."""
         options = [name for action in self._actions for name in action.option_strings]
-        for word in self._given:
+        for word in self._arguments:
             name = word.partition('=')[0]
             if name.startswith('--') and not any(each.startswith(name) for each in options):
                 message += suggestion(name, options)

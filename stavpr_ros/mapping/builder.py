@@ -35,7 +35,7 @@ class _Place(NamedTuple):
 
     number: int
     image: np.ndarray
-    known: Place
+    place: Place
     thumbnail: bytes
 
 
@@ -86,7 +86,7 @@ def build_map(
     with closing(_extracted(frames, extractor, poses, *options, progress)) as batches:
         for batch, extracted in batches:
             features.append(extracted)
-            rows_of_places += [(place.known, place.thumbnail) for place in batch]
+            rows_of_places += [(each.place, each.thumbnail) for each in batch]
     places, encoded = zip(*rows_of_places, strict=True)
     rows = np.array([np.full(7, np.nan) if each.pose is None else each.pose for each in places])
     return PlaceMap(
@@ -196,7 +196,7 @@ def _extracted(
         ) as bar,
     ):
         for batch in batches:
-            yield batch, extractor.extract([place.image for place in batch])
+            yield batch, extractor.extract([each.image for each in batch])
             bar.update(batch[-1].number + 1 - bar.n)
 
 

@@ -314,9 +314,9 @@ class PlaceRecognizer(SequenceRecognizer):
         backend: 'str | torch.device' = 'cpu',
         precision: str = 'float32',
     ) -> None:
-        maps, given = 'a PlaceMap, as of load_map() or build_map()', 'RecognizerSettings(...)'
+        maps, expected = 'a PlaceMap, as of load_map() or build_map()', 'RecognizerSettings(...)'
         require_type('place_map', place_map, PlaceMap, maps)
-        require_type('settings', settings, RecognizerSettings, given)
+        require_type('settings', settings, RecognizerSettings, expected)
         backend = choose_backend(backend)
         settings = replace(settings, error_risks=place_map.error_risks)
         features, options = place_map.features, settings.applied_options

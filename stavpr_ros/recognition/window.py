@@ -155,9 +155,9 @@ class SequenceBuffer:
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up, and new ones have room behind them."""
-        kept = self.places - count
-        self.memory[:, :kept] = self.memory[:, count : self.places].copy()
-        self.memory[:, kept : self.places] = np.inf
+        remaining = self.places - count
+        self.memory[:, :remaining] = self.memory[:, count : self.places].copy()
+        self.memory[:, remaining : self.places] = np.inf
         self.known = max(0, self.known - count)
         self.first += count
 

@@ -108,7 +108,7 @@ class CameraInput:
     """
 
     def __init__(self, node: Node, transform: str) -> None:
-        self._node, self._given = node, mount_of(transform)
+        self._node, self._fixed_mount = node, mount_of(transform)
         self._info: CameraInfo | None = None
         self._known: tuple[Any, ...] = ()  # message, frames and camera of the last call
         self.assumed = False
@@ -118,7 +118,7 @@ class CameraInput:
         self._subscription = subscribe(node, CameraInfo, topic, self._on_info, qos)
         self._tf: Any = None
         self._listener: Any = None
-        if self._given is None:
+        if self._fixed_mount is None:
             try:
                 from tf2_ros import Buffer, TransformListener
             except ImportError:
@@ -166,8 +166,8 @@ class CameraInput:
             self._info = info
 
     def _mount(self, base: str, frame: str) -> tuple[float, ...] | None:
-        if self._given is not None:
-            return self._given
+        if self._fixed_mount is not None:
+            return self._fixed_mount
         if base == frame:
             return AT_THE_BASE
         if self._tf is not None:

@@ -163,15 +163,15 @@ class _Loader:
 
     def _read(self, path: str) -> PlaceMap:
         """Read descriptors; those of the map and the query must be comparable."""
-        given = self._arguments
+        args = self._arguments
         names = 'features', 'strips', 'projection'
-        options = {f'--{name}': getattr(given, name) for name in names} | kind_options(given)
+        options = {f'--{name}': getattr(args, name) for name in names} | kind_options(args)
         for option, value in options.items():
             if value is not None:
                 raise SettingsError(
                     f'{option}: {path} holds descriptors as they are; leave it out'
                 )
-        source, bits = given.descriptors_source, given.descriptors_bits
+        source, bits = args.descriptors_source, args.descriptors_bits
         first = self._saved
         if first is not None and first.settings.kind == 'descriptors':
             own = first.settings.backbone
@@ -180,9 +180,9 @@ class _Loader:
         features = read_descriptors(path, source or '', bool(bits))
         if first is not None:
             require_comparable(features, first.settings, first.dimension)
-        found = descriptor_map(features)
-        self._saved = first or found
-        return found
+        place_map = descriptor_map(features)
+        self._saved = first or place_map
+        return place_map
 
     def _load_map(self, path: str) -> PlaceMap:
         """Load a saved map, and refuse options that contradict its features."""

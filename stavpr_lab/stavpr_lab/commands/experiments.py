@@ -254,7 +254,7 @@ def _run(arguments: argparse.Namespace) -> None:
                     reason = _reason(name, dataset, column)
                     blanks.setdefault(reason, []).append(f'{name}, {column.title}')
         numbers = {
-            key: None if found is None else found.to_json() for key, found in metrics.items()
+            key: None if value is None else value.to_json() for key, value in metrics.items()
         }
         cells = [None if row is None else row[metric] for row in numbers.values()]
         label = name

@@ -44,10 +44,10 @@ def read_descriptors(path: str, source: str = '', bits: bool = False) -> LocalFe
     :raises SourceError: the file cannot be read, has no such array, or other numbers or another
         shape than expected; it is uint8 without ``bits``, or not with them.
     """
-    found = _PATH.fullmatch(path)
-    if found is None:
+    match = _PATH.fullmatch(path)
+    if match is None:
         raise SourceError(f'descriptors {path}: expected a file .npy, .npz, .csv or .mat')
-    file, name = Path(found['file']), found['name'] or ''
+    file, name = Path(match['file']), match['name'] or ''
     read = _READERS[file.suffix.lower()]
     try:
         require_regular(file)
@@ -174,9 +174,9 @@ def _chosen(file: Path, name: str, shapes: dict[str, tuple[int, ...]]) -> str:
     if not name and len(able if len(shapes) > 1 else shapes) == 1:
         return (able or list(shapes))[0]
     if name not in shapes:
-        listed = ', '.join(list(shapes)[:20]) or 'none'
+        names = ', '.join(list(shapes)[:20]) or 'none'
         raise SourceError(
-            f'descriptors {file}: {name or "which array"}? Its arrays of numbers are {listed}: '
+            f'descriptors {file}: {name or "which array"}? Its arrays of numbers are {names}: '
             f'give {file}:NAME'
         )
     return name

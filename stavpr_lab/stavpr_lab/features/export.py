@@ -108,7 +108,7 @@ class Chosen(nn.Module):
         self.names = [name for name, output in ((GLOBAL, vector), (MAP, map)) if output]
         self.network = network.eval().float()
         self._vector, self._module, self._map, self._prefix = vector, module, map, prefix_tokens
-        self._kept: list[Any] = []
+        self._module_outputs: list[Any] = []
         if map and module:
             try:
                 inner = network.get_submodule(module)
@@ -118,7 +118,7 @@ class Chosen(nn.Module):
                     f'the network has no module {module!r}: its modules are '
                     f'{", ".join(names[:60])}'
                 ) from error
-            inner.register_forward_hook(lambda *call: self._kept.append(call[-1]))
+            inner.register_forward_hook(lambda *call: self._module_outputs.append(call[-1]))
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """
@@ -127,7 +127,7 @@ class Chosen(nn.Module):
         :raises SettingsError: the network has no such outputs, or of another shape.
         """
         outputs = []
-        self._kept.clear()
+        self._module_outputs.clear()
         results = self.network(images)
         if self._vector:
             vector = one_of(results, self._vector, 'the network')
@@ -138,9 +138,9 @@ class Chosen(nn.Module):
                 )
             outputs.append(vector)
         if self._map:
-            if self._module and not self._kept:
+            if self._module and not self._module_outputs:
                 raise SettingsError(f'module {self._module!r} is not called by the network')
-            owner = self._kept[-1] if self._module else results
+            owner = self._module_outputs[-1] if self._module else results
             output = one_of(owner, self._map, self._module or 'the network')
             name = f'module {self._module!r}' if self._module else f'output {self._map!r}'
             maps = as_maps(output, len(images), self._prefix, name)
