@@ -62,6 +62,6 @@ def accumulated(costs: np.ndarray) -> float:
 
 
 def sample(n: int, k: int, count: int) -> list[int]:
-    """Return ``count`` starts, spread evenly over those with k columns, or all of these."""
+    """Return ``count`` starts, spread evenly over the starts with k columns, or all of these."""
     whole = max(1, n - k + 1)
     return sorted({int(start) for start in np.linspace(0, whole - 1, min(count, whole))})

@@ -3,7 +3,7 @@
 """
 Close loops: ros2 launch stavpr_ros loop_closure.launch.py image:=/camera/image_raw odom:=/odom.
 
-With map_path, the kind of features is that of the map; its places are not compared.
+With map_path, the kind of features is the map's; its places are not compared.
 """
 
 from launch import LaunchDescription

@@ -36,7 +36,7 @@ LOCKED_EXTRAS = (
     'onnx', 'hdf5', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench', 'dev', 'docs',
 )  # fmt: skip
 
-# The files that a package is built from, in build order: each depends on those before.
+# The files that a package is built from, in build order: each depends on earlier ones.
 SOURCES = {
     'stavpr_msgs': ('stavpr_msgs',),
     'stavpr_ros': (

@@ -125,7 +125,7 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
 
 
 class _Images:
-    """Every N-th image of a source; counts those that were read."""
+    """Every N-th image of a source; counts the images that were read."""
 
     def __init__(self, source: 'FolderSource | VideoSource | BagSource', every: int) -> None:
         self._source, self._every = source, every

@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         '--drop-duplicates',
         action='store_true',
         help='without places at which the camera did not move since the place before; of a '
-        'map without poses, also those of a drive through the dark',
+        'map without poses, also the places of a drive through the dark',
     )
     action.add_argument(
         '--drop-thumbnails',
@@ -123,14 +123,14 @@ def _parser() -> argparse.ArgumentParser:
         '--different-routes',
         action='store_true',
         help='do not look for places that several sessions show; it takes the time of driving '
-        'each session once on a map of those before it',
+        'each session once on a map of the earlier ones',
     )
     add_storage(action, '', halves)
     text = 'Write selected sessions of a map to another map.'
     action = add('sessions', _sessions, text, 'map', 'output', force=force)
     group = action.add_mutually_exclusive_group(required=True)
     group.add_argument('--keep', metavar='ID', help='only the places of this session')
-    group.add_argument('--remove', metavar='ID', help='all places except those of this session')
+    group.add_argument('--remove', metavar='ID', help="all places except this session's")
     text = 'Write a map to the home of a fleet, docs/fleet.md.'
     action = add('upload', _upload, text, 'map', force='replace the map that is there')
     action.add_argument(
@@ -144,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     action.add_argument(
         '--output',
         metavar='MAP',
-        help='the file to write; without it that of the recording, or a numbered name beside it',
+        help="the file to write; by default the recording's, or a numbered name beside it",
     )
     return parser
 

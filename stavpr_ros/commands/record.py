@@ -109,7 +109,7 @@ def _write_messages(
     """
     Write messages until a signal; return their number.
 
-    :raises OutputError: a message cannot be written; those before it stay.
+    :raises OutputError: a message cannot be written; earlier ones stay.
     """
     import rclpy
     from rclpy.qos import QoSProfile

@@ -6,7 +6,7 @@ import sys
 
 from stavpr_ros.commands.program import make_parser, run_program
 
-EPILOG = """The folder is NUMBA_CACHE_DIR, or else that of the package or, if it cannot be
+EPILOG = """The folder is NUMBA_CACHE_DIR, or else the package's or, if it cannot be
 written, ~/.cache/stavpr.
 
 exit codes: 0 done; 1 no folder can be written; 2 usage error; 130 interrupted

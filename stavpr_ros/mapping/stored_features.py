@@ -52,7 +52,7 @@ class StoredFeatures(LocalFeatures):
     :param weights: see :class:`LocalFeatures`; in memory.
 
     ``statistics`` is what recognition has learned from them, None = unknown;
-    ``has_stale_statistics`` whether those in the file are of other features.
+    ``has_stale_statistics`` whether the statistics in the file are of other features.
     """
 
     statistics: MapStatistics | None = None

@@ -57,7 +57,7 @@ def _centered(
 
 
 def _related(same_as: np.ndarray, keeper: np.ndarray) -> np.ndarray:
-    """Return the relations of places between those that are kept."""
+    """Return the relations of places between the remaining places."""
     step = same_as[keeper].astype(np.int32)
     while not np.array_equal(step[step], step):
         step = step[step]

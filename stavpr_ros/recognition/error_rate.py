@@ -27,13 +27,13 @@ def least_probability(max_error: float, risks: ErrorRisks | None = None) -> floa
     """
     Return the probability above which matches are wrong at a rate of at most ``max_error``.
 
-    Between the error rates that were measured, the logarithm of the odds is interpolated over that
-    of the rate.
+    Between measured error rates, the logarithm of the odds is interpolated over the logarithm of
+    the rate.
 
     :param max_error: 0.005 to below 1; above 0.1 as 0.1 without risks.
-    :param risks: of drives on the map, instead of those that were measured. Where there are too
-        few, or too many wrong matches, for the rate: the probability above which the mean of
-        their rates is not above it, or that of those that were measured; the stricter applies.
+    :param risks: of drives on the map, instead of the measured ones. Where there are too few, or
+        too many wrong matches, for the rate: the probability above which the mean of their rates
+        is not above it, or the measured probability; the stricter applies.
     :raises SettingsError: out of range.
     """
     if not ERRORS[-1] <= max_error < 1:

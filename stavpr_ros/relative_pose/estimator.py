@@ -62,7 +62,7 @@ class EdgeEstimator:
         obstacle: str = '',
     ) -> Edge:
         """
-        Return the edge of a pair, and whether it is independent of those before.
+        Return the edge of a pair, and whether it is independent of earlier edges.
 
         Where PnP is possible, nothing else replaces it: an edge that keypoints do not confirm has
         no pose.

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A matched pair of images, with all that is known of their surroundings."""
+"""A matched pair of images with the images, poses and distances around them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -21,7 +21,7 @@ exit codes: 0 the map is written; 1 it is not (the reason is printed); 2 usage
 def add_descriptor_options(parser: argparse.ArgumentParser) -> None:
     """Add the settings of descriptors; None = not given."""
     add = parser.add_argument_group('descriptors').add_argument
-    source = 'what computed them, such as netvlad; those of map and query must be equal'
+    source = 'what computed them, such as netvlad; the same for map and query'
     add('--descriptors-source', metavar='NAME', help=source)
     bits = 'true: arrays are uint8 with 8 bits a number, as of numpy.packbits'
     add('--descriptors-bits', type=boolean, metavar='true|false', help=bits)

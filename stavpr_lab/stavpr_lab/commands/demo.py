@@ -113,9 +113,7 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         if arguments.map or arguments.query:
             parser.error('--loop is one traverse: leave --map and --query out')
         if truth == 'identity' or (truth and arguments.loop == SYNTHETIC):
-            parser.error(
-                '--loop FOLDER takes a file as --truth; that of the synthetic street is known'
-            )
+            parser.error('--loop FOLDER takes a file as --truth; the synthetic street has its own')
         if arguments.mode == 'paper' and arguments.threshold is None:
             parser.error('--loop in mode paper needs --threshold')
         return

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of ``evaluate --export``: arrays, and those that programs of other groups read."""
+"""The files of ``evaluate --export``: arrays, and files that programs of other groups read."""
 
 import argparse
 import io

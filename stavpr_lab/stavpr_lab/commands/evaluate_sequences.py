@@ -162,7 +162,7 @@ class _Loader:
         return extracted
 
     def _read(self, path: str) -> PlaceMap:
-        """Read descriptors; those of the map and the query must be comparable."""
+        """Read descriptors; the map's and the query's must be comparable."""
         args = self._arguments
         names = 'features', 'strips', 'projection'
         options = {f'--{name}': getattr(args, name) for name in names} | kind_options(args)

@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add('experiment', choices=(*PRESETS, 'sweep'), help='see below')
     add('--data', metavar='FOLDER', help='the folder of all data sets')
-    datasets = 'data sets to run (those of the paper, or of the field, in --data)'
+    datasets = "data sets to run (the paper's, or the field's, in --data)"
     add('--datasets', nargs='+', metavar='NAME[=FOLDER]', help=datasets)
     add('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
     add('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')

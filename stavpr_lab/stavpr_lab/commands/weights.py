@@ -38,8 +38,8 @@ def main(args: list[str] | None = None) -> int:
         sha256 = arguments.sha256.lower() or published.sha256
         if not sha256:
             raise SettingsError(
-                f'the authors of {published.name} publish no hash: give --sha256, that of a file '
-                'which you trust'
+                f'the authors of {published.name} publish no hash: give --sha256, the hash of a '
+                'file which you trust'
             )
         if len(sha256) != 64 or set(sha256) - set('0123456789abcdef'):
             raise SettingsError(f'--sha256 {sha256}: expected 64 digits 0-9 a-f')

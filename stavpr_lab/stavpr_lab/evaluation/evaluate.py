@@ -80,7 +80,7 @@ class TraverseResults:
     :param seconds: to match each image, features excluded, shape (N,).
     :param windows: distances of up to :data:`WINDOWS` windows.
     :param distances: of all images.
-    :param accepted: of the windows' matches, those that the recognizer accepts, shape (N,), bool.
+    :param accepted: whether the recognizer accepts the window's match, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
     """
 

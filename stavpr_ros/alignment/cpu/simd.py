@@ -5,7 +5,7 @@ Vectors of LANES numbers as a type that numba compiles.
 
 Both recursions run over *lanes*: neighboring map images (or starts) side by side in one SIMD
 register. Left to the compiler, such loops are vectorized depending on the size, an order
-of magnitude apart; written with vectors they are what they say, on every processor. In a kernel
+of magnitude apart; explicit vectors give predictable code on every processor. In a kernel
 ``+ - * / <`` work on vectors as on numbers; ``<`` gives a mask for :func:`select`. IEEE
 arithmetic, nothing is reordered.
 

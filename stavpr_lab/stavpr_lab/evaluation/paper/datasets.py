@@ -147,7 +147,7 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
 
 
 def _images(folder: Path) -> FolderSource:
-    """Return the images of a traverse, those that the list beside it names where there is one."""
+    """Return the images of a traverse, where a list is beside it only the images that it names."""
     images, names = FolderSource(folder), folder.parent / KEPT
     if names.is_file():
         selection = set(names.read_text(encoding='utf-8', errors='replace').split())

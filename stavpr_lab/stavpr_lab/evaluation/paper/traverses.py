@@ -53,7 +53,7 @@ def read_traverse(reader: Reader, folder: Path) -> PosedTraverse:
 def utm_names(folder: Path) -> PosedTraverse:
     """Read the format of VPR-datasets-downloader: images ``@easting@northing@...@.jpg``."""
     images = FolderSource(folder)
-    # the eighth field, pano_id, and those after it follow the order of the recording
+    # the eighth field, pano_id, and later ones follow the order of the recording
     images.files.sort(key=lambda file: list(map(natural_key, file.name.split('@')[7:])))
     positions = [[float(field) for field in file.name.split('@')[1:3]] for file in images.files]
     return PosedTraverse(images, _poses(positions), np.ones(len(images), bool))
