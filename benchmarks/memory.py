@@ -165,7 +165,7 @@ def run_pipeline(
         message = SimpleNamespace(
             height=8, width=8, encoding='rgb8', is_bigendian=False, step=24, data=pixels
         )
-        pipeline.process(message, (i + 1) * 10**9)
+        pipeline.operation.process(message, (i + 1) * 10**9)
     return pipeline
 
 

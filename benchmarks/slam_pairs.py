@@ -84,9 +84,9 @@ def recognize(
     route: Any = None  # pairs without their map can be kept in a file
     for i, (lap, number) in enumerate(drive.images.tolist()):
         record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
-        result = pipeline.process(record, int(drive.stamps[i]), odometry[i], camera)
+        result = pipeline.operation.process(record, int(drive.stamps[i]), odometry[i], camera)
         for each in (result, *result.late):
-            pair = pipeline.matched_pair(each)
+            pair = pipeline.operation.matched_pair(each)
             if pair is None or each.match is None:
                 continue
             window = each.match

@@ -26,8 +26,7 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import descriptor_map, PlaceMap
-from stavpr_ros.pipeline import Pipeline, PipelineSettings
-from stavpr_ros.pipeline.start import LoadedMap
+from stavpr_ros.pipeline import LoadedMap, Pipeline, PipelineSettings
 from stavpr_ros.prepare.centering import MeanCentering, normalize
 from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.matcher import make_matcher
@@ -241,7 +240,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
 
 def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
     """
-    Measure ``Pipeline.process`` of images that match, with the inputs of their edges.
+    Measure ``Operation.process`` of images that match, with the inputs of their edges.
 
     The peer processes images of the same drive that do not match, as no probability is enough.
     """
@@ -270,9 +269,9 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
         limit = min(min_probability, 1 - 1e-9)
         pipeline.change(replace(pipeline.settings, min_probability=limit))
         i = next(following)
-        match = pipeline.process(ImageRecord.of_image(images[i], 0), i, poses[i])
-        pipeline.matched_pair(match)
-        accepted[min_probability] += match.accepted
+        result = pipeline.operation.process(ImageRecord.of_image(images[i], 0), i, poses[i])
+        pipeline.operation.matched_pair(result)
+        accepted[min_probability] += result.accepted
 
     for _ in range(2 * SEQUENCE.length):
         process(0.5)

@@ -69,7 +69,7 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
     monkeypatch.setattr(worker, 'run', run)
     act(node)
     assert until_processed(node, 3).dropped.total == {cause: 3}
-    assert node.runtime.pipeline.window_fill == 0
+    assert node.runtime.pipeline.operation.window_fill == 0
 
 
 def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
@@ -77,7 +77,7 @@ def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
 ):
     node = activated(make_node(operation='mapping'))
     with monkeypatch.context() as defect:
-        defect.setattr(node.runtime.pipeline.extractor, 'extract', lambda images: 1 / 0)
+        defect.setattr(node.runtime.pipeline.operation.extractor, 'extract', lambda images: 1 / 0)
         enqueue(node, route[:1])
         assert until_processed(node, 1).dropped.total == {'internal error': 1}
     enqueue(node, route[:2])
@@ -156,9 +156,9 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make_node, 
     assert node.trigger_configure() == SUCCESS
     node.set_operation('mapping')
     assert set_parameter(node, 'candidates', 3).successful
-    assert node.settings.operation == node.runtime.pipeline.operation == 'mapping'
+    assert node.settings.operation == node.runtime.pipeline.operation.name == 'mapping'
     assert node.trigger_cleanup() == node.trigger_configure() == SUCCESS
-    assert node.settings.operation == node.runtime.pipeline.operation == 'localization'
+    assert node.settings.operation == node.runtime.pipeline.operation.name == 'localization'
 
 
 def test_failed_odometry_subscription_is_the_problem(make_node, map_file):

@@ -74,7 +74,7 @@ def publishing(map_file, monkeypatch):
     def show(images, first=0):
         statuses = []
         for i, image in enumerate(images, first):
-            match = pipeline.process(message(image), (i + 1) * SECOND)
+            match = pipeline.operation.process(message(image), (i + 1) * SECOND)
             navigation.publish(header(i), match, pipeline.places, at(i - 10), 'odom')
             statuses.append(match.accepted)
         return statuses
@@ -103,7 +103,7 @@ def test_initial_pose_is_published_once_for_each_relocalization(publishing, rout
     first = accepted.index(True)
     assert pose.header.stamp.sec == first + 1
     assert pose.pose.pose.position.x == pytest.approx(first, abs=1)
-    publishing.pipeline.reset()  # a new window
+    publishing.pipeline.operation.reset()  # a new window
     assert publishing.show(route[30:45], 30)[:: LENGTH - 1][:2] == [False, True]
     assert len(publishing.initial) == 2
     assert publishing.initial[-1].header.stamp.sec > 30

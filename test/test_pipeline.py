@@ -23,6 +23,7 @@ from pipelines import (
     statuses,
 )
 import pytest
+from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import save_map, Session
@@ -52,27 +53,31 @@ def test_localization_returns_the_matches_of_the_recognizer(
     core = PlaceRecognizer(small_map, pipeline.settings.recognition())
     matches = process(pipeline, images)
     for i, match in enumerate(matches):
-        same_recognition(match, core.update(pipeline.extractor.extract([images[i]])))
+        same_recognition(match, core.update(pipeline.operation.extractor.extract([images[i]])))
         assert match.match.window_stamps == tuple(
             (j + 1) * SECOND for j in range(max(0, i - 4), i + 1)
         )
         assert (match.image_index, match.match.first_image_index, match.inliers) == (-1, -1, -1)
         assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
-    assert (pipeline.map_state, pipeline.window_fill, pipeline.missing) == ('loaded', LENGTH, '')
+    operation = pipeline.operation
+    state = operation.map_state, operation.window_fill, operation.missing
+    assert state == ('loaded', LENGTH, '')
 
 
 def test_missing_map_or_threshold_is_the_reason(map_file, route):
     pipeline = Pipeline(settings_of(mode='paper'))
-    assert (pipeline.map_state, pipeline.places, pipeline.window_fill) == ('none', None, 0)
-    assert 'map_path' in pipeline.missing
+    operation = pipeline.operation
+    state = operation.map_state, operation.places, operation.window_fill
+    assert state == ('none', None, 0)
+    assert 'map_path' in pipeline.operation.missing
     (match,) = process(pipeline, route[:1])
-    assert (match.status, match.reason) == (Status.NOT_READY, pipeline.missing)
+    assert (match.status, match.reason) == (Status.NOT_READY, pipeline.operation.missing)
     assert match.cause == 'not ready'
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    assert (pipeline.map_state, len(pipeline.places)) == ('loaded', 60)
-    assert 'threshold' in pipeline.missing
-    assert process(pipeline, route[:1])[0].reason == pipeline.missing
+    assert (pipeline.operation.map_state, len(pipeline.places)) == ('loaded', 60)
+    assert 'threshold' in pipeline.operation.missing
+    assert process(pipeline, route[:1])[0].reason == pipeline.operation.missing
     pipeline.change(replace(pipeline.settings, threshold=0.2))
     assert statuses(process(pipeline, route[:LENGTH]))[-1] is Status.MATCH
     pipeline.change(replace(pipeline.settings, threshold=None))
@@ -85,19 +90,20 @@ def test_missing_map_or_threshold_is_the_reason(map_file, route):
 def test_paper_takes_the_threshold_of_the_map_unless_it_is_set(small_map, route, tmp_path):
     save_map(replace(small_map, threshold=0.2), tmp_path / 'route.stavpr')
     pipeline = localizing(str(tmp_path / 'route.stavpr'), mode='paper')
-    assert (pipeline.threshold, pipeline.missing) == (0.2, '')
+    assert (pipeline.operation.threshold, pipeline.operation.missing) == (0.2, '')
     match = process(pipeline, route[20:30])[-1]
     assert (match.status, match.threshold) == (Status.MATCH, 0.2)
     for threshold in (0.3, None):
         pipeline.change(replace(pipeline.settings, threshold=threshold))
         (match,) = process(pipeline, route[30:31])
         assert (match.status, match.threshold) == (Status.MATCH, threshold or 0.2)
-    assert localizing(str(tmp_path / 'route.stavpr')).threshold == 1 - MIN_PROBABILITY
+    assert localizing(str(tmp_path / 'route.stavpr')).operation.threshold == 1 - MIN_PROBABILITY
 
 
 def test_mapping_records_places(route):
     pipeline = Pipeline(settings_of(thumbnail_width=64), 'mapping')
-    assert (pipeline.map_state, pipeline.missing, len(pipeline.places)) == ('growing', '', 0)
+    operation = pipeline.operation
+    assert (operation.map_state, operation.missing, len(pipeline.places)) == ('growing', '', 0)
     matches = process(pipeline, route[:4], poses=True) + process(pipeline, route[4:8], first=4)
     assert statuses(matches) == [Status.MAPPED] * 8
     places = pipeline.places.snapshot()
@@ -117,7 +123,8 @@ def test_mapping_stops_at_max_places(route):
     matches = process(pipeline, (route + route)[:103])
     assert statuses(matches) == [Status.MAPPED] * 100 + [Status.NOT_READY] * 3
     assert matches[-1].cause == 'map full'
-    assert (pipeline.map_state, stamps_of(pipeline.places)) == ('full', list(range(1, 101)))
+    assert pipeline.operation.map_state == 'full'
+    assert stamps_of(pipeline.places) == list(range(1, 101))
 
 
 @pytest.mark.parametrize('exclude_seconds', [0.0, 30.0])
@@ -127,12 +134,12 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
     core = LoopCloser(
         pipeline.settings.recognition(),
         EXCLUDED,
-        pipeline.extractor.settings,
+        pipeline.operation.extractor.settings,
         limit=20000,
         exclude_seconds=exclude_seconds,
     )
     for i, match in enumerate(process(pipeline, images, poses=True)):
-        features = pipeline.extractor.extract([images[i]])
+        features = pipeline.operation.extractor.extract([images[i]])
         same_recognition(match, core.update(features, (i + 1) * SECOND, at(i)))
         assert (match.image_index, len(match.match.window_stamps)) == (i, min(i + 1, LENGTH))
         assert match.match.first_image_index == max(0, i - LENGTH + 1)
@@ -140,7 +147,7 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
             assert match.match.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
         if i >= 40 + 2 * LENGTH:
             assert (match.status, match.newest_index) == (Status.MATCH, i - 40)
-    assert (pipeline.map_state, len(pipeline.places)) == ('growing', 80)
+    assert (pipeline.operation.map_state, len(pipeline.places)) == ('growing', 80)
 
 
 def test_loop_closure_evicts_places_and_indices_stay(route):
@@ -176,13 +183,13 @@ def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkey
     matches, rows, earlier = [], [], 0
     for i, image in enumerate(route[:30]):
         (match,) = process(pipeline, [image], first=i, poses=True)
-        row = pipeline.newest_distances()
+        row = pipeline.operation.recognizer.newest_row()
         rows.append(np.pad(row, (0, 60 - len(row)), constant_values=np.inf))
         if len(rows) < LENGTH:
             continue
         with monkeypatch.context() as patch:
             patch.setattr(SequenceBuffer, 'rows', lambda buffer: pytest.fail('the whole window'))
-            pairs = {one: pipeline.matched_pair(one) for one in (match, *match.late)}
+            pairs = {one: pipeline.operation.matched_pair(one) for one in (match, *match.late)}
         for one, pair in pairs.items():
             if pair is None:
                 continue
@@ -210,8 +217,25 @@ def test_matched_pair_without_alignment_copies_nothing_of_the_window(
     pipeline = localizing(map_file)
     match = process(pipeline, route[:LENGTH], poses=has_odometry)[-1]
     monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
-    pair = pipeline.matched_pair(match, relative_pose)
+    pair = pipeline.operation.matched_pair(match, relative_pose)
     assert (pair.place, pair.distances.size, len(pair.thumbnails)) == (match.place_index, 0, 8)
+
+
+def test_matched_pair_of_the_newest_images_alone_is_of_these(route):
+    """After a jump, while images from before it are in the window."""
+    pipeline = recorded(route, 'localization', 60, sequence=SequenceSettings(12))
+    pipeline.change(replace(pipeline.settings, min_probability=0.5))
+    process(pipeline, route[5:22], first=5, poses=True)
+    lengths = []
+    for i in range(35, 44):
+        (result,) = process(pipeline, route[i : i + 1], first=i, poses=True)
+        if (pair := pipeline.operation.matched_pair(result)) is not None:
+            stamps = np.array(result.match.window_stamps)
+            np.testing.assert_array_equal(pair.query_poses[:, 0], stamps // SECOND - 1)
+            assert pair.distances.shape == (len(stamps), len(pair.poses))
+            assert pair.query_pose[0] == pytest.approx(pair.place, abs=2)
+            lengths.append(len(stamps))
+    assert min(lengths) < 12 == pipeline.operation.window_fill
 
 
 def test_matched_pair_has_thumbnails_of_one_session(small_map, route, tmp_path):
@@ -221,7 +245,7 @@ def test_matched_pair_has_thumbnails_of_one_session(small_map, route, tmp_path):
     pipeline = localizing(str(path))
     match = process(pipeline, route[2 : 2 + LENGTH], poses=True)[-1]
     assert match.place_index == 4
-    assert min(pipeline.matched_pair(match, 'pnp').thumbnails) == 3
+    assert min(pipeline.operation.matched_pair(match, 'pnp').thumbnails) == 3
 
 
 @pytest.mark.parametrize('has_poses', [True, False])
@@ -235,7 +259,7 @@ def test_matched_pair_is_not_made_where_a_map_has_no_edges(
     assert match.accepted
     monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
     monkeypatch.setattr(type(pipeline.places.thumbnails), '__getitem__', pytest.fail)
-    assert pipeline.matched_pair(match, 'none' if has_poses else 'auto') is None
+    assert pipeline.operation.matched_pair(match, 'none' if has_poses else 'auto') is None
 
 
 # ------------------------------------------------ changes of operation and map
@@ -248,7 +272,7 @@ def test_change_of_operation_keeps_the_places(route, images):
         pipeline = Pipeline(settings_of(), names[0])
         held, new_route, first = [], [], 0
         for name, count in zip(names, images, strict=True):
-            if name != pipeline.operation:
+            if name != pipeline.operation.name:
                 held, new_route = new_route or held, []
                 mark_saved(pipeline)
                 pipeline.change(operation=name)
@@ -268,7 +292,7 @@ def test_change_of_operation_keeps_the_places(route, images):
             if new_route or held:
                 assert stamps_of(pipeline.snapshot().places) == (new_route or held)
             state = 'growing' if name != 'localization' else 'loaded' if held else 'none'
-            assert (pipeline.operation, pipeline.map_state) == (name, state)
+            assert (pipeline.operation.name, pipeline.operation.map_state) == (name, state)
 
 
 def test_change_that_would_lose_unsaved_places_is_rejected(map_file, route):
@@ -278,18 +302,19 @@ def test_change_that_would_lose_unsaved_places_is_rejected(map_file, route):
     for change in ({'operation': 'loop_closure'}, {'loaded': loaded}):
         with pytest.raises(InputError, match='7 places that are not saved'):
             pipeline.change(**change)
-        assert (pipeline.operation, len(pipeline.places), pipeline.path) == ('mapping', 7, '')
+        assert (pipeline.operation.name, len(pipeline.places)) == ('mapping', 7)
+        assert pipeline.save_state.path == ''
     pipeline.change(operation='localization')
     assert (len(pipeline.places), pipeline.unsaved) == (7, 7)
     pipeline.change(loaded=loaded)  # discards them
-    assert (len(pipeline.places), pipeline.path, pipeline.unsaved) == (60, map_file, 0)
+    assert (len(pipeline.places), pipeline.save_state.path, pipeline.unsaved) == (60, map_file, 0)
     pipeline.change(operation='loop_closure')
     process(pipeline, route[:3])
     with pytest.raises(InputError, match='recorded route would be lost'):
         pipeline.change(loaded=loaded)
     assert len(pipeline.places) == 3
     pipeline.change(operation='localization')
-    assert (len(pipeline.places), pipeline.path, pipeline.unsaved) == (3, '', 3)
+    assert (len(pipeline.places), pipeline.save_state.path, pipeline.unsaved) == (3, '', 3)
     with pytest.raises(InputError, match='3 places that are not saved'):
         pipeline.change(operation='loop_closure')
     pipeline.change(operation='localization', loaded=loaded)
@@ -297,7 +322,7 @@ def test_change_that_would_lose_unsaved_places_is_rejected(map_file, route):
     process(pipeline, route[4:5])
     mark_saved(pipeline)
     pipeline.change(loaded=loaded)
-    assert (len(pipeline.places), pipeline.path) == (60, map_file)
+    assert (len(pipeline.places), pipeline.save_state.path) == (60, map_file)
 
 
 def test_change_of_operation_that_fails_changes_nothing(map_file, route):
@@ -312,8 +337,9 @@ def test_change_of_operation_that_fails_changes_nothing(map_file, route):
     ):
         with pytest.raises(error, match=words):
             pipeline.change(replace(pipeline.settings, min_probability=0.9), name, places_of)
-        assert (pipeline.operation, pipeline.places) == ('localization', places)
-        assert (pipeline.window_fill, pipeline.threshold) == (LENGTH, 1 - MIN_PROBABILITY)
+        assert (pipeline.operation.name, pipeline.places) == ('localization', places)
+        assert pipeline.operation.window_fill == LENGTH
+        assert pipeline.operation.threshold == 1 - MIN_PROBABILITY
     assert process(pipeline, route[5:6], first=5)[0].newest_index == 5
     pipeline.change(operation='localization')  # the current one: the window stays
     assert process(pipeline, route[6:7], first=6)[0].newest_index == 6
@@ -323,10 +349,10 @@ def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline = Pipeline(settings_of(), 'loop_closure')
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
     # the map file is not that of the route
-    assert (len(pipeline.places), pipeline.path) == (0, '')
-    assert pipeline.extractor.settings.projection is not None
+    assert (len(pipeline.places), pipeline.save_state.path) == (0, '')
+    assert pipeline.operation.extractor.settings.projection is not None
     pipeline.change(operation='localization')
-    assert (len(pipeline.places), pipeline.path) == (60, map_file)
+    assert (len(pipeline.places), pipeline.save_state.path) == (60, map_file)
     pipeline.change(operation='loop_closure')
     process(pipeline, route[:8])
     assert pipeline.places.features.strips.shape == (7, 8, 64)

@@ -50,7 +50,8 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     match = process(pipeline, route[12:13], first=12)[0]
     assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 12, 0.9)
     assert len(match.candidates) == 1
-    assert pipeline.process(message(route[13]), 14, list_candidates=False).candidates == ()
+    match = pipeline.operation.process(message(route[13]), 14, list_candidates=False)
+    assert match.candidates == ()
     pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
     match = process(pipeline, route[13:14], first=13)[0]
     assert match.threshold == pytest.approx(0.03)
@@ -84,7 +85,7 @@ def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
     assert (accepted.status, accepted.reason, accepted.place_index) == (Status.MATCH, '', 7)
     found = PlaceVerifier(check).inliers(thumbnail_of(route[7]), pipeline.places, 7)
     assert accepted.inliers == found >= 100
-    pipeline.reset()
+    pipeline.operation.reset()
     process(pipeline, route[: CERTAIN + 2])  # the same images again
     pipeline.change(replace(pipeline.settings, geometric=replace(check, min_inliers=found + 1)))
     match = process(pipeline, route[9:10], first=9)[0]
@@ -172,25 +173,25 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     """
     keyframes = KeyframeSettings(change=0.01)
     pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
-    extract = Failing(pipeline.extractor.extract)
-    monkeypatch.setattr(pipeline.extractor, 'extract', extract)
+    extract = Failing(pipeline.operation.extractor.extract)
+    monkeypatch.setattr(pipeline.operation.extractor, 'extract', extract)
     thumbnail = Failing(lambda image: b'')
-    monkeypatch.setattr('stavpr_ros.pipeline.pipeline.encode_thumbnail', thumbnail)
+    monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
     cut_off = message(route[0])
     object.__setattr__(cut_off, 'data', cut_off.data[:100])
     for i, image in enumerate(route[:12] if operation != 'mapping' else route[30:42]):
-        broken = pipeline.process(cut_off, i)
+        broken = pipeline.operation.process(cut_off, i)
         assert (broken.status, broken.cause) == (Status.INVALID_IMAGE, 'invalid: cut off')
         extract.error = ImageError('not finite', kind='features')
-        broken = pipeline.process(message(image), i)
+        broken = pipeline.operation.process(message(image), i)
         assert (broken.cause, broken.reason) == ('invalid: features', 'not finite')
         extract.error = None
         if operation != 'localization':
             thumbnail.error = InputError('no JPEG')
-            assert pipeline.process(message(image), i).cause == 'invalid: InputError'
+            assert pipeline.operation.process(message(image), i).cause == 'invalid: InputError'
             thumbnail.error = None
         with pytest.raises(InputError, match='quaternion of norm 0'):
-            pipeline.process(message(image), i, np.zeros(7))
+            pipeline.operation.process(message(image), i, np.zeros(7))
         good, expected = (
             process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
         )
@@ -206,10 +207,10 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
 def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     pipeline = recorded(route, operation, keyframes=KeyframeSettings(change=0.01))
     process(pipeline, route[:LENGTH])
-    assert pipeline.window_fill == LENGTH
+    assert pipeline.operation.window_fill == LENGTH
     places = len(pipeline.places)
-    pipeline.reset()
-    assert (pipeline.window_fill, len(pipeline.places)) == (0, places)
+    pipeline.operation.reset()
+    assert (pipeline.operation.window_fill, len(pipeline.places)) == (0, places)
     # the first equals the last keyframe
     matches = process(pipeline, route[4 : 4 + LENGTH], first=100)
     waiting = statuses(matches).count(Status.WARMING_UP)
@@ -231,7 +232,7 @@ def test_saving_that_fails_leaves_places_unsaved_and_the_file_unchanged(route, t
     process(pipeline, route[:3])
     with pytest.raises(OutputError, match='make it first'):
         save(pipeline, tmp_path / 'missing' / 'recorded.stavpr')
-    assert (save(pipeline, path), pipeline.path, pipeline.unsaved) == (3, str(path), 0)
+    assert (save(pipeline, path), pipeline.save_state.path, pipeline.unsaved) == (3, str(path), 0)
     process(pipeline, route[3:4], first=3)
     with pytest.raises(OutputError, match='exists already'):
         save(pipeline, path)

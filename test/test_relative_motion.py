@@ -202,11 +202,11 @@ def test_pipeline_compares_the_pose_of_each_image(small_map, route, tmp_path):
     pipeline = localizing(str(tmp_path / 'turned.stavpr'))
     images = route[5:25]
     assert process(pipeline, images)[-1].accepted
-    pipeline.reset()
+    pipeline.operation.reset()
     match = None
     for i, image in enumerate(images):
         pose = poses_of(track(-90, 9, 20, step=2.0))[i]
-        match = pipeline.process(message(image), (i + 1) * 10**9, pose)
+        match = pipeline.operation.process(message(image), (i + 1) * 10**9, pose)
     assert match.status is Status.NO_MATCH
     assert 'odometry disagrees' in match.reason
 

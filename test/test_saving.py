@@ -110,7 +110,7 @@ def test_write_map_leaves_places_recorded_meanwhile_unsaved(mapping, route, tmp_
 
     path = str(tmp_path / 'route.stavpr')
     assert write_map(mapping, on_worker, path, overwrite=False) == 7
-    assert (mapping.unsaved, mapping.path) == (3, path)
+    assert (mapping.unsaved, mapping.save_state.path) == (3, path)
 
 
 @pytest.mark.parametrize('another', [False, True])
@@ -125,7 +125,7 @@ def test_write_map_keeps_the_state_of_a_map_loaded_meanwhile(another, mapping, m
         return result
 
     write_map(mapping, on_worker, path, overwrite=False)
-    assert (mapping.unsaved, mapping.path) == (0, map_file if another else path)
+    assert (mapping.unsaved, mapping.save_state.path) == (0, map_file if another else path)
     assert mapping.save_state.owned(map_file) == (FileVersion.of(map_file) if another else False)
 
 

@@ -127,4 +127,4 @@ def test_decode_of_large_image_cut_off_is_rejected(image):
 def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes, rows):
     settings = settings_of(feature_settings=f'{{"resize": "{resize}"}}', **changes)
     pipeline = Pipeline(settings, 'mapping')
-    assert pipeline.process(raw(image), 1).image.shape[0] == rows
+    assert pipeline.operation.process(raw(image), 1).image.shape[0] == rows

@@ -81,7 +81,7 @@ def test_rolled_or_tilted_camera_is_matched_by_the_view_that_undoes_it(
     plain = matched(process(localizer(night_map, other_views=False), images))
     matches = process(pipeline, images)
     assert matched(matches) >= plain + 15
-    assert pipeline.view == view
+    assert pipeline.operation.view == view
     assert matches[-1].candidates[0].place == matches[-1].place_index
 
 
@@ -93,47 +93,47 @@ def test_camera_as_that_of_the_map_is_matched_as_without_other_views(night_map):
         assert matched(matches) > 2 * LENGTH
         found.append([(match.place_index, match.probability) for match in matches])
     assert found[0] == found[1]
-    assert pipeline.view == AS_THEY_ARE
+    assert pipeline.operation.view == AS_THEY_ARE
 
 
 def test_other_street_is_matched_in_no_view(night_map):
     pipeline = localizer(night_map)
     assert matched(process(pipeline, drive(street=1))) == 0
-    assert pipeline.view == AS_THEY_ARE
+    assert pipeline.operation.view == AS_THEY_ARE
 
 
 def test_views_are_followed_again_after_two_windows_without_a_match(night_map):
     pipeline, images = localizer(night_map), drive(roll=10)
     process(pipeline, images)
-    assert pipeline.view == RIGHT
+    assert pipeline.operation.view == RIGHT
     process(pipeline, drive(street=1), first=PLACES)
     images = drive(roll=-10)
     assert matched(process(pipeline, images, first=2 * PLACES)) > LENGTH
-    assert pipeline.view == LEFT
-    pipeline.reset()
-    assert pipeline.view == AS_THEY_ARE
+    assert pipeline.operation.view == LEFT
+    pipeline.operation.reset()
+    assert pipeline.operation.view == AS_THEY_ARE
     assert matched(process(pipeline, drive(), first=3 * PLACES)) > 2 * LENGTH
 
 
 def test_standing_camera_adopts_no_view(night_map):
     pipeline = localizer(night_map, keyframes=KeyframeSettings(change=0.0))
     images, adopted = drive(roll=10), 0
-    while pipeline.view == AS_THEY_ARE:
+    while pipeline.operation.view == AS_THEY_ARE:
         process(pipeline, images[adopted : adopted + 1], first=adopted)
         adopted += 1
-    pipeline.reset()
+    pipeline.operation.reset()
     process(pipeline, images[: adopted - IN_A_ROW + 1])
     process(pipeline, images[adopted - IN_A_ROW : adopted - IN_A_ROW + 1] * 2 * IN_A_ROW, adopted)
-    assert pipeline.view == AS_THEY_ARE
+    assert pipeline.operation.view == AS_THEY_ARE
     process(pipeline, images[adopted - IN_A_ROW + 1 : adopted], 3 * PLACES)
-    assert pipeline.view == RIGHT
+    assert pipeline.operation.view == RIGHT
 
 
 def test_limits_apply_to_all_views(night_map):
     pipeline, strict = localizer(night_map), 1 - 1e-9
     pipeline.change(replace(pipeline.settings, min_probability=strict))
     matches = process(pipeline, drive(roll=10))
-    assert pipeline.view == RIGHT  # by the probability, whatever limit it has to exceed
+    assert pipeline.operation.view == RIGHT  # by the probability, whatever limit it has to exceed
     assert not any(match.accepted for match in matches)
     assert {match.match.min_probability for match in matches} == {strict}
 

@@ -79,9 +79,10 @@ def localized(map_file, route):
 
 def test_visualization_without_subscribers_publishes_and_draws_nothing(localized, monkeypatch):
     pipeline, match = localized
-    monkeypatch.setattr(pipeline, 'newest_distances', lambda: pytest.fail('not requested'))
+    recognizer = pipeline.operation.recognizer
+    monkeypatch.setattr(recognizer, 'newest_row', lambda: pytest.fail('not requested'))
     views, publishers = views_of()
-    views.publish(header(), match, pipeline, 'map')
+    views.publish(header(), match, pipeline.operation, 'map')
     views.publish_route(pipeline.places, 'map')
     assert set(publishers.by_topic) == TOPICS
     assert not any(publisher.messages for publisher in publishers.by_topic.values())
@@ -93,7 +94,7 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
     assert match.accepted
     views, publishers = views_of('map_path', 'matched_path', 'markers')
     for i in range(2):
-        views.publish(header(i), match, pipeline, 'map')
+        views.publish(header(i), match, pipeline.operation, 'map')
     (route,) = publishers.messages('map_path')  # it has not changed
     assert route.header.frame_id == 'map'
     assert [stamped.pose.position.x for stamped in route.poses] == list(range(60))
@@ -114,7 +115,7 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
 def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
     pipeline, _ = localized
     views, publishers = views_of(*TOPICS)
-    views.publish(header(), ImageResult(Status.DROPPED, 'because'), pipeline, 'map')
+    views.publish(header(), ImageResult(Status.DROPPED, 'because'), pipeline.operation, 'map')
     assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
     assert not publishers.messages('matched_path')
     assert not publishers.messages('match_image/compressed')
@@ -125,7 +126,7 @@ def test_visualization_of_loop_closures_connects_query_and_place(route):
     views, publishers = views_of('markers', 'map_path')
     matches = process(pipeline, route[:30], first=30, poses=True)
     for i, match in enumerate(matches):
-        views.publish(header(i), match, pipeline, 'odom')
+        views.publish(header(i), match, pipeline.operation, 'odom')
     accepted = [match for match in matches if match.accepted]
     lines = publishers.messages('markers')[-1].markers[1]
     assert lines.type == Marker.LINE_LIST
@@ -142,7 +143,7 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
     matches = process(pipeline, route[: LENGTH + 4])
     for i, match in enumerate(matches):
         odometry = np.array([0.1 * i, i, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])
-        views.publish(header(i), match, pipeline, 'map', odometry)
+        views.publish(header(i), match, pipeline.operation, 'map', odometry)
     accepted = [match for match in matches if match.accepted]
     assert len(accepted) > 2
     lines = publishers.messages('markers')[-1].markers[1]
@@ -153,7 +154,7 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
     pose = pipeline.places.place(accepted[-1].newest_index).pose
     assert place.x == pose[0]
     assert np.hypot(query.x - place.x, query.y - place.y) == pytest.approx(0.1, abs=1e-6)
-    views.publish(header(99), matches[0], localizing(map_file), 'map', odometry)
+    views.publish(header(99), matches[0], localizing(map_file).operation, 'map', odometry)
     assert len(publishers.messages('markers')[-1].markers) == 1  # another map: deleted
 
 
@@ -162,7 +163,10 @@ def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     views, publishers = views_of('map_path')
     for i in range(30):
         views.publish(
-            header(), process(pipeline, route[30 + i : 31 + i], 30 + i, True)[0], pipeline, ''
+            header(),
+            process(pipeline, route[30 + i : 31 + i], 30 + i, True)[0],
+            pipeline.operation,
+            '',
         )
     sizes = [len(message.poses) for message in publishers.messages('map_path')]
     assert sizes[0] == 31
@@ -174,7 +178,7 @@ def test_visualization_in_another_frame_starts_again(localized):
     pipeline, match = localized
     views, publishers = views_of('matched_path', 'map_path')
     for frame in ('map', 'map', 'odom'):
-        views.publish(header(), match, pipeline, frame)
+        views.publish(header(), match, pipeline.operation, frame)
     assert [len(m.poses) for m in publishers.messages('matched_path')] == [1, 2, 1]
     assert [m.header.frame_id for m in publishers.messages('map_path')] == ['map', 'odom']
 
@@ -182,12 +186,12 @@ def test_visualization_in_another_frame_starts_again(localized):
 def test_visualization_of_distances_is_the_newest_row(localized):
     pipeline, match = localized
     views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
-    views.publish(header(), match, pipeline, 'map')
+    views.publish(header(), match, pipeline.operation, 'map')
     (row,) = publishers.messages('distances')
     assert (row.encoding, row.width) == ('32FC2', 60)
     values, numbers = np.frombuffer(row.data, np.float32).reshape(-1, 2).T
     assert numbers.tolist() == list(range(60))
-    np.testing.assert_array_equal(values, pipeline.newest_distances())
+    np.testing.assert_array_equal(values, pipeline.operation.recognizer.newest_row())
     assert values.argmin() == match.newest_index
     assert len(publishers.messages('window_image')) == 1
     (jpeg,) = publishers.messages('match_image/compressed')
@@ -206,8 +210,9 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     route.first = 3000
     row = np.arange(1200, dtype=np.float32)
     views, publishers = views_of('distances')
-    pipeline = SimpleNamespace(places=route, newest_distances=lambda: row)
-    views.publish(header(), ImageResult(Status.NO_MATCH), pipeline, 'map')
+    recognizer = SimpleNamespace(window_fill=1, newest_row=lambda: row)
+    operation = SimpleNamespace(places=route, recognizer=recognizer)
+    views.publish(header(), ImageResult(Status.NO_MATCH), operation, 'map')
     (message,) = publishers.messages('distances')
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
     assert (message.width, numbers[0]) == (512, 3000)
@@ -216,11 +221,11 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
 
 def test_distances_of_a_window_that_fills_are_those_of_its_images(map_file, route):
     pipeline, rows = localizing(map_file), []
-    assert pipeline.newest_distances().shape == (0,)
     for i in range(LENGTH + 2):
-        pipeline.process(message(route[i]), (i + 1) * SECOND)
-        rows = [*rows, pipeline.newest_distances()][-LENGTH:]
-        np.testing.assert_array_equal(pipeline.window_distances(np.arange(60)), rows)
+        pipeline.operation.process(message(route[i]), (i + 1) * SECOND)
+        rows = [*rows, pipeline.operation.recognizer.newest_row()][-LENGTH:]
+        window = pipeline.operation.recognizer.window_columns(np.arange(60))
+        np.testing.assert_array_equal(window, rows)
 
 
 @pytest.mark.parametrize(

@@ -310,7 +310,10 @@ def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, ca
     assert 'faiss:' in capsys.readouterr().err
     pipeline = Pipeline(settings_of())
     pipeline.change(loaded=read_map(address, pipeline.settings))
-    matches = [pipeline.process(message(image), (i + 1) * SECOND) for i, image in enumerate(route)]
+    matches = [
+        pipeline.operation.process(message(image), (i + 1) * SECOND)
+        for i, image in enumerate(route)
+    ]
     assert [match.probability > MIN_PROBABILITY for match in matches[20:]] == [True] * 40
     assert abs(matches[-1].newest_index - 59) <= 1
     assert pipeline.places.place(40).identifier == 'place 40'

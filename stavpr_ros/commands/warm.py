@@ -27,7 +27,8 @@ def _run(_: object) -> None:
     from stavpr_ros.errors import OutputError
     from stavpr_ros.mapping import build_map
     from stavpr_ros.pipeline import PipelineSettings
-    from stavpr_ros.pipeline.start import start_operation
+    from stavpr_ros.pipeline.operations import Localizer, RouteCloser
+    from stavpr_ros.pipeline.save_state import SaveState
     from stavpr_ros.sources.frame import Frame
 
     if CACHE is None:
@@ -39,8 +40,8 @@ def _run(_: object) -> None:
             settings = PipelineSettings(mode=mode, precision=precision, backend='cpu')
             extractor = settings.extractor()
             route = build_map(frames, extractor, progress=False)
-            start_operation('localization', settings, route, extractor)
-            start_operation('loop_closure', settings, None, extractor)
+            Localizer(settings, route, extractor, SaveState())
+            RouteCloser(settings, None, extractor, SaveState())
     print(f'the kernels are in {CACHE}')
 
 

@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processing of one image, without ROS: localization, mapping, loop closure."""
 
-from stavpr_ros.pipeline.pipeline import Pipeline
+from stavpr_ros.pipeline.operations import Operation
+from stavpr_ros.pipeline.pipeline import LoadedMap, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.settings import node_settings, NodeSettings, OPERATIONS, PipelineSettings
-from stavpr_ros.pipeline.start import LoadedMap, read_map
 
 __all__ = [
     'OPERATIONS',
     'ImageResult',
     'LoadedMap',
     'NodeSettings',
+    'Operation',
     'Pipeline',
     'PipelineSettings',
     'node_settings',

@@ -35,29 +35,14 @@ class GeometricCheck:
         is_weighed: bool,
     ) -> ImageResult:
         """
-        Return a result, and its late ones, after the check; without thumbnails, as they are.
+        Return a result after the check; without thumbnails, as it is.
 
         Matches with too few inliers are rejected.
 
-        :param query: thumbnail of the middle image of the window, RGB (h, w, 3) uint8; None =
-            unknown.
+        :param query: thumbnail of its image, RGB (h, w, 3) uint8; None = unknown.
         :param is_weighed: the result changes the probability instead (:class:`GeometricEvidence`),
             where the match is doubtful.
         """
-        late = []
-        for each in result.late:
-            assert each.match is not None
-            of_late = places.thumbnail(each.match.first_image_index + each.match.position)
-            late.append(self._checked(each, places, of_late, is_weighed))
-        return replace(self._checked(result, places, query, is_weighed), late=tuple(late))
-
-    def _checked(
-        self,
-        result: ImageResult,
-        places: PlaceMap | GrowingMap,
-        query: np.ndarray | None,
-        is_weighed: bool,
-    ) -> ImageResult:
         match = result.match
         if match is None or match.sequence is None or query is None:
             return result

@@ -52,12 +52,8 @@ class ImageResult:
     def of_match(cls, match: Match) -> 'ImageResult':
         """Return the result of a match, and of its late ones."""
         return cls(
-            match.status,
-            match.reason,
-            match.threshold,
-            match=match,
-            distance=match.distance,
-            probability=match.probability,
+            *(match.status, match.reason, match.threshold, ''),
+            *(match, match.distance, match.probability),
             late=tuple(map(cls.of_match, match.late)),
             image_index=match.image_index,
         )

@@ -23,12 +23,14 @@ class SaveState:
 
     :param path: file that the map was loaded from or last saved to, '' = none.
     :param base: its places, which recorded ones continue.
+    :param open_journal: returns the journal of recorded places; None if it cannot be written.
     :param recorded: places recorded since the map was loaded or started; ``saved`` of them are in
         a file, the others in the ``journal`` if there is one.
     """
 
     path: str = ''
     base: Base = field(default_factory=Base)
+    open_journal: OpenJournal = lambda base, template: None
     recorded: int = 0
     saved: int = 0
     journal: JournalWriter | None = None
@@ -51,20 +53,17 @@ class SaveState:
         """Return the version of a file that contains this map, or did, and may be replaced."""
         return self._files.get(os.path.abspath(path)) or False
 
-    def record(
-        self, places: GrowingMap, features: LocalFeatures, open_journal: OpenJournal
-    ) -> None:
+    def record(self, places: GrowingMap, features: LocalFeatures) -> None:
         """
         Count the newest place, and add it to the journal, which the first unsaved one opens.
 
         :param features: of its image.
-        :param open_journal: returns None if it cannot be written.
         """
         newest = places.place(places.first + len(places) - 1)
         if self.journal is None and self.recorded == self.saved:
             stamps, ids = np.array([newest.stamp]), (newest.identifier,)
             template = PlaceMap(features, places.projection, stamps, ids, camera=places.camera)
-            self.journal = open_journal(self.base, template)
+            self.journal = self.open_journal(self.base, template)
         if self.journal is not None:
             thumbnail = places.thumbnails[-1]
             self.journal.append(JournalPlace(self.recorded, newest, features, thumbnail))

@@ -51,7 +51,7 @@ def save_recorded_map(
             log.info(f'writing the map to {path}')
             places, target = _write_beside(pipeline, on_worker, path)
             log.info(f'{places} places written to {target}')
-        elif unsaved and pipeline.operation != 'loop_closure':
+        elif unsaved and pipeline.operation.name != 'loop_closure':
             log.warning(f'{unsaved} recorded places are in no map: set save_path, call ~/save_map')
         return True
     except TimeoutError:

@@ -14,7 +14,7 @@ from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.relative_pose.edge import Edge, Source
@@ -74,7 +74,7 @@ class EdgePublisher:
         self,
         header: Header,
         result: ImageResult,
-        pipeline: Pipeline,
+        operation: Operation,
         frames: PoseFrames,
         camera: Camera | None,
     ) -> tuple[Edge | None, list[WaitingClosure]]:
@@ -86,12 +86,15 @@ class EdgePublisher:
         :returns: the edge for the message of the match, None without a match; the closures of the
             match and of its late ones.
         """
-        places, edge, closures = pipeline.places, None, []
+        places, edge = operation.places, None
+        closures: list[WaitingClosure] = []
+        if not result.accepted:
+            return edge, closures
         # a route has the camera of the query
         place_camera = places.camera if isinstance(places, PlaceMap) else camera
         for each in (result, *result.late):
-            pair = pipeline.matched_pair(each, self._estimator.method)
-            if each is result and result.accepted:
+            pair = operation.matched_pair(each, self._estimator.method)
+            if each is result:
                 edge = self._immediate(pair, camera, place_camera)
             if pair is None or each.match is None:
                 continue

@@ -9,7 +9,7 @@ import math
 from diagnostic_msgs.msg import DiagnosticStatus
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.pipeline import NOT_A_KEYFRAME
+from stavpr_ros.pipeline.operations import NOT_A_KEYFRAME
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
 from stavpr_ros.ros.edges import MAX_WAITING
 from stavpr_ros.ros.input import InputStatus

@@ -10,7 +10,7 @@ import time
 
 from stavpr_ros.errors import MapFileError, StavprError
 from stavpr_ros.mapping import GrowingMap, PlaceMap, verify_map
-from stavpr_ros.pipeline.start import LoadedMap
+from stavpr_ros.pipeline import LoadedMap
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.worker import END_POLL
 from stavpr_ros.threads import call_on_thread

@@ -176,7 +176,7 @@ class PlaceRecognitionNode(ManagedNode):
         if settings.map_path:
             self._publish_map_info('loading', settings.map_path)
         self._runtime = Runtime(self, settings, self.statistics, self._publish_map_info)
-        if missing := self._runtime.pipeline.missing:
+        if missing := self._runtime.pipeline.operation.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self._publish_map_info()
         # objects of the map and the model are permanent: scanning them again and again takes the

@@ -16,7 +16,7 @@ from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.pipeline import NodeSettings, Pipeline, read_map
+from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
     close_journals,
@@ -24,14 +24,12 @@ from stavpr_ros.pipeline.saving import (
     recover_maps,
     save_recorded_map,
 )
-from stavpr_ros.pipeline.start import LoadedMap
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Status
-from stavpr_ros.relative_pose.edge import Edge
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
 from stavpr_ros.ros import REPORT_PERIOD
-from stavpr_ros.ros.edges import EdgePublisher, WaitingClosure
+from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus
 from stavpr_ros.ros.map_loading import MapLoader
@@ -44,7 +42,6 @@ from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
-from std_msgs.msg import Header
 
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
 
@@ -197,9 +194,12 @@ class Runtime:
             if subscription is not None:
                 subscription.close()
         self.images = self.odometry = self.camera = None
+        self._drop_waiting('the node was deactivated', 'deactivated')
+
+    def _drop_waiting(self, event: str, cause: str) -> None:
         for item in self.worker.clear():
-            reason = 'the node was deactivated before it was processed'
-            self._drop(item.message, Status.DROPPED, reason, 'deactivated')
+            reason = f'{event} before it was processed'
+            self._drop(item.message, Status.DROPPED, reason, cause)
 
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
@@ -250,8 +250,9 @@ class Runtime:
         """
         self._maps.load(path, lock, verify)
         self.worker.call(self._publish_route)
-        if stages := self.pipeline.stages:
-            self._node.get_logger().info(stages)
+        recognizer = self.pipeline.operation.recognizer
+        if recognizer is not None and recognizer.start_notes:
+            self._node.get_logger().info(recognizer.start_notes)
 
     def _use_map(self, loaded: LoadedMap) -> None:
         self.worker.run(lambda: self.pipeline.change(loaded=loaded))
@@ -267,24 +268,18 @@ class Runtime:
 
     def reset(self) -> None:
         """Empty the window now, and drop waiting images."""
-        self._epoch += 1
-        epoch = self._epoch
-
-        def empty() -> None:
-            self._pipeline_epoch = epoch
-            self.pipeline.reset()
-
-        self.worker.run(empty)
+        self._drop_waiting('the window was reset', 'window reset')
+        self.worker.run(self.pipeline.operation.reset)
 
     def map_info(self) -> MapInfo:
         """Return the description of the map in use."""
         pipeline = self.pipeline
         return map_info_message(
-            pipeline.operation,
-            'loading' if self._maps.path else pipeline.map_state,
-            pipeline.path,
+            pipeline.operation.name,
+            'loading' if self._maps.path else pipeline.operation.map_state,
+            pipeline.save_state.path,
             pipeline.places,
-            pipeline.extractor,
+            pipeline.operation.extractor,
             self._node.get_clock().now().to_msg(),
             self.settings.robot_id,
         )
@@ -300,13 +295,13 @@ class Runtime:
             input=InputStatus() if images is None else images.status(),
             odometry='' if odometry is None else odometry.freshness(),
             queue=self.worker.waiting,
-            window=pipeline.window_fill,
-            missing=pipeline.missing,
+            window=pipeline.operation.window_fill,
+            missing=pipeline.operation.missing,
             camera='not needed' if camera is None else camera.state,
-            view=pipeline.view,
+            view=pipeline.operation.view,
             odometry_fault='' if odometry is None else odometry.fault(),
-            contrast=pipeline.contrast,
-            applied_threshold=pipeline.threshold,
+            contrast=pipeline.operation.contrast,
+            applied_threshold=pipeline.operation.threshold,
         )
 
     # images
@@ -324,40 +319,39 @@ class Runtime:
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
         self._statistics.dropped(cause)
-        threshold = self.pipeline.threshold
+        threshold = self.pipeline.operation.threshold
         result = ImageResult(status, reason, math.nan if threshold is None else threshold)
         self._output.publish(message.header, result, self.pipeline.places)
 
     def _process(self, item: _Item) -> None:
         """Process one image, on the worker."""
-        if item.epoch < self._pipeline_epoch:
-            reason = 'the window was reset before it was processed'
-            self._drop(item.message, Status.DROPPED, reason, 'window reset')
-            return
-        if item.epoch > self._pipeline_epoch:
+        if item.epoch != self._pipeline_epoch:
             self._pipeline_epoch = item.epoch
-            self.pipeline.reset()
-        waited = time.monotonic() - item.arrival
-        header = item.message.header
+            self.pipeline.operation.reset()
+        operation, waited = self.pipeline.operation, time.monotonic() - item.arrival
+        header, places, view = item.message.header, operation.places, operation.view
         pose, frames = self._pose_at(nanoseconds(header.stamp))
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
-        view = self.pipeline.view
         result = self._match(item.message, pose, camera)
-        if self.pipeline.view != view:
-            self._node.get_logger().info(f'images are compared {self.pipeline.view}')
+        if operation.view != view:
+            self._node.get_logger().info(f'images are compared {operation.view}')
         began = time.monotonic()
-        message = self._publish(header, result, pose, frames, camera)
+        if self._navigation is not None:
+            self._navigation.publish(header, result, places, pose, frames.odometry)
+        self._views.publish(header, result, operation, frames.frame, pose)
+        edge, closures = self._edges.prepare(header, result, operation, frames, camera)
+        message = self._output.publish(header, result, places, frames, edge)
+        for closure in closures:
+            self._edges.put(closure)
         stages = {WAITING: waited, **result.stages, 'publishing': time.monotonic() - began}
         if result.cause:
             self._statistics.dropped(result.cause)
             self._log_cause(result)
             return
-        self.last_match, self.last_frame = message, frames.frame
-        place = message.newest_index if result.status is Status.MAPPED else message.place_index
-        self._statistics.answered(
-            result.status.name, result.reason, place, message.distance, stages
-        )
+        self.last_match, self.last_frame, status = message, frames.frame, result.status
+        place = message.newest_index if status is Status.MAPPED else message.place_index
+        self._statistics.answered(status.name, result.reason, place, message.distance, stages)
 
     def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
         """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""
@@ -365,7 +359,7 @@ class Runtime:
         if odometry is None:
             return None, PoseFrames(map_frame)
         # places of a route have the poses of the odometry
-        frame = map_frame if self.pipeline.operation == 'localization' else odometry.frame
+        frame = map_frame if self.pipeline.operation.name == 'localization' else odometry.frame
         return odometry.trajectory.at(stamp), PoseFrames(
             frame, odometry.child_frame, odometry.frame
         )
@@ -377,7 +371,7 @@ class Runtime:
         )
         stamp = nanoseconds(message.header.stamp)
         try:
-            result = self.pipeline.process(message, stamp, pose, camera, candidates)
+            result = self.pipeline.operation.process(message, stamp, pose, camera, candidates)
         except Exception as error:
             self._node.get_logger().error(
                 f'an image could not be processed: {traceback.format_exc()}'
@@ -388,32 +382,10 @@ class Runtime:
             return replace(result, reason=f'map {path} is being loaded')
         return result
 
-    def _publish(
-        self,
-        header: Header,
-        result: ImageResult,
-        pose: np.ndarray | None,
-        frames: PoseFrames,
-        camera: Camera | None,
-    ) -> PlaceMatch:
-        """Publish a match; its closure, and that of its late match, when their edges are ready."""
-        pipeline = self.pipeline
-        if self._navigation is not None:
-            self._navigation.publish(header, result, pipeline.places, pose, frames.odometry)
-        self._views.publish(header, result, pipeline, frames.frame, pose)
-        edge: Edge | None = None
-        closures: list[WaitingClosure] = []
-        if result.accepted:
-            edge, closures = self._edges.prepare(header, result, pipeline, frames, camera)
-        message = self._output.publish(header, result, pipeline.places, frames, edge)
-        for closure in closures:
-            self._edges.put(closure)
-        return message
-
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""
         if self._pipeline is not None:  # a subscriber may come first
-            in_map = self.pipeline.operation == 'localization'
+            in_map = self.pipeline.operation.name == 'localization'
             frame = self.settings.map_frame if in_map else self._views.frame
             self._views.publish_route(self.pipeline.places, frame)
 

@@ -106,7 +106,7 @@ class Services:
     def _save_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         if request.path:
             path = inside(runtime.settings.maps_path, request.path)
-        elif own := runtime.settings.save_path or runtime.pipeline.path:
+        elif own := runtime.settings.save_path or runtime.pipeline.save_state.path:
             path = os.path.abspath(own)
         else:
             raise StavprError(
@@ -126,7 +126,7 @@ class Services:
         def relocalize() -> None:
             # messages are made on the worker: a growing route may evict places before the next
             # call
-            result = runtime.pipeline.relocalize(count)
+            result = runtime.pipeline.operation.relocalize(count)
             response.match = runtime.last_match
             header, places = response.match.header, runtime.pipeline.places
             candidates = candidates_message(header, result, places)

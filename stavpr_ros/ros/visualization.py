@@ -17,7 +17,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.ros.messages import image_message, pose_message
@@ -69,7 +69,7 @@ class Visualization:
         self,
         header: Header,
         result: ImageResult,
-        pipeline: Pipeline,
+        operation: Operation,
         frame: str,
         odometry: np.ndarray | None = None,
     ) -> None:
@@ -79,7 +79,7 @@ class Visualization:
         :param frame: of the poses of the places.
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
-        places = pipeline.places
+        places = operation.places
         fixed = places if isinstance(places, PlaceMap) else None
         if frame != self.frame or fixed is not self._map:
             self.frame, self._map, self._correction = frame, fixed, None
@@ -99,7 +99,7 @@ class Visualization:
                 image = CompressedImage(header=header, format='jpeg', data=jpeg.tobytes())
                 self._image.publish(image)
             if self._is_requested(self._window) or self._is_requested(self._distances):
-                self._publish_distances(header, result, pipeline)
+                self._publish_distances(header, result, operation)
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
@@ -129,14 +129,19 @@ class Visualization:
         ):
             self._node.destroy_publisher(publisher)
 
-    def _publish_distances(self, header: Header, result: ImageResult, pipeline: Pipeline) -> None:
-        row, places = pipeline.newest_distances(), pipeline.places
-        if places is None or not row.size:
+    def _publish_distances(
+        self, header: Header, result: ImageResult, operation: Operation
+    ) -> None:
+        recognizer, places = operation.recognizer, operation.places
+        if recognizer is None or places is None or not recognizer.window_fill:
+            return
+        row = recognizer.newest_row()
+        if not row.size:
             return
         first = places.first if isinstance(places, GrowingMap) else 0
         shown = places_to_draw(result, first, len(row))
         if self._is_requested(self._window):
-            rows = pipeline.window_distances(shown)
+            rows = recognizer.window_columns(shown)
             self._window.publish(image_message(header, draw_window(rows, int(shown[0]), result)))
         if self._is_requested(self._distances):
             row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]

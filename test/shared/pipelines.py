@@ -30,7 +30,7 @@ def at(i):
 def process(pipeline, images, first=0, poses=False):
     """Image i of all is stamped i + 1 seconds and, with poses, taken at x = i."""
     return [
-        pipeline.process(message(image), (i + 1) * SECOND, at(i) if poses else None)
+        pipeline.operation.process(message(image), (i + 1) * SECOND, at(i) if poses else None)
         for i, image in enumerate(images, first)
     ]
 

@@ -1,0 +1,446 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The operations: a localizer, a mapper and a route closer; each turns a message into a result."""
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+import math
+import time
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of, verify_map
+from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.keyframes import KeyframeSelector
+from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
+from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.pipeline.geometric_check import GeometricCheck
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.pipeline.save_state import SaveState
+from stavpr_ros.pipeline.settings import PipelineSettings
+from stavpr_ros.pipeline.view_bank import ViewBank
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.recognition.recognizer import SequenceRecognizer
+from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
+from stavpr_ros.sources.encodings import decode_message
+
+NO_MAP = (
+    "no map: call the service load_map, or set parameter 'map_path' before the node is configured"
+)
+NO_THRESHOLD = (
+    "parameter 'threshold' is not set, which mode paper requires where the map suggests none: "
+    "'ros2 param set /stavpr threshold VALUE', or build the map again"
+)
+NOT_A_KEYFRAME = 'not a keyframe'
+BLANK_IMAGE = np.zeros((480, 640, 3), np.uint8)
+
+
+@runtime_checkable
+class PartialMap(Protocol):
+    """A map in a store: it recognizes with the places that it has fetched."""
+
+    def recognizer(self, settings: RecognizerSettings) -> SequenceRecognizer:
+        """Return a recognizer of the map; SettingsError for settings that it does not have."""
+
+
+class WindowRow(NamedTuple):
+    """An image of the window: stamp [ns], 0 = unknown; pose (7,) and thumbnail, None = unknown."""
+
+    stamp: int
+    pose: np.ndarray | None
+    thumbnail: np.ndarray | None = None
+
+    @property
+    def jpeg(self) -> bytes:
+        """Return the thumbnail, encoded; empty without one."""
+        return b'' if self.thumbnail is None else encode_thumbnail(self.thumbnail)
+
+
+class Operation(ABC):
+    """
+    Base of the operations: from one image message to one result; the window of the images.
+
+    All calls must come from one thread, but not those of properties.
+
+    :param place_map: the map to localize on or to extend; loop closure has a route of its own.
+    :param extractor: of the map; None = of the settings, for growing maps.
+    :param save_state: of the places.
+    :raises StavprError: invalid settings, a map that cannot be used, or a missing model.
+
+    ``places`` is a map, a growing one, or None while localization waits for one; ``contrast`` the
+    standard deviation of the last image.
+    """
+
+    name = ''
+
+    def __init__(
+        self,
+        settings: PipelineSettings,
+        place_map: PlaceMap | None,
+        extractor: FeatureExtractor | None,
+        save_state: SaveState,
+    ) -> None:
+        self.settings, self.extractor, self.save_state = settings, extractor, save_state
+        self.places: PlaceMap | GrowingMap | None = place_map
+        self._recognizer: SequenceRecognizer | ViewBank | None = None
+        self._start(place_map)
+        self._keyframes = KeyframeSelector(settings.keyframes)
+        self._check = GeometricCheck(settings.geometric) if settings.geometric else None
+        self._last: ImageResult | None = None
+        self._window: deque[WindowRow] = deque(maxlen=settings.sequence.length)
+        self.contrast = math.nan
+
+    @abstractmethod
+    def _start(self, place_map: PlaceMap | None) -> None:
+        """Make the places and their recognizer: all that may fail or takes long."""
+
+    @abstractmethod
+    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+        """Match the window that ends with an image, or make the image a place, or both."""
+
+    @property
+    def recognizer(self) -> SequenceRecognizer | None:
+        """Return the recognizer, of the present view; None in mapping, or without a map."""
+        own = self._recognizer  # once: other threads read this while the worker changes it
+        return own.recognizer if isinstance(own, ViewBank) else own
+
+    @property
+    def view(self) -> str:
+        """Return how images are compared, one of ``VIEWS``; empty without other views."""
+        return self._recognizer.view if isinstance(self._recognizer, ViewBank) else ''
+
+    @property
+    def map_state(self) -> str:
+        """Return one of ``none``, ``loaded``, ``growing`` or ``full``."""
+        places = self.places
+        if not isinstance(places, GrowingMap):
+            return 'none' if places is None else 'loaded'
+        # a full route evicts places instead
+        return 'full' if places.full and self.recognizer is None else 'growing'
+
+    @property
+    def threshold(self) -> float | None:
+        """Return the distance below which a window is matched: as set, or the map's; or None."""
+        if (recognizer := self.recognizer) is None:
+            return self.settings.applied_threshold
+        return recognizer.threshold
+
+    @property
+    def missing(self) -> str:
+        """Return why no match is possible yet; empty when nothing is missing."""
+        if self.places is None:
+            return NO_MAP
+        is_open = self.recognizer is not None and self.threshold is None
+        return NO_THRESHOLD if is_open else ''
+
+    @property
+    def window_fill(self) -> int:
+        """Return the number of images in the window of the recognizer."""
+        return 0 if (recognizer := self.recognizer) is None else recognizer.window_fill
+
+    def apply(self, settings: PipelineSettings) -> None:
+        """
+        Apply the limits, keyframes, candidates and geometric check of other settings.
+
+        :raises SettingsError: limits out of range; nothing is changed then.
+        """
+        before, check = self.threshold, settings.geometric
+        if self._recognizer is not None:
+            self._recognizer.set_limits(
+                settings.threshold, settings.min_probability, settings.max_error
+            )
+        self.settings, self._keyframes.settings = settings, settings.keyframes
+        if before is None and self.threshold is not None:
+            self.reset()  # images since then are not in the window
+        if check != (self._check and self._check.settings):
+            self._check = GeometricCheck(check) if check else None
+
+    def reset(self) -> None:
+        """Empty the window: the next images do not continue those before."""
+        self._last = None
+        self._window.clear()
+        for each in (self._keyframes, self._check, self._recognizer):
+            if each is not None:
+                each.reset()
+
+    def process(
+        self,
+        message: Any,
+        stamp: int,
+        pose: np.ndarray | None = None,
+        camera: Camera | None = None,
+        list_candidates: bool = True,
+    ) -> ImageResult:
+        """
+        Process one image message, raw or compressed. An invalid image changes nothing.
+
+        :param stamp: of the image, ns, 0 = unknown.
+        :param pose: of the camera, from odometry, shape (7,), or None.
+        :param camera: None = unknown: in localization, no thumbnail is kept for an edge.
+        :param list_candidates: the result has its candidates.
+        :raises InputError: an invalid pose; nothing is changed then.
+        """
+        threshold = math.nan if self.threshold is None else self.threshold
+        pose = None if pose is None else checked_pose(pose)
+        if self.missing:
+            return ImageResult(Status.NOT_READY, self.missing, threshold, 'not ready')
+        if reason := self._keyframes.too_soon(stamp, pose):
+            blind = pose is None and self.settings.keyframes.needs_poses
+            cause = 'no odometry' if blind else NOT_A_KEYFRAME
+            return ImageResult(Status.SKIPPED, reason, threshold, cause)
+        stages: dict[str, float] = {}
+        try:
+            result = self._process(stages, message, WindowRow(stamp, pose), camera)
+        except StavprError as error:
+            kind = error.kind if isinstance(error, ImageError) else type(error).__name__
+            result = ImageResult(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
+        if list_candidates and self.recognizer is not None and result.nearest_index >= 0:
+            result = result.with_candidates(self.recognizer.ranked(self.settings.candidates))
+        if math.isnan(result.threshold):  # none has applied
+            result = replace(result, threshold=threshold)
+        return replace(result, stages=stages)
+
+    def _process(
+        self, stages: dict[str, float], message: Any, row: WindowRow, camera: Camera | None
+    ) -> ImageResult:
+        assert self.extractor is not None
+        width, bank = self._thumbnail_width(camera), self._recognizer
+        with _timed(stages, 'decoding'):
+            image = decode_message(message, _needed_size(self.extractor, width))
+            self.contrast = _contrast(image)
+            if reason := self._keyframes.too_alike(image):
+                return ImageResult(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
+        if self.map_state == 'full':
+            reason = f'the map is full: parameter max_places = {self.settings.max_places}'
+            return ImageResult(Status.NOT_READY, reason, image=image, cause='map full')
+        with _timed(stages, 'extraction'):
+            images = bank.warped(image) if isinstance(bank, ViewBank) else [image]
+            features = self.extractor.extract(images)
+        with _timed(stages, 'matching'):
+            row = row._replace(thumbnail=thumbnail_of(image, width) if width else None)
+            result = replace(self._update(features, row), image=image)
+        self._window.append(row)
+        self._keyframes.accept(row.stamp, row.pose, image)
+        if isinstance(self.places, GrowingMap):
+            self.places.camera = self.places.camera or camera
+            self.save_state.record(self.places, features)
+        if result.match is not None:
+            with _timed(stages, 'verification'):
+                result = self._checked(result)
+            self._last = result
+        return result
+
+    def _checked(self, result: ImageResult) -> ImageResult:
+        """Return a result, and its late ones that are matches, after the geometric check."""
+        check, places, late = self._check, self.places, result.late
+        if check is not None and places is not None:
+            is_weighed = isinstance(places, PlaceMap) and not math.isnan(result.probability)
+            late = tuple(check.checked(each, places, self._query(each), False) for each in late)
+            result = check.checked(result, places, self._query(result), is_weighed)
+        return replace(result, late=tuple(each for each in late if each.accepted))
+
+    def _query(self, result: ImageResult) -> np.ndarray | None:
+        """Return the thumbnail of the image that a match is of; None = unknown."""
+        match, places = result.match, self.places
+        assert match is not None
+        if match.is_late and isinstance(places, GrowingMap):
+            return places.thumbnail(match.first_image_index + match.position)
+        return self._window[match.position - len(match.window_stamps)].thumbnail
+
+    def _thumbnail_width(self, camera: Camera | None) -> int:
+        """Return the width of the thumbnails that are needed, 0 = none is."""
+        width = self.settings.thumbnail_width
+        if isinstance(self.places, GrowingMap):
+            return width
+        return (width or THUMBNAIL_WIDTH) if self._check or camera else 0
+
+    def relocalize(self, count: int) -> ImageResult:
+        """
+        Return the result of the current window, with ``count`` candidates.
+
+        :raises InputError: the window is not full, or no match is possible; names the reason.
+        """
+        if self.missing:
+            raise InputError(self.missing)
+        recognizer, last = self.recognizer, self._last
+        if recognizer is None:
+            raise InputError(
+                f'operation {self.name} recognizes no places: set_operation localization first'
+            )
+        if last is None or last.status is Status.WARMING_UP:
+            length = self.settings.sequence.length
+            raise InputError(f'{self.window_fill} of {length} images in the window')
+        return last.with_candidates(recognizer.ranked(count))
+
+    def matched_pair(self, result: ImageResult, relative_pose: str = 'auto') -> MatchedPair | None:
+        """
+        Return the pair of the newest match, or of one of its late ones, for its edge.
+
+        :param relative_pose: the parameter of this name.
+        :returns: None without a match, or where the place of a map can have no edge.
+        """
+        match, places, recognizer = result.match, self.places, self.recognizer
+        if not result.accepted or match is None or places is None or recognizer is None:
+            return None
+        place = result.place_index
+        if isinstance(places, PlaceMap) and (
+            relative_pose == 'none' or places.place(place).pose is None
+        ):
+            return None
+        count, distances = len(match.window_stamps), None
+        if relative_pose in ('auto', 'aligned'):
+            columns = recognizer.window_columns
+            distances = match.columns_of if match.is_late else lambda k: columns(k)[-count:]
+        if match.is_late and isinstance(places, GrowingMap):
+            poses = places.poses[match.first_image_index - places.first + np.arange(count)]
+        else:
+            rows, unknown = list(self._window)[-count:], np.full(7, np.nan)
+            poses = np.array([unknown if row.pose is None else row.pose for row in rows])
+        return matched_pair(match, place, places, self._query(result), poses, distances)
+
+
+class Localizer(Operation):
+    """Recognizes the places of a map; without one, it waits for it."""
+
+    name = 'localization'
+
+    def _start(self, place_map: PlaceMap | None) -> None:
+        settings = self.settings
+        if self.extractor is None or place_map is None:
+            return
+        if place_map.partial:
+            recognizer = _partial_recognizer(settings, place_map)
+        else:
+            backend = settings.matching_backend(self.name)
+            recognizer = PlaceRecognizer(
+                place_map, settings.recognition(), backend, settings.precision
+            )
+        _warm_up(recognizer, self.extractor, settings.sequence.length)
+        self._recognizer = recognizer
+        if settings.other_views and isinstance(recognizer, PlaceRecognizer):
+            self._recognizer = ViewBank(recognizer, place_map)
+
+    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+        assert self._recognizer is not None
+        return ImageResult.of_match(self._recognizer.update(features, row.stamp, row.pose))
+
+
+class Mapper(Operation):
+    """Records places, of a new map or of one that it extends."""
+
+    name = 'mapping'
+    places: GrowingMap
+
+    def _start(self, place_map: PlaceMap | None) -> None:
+        limit = self.settings.max_places
+        self.extractor = extractor = self.extractor or self.settings.extractor()
+        extractor.extract([BLANK_IMAGE])
+        if place_map is None:
+            self.places = GrowingMap(extractor.settings, extractor.projection, limit)
+            return
+        if place_map.partial:
+            raise SettingsError(
+                'operation mapping does not extend the map of a fleet: record a map of its own, '
+                'without map_path'
+            )
+        verify_map(place_map)  # damage would be saved again, with correct hashes
+        self.places = GrowingMap.from_map(place_map, limit)
+
+    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+        index = self.places.add(features, row.stamp, pose=row.pose, thumbnail=row.jpeg)
+        return ImageResult(Status.MAPPED, image_index=index)
+
+
+class RouteCloser(Operation):
+    """Records a route and recognizes its earlier places; a full route evicts its oldest ones."""
+
+    name = 'loop_closure'
+    places: GrowingMap
+
+    def _start(self, place_map: PlaceMap | None) -> None:
+        settings = self.settings
+        self.extractor = extractor = self.extractor or settings.extractor()
+        self._recognizer = self._closer = _loop_closer(
+            settings, settings.exclude_places, extractor
+        )
+        # a closer that excludes next to nothing needs few images to warm up
+        _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
+        self.places = GrowingMap(
+            extractor.settings,
+            extractor.projection,
+            settings.max_places,
+            held_features=self._closer.features,
+        )
+
+    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+        jpeg = row.jpeg  # first, since it may fail: recognizer and route stay in step
+        result = ImageResult.of_match(self._closer.update(features, row.stamp, row.pose))
+        self.places.forget(self._closer.first - self.places.first)  # it evicts the oldest places
+        self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
+        return result
+
+
+CLASSES = {each.name: each for each in (Localizer, Mapper, RouteCloser)}
+
+
+def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
+    if settings.backend == 'cuda' or settings.precision != 'float32' or settings.other_views:
+        raise SettingsError(
+            f'backend {settings.backend}, precision {settings.precision}, other_views '
+            f'{settings.other_views}: the map of a fleet is matched on the CPU in float32; take '
+            'backend auto or cpu, precision float32, and other_views false'
+        )
+    assert isinstance(place_map, PartialMap)
+    return place_map.recognizer(settings.recognition())
+
+
+def _loop_closer(
+    settings: PipelineSettings, exclude: int, extractor: FeatureExtractor
+) -> LoopCloser:
+    return LoopCloser(
+        settings.recognition(),
+        exclude,
+        extractor.settings,
+        limit=settings.max_places,
+        exclude_seconds=settings.exclude_seconds,
+        precision=settings.precision,
+    )
+
+
+def _warm_up(recognizer: SequenceRecognizer, extractor: FeatureExtractor, images: int) -> None:
+    """Compile and allocate everything, so that the first image is as fast as the others."""
+    features = extractor.extract([BLANK_IMAGE])
+    for _ in range(images):
+        recognizer.update(features)
+    recognizer.ranked(2)
+    recognizer.reset()
+
+
+def _needed_size(extractor: FeatureExtractor, thumbnail_width: int) -> tuple[int, int] | None:
+    """Return the rows and columns of an image that have an effect; None = all."""
+    backbone = extractor.settings.backbone
+    if backbone.resize != 'area':  # bilinear features are of single pixels
+        return None
+    return backbone.size, max(backbone.size, thumbnail_width)
+
+
+def _contrast(image: np.ndarray) -> float:
+    """Return the standard deviation of the green channel, of 255; from 32 rows or columns."""
+    step = max(1, min(image.shape[:2]) // 32)
+    return float(image[::step, ::step, 1].std())
+
+
+@contextmanager
+def _timed(stages: dict[str, float], name: str) -> Iterator[None]:
+    """Record the duration of a stage, seconds."""
+    began = time.perf_counter()
+    try:
+        yield
+    finally:
+        stages[name] = time.perf_counter() - began
