@@ -52,7 +52,7 @@ class Case:
 
     :param name: of the case in the table.
     :param places, query: images of the map and of the query.
-    :param truth: of number of queries and of places.
+    :param truth: function of the numbers of queries and places.
     :param warps: also at other speeds of the query.
     """
 

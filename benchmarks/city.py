@@ -185,7 +185,7 @@ def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def node_lines(folder: Path) -> list[str]:
-    """Return the table of the results of ``soak.py`` on maps of cities."""
+    """Return the table of ``soak.py``'s results on city maps."""
     rows = []
     for path in sorted(folder.glob('node-*.json')):
         one = json.loads(path.read_text(encoding='utf-8'))

@@ -108,7 +108,7 @@ def start(path: Path, precision: str, cache: str) -> dict[str, Any]:
 
 
 def measure(path: Path, case: Case, cache: str, runs: int) -> dict[str, Any]:
-    """Return the run of the least time of several, each a process of its own."""
+    """Return the fastest of several runs, each a process of its own."""
     starts = []
     for _ in range(runs):
         with ProcessPoolExecutor(1, get_context('spawn')) as pool:

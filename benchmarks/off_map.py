@@ -264,7 +264,7 @@ def with_standstill(place_map: PlaceMap) -> PlaceMap:
 @dataclass
 class Measurement:
     """
-    Rows of the table of one kind of features, and the outcomes that are pooled.
+    The table's rows for one kind of features, and the outcomes that are pooled.
 
     :param coarser: factor on all steps.
     """

@@ -44,7 +44,7 @@ def _rows(results: Results, section: str) -> Iterator[tuple[str, str, dict[str, 
 
 
 def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
-    """Return value and aim of each row of the summary, for one kind of features."""
+    """Return value and aim of each summary row, for one kind of features."""
 
     def of(section: str) -> dict[str, dict[str, Any]]:
         return {name: v for f, name, v in _rows(results, section) if f == feature}

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Time of an update of a large pose graph: laps on a circle, a closure at 85 % of the keyframes.
+Update time of a large pose graph: laps on a circle, a closure at 85 % of the keyframes.
 
 Before the timed updates the graph grows in larger steps; the timed ones add one keyframe each.
 """

@@ -47,7 +47,7 @@ def value_of(row: Row, name: str) -> float | None:
 
 
 def stage_times(rows: Sequence[Row], frame: Row) -> list[float]:
-    """Return the median of each of :data:`ROBUST_STAGES` at the sizes of a frame, seconds."""
+    """Return the median for each of :data:`ROBUST_STAGES` at the frame's sizes, seconds."""
     # only image distances depend on the precision
     parts = {
         part.stage: part.median_s

@@ -81,7 +81,7 @@ def ate(drive: LapDrive, poses: np.ndarray, count: int | None = None) -> float:
 
 
 def pass_errors(drive: LapDrive, poses: np.ndarray) -> np.ndarray:
-    """Return the errors of relative positions of images of two laps near each other, m."""
+    """Return the errors of relative positions between nearby images of two laps, m."""
     later = np.flatnonzero(drive.images[:, 0] > 0)
     errors = []
     T, truth = matrices(poses), matrices(planar_poses(drive.truth))

@@ -79,7 +79,7 @@ def end_process(code: int) -> NoReturn:
 @contextmanager
 def signals_deferred() -> Iterator[None]:
     """
-    Raise the KeyboardInterrupt of a signal at the end of the block instead of within.
+    Raise the KeyboardInterrupt by a signal at the end of the block instead of within.
 
     For calls into rclpy: an exception within its C++ comes out as another one.
     """

@@ -171,7 +171,7 @@ class FleetRecognizer(SequenceRecognizer):
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
     ) -> Match:
         """See :meth:`SequenceRecognizer.update`."""
-        position = position_of(pose)
+        odometry_xy = position_of(pose)
         self._require_one_image(features, 'the map')
         if features.dimension != self._city.dimension:
             raise FeatureMismatchError(
@@ -194,8 +194,8 @@ class FleetRecognizer(SequenceRecognizer):
         elif len(self._order):
             self._push(image)
         if len(self._order):
-            return self._match(position)
-        self._motion.trajectory.append(position)
+            return self._match(odometry_xy)
+        self._motion.trajectory.append(odometry_xy)
         status = Status.WARMING_UP
         if self.window_fill == self._settings.sequence.length:
             status = Status.NO_MATCH

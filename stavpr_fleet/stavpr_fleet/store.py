@@ -28,7 +28,7 @@ class MapIndex:
     The part of a map that a robot downloads before any place.
 
     :param places: number n of places.
-    :param firsts: first place of every run of places of one session, ascending, int64; the first
+    :param firsts: first place of every run of one session's places, ascending, int64; the first
         one is 0.
     :param sessions: of each run; empty = the map has none.
     :param sample: the places :func:`sample_places` of the map, with its settings and projection.

@@ -97,7 +97,7 @@ class ImageChange:
 
     def copy_statistics(self, learned: 'ImageChange', from_before: np.ndarray) -> None:
         """
-        Use the statistics of a sample of the map that these places are of.
+        Use the statistics of a sample of these places' map.
 
         :param from_before: change of each place from the one before, (n,), float32.
         """

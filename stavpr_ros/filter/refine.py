@@ -61,7 +61,7 @@ def refine(
 @kernel
 def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """
-    Return the times of images, (m,), float64, ascending, in intervals of most of them.
+    Return the times of images, (m,), float64, ascending; the unit is the median interval.
 
     A camera that loses images still advances evenly in time: the stamps of a window show where
     images are missing, the stamps of a map where places are. An interval is 1 where a stamp is

@@ -16,7 +16,7 @@ class ErrorRisks:
     :param method: settings of recognition that they were measured with.
     :param units: blocks of images n that were driven, at least 1.
     :param probabilities: above which images are matched, ascending, between 0 and 1, k of them.
-    :param risks: for each of these, the sum of the rates of the n blocks; never ascending, k.
+    :param risks: for each of these, the sum of the n blocks' rates; never ascending, k.
     :raises InputError: other values.
     """
 

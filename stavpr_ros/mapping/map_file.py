@@ -44,7 +44,7 @@ def save_map(
     :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
     :param statistics: learned by recognition from the features as they will be stored, see
         :func:`stavpr_ros.prepare.prepared_map.statistics_of_map`; None = write none.
-    :returns: the id of the map, 16 hexadecimal digits of the hash of its content.
+    :returns: the id of the map, 16 hexadecimal digits of the content's hash.
     :raises OutputError: the file is there already, or cannot be written.
     :raises SettingsError: no such storage.
     """

@@ -125,7 +125,7 @@ def draw_window(rows: np.ndarray, first: int, result: ImageResult) -> np.ndarray
 
 def least_of_each(rows: np.ndarray, columns: int) -> np.ndarray:
     """
-    Return rows of at most so many columns, each the least of its part of the places.
+    Return rows of at most so many columns; each is the minimum over its places.
 
     :param rows: shape (m, n), n at least 1.
     """

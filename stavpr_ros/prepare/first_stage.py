@@ -6,8 +6,8 @@ A first stage for maps too large to be compared exactly within a time budget.
 Every strip of every place is reduced to a few principal components, so that an image is one vector
 of ``BYTES`` bytes. The *coarse* distance of two images is 1 less their largest cosine similarity,
 when one is shifted against the other by whole strips. It is computed for all places. Exact
-distances are computed in chunks of places: those with the smallest coarse distances, those that
-the place filter finds probable after the images so far, and a fixed sample. Mean and deviation of
+distances are computed in chunks of places: where coarse distances are smallest, where the place
+filter finds places probable after the images so far, and a fixed sample. Mean and deviation of
 the sample scale the coarse distances to exact ones, so that z-normalization, the filter and the
 second best have one row with an entry for every place.
 """

@@ -38,7 +38,7 @@ class LoopCloser(SequenceRecognizer):
     """
     Recognizes places that the same traverse has passed before, one image at a time.
 
-    Every image becomes a place; an image is compared with those that came at least ``exclude``
+    Every image becomes a place; an image is compared with images that came at least ``exclude``
     images and ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is
     full; the mean that is subtracted (option ``mean_centering``) is updated when the route is an
     eighth longer, as is ``whitening`` until it is settled. The closer is the owner of the route's
@@ -122,12 +122,12 @@ class LoopCloser(SequenceRecognizer):
 
         Without a stamp, only the count of images excludes places.
         """
-        position = position_of(pose)
+        odometry_xy = position_of(pose)
         self._require_one_image(features, 'the route so far')
         self._append(features, stamp)
-        self._track.append(position)
+        self._track.append(odometry_xy)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)
-        verdict = self._decide(position)
+        verdict = self._decide(odometry_xy)
         return self._confirmed(verdict, self._oldest(verdict), self.first + len(self) - 1)
 
     def _confirmed(self, verdict: Verdict, oldest: list[Match], image: int) -> Match:

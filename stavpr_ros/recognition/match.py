@@ -76,7 +76,7 @@ class WindowMatch:
         (m,); empty in mode paper.
     :param sequences: returns all sequences; valid until the next match of the window.
     :param min_probability: below which it is no match whatever the limits: of a camera at rest.
-    :param images: number of the newest images that it is of; 0 = of the whole window.
+    :param images: number of the newest images that are matched; 0 = the whole window.
     """
 
     nearest: SequenceMatch | None = None
@@ -88,7 +88,7 @@ class WindowMatch:
     images: int = 0
 
     def path_ratios(self, position: int) -> np.ndarray:
-        """Return the shares over the share of the place of one image of the window, (m,)."""
+        """Return the shares, divided by the share of the place at a position, (m,)."""
         if not len(self.shares):
             return NO_SHARES
         return self.shares / max(self.shares[position], MIN_SHARE)

@@ -212,18 +212,18 @@ class SequenceRecognizer(ABC):
             raise InputError(f'features of {len(features)} images: expected one image')
         require_finite(features, 'the image')
 
-    def _match(self, position: np.ndarray) -> Match:
+    def _match(self, odometry_xy: np.ndarray) -> Match:
         """
         Match the window.
 
-        :param position: of the newest image by odometry, (2,); NaN = unknown.
+        :param odometry_xy: of the newest image by odometry, (2,); NaN = unknown.
         """
-        return self._built(self._decide(position))
+        return self._built(self._decide(odometry_xy))
 
-    def _decide(self, position: np.ndarray) -> 'Verdict':
+    def _decide(self, odometry_xy: np.ndarray) -> 'Verdict':
         """Decide on the window, and where it has no match, on its newest images."""
         window, radius = self._window, self._settings.nms_radius
-        self._motion.trajectory.append(position)
+        self._motion.trajectory.append(odometry_xy)
         fill, length = len(window.images), window.buffer.length
         reason = f'{fill} of {length} images in the window'
         verdict = Verdict(WindowMatch(), self._limits, Status.WARMING_UP, reason)
@@ -453,7 +453,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
     ) -> Match:
         """See :meth:`SequenceRecognizer.update`."""
-        position = position_of(pose)
+        odometry_xy = position_of(pose)
         self._require_one_image(features, 'the map')
         self._require_dimension(features)
         strips = features.strips[:, 0]
@@ -463,7 +463,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self._window.push(row, strips, stamp)
         if self._centering is not None:
             self._centering.note_standstill(self._window.is_standstill)
-        return self._match(position)
+        return self._match(odometry_xy)
 
 
 def _window_of(

@@ -15,7 +15,7 @@ import numpy as np
 from stavpr_ros.recognition.match import WindowMatch
 
 ALONG = 0.5  # deviation of a matched place along the track, places
-TURNS = 2  # degrees of freedom of the shape of the trajectory; its length has one
+TURNS = 2  # degrees of freedom of the trajectory's shape; its length has one
 UNUSUAL = 0.05  # share of right paths that disagree more, below which probabilities are lowered
 MIN_IMAGES = 3
 LONGEST = 5  # windows of the trajectory that are compared

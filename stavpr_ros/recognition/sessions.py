@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions of a map as columns of a window, and matches in columns as matches of places."""
+"""The map's sessions as columns of a window, and matches in columns as matches of places."""
 
 from dataclasses import replace
 

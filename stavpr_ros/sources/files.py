@@ -39,7 +39,7 @@ COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
 
 def reduction(height: int, width: int, least: tuple[int, int] | None) -> int:
     """
-    Return the divisor of the sides of a large image, a power of two, 1 of a small one.
+    Return by what the sides of a large image are divided, a power of two; 1 for a small image.
 
     :param least: rows and columns that must remain; None = all.
     """

@@ -66,7 +66,7 @@ class VideoSource:
     Iterating yields :class:`Frame` with ``name#i`` as identifier, i counting the images from 0. A
     stamp is the time of the frame in the container, counted from 1 s, since 0 is unknown.
 
-    Each iteration decodes in a process of its own, with limits of memory and of time: a damaged
+    Each iteration decodes in a process of its own, with limited memory and time: a damaged
     file cannot crash this one.
 
     :param path: .mp4, .m4v, .mov, .avi, .mkv, .webm or .3gp, of a codec that OpenCV decodes.

@@ -216,7 +216,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
 
 
 def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, object]:
-    """Return the parameters of the node of the limit of a match."""
+    """Return the node's parameters that limit matches."""
     if arguments.mode == 'robust':
         return {'mode': 'robust', 'min_probability': arguments.min_probability}
     return {'mode': 'paper', 'threshold': threshold}

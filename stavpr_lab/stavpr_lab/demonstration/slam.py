@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The SLAM demonstration: the bag of a drive of laps, and the errors and plot of the result."""
+"""The SLAM demonstration: the bag of a lap drive, and the errors and plot of the result."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

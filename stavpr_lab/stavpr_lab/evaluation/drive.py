@@ -84,7 +84,7 @@ class DriveChanges:
     @classmethod
     def named(cls, name: str, n: int) -> Self:
         """
-        Return the changes of a query of n images by the name of a row or of an option.
+        Return the changes that a row or an option names, for a query of n images.
 
         :param name: ``same``; a speed, such as ``0.5x``, or ``vary``, ``varying``; ``stop`` or
             ``stop 100``: images that are added in the middle; ``drop 0.3``.

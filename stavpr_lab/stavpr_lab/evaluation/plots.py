@@ -173,7 +173,7 @@ def distance_histogram(
 
 def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: int = 0) -> None:
     """
-    Draw the distances of one window of queries to a stretch of the map, and the warping path.
+    Draw the distances between a query window and a stretch of the map, and the warping path.
 
     :param distances: shape (l, k): images of the window by places of the stretch.
     :param pairs: (query, place) along the path, counted within the matrix, shape (m, 2).

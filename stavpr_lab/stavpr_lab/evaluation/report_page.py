@@ -91,7 +91,7 @@ def _text(value: Any) -> str:
 
 
 def _cards(evaluation: Evaluation) -> list[tuple[str, float, float, str]]:
-    """Return name, value of sequences and of single images, and color of each card."""
+    """Return each card: name, value for sequences, value for single images, color."""
     sequence, single = evaluation.sequence.to_json(), evaluation.single.to_json()
     keys = {'F1 of sequences': 'f1'} | {name: NUMBERS[name] for name in CARDS}
     cards = [(name, sequence[key], single[key], SEQUENCE) for name, key in keys.items()]

@@ -186,8 +186,7 @@ def _from_csv(file: Path, name: str) -> np.ndarray:
     """
     Read a table: separators, a line and a column of names are recognized by the first two lines.
 
-    Column numbers 0, 1, 2 ... as the first line, and a first column without a name, are those that
-    pandas writes.
+    Pandas writes column numbers 0, 1, 2 ... as the first line, and a first column without a name.
     """
     if name:
         raise SourceError(f'descriptors {file} is one table: leave :{name} out')

@@ -283,7 +283,7 @@ class Monitor:
 
 
 def span_of(places: np.ndarray) -> tuple[float, float]:
-    """Return where a row begins and ends, of the first place of each of its columns."""
+    """Return where a row begins and ends, from the first place of each column."""
     first, last = float(places[0]), float(places[-1])
     return first, last + max((last - first) / max(len(places) - 1, 1), 1)
 

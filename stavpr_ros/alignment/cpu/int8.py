@@ -416,7 +416,7 @@ def cosine_distances(features, queries, out):
 @parallel_kernel
 def smallest_distances(features, queries, chunk, out, nearest):
     """
-    Smallest distance of any strip of one image to the one strip of each place.
+    Smallest distance between any strip of one image and each place's only strip.
 
     :param features, queries: as in :func:`block_distances`; W = 1 and Q = 1.
     :param chunk: places, a divisor of ``IMAGES``.

@@ -153,7 +153,7 @@ class BaselineInputs:
     """
     Inputs of the baselines besides the images.
 
-    :param arrays: files of the descriptors of map and query, by the name of the column.
+    :param arrays: descriptor files of map and query, by the name of the column.
     :param ssm_layers: two layers of the network of the features, for SSM-VPR.
     """
 
