@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a filter over the places of a map is: the interface between a window and its filter."""
 
+from abc import abstractmethod
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +22,7 @@ class Filter(Protocol):
     settings: FilterSettings
     count: int
 
+    @abstractmethod
     def update(
         self,
         z: Any,
@@ -40,9 +42,11 @@ class Filter(Protocol):
         :param not_near: places below m whose z counts as 0 at least.
         """
 
+    @abstractmethod
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place now, (room,), float32."""
 
+    @abstractmethod
     def belief(self, n: int, images_ago: int) -> Belief:
         """
         Return where the camera was a number of images ago, by the images since then, too.
@@ -51,6 +55,7 @@ class Filter(Protocol):
         :param images_ago: at most the lag and ``count - 1``.
         """
 
+    @abstractmethod
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
         """
         Return the most probable path to a state: a place per image, (images + 1,), int.
@@ -60,6 +65,7 @@ class Filter(Protocol):
         :param images: to go back, at most the lag.
         """
 
+    @abstractmethod
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """
         Return the most probable place outside ``excluded`` now, and its probability, 0 if none.
@@ -67,17 +73,22 @@ class Filter(Protocol):
         :param excluded: places, ascending.
         """
 
+    @abstractmethod
     def mean_z(self, state: np.ndarray) -> float:
         """Return the mean z of right places in a state: how near they are on this drive."""
 
+    @abstractmethod
     def speed(self, state: np.ndarray) -> float:
         """Return the speed of a state at the time of its belief, places an image."""
 
+    @abstractmethod
     def reset(self) -> None:
         """Forget where the camera was."""
 
+    @abstractmethod
     def grow(self, places: int) -> None:
         """Make room for more places."""
 
+    @abstractmethod
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
