@@ -243,7 +243,7 @@ def test_unknown_parameter_is_logged_and_not_set(make_node, capfd, name, remedy)
 
 def test_lost_images_are_logged_once_with_their_remedy(make_node, capfd):
     node = make_node(diagnostics_period=0.1)
-    node.statistics.dropped('lost in transport', 3)
+    node.statistics.add_drop('lost in transport', 3)
     published = threading.Event()
     publish, reports = node._diagnostics._publisher.publish, []
 

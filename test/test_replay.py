@@ -21,7 +21,7 @@ from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
 from stavpr_ros.commands.replay import main
 from stavpr_ros.ros import process
 from stavpr_ros.ros.qos import LATCHED
-from stavpr_ros.ros.receipts import MAX_BEHIND
+from stavpr_ros.ros.subscriber_progress import MAX_BEHIND
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_playback import spinning

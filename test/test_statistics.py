@@ -32,7 +32,7 @@ def stream(clock, seconds, hertz, event):
 
 def test_edges_are_counted_by_source_with_the_last_reason(clock, statistics):
     for source, reason in (('PNP', ''), ('REFUTED', 'PnP: 3 inliers')):
-        statistics.closed(source, reason)
+        statistics.add_edge(source, reason)
     counts = statistics.counts()
     assert (counts.edges.total, counts.edge_reason) == ({'pnp': 1, 'refuted': 1}, 'PnP: 3 inliers')
     clock.now += RECENT + 1
@@ -42,7 +42,7 @@ def test_edges_are_counted_by_source_with_the_last_reason(clock, statistics):
 
 
 def answer(statistics, status='match', reason='', place=0, distance=0.5, **stages):
-    statistics.answered(status, reason, place, distance, stages)
+    statistics.add_match(status, reason, place, distance, stages)
 
 
 def test_counts_without_events_are_empty(clock, statistics):
@@ -58,14 +58,14 @@ def test_counts_without_events_are_empty(clock, statistics):
 @pytest.mark.parametrize('seconds', [1, 9.3, 10, 11.7])
 def test_rate_of_a_steady_stream_is_correct_from_the_start(clock, statistics, hertz, seconds):
     clock.now += 100
-    stream(clock, seconds, hertz, statistics.received)
+    stream(clock, seconds, hertz, statistics.add_image)
     received = statistics.counts().received
     assert received.rate == pytest.approx(hertz, abs=0.112 if seconds > 9 else 1e-6)
     assert received.count == round(hertz * seconds)
 
 
 def test_rate_after_the_last_image_falls_to_zero_within_the_window(clock, statistics):
-    stream(clock, 30, 30, statistics.received)
+    stream(clock, 30, 30, statistics.add_image)
     rates = [statistics.counts().received.rate]
     for _ in range(RECENT):
         clock.now += 1
@@ -76,24 +76,24 @@ def test_rate_after_the_last_image_falls_to_zero_within_the_window(clock, statis
 
 
 def test_rate_of_a_burst_is_finite(clock, statistics):
-    statistics.received()
+    statistics.add_image()
     assert statistics.counts().received.rate == pytest.approx(1 / RECENT)
     for _ in range(3):
         clock.now += 0.001
-        statistics.received()
+        statistics.add_image()
     assert statistics.counts().received.rate == pytest.approx(3 / SHORTEST_SPAN)
 
 
 def test_drops_are_counted_by_cause_ever_and_recently(clock, statistics):
-    statistics.dropped('queue full')
-    statistics.dropped('lost in transport', 7)
+    statistics.add_drop('queue full')
+    statistics.add_drop('lost in transport', 7)
     clock.now += 20
-    statistics.dropped('queue full', 2)
+    statistics.add_drop('queue full', 2)
     clock.now += 5
-    statistics.dropped('max_rate')
+    statistics.add_drop('max_rate')
     dropped = statistics.counts().dropped
     clock.now += 5.1
-    statistics.dropped('lost in transport')
+    statistics.add_drop('lost in transport')
     assert statistics.counts().dropped.recent == {'max_rate': 1, 'lost in transport': 1}
     # later events do not change counts
     assert dropped.total == {'queue full': 3, 'lost in transport': 7, 'max_rate': 1}
@@ -134,7 +134,7 @@ def test_stage_times_are_mean_and_maximum_of_recent_images(clock, statistics):
 
 def test_steps_of_the_stamps_are_counted_with_the_longest(clock, statistics):
     for ahead, missing in ((0.5, 0), (3.0, 2), (2.0, 1), (-60.0, 0), (-5.0, 0), (0.0, 0)):
-        statistics.stepped(ahead, missing)
+        statistics.add_stamp_jump(ahead, missing)
     counts = statistics.counts()
     assert (counts.gaps, counts.longest_gap) == (3, 3.0)
     assert (counts.jumps_back, counts.longest_jump_back) == (2, 60.0)
@@ -145,11 +145,11 @@ def test_steps_of_the_stamps_are_counted_with_the_longest(clock, statistics):
 
 
 def test_restart_keeps_totals_and_nothing_recent(clock, statistics):
-    statistics.received()
+    statistics.add_image()
     answer(statistics, 'no match', 'x', 3, 0.1, matching=1)
-    statistics.dropped('queue full')
-    statistics.stepped(2, 1)
-    statistics.stepped(-3, 0)
+    statistics.add_drop('queue full')
+    statistics.add_stamp_jump(2, 1)
+    statistics.add_stamp_jump(-3, 0)
     clock.now += 5
     statistics.restart()
     tallies = {'received': '', 'answered': 'no match', 'dropped': 'queue full', 'missing': ''}
@@ -167,10 +167,10 @@ def test_counts_from_many_threads_are_complete():
 
     def count(number):
         for _ in range(300):
-            statistics.received()
+            statistics.add_image()
             answer(statistics, waiting=0.001, matching=0.001)
-            statistics.dropped(f'cause {number % 2}')
-            statistics.stepped(0.5, 1)
+            statistics.add_drop(f'cause {number % 2}')
+            statistics.add_stamp_jump(0.5, 1)
 
     try:
         with ThreadPoolExecutor(8) as pool:
@@ -185,9 +185,9 @@ def test_counts_from_many_threads_are_complete():
 
 def test_memory_of_a_long_stream_does_not_grow(clock, statistics):
     def event():
-        statistics.received()
+        statistics.add_image()
         answer(statistics, matching=0.001)
-        statistics.dropped('queue full')
+        statistics.add_drop('queue full')
 
     stream(clock, 2 * RECENT, 100, event)
     tracemalloc.start()

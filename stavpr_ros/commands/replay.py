@@ -189,7 +189,7 @@ def _replay(
     )
     if options.lossless:
         summary += f', {replayer.resent} sent again, {replayer.dropped} dropped'
-    elif report := replayer.receipts.report():
+    elif report := replayer.progress.report():
         summary += f', {report}'
     return summary
 

@@ -51,7 +51,7 @@ def match_image(
     :param query: RGB, shape (h, w, 3), uint8.
     :param place: RGB uint8 of any size, or None where there is nothing to show.
     :param text: the status, one line of ASCII; shrunk until it fits.
-    :param accepted: whether the bar at the edge is that of a match.
+    :param accepted: whether the bar at the edge has the color of a match.
     :param label: of the place.
     :returns: RGB, shape (h + bar, 2 w + gap, 3), uint8.
     """
@@ -83,10 +83,10 @@ def match_image(
 
 
 def places_to_draw(result: ImageResult, first: int, count: int) -> np.ndarray:
-    """Return those of the places from ``first`` on that are around the nearest sequence, (k,)."""
+    """Return the places from ``first`` on that are around the nearest sequence, (k,)."""
     middle = result.nearest_index if result.nearest_index >= 0 else first
-    left = min(max(first, middle - NEARBY), max(first, first + count - 2 * NEARBY))
-    return np.arange(left, min(left + 2 * NEARBY, first + count))
+    start = min(max(first, middle - NEARBY), max(first, first + count - 2 * NEARBY))
+    return np.arange(start, min(start + 2 * NEARBY, first + count))
 
 
 def draw_window(rows: np.ndarray, first: int, result: ImageResult) -> np.ndarray:
@@ -153,8 +153,8 @@ def _write(area: np.ndarray, text: str, size: float, centered: bool = False) -> 
     if across > width - 2 * margin:
         scale *= (width - 2 * margin) / across
         across, up = cv2.getTextSize(text, font, scale, 1)[0]
-    left = (width - across) // 2 if centered else margin
+    x = (width - across) // 2 if centered else margin
     # OpenCV writes into contiguous memory only; a view of columns is not.
     patch = np.ascontiguousarray(area)
-    cv2.putText(patch, text, (left, (height + up) // 2), font, scale, _INK, 1, cv2.LINE_AA)
+    cv2.putText(patch, text, (x, (height + up) // 2), font, scale, _INK, 1, cv2.LINE_AA)
     area[:] = patch

@@ -140,14 +140,14 @@ class Pipeline:
 
         :param delete_route: a route of loop closure is needed no longer.
         """
-        kept = []
+        paths = []
         for state in {self.save_state, self._map_save_state}:
             is_route = self.operation.name == 'loop_closure' and state is self.save_state
             path = str(state.journal.path) if state.journal and state.unsaved else ''
             state.close_journal(delete=delete_route and is_route)
             if path and not (delete_route and is_route):
-                kept.append(path)
-        return kept
+                paths.append(path)
+        return paths
 
     def _start(self, name: str, settings: PipelineSettings, loaded: LoadedMap | None) -> None:
         """Start an operation; an error changes nothing."""

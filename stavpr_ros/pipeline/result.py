@@ -96,7 +96,7 @@ class ImageResult:
         )
 
     def with_candidates(self, ranked: Sequence[Candidate]) -> 'ImageResult':
-        """Return the result with its ranked places; the first is that of the match."""
+        """Return the result with its ranked places; the first is the match's."""
         own = [
             replace(first, distance=self.distance, probability=self.probability)
             for first in ranked[:1]

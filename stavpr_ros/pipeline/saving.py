@@ -81,17 +81,17 @@ def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -
             )
             continue
         try:
-            found = recover(journal)
+            recovery = recover(journal)
         except Exception as error:  # any error: the node must start
             cause = str(error) if isinstance(error, StavprError) else repr(error)
             log.warning(f'the journal {journal} was left as it is: {cause}')
             continue
-        latest = found.path
+        latest = recovery.path
         log.warning(
-            f'{found.recorded} places of an earlier recording were recovered from {journal}: '
-            f'{found.path} has {found.places} places'
+            f'{recovery.recorded} places of an earlier recording were recovered from {journal}: '
+            f'{recovery.path} has {recovery.places} places'
         )
-        for problem in found.problems:
+        for problem in recovery.problems:
             log.error(problem)
     return latest
 

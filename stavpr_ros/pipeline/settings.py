@@ -128,7 +128,7 @@ class PipelineSettings:
 
     def matching_backend(self, operation: str) -> str:
         """
-        Return the backend of the image distances: ``cuda``, or ``cpu``, that of loop closure, too.
+        Return the backend of the image distances: ``cuda``, or ``cpu``, always for loop closure.
 
         :raises UnavailableError: ``cuda`` is set and not available.
         """
@@ -165,7 +165,7 @@ class PipelineSettings:
 
     @property
     def extraction_device(self) -> str:
-        """Return the requested device of the features; that of ``auto`` is the backend's."""
+        """Return the requested device of the features; ``auto`` takes the backend's."""
         return 'cpu' if choose_backend(self.backend) == 'cpu' else self.backend
 
 
@@ -223,9 +223,9 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     :raises UnavailableError: the backend is not available.
     """
     for name, value in values.items():
-        allowed = kinds() if name == 'features' else BY_NAME[name].choices
-        if allowed:
-            require_choice(name, value, allowed)
+        choices = kinds() if name == 'features' else BY_NAME[name].choices
+        if choices:
+            require_choice(name, value, choices)
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}
     for name in ('map_path', 'save_path'):  # a file, '' = none, or the address of a fleet's map
         if (path := values[name]) and not is_address(path):

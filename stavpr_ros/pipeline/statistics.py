@@ -24,7 +24,7 @@ LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
 
 @dataclass(frozen=True)
 class Tally:
-    """The events of one kind, by name; recent ones are those of the last ``RECENT`` seconds."""
+    """The events of one kind, by name; recent: in the last ``RECENT`` seconds."""
 
     total: Counter[str] = field(default_factory=Counter)  # since the start
     recent: Counter[str] = field(default_factory=Counter)
@@ -91,12 +91,12 @@ class Statistics:
             self._recent: defaultdict[str, deque[tuple[float, str, int]]] = defaultdict(deque)
             self._stages: deque[tuple[float, Mapping[str, float]]] = deque()
 
-    def received(self) -> None:
+    def add_image(self) -> None:
         """Count a received image."""
         with self._lock:
             self._add('received')
 
-    def answered(
+    def add_match(
         self, status: str, reason: str, place: int, distance: float, stages: Mapping[str, float]
     ) -> None:
         """
@@ -119,18 +119,18 @@ class Statistics:
             counts.place, counts.distance = place, distance
             counts.nearest = min(counts.nearest, distance)  # NaN is not less
 
-    def dropped(self, cause: str, count: int = 1) -> None:
+    def add_drop(self, cause: str, count: int = 1) -> None:
         """Count images without a result, by cause: ``'queue full'``, ``'invalid: encoding'``."""
         with self._lock:
             self._add('dropped', cause, count)
 
-    def closed(self, source: str, reason: str) -> None:
+    def add_edge(self, source: str, reason: str) -> None:
         """Count a loop closure by the source of its edge; reason: why it is not PnP."""
         with self._lock:
             self._add('edges', source.lower())
             self._counts.edge_reason = reason
 
-    def stepped(self, ahead: float, missing: int) -> None:
+    def add_stamp_jump(self, ahead: float, missing: int) -> None:
         """Count a gap or jump back of the stamps, and missing images (:class:`StampWatch`)."""
         with self._lock:
             counts = self._counts
@@ -196,7 +196,7 @@ class StampWatch:
         """
         Take the next stamp; return the step and the number of images missing before it.
 
-        The step is the seconds of a gap, minus those of a jump back, 0 = neither. A reordered
+        The step is the seconds of a gap, negative of a jump back, 0 = neither. A reordered
         image does not move the newest stamp back: the next image comes after no gap.
 
         Missing images are estimated at a camera of steady rate, with jitter up to a tenth of the
@@ -223,13 +223,13 @@ class StampWatch:
         if interval <= 0:  # equal or out of order
             return 0
         self._intervals.append(interval)
-        ordered = sorted(self._intervals)
-        if len(ordered) < INTERVALS // 2:
+        intervals = sorted(self._intervals)
+        if len(intervals) < INTERVALS // 2:
             return 0
         # a short interval, since long ones have losses, but not the shortest: it has most jitter
-        guess = ordered[len(ordered) // 5]
-        period = median(each / max(round(each / guess), 1) for each in ordered)
-        multiples = [each / period for each in ordered]
+        guess = intervals[len(intervals) // 5]
+        period = median(each / max(round(each / guess), 1) for each in intervals)
+        multiples = [each / period for each in intervals]
         near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)
         if near < REGULAR * len(multiples) or interval > LONGEST_LOSS * period:
             return 0
@@ -242,10 +242,10 @@ def _evict(events: deque[Any], now: float) -> None:
         events.popleft()
 
 
-def _times(measured: list[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
+def _times(rows: list[Mapping[str, float]]) -> dict[str, tuple[float, float]]:
     """Return mean and maximum [ms] of total, work and each stage."""
     seconds: dict[str, list[float]] = {}
-    for stages in measured:
+    for stages in rows:
         total = sum(stages.values())
         sums = {'total': total, 'work': total - stages.get(WAITING, 0.0)}
         for name, value in {**sums, **stages}.items():

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A bank of views, for a camera that is rolled or tilted against that of the map."""
+"""A bank of views, for a camera that is rolled or tilted against the map's camera."""
 
 import cv2
 import numpy as np
@@ -42,11 +42,11 @@ class ViewBank:
 
     @property
     def recognizer(self) -> PlaceRecognizer:
-        """Return that of the present view."""
+        """Return the recognizer of the present view."""
         return self._recognizers[self.view]
 
     def reset(self) -> None:
-        """Drop all images; the present view is that of the images as they are."""
+        """Drop all images; the present view becomes the original one."""
         self.view = next(iter(VIEWS))
         self.recognizer.reset()
         self._follow_all()

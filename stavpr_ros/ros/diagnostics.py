@@ -50,8 +50,8 @@ class DiagnosticsPublisher:
                 name = self._node.get_fully_qualified_name()
                 health = self._health()
                 self._publisher.publish(diagnostic_array(health, name, stamp))
-                if lost := loss(health):
-                    self._node.get_logger().warning(lost, throttle_duration_sec=LOSS_PERIOD)
+                if text := loss(health):
+                    self._node.get_logger().warning(text, throttle_duration_sec=LOSS_PERIOD)
             except Exception as error:  # the next report may succeed
                 self._node.get_logger().error(
                     f'no diagnostics: {type(error).__name__}: {error}',
@@ -67,11 +67,11 @@ def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:
     """
     values = _values(health)
     statuses = []
-    for part, found in findings(health, node).items():
-        found.sort(key=lambda finding: finding[0], reverse=True)  # monitors cut long messages
-        text = '; '.join(text for _, text in found)
-        shown = {key: _text(value) for key, value in values[part].items()}
-        statuses.append(_status(f'{node}: {part}', found[0][0], text, shown))
+    for part, rows in findings(health, node).items():
+        rows.sort(key=lambda finding: finding[0], reverse=True)  # monitors cut long messages
+        text = '; '.join(text for _, text in rows)
+        texts = {key: _text(value) for key, value in values[part].items()}
+        statuses.append(_status(f'{node}: {part}', rows[0][0], text, texts))
         statuses[-1].hardware_id = health.hardware_id
     return DiagnosticArray(header=Header(stamp=stamp), status=statuses)
 
@@ -169,8 +169,8 @@ def _drops(counts: ImageCounts, of_input: bool) -> dict[str, Value]:
 
 
 def _status(name: str, level: bytes, text: str, values: Mapping[str, object]) -> DiagnosticStatus:
-    shown = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(level=level, name=name.lstrip('/'), message=text, values=shown)
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name.lstrip('/'), message=text, values=pairs)
 
 
 def _key(*words: str) -> str:

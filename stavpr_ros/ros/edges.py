@@ -163,7 +163,7 @@ class EdgePublisher:
         except Exception as error:  # a failed edge must not lose its closure
             get_logger('stavpr_edges').error(f'no edge: {traceback.format_exc()}')
             edge = Edge(Source.NONE, f'internal error: {type(error).__name__}: {error}')
-        self._statistics.closed(edge.source.name, edge.reason)
+        self._statistics.add_edge(edge.source.name, edge.reason)
         message = closure.message
         message.has_relative_pose = edge.has_pose
         message.relative_pose = relative_pose_message(edge, message, message.pose_child_frame)

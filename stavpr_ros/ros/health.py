@@ -19,7 +19,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 SILENCE = 2.0  # seconds without an image from which on the input of an active node has a fault
 BUSY = 0.8  # share of its time that the worker is busy; below it, a full queue is due to a burst
 MISSING = 0.05  # share of the received images; from this estimate on missing ones are reported
-HOPELESS = 5  # windows' lengths of images without any match, from which on the limit is suspect
+MAX_IMAGES_WITHOUT_MATCH = 5  # in lengths of a window; after more, the limit is suspect
 BLANK_CONTRAST = 3.0  # standard deviation of 255; the darkest tunnels of Nordland have 3
 NEXT_TRANSITION = {'unconfigured': 'configure', 'inactive': 'activate'}
 INVALID = 'invalid: '  # first word of the causes of images that cannot be decoded
@@ -48,7 +48,7 @@ class Health:
     odometry_fault: str = ''  # why no odometry can arrive on its topic
     camera: str = 'not needed'  # whether the camera of the edges is known, or why not
     contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown
-    applied_threshold: float | None = None  # that of the recognizer; None = that of the settings
+    applied_threshold: float | None = None  # the recognizer's; None = the settings'
 
     @property
     def limit(self) -> float | None:
@@ -76,9 +76,9 @@ def findings(health: Health, node: str) -> dict[str, list[Finding]]:
         remedy = f"; run 'ros2 lifecycle set {node} {transition}'" if transition else ''
         idle = [(OK, f'{health.state}: no image is processed{remedy}')]
         return {'input': idle, 'map': of_map, 'recognition': idle, 'processing': idle}
-    received, topic = health.counts.received, health.input.topic
-    normal = f'{received.rate:.1f} images per second on {topic}'
-    if received.age is None:
+    images, topic = health.counts.received, health.input.topic
+    normal = f'{images.rate:.1f} images per second on {topic}'
+    if images.age is None:
         normal = f'waiting for the first image on {topic}'
     return {
         'input': [*_silence(health), *_image_faults(health)] or [(OK, normal)],
@@ -93,30 +93,30 @@ def _silence(health: Health) -> Iterator[Finding]:
     source, age = health.input, health.counts.received.age
     silent = (health.counts.uptime if age is None else age) > SILENCE
     nothing = f'no image {"yet" if age is None else f"for {age:.0f} s"} on {source.topic}: '
-    refused = f'{_of(source.incompatible, "publisher")} refused for QoS'
+    refusal = f'{_plural(source.incompatible, "publisher")} refused for QoS'
     qos = source.remedy or f"compare 'ros2 topic info --verbose {source.topic}'"
     if silent and not source.publishers:
         find = "find the camera's topic with 'ros2 topic list', remap to it"
         remedy = source.remedy or f'{find} with --ros-args -r image:=TOPIC'
         yield WARN, f'{nothing}no publisher; {remedy}'
     elif silent and source.incompatible:
-        yield ERROR, f'{nothing}{refused}: {qos}'
+        yield ERROR, f'{nothing}{refusal}: {qos}'
     elif silent and source.mistyped:
         remedy = 'compare image_transport and the topic'
         yield ERROR, f'{nothing}{source.mistyped} is published there: {remedy}'
     elif silent:
-        remedy = 'check for a paused bag or a camera that is off'
-        yield WARN, f'{nothing}{_of(source.publishers, "publisher")} there, but silent; {remedy}'
+        silence = f'{_plural(source.publishers, "publisher")} there, but silent'
+        yield WARN, f'{nothing}{silence}; check for a paused bag or a camera that is off'
     elif source.incompatible and source.publishers > 1 and age is not None:
         # a single publisher is not the refused one: images arrive
-        yield WARN, f'{refused}, while images of others arrive: {qos}'
+        yield WARN, f'{refusal}, while images of others arrive: {qos}'
 
 
 def loss(health: Health) -> str:
     """Return the finding on images that were lost in transport, '' = none."""
-    lost = health.counts.dropped.recent['lost in transport']
+    count = health.counts.dropped.recent['lost in transport']
     remedy = f'{health.input.loss_remedy} (docs/troubleshooting.md, images are lost)'
-    return f'{_of(lost, "image")} lost in transport {RECENTLY}: {remedy}' if lost else ''
+    return f'{_plural(count, "image")} lost in transport {RECENTLY}: {remedy}' if count else ''
 
 
 def _image_faults(health: Health) -> Iterator[Finding]:
@@ -127,15 +127,16 @@ def _image_faults(health: Health) -> Iterator[Finding]:
         kinds = ', '.join(f'{cause.removeprefix(INVALID)} {n}' for cause, n in invalid.items())
         text = f'{RECENTLY} were invalid ({kinds}): see the log'
         if counts.answered.recent or NOT_A_KEYFRAME in drops:  # others could be decoded
-            yield WARN, f'{_of(sum(invalid.values()), "image")} {text}'
+            yield WARN, f'{_plural(sum(invalid.values()), "image")} {text}'
         else:
             yield ERROR, f'all images {text}, and docs/node.md for the supported encodings'
     missing = counts.missing.recent.total()
-    if lost := loss(health):
-        yield WARN, lost
+    if fault := loss(health):
+        yield WARN, fault
     elif missing > MISSING * RECENT * counts.received.rate:
         remedy = 'none was lost in transport: check the camera driver, its cable and its exposure'
-        yield WARN, f'about {_of(missing, "image")} missing by their stamps {RECENTLY}; {remedy}'
+        text = f'about {_plural(missing, "image")} missing by their stamps {RECENTLY}'
+        yield WARN, f'{text}; {remedy}'
     absent = health.odometry in ('stale', 'never')
     if absent and (health.odometry_required or health.odometry_fault):
         need = 'required by a parameter' if health.odometry_required else 'for poses of the map'
@@ -143,7 +144,7 @@ def _image_faults(health: Health) -> Iterator[Finding]:
         remedy = health.odometry_fault or 'start it, compare its topic and its stamps'
         yield WARN, f'odometry, {need}, {state}: {remedy}'
     elif without := drops['no odometry']:
-        text = f'{_of(without, "image")} without odometry at their stamps {RECENTLY}'
+        text = f'{_plural(without, "image")} without odometry at their stamps {RECENTLY}'
         yield WARN, f'{text}: compare both'
     if counts.received.rate and health.contrast < BLANK_CONTRAST:
         text = f'the images show nothing (standard deviation {health.contrast:.1f} of 255)'
@@ -154,7 +155,7 @@ def _image_faults(health: Health) -> Iterator[Finding]:
 def _map_finding(health: Health) -> Finding:
     """Return the finding on the map, in any state of the node."""
     info, settings = health.map_info, health.settings.pipeline
-    places = _of(info.places, 'place')
+    places = _plural(info.places, 'place')
     warning = WARN if health.state == 'active' else OK
     if health.problem:
         in_use = info.state in ('loaded', 'growing', 'full')
@@ -183,12 +184,12 @@ def _recognition_finding(health: Health) -> Finding:
         return OK, 'waiting for the map'
     if health.missing:
         return WARN, f'no match is possible: {health.missing}'
-    if hopeless := _hopeless(health):
-        return WARN, hopeless
+    if obstacle := _why_no_match_is_possible(health):
+        return WARN, obstacle
     if health.window < length:
         return OK, f'warming up: {health.window} of {length} images'
-    matched, rejected = (counts.answered.recent[status] for status in ('match', 'no match'))
-    text = f'{matched} of {_of(matched + rejected, "image")} matched {RECENTLY}'
+    hits, rejected = (counts.answered.recent[status] for status in ('match', 'no match'))
+    text = f'{hits} of {_plural(hits + rejected, "image")} matched {RECENTLY}'
     if counts.status:
         place = f', place {counts.place}' if counts.place >= 0 else ''
         distance = '' if math.isnan(counts.distance) else f', distance {counts.distance:.3f}'
@@ -197,7 +198,7 @@ def _recognition_finding(health: Health) -> Finding:
     return OK, text
 
 
-def _hopeless(health: Health) -> str:
+def _why_no_match_is_possible(health: Health) -> str:
     """Return why no image can be matched on a loaded map, or was, '' = one may be."""
     counts, settings, places = health.counts, health.settings.pipeline, health.map_info.places
     if health.settings.operation != 'localization' or health.map_info.state != 'loaded':
@@ -208,10 +209,10 @@ def _hopeless(health: Health) -> str:
             f'{length}): record a longer map, with smaller keyframe distances, or set a shorter '
             'sequence_length'
         )
-    tried, limit = counts.answered.total['no match'], health.limit
-    if counts.answered.total['match'] or tried < HOPELESS * length:
+    images, limit = counts.answered.total['no match'], health.limit
+    if counts.answered.total['match'] or images < MAX_IMAGES_WITHOUT_MATCH * length:
         return ''
-    never = f'none of {tried} images was ever matched'
+    never = f'none of {images} images was ever matched'
     if limit is not None and counts.nearest < limit:
         return f'{never}: the geometric check rejects all, lower min_inliers or set it to none'
     if settings.mode == 'robust':
@@ -233,8 +234,9 @@ def _processing_finding(health: Health) -> Finding:
     counts, drops = health.counts, health.counts.dropped.recent
     mean, _ = counts.times.get('work', (math.nan, math.nan))  # [ms]
     rate, takes = counts.received.rate, f', one takes {mean:.1f} ms'
-    if failed := drops['internal error']:
-        return ERROR, f'{_of(failed, "image")} failed {RECENTLY} by an internal error: see the log'
+    if errors := drops['internal error']:
+        text = f'{_plural(errors, "image")} failed {RECENTLY} by an internal error: see the log'
+        return ERROR, text
     if not drops['queue full']:
         if math.isnan(mean):
             return OK, f'no image {RECENTLY}'
@@ -247,19 +249,19 @@ def _processing_finding(health: Health) -> Finding:
         int8 = '' if health.settings.pipeline.precision == 'int8' else 'precision int8, '
         remedy = f'set max_rate or keyframe_*, {int8}a smaller map'
         why = f'{takes}, so {1e3 / mean:.1f} per second are possible: {remedy}'
-    dropped = f'{_of(drops["queue full"], "image")} dropped {RECENTLY}, the queue was full'
-    return WARN, f'{dropped}: {rate:.1f} images per second arrive{why}'
+    losses = f'{_plural(drops["queue full"], "image")} dropped {RECENTLY}, the queue was full'
+    return WARN, f'{losses}: {rate:.1f} images per second arrive{why}'
 
 
 def _edge_faults(health: Health) -> Iterator[Finding]:
     """Yield the finding on loop closures that PnP had no time for."""
     edges = health.counts.edges.recent
-    if dropped := edges['dropped']:
-        text = f'{dropped} of {_of(edges.total(), "loop closure")} without a relative pose'
+    if drops := edges['dropped']:
+        text = f'{drops} of {_plural(edges.total(), "loop closure")} without a relative pose'
         why = f'PnP is slower than they come, more than {MAX_WAITING} waited'
         remedy = 'set max_rate or keyframe_distance, or free a processor core'
         yield WARN, f'{text} {RECENTLY}: {why}; {remedy}'
 
 
-def _of(count: int, noun: str) -> str:
+def _plural(count: int, noun: str) -> str:
     return f'{count} {noun}{"" if count == 1 else "s"}'

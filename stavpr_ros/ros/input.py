@@ -52,7 +52,7 @@ class InputStatus:
     publishers: int = 0  # of any QoS and type
     incompatible: int = 0  # not received because of their QoS
     mistyped: str = ''  # other message types on the topic
-    remedy: str = ''  # for incompatible publishers, or those of the other transport
+    remedy: str = ''  # for incompatible publishers, or publishers of the other transport
     loss_remedy: str = ''  # for lost images
     reliability: str = ''  # of the subscription, with the reason
 
@@ -88,8 +88,8 @@ class ImageInput:
         self._lock = threading.Lock()  # close() waits for the image of another thread
         self._closed = False
         # as in image_transport, the compressed topic is below the one that `image` is remapped to
-        compressed = node.resolve_topic_name('image') + '/compressed'
-        kinds = {'raw': (Image, 'image'), 'compressed': (CompressedImage, compressed)}
+        compressed_topic = node.resolve_topic_name('image') + '/compressed'
+        kinds = {'raw': (Image, 'image'), 'compressed': (CompressedImage, compressed_topic)}
         message_type, name = kinds[settings.image_transport]
         self._type = f'sensor_msgs/msg/{message_type.__name__}'
         self.topic = node.resolve_topic_name(name)  # before events, which come on another thread
@@ -99,7 +99,7 @@ class ImageInput:
             name,
             QUEUE,
             self.on_image,
-            lambda count: statistics.dropped('lost in transport', count),
+            lambda count: statistics.add_drop('lost in transport', count),
             self._on_refused,
         )
 
@@ -141,10 +141,10 @@ class ImageInput:
             if self._closed:
                 return
             arrival = time.monotonic()
-            self._statistics.received()
+            self._statistics.add_image()
             stamp = nanoseconds(message.header.stamp)
             ahead, missing = self.stamps.update(stamp)
-            self._statistics.stepped(ahead, missing)
+            self._statistics.add_stamp_jump(ahead, missing)
             if ahead < 0:
                 self._last = None
                 self._restart(f'the stamps of the images jumped back by {-ahead:.3f} s')
@@ -366,10 +366,10 @@ class AdaptiveSubscription:
         Neither has all: the middleware does not report images that another one displaced in a
         queue, and the sequence has no end.
         """
-        lost = max(self._reported, self._missing)
-        if lost > self._lost:
-            self._on_lost(lost - self._lost)
-            self._lost = lost
+        count = max(self._reported, self._missing)
+        if count > self._lost:
+            self._on_lost(count - self._lost)
+            self._lost = count
 
     def _finish_switch(self) -> None:
         """Deliver the remaining images of the previous subscription, and destroy it."""
@@ -378,17 +378,17 @@ class AdaptiveSubscription:
             return
         with previous.handle:
             while not self._closed and (
-                taken := previous.handle.take_message(previous.msg_type, False)
+                message := previous.handle.take_message(previous.msg_type, False)
             ):
-                self._deliver(*taken)
+                self._deliver(*message)
         self._node.destroy_subscription(previous)
 
     def _deliver(self, message: Any, info: Any) -> None:
         """Call back with an image, unless it was; count those between it and the last one."""
-        written, sequence = info['source_timestamp'], info['publication_sequence_number']
-        if written and (written, sequence) in self._seen:
+        stamp, sequence = info['source_timestamp'], info['publication_sequence_number']
+        if stamp and (stamp, sequence) in self._seen:
             return
-        self._seen.append((written, sequence))
+        self._seen.append((stamp, sequence))
         # the numbers of several publishers are mixed
         before = self._sequence if self._publishers == 1 else None
         self._sequence = sequence if self._publishers == 1 else None

@@ -62,16 +62,16 @@ def node_launch(
     return LaunchDescription([*arguments, check, OpaqueFunction(function=start), *actions])
 
 
-def unknown_arguments(given: Iterable[str], known: Iterable[str]) -> list[str]:
+def unknown_arguments(words: Iterable[str], names: Iterable[str]) -> list[str]:
     """
     Return a sentence for each argument that no launch file declares; launch ignores them.
 
-    :param given: words of the command line, arguments as ``NAME:=VALUE``.
+    :param words: words of the command line, arguments as ``NAME:=VALUE``.
     """
     problems = []
-    for name, found, _ in (word.partition(':=') for word in given):
-        if found and name not in known:
-            near = difflib.get_close_matches(name, known, 1)
+    for name, separator, _ in (word.partition(':=') for word in words):
+        if separator and name not in names:
+            near = difflib.get_close_matches(name, names, 1)
             hint = f'did you mean {near[0]}?' if near else 'see the option --show-args'
             problems.append(f'argument {name!r} is unknown: {hint}')
     return problems
@@ -90,13 +90,13 @@ def value_of(name: str, text: str) -> bool | float | str:
         raise RuntimeError(f'{name} = {text!r}: expected {EXPECTED[kind]}') from None
 
 
-def _check(known: list[str]) -> OpaqueFunction:
-    """Reject unknown arguments, unless the command line is that of another launch file."""
+def _check(names: list[str]) -> OpaqueFunction:
+    """Reject unknown arguments, unless the command line is for another launch file."""
 
     def check(context: LaunchContext) -> None:
         file = context.get_locals_as_dict().get('current_launch_file_path')
         own = PACKAGE in sys.argv or file in (str(Path(word).resolve()) for word in sys.argv)
-        if own and (problems := unknown_arguments(sys.argv, known)):
+        if own and (problems := unknown_arguments(sys.argv, names)):
             raise RuntimeError('; '.join(problems))
 
     return OpaqueFunction(function=check)

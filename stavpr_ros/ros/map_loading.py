@@ -29,8 +29,8 @@ class MapLoader:
     :param in_use: returns the places in use.
     :param on_change: called when ``path`` or ``problem`` has changed.
 
-    ``path`` is that of the map that is being loaded, '' = none; ``problem`` the error of the last
-    map, for the diagnostics.
+    ``path`` is the path of the map that is being loaded, '' = none; ``problem`` the error of the
+    last map, for the diagnostics.
     """
 
     def __init__(

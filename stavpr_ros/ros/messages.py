@@ -324,8 +324,8 @@ def transform_message(pose: np.ndarray, parent: str, child: str) -> TransformSta
     """Return a pose of a frame, shape (7,), as a transform without a stamp."""
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
-    moved = message.transform.translation
-    moved.x, moved.y, moved.z = map(float, pose[:3])
+    shift = message.transform.translation
+    shift.x, shift.y, shift.z = map(float, pose[:3])
     message.transform.rotation = pose_message(pose).orientation
     return message
 
@@ -337,7 +337,7 @@ def camera_of(info: CameraInfo, mount: tuple[float, ...]) -> Camera:
     :raises InputError: it is not calibrated, or the numbers are invalid.
     """
     bins, roi, k = (max(info.binning_x, 1), max(info.binning_y, 1)), info.roi, info.k
-    distorted = any(info.d)
+    has_distortion = any(info.d)
     return Camera(
         width=(roi.width or info.width) // bins[0],
         height=(roi.height or info.height) // bins[1],
@@ -346,8 +346,8 @@ def camera_of(info: CameraInfo, mount: tuple[float, ...]) -> Camera:
             (float(k[2]) - roi.x_offset + 0.5) / bins[0] - 0.5,
             (float(k[5]) - roi.y_offset + 0.5) / bins[1] - 0.5,
         ),
-        model=info.distortion_model if distorted else '',
-        distortion=tuple(map(float, info.d)) if distorted else (),
+        model=info.distortion_model if has_distortion else '',
+        distortion=tuple(map(float, info.d)) if has_distortion else (),
         mount=mount,
     )
 
@@ -383,7 +383,7 @@ def map_info_message(
             message.dimension = places.dimension
         message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)
         message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
-        thumbnails = places.thumbnails  # those of a map stay in its file, which is not read here
+        thumbnails = places.thumbnails  # a map's stay in its file, which is not read here
         is_map = isinstance(places, PlaceMap)
         message.has_thumbnails = bool(len(thumbnails)) if is_map else any(thumbnails)
     return message

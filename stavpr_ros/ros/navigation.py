@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 # (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: a place does not determine the lateral
 # offset from the mapped route
 MIN_VARIANCE_XY, MIN_VARIANCE_YAW = 0.25, 0.0685
-TF_DEPTH = 100  # that of tf2_ros
+TF_DEPTH = 100  # as tf2_ros has it
 
 
 class Navigation:
@@ -63,11 +63,11 @@ class Navigation:
         map_frame = self._settings.map_frame
         pose = places.place(result.newest_index).pose if result.accepted else None
         if pose is not None and odometry is not None:
-            moved = map_to_odometry(pose, odometry)
-            self._transform = transform_message(moved, map_frame, odometry_frame)
+            correction = map_to_odometry(pose, odometry)
+            self._transform = transform_message(correction, map_frame, odometry_frame)
         # a whole window without a match, or a new window
         length = self._settings.pipeline.sequence.length
-        lost = self._unmatched >= length - 1
+        is_lost = self._unmatched >= length - 1
         if result.status is Status.WARMING_UP:
             self._unmatched = length
         else:
@@ -76,9 +76,9 @@ class Navigation:
             if self._tf is not None and self._transform is not None:
                 self._transform.header.stamp = header.stamp  # without a match, the last transform
                 self._tf.publish(tf_message()(transforms=[self._transform]))
-            found = matched_pose_message(header, result, places, map_frame) if lost else None
-            if self._initial_pose is not None and found is not None:
-                self._initial_pose.publish(planar(found))
+            message = matched_pose_message(header, result, places, map_frame) if is_lost else None
+            if self._initial_pose is not None and message is not None:
+                self._initial_pose.publish(planar(message))
 
     def close(self) -> None:
         """Destroy the publishers, and release the map."""

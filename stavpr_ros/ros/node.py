@@ -109,11 +109,11 @@ class PlaceRecognitionNode(ManagedNode):
         self._start.cancel()
         if self.state != 'unconfigured':
             return
-        tried = self.settings
+        settings = self.settings
         if self.advance(self.trigger_configure):
             if not self.ending.is_set():
                 self.advance(self.trigger_activate)
-        elif self.state == 'unconfigured' and self.settings != tried:
+        elif self.state == 'unconfigured' and self.settings != settings:
             self._start.reset()  # a parameter was set during the failing transition
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -220,8 +220,8 @@ class PlaceRecognitionNode(ManagedNode):
                 raise SettingsError('; '.join(unknown))
             with self._lock:
                 folder = self.settings.maps_path
-                given = [inside_maps_folder(typed(row), self, folder) for row in parameters]
-                return super().set_parameters_atomically(given)
+                rows = [inside_maps_folder(typed(row), self, folder) for row in parameters]
+                return super().set_parameters_atomically(rows)
         except SettingsError as error:
             return self._rejected(error)
 
@@ -296,7 +296,7 @@ class PlaceRecognitionNode(ManagedNode):
                 self._start.reset()
 
     def _apply_verbosity(self, verbosity: str) -> None:
-        """Set the log level; that of --log-level stays until the parameter is changed."""
+        """Set the log level; the level by --log-level stays until the parameter is changed."""
         if verbosity != self._verbosity:
             name = 'UNSET' if verbosity == 'default' else verbosity.upper()
             self.get_logger().set_level(LoggingSeverity[name])
@@ -351,8 +351,8 @@ class PlaceRecognitionNode(ManagedNode):
             self.get_logger().warning('a thread is still loading or compiling: it is abandoned')
         counts = self.statistics.counts()
         drops = sorted(counts.dropped.total.items())
-        dropped = ''.join(f', {count} {cause}' for cause, count in drops)
+        losses = ''.join(f', {count} {cause}' for cause, count in drops)
         self.get_logger().info(
-            f'{counts.received.count} images received, {counts.answered.count} processed{dropped}'
+            f'{counts.received.count} images received, {counts.answered.count} processed{losses}'
         )
         super().destroy_node()

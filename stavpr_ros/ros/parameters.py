@@ -61,19 +61,19 @@ def declare_parameters(node: ManagedNode) -> dict[str, Any]:
 
     :raises SettingsError: a parameter was given with the wrong type.
     """
-    given = node.parameter_overrides
+    overrides = node.parameter_overrides
     values = {}
     for row in PARAMETERS:
-        value = typed(given[row.name]).value if row.name in given else row.default
+        value = typed(overrides[row.name]).value if row.name in overrides else row.default
         node.declare_parameter(row.name, value, descriptor(row), ignore_override=True)
         values[row.name] = value
     return values
 
 
-def unknown_parameters(given: Iterable[str]) -> list[str]:
+def unknown_parameters(names: Iterable[str]) -> list[str]:
     """Return a warning for each unknown parameter, with the most similar name."""
     warnings = []
-    for name in given:
+    for name in names:
         if name in BY_NAME or name.startswith(_RCLPY_PARAMETERS):
             continue
         near = difflib.get_close_matches(name, BY_NAME, 1)
@@ -96,9 +96,9 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
                 f'{name} is read when the node is configured, it is {state}: call the service '
                 f'~/{service}'
             )
-    if fixed := [name for name in changes if BY_NAME[name].when != 'live']:
+    if names := [name for name in changes if BY_NAME[name].when != 'live']:
         raise SettingsError(
-            f'{", ".join(fixed)} can be set only while the node is unconfigured, it is {state}: '
+            f'{", ".join(names)} can be set only while the node is unconfigured, it is {state}: '
             'clean it up first (`ros2 lifecycle set NODE deactivate`, then cleanup)'
         )
 

@@ -19,8 +19,8 @@ class Playback:
     """
     Maps the time of recording to the time of this machine; it can be paused and stepped.
 
-    :param rate: recorded seconds per second, above 0; None = items are due at once, and time is
-        that of the last item.
+    :param rate: recorded seconds per second, above 0; None = items are due at once, and the last
+        item determines the time.
     :param steady: returns seconds; replaced in tests.
     """
 
@@ -81,7 +81,7 @@ def keyboard(keys: Mapping[str, Callable[[], object]]) -> Iterator[Callable[[], 
     Read single keys from the terminal, if there is one and this process is in its foreground.
 
     :param keys: the function of each key.
-    :returns: a function that calls those of the keys pressed since.
+    :returns: a function that calls the functions of the keys pressed since.
     """
     try:
         terminal = sys.stdin.fileno()
@@ -95,11 +95,11 @@ def keyboard(keys: Mapping[str, Callable[[], object]]) -> Iterator[Callable[[], 
     def poll() -> None:
         # reading in the background would stop the process
         while _in_foreground(terminal) and select.select([terminal], [], [], 0)[0]:
-            pressed = os.read(terminal, 16).decode(errors='replace')
-            if not pressed:
+            text = os.read(terminal, 16).decode(errors='replace')
+            if not text:
                 return
             # the sequence of an arrow is one key
-            for key in [pressed] if pressed in keys else pressed:
+            for key in [text] if text in keys else text:
                 keys.get(key, lambda: None)()
 
     tty.setcbreak(terminal, termios.TCSANOW)

@@ -68,7 +68,7 @@ def own_arguments(arguments: Sequence[str]) -> list[str]:
     """
     Return the arguments that are not for ROS.
 
-    :raises SettingsError: those after ``--ros-args`` are invalid.
+    :raises SettingsError: arguments after ``--ros-args`` are invalid.
     """
     with ros_arguments_checked():
         return list(remove_ros_args(arguments))
@@ -101,11 +101,11 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
             end_process(int(getattr(node, 'failed', False)))
 
 
-def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:
+def spin_until(node: Node, is_done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:
     """
-    Spin until ``done`` returns True or the context is shut down.
+    Spin until ``is_done`` returns True or the context is shut down.
 
-    A signal raises KeyboardInterrupt. Errors of callbacks are logged, except those of this
+    A signal raises KeyboardInterrupt. Errors of callbacks are logged, except errors of this
     package, which are raised.
 
     :param node: if it has an event ``ending``, that is set at the end.
@@ -118,7 +118,7 @@ def spin_until(node: Node, done: Callable[[], bool] = lambda: False, threads: in
     )
     executor.add_node(node)
     try:
-        while node.context.ok() and not done():
+        while node.context.ok() and not is_done():
             try:
                 with signals_deferred():
                     executor.spin_once(timeout_sec=SIGNAL_POLL)
@@ -153,8 +153,8 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
         elif not of_ros:
             words.append(word)
     # rcl takes NAME:=VALUE alone as a remapping, of a parameter without effect
-    remapped = {word.partition(':=')[0] for word in words}
-    if not own_arguments(arguments) and remapped.isdisjoint(parameters):
+    names = {word.partition(':=')[0] for word in words}
+    if not own_arguments(arguments) and names.isdisjoint(parameters):
         return
     line, unknown = ['--ros-args'], ''
     for word in words:
@@ -207,7 +207,7 @@ class Discovery:
     Finds out when the nodes at the other end of our topics have discovered us.
 
     A matched endpoint on our side does not imply a matched one on theirs, and DDS does not report
-    it. But endpoints are announced in order, those of a request after those made before: a node
+    it. But endpoints are announced in order, so a request's come after earlier ones: a node
     that responds to a request has discovered our topics. Nodes serve parameter requests by
     default.
 
@@ -245,8 +245,8 @@ class Discovery:
                 self._clients[name] = self._node.create_client(GetParameters, service)
             if self._clients[name].service_is_ready():
                 self._responses[name] = self._clients[name].call_async(GetParameters.Request())
-        requested = [self._responses[name] for name in names if name in self._responses]
-        waited = time.monotonic() - self._start
-        if not all(response.done() for response in requested):
-            return waited > self._timeout
-        return (bool(names) and len(requested) == len(names)) or waited > SERVICE_SECONDS
+        responses = [self._responses[name] for name in names if name in self._responses]
+        seconds = time.monotonic() - self._start
+        if not all(response.done() for response in responses):
+            return seconds > self._timeout
+        return (bool(names) and len(responses) == len(names)) or seconds > SERVICE_SECONDS

@@ -243,25 +243,25 @@ class ManagedNode(LifecycleNodeMixin, Node):
         super().destroy_node()
 
     def _change_or_reject(self, request: Any, response: Any) -> Any:
-        requested = request.transition.label or request.transition.id
+        transition = request.transition.label or request.transition.id
         response.success = self._guarded(
-            requested, lambda: self._upstream_change_state(request, response).success
+            transition, lambda: self._upstream_change_state(request, response).success
         )
         return response
 
-    def _guarded(self, requested: str | int, change: Callable[[], bool]) -> bool:
+    def _guarded(self, transition: str | int, change: Callable[[], bool]) -> bool:
         if self._destroyed:  # a timer may have been due; the state machine must not be used
             return False
         if not self._in_transition.acquire(blocking=False):
             self.get_logger().warning(
-                f'transition {requested!r} rejected: another is under way ({self.state})'
+                f'transition {transition!r} rejected: another is under way ({self.state})'
             )
             return False
         try:
             return change()
         except rclpy_implementation.RCLError as error:
             self.get_logger().error(
-                f'no transition {requested!r} from state {self.state}: {error}'
+                f'no transition {transition!r} from state {self.state}: {error}'
             )
             return False
         finally:

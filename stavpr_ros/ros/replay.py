@@ -25,7 +25,7 @@ from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.ros.messages import record_message, time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
-from stavpr_ros.ros.receipts import Receipts
+from stavpr_ros.ros.subscriber_progress import SubscriberProgress
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_srvs.srv import Trigger
@@ -57,9 +57,9 @@ def message_class(name: str) -> type:
         spec = importlib.util.find_spec(package)  # does not import it
         folders = (spec.submodule_search_locations if spec else None) or []
         if any(Path(folder, 'msg').is_dir() for folder in folders):
-            found = getattr(importlib.import_module(f'{package}.msg'), kind, None)
-            if isinstance(found, type):
-                return found
+            kind_class = getattr(importlib.import_module(f'{package}.msg'), kind, None)
+            if isinstance(kind_class, type):
+                return kind_class
     raise UnavailableError(
         f'the message type {name} is not installed: install its package and source its '
         'environment, or leave the topic out'
@@ -108,7 +108,7 @@ class Replayer:
         self.node, self.notify, self.options = node, notify, options
         self.published = self.resent = self.dropped = 0
         self.publisher = node.create_publisher(Image, 'image', RELIABLE_QOS)
-        self.receipts = Receipts(node)
+        self.progress = SubscriberProgress(node)
         self._others = {topic.name: self._publish_on(topic, to) for topic, to in topics.items()}
         self._match_topic = node.resolve_topic_name('stavpr/match')
         self.playback = Playback(None if options.lossless else options.rate, options.paused)
@@ -134,14 +134,14 @@ class Replayer:
 
         :raises NoSubscriberError: not within ``wait`` seconds.
         """
-        notified = ''
+        last_notice = ''
 
         def complete() -> bool:
-            nonlocal notified
+            nonlocal last_notice
             missing = self._missing()
-            if missing not in ('', notified):
+            if missing not in ('', last_notice):
                 self.notify(f'waiting for {missing}')
-                notified = missing
+                last_notice = missing
             return not missing
 
         if not self._spin_until(complete, self.options.wait):
@@ -180,7 +180,7 @@ class Replayer:
             self._others[record.topic].publish(record.content)
             return
         message = record_message(record)
-        self.receipts.sent(message.header)
+        self.progress.sent(message.header)
         if self.options.lossless:
             self._send_until_answered(message)
         else:
@@ -203,20 +203,20 @@ class Replayer:
             )
         # best-effort subscribers acknowledge nothing: a response to a later request proves it
         self._wait_for_discovery()
-        self._spin_until(self.receipts.settled, None)
+        self._spin_until(self.progress.settled, None)
 
     def close(self) -> None:
         """Release the node; the caller destroys it."""
         self._executor.shutdown()
 
-    def _spin_until(self, done: Callable[[], bool], seconds: float | None) -> bool:
-        """Spin until ``done`` returns True; return False when the time is over."""
+    def _spin_until(self, is_done: Callable[[], bool], seconds: float | None) -> bool:
+        """Spin until ``is_done`` returns True; return False when the time is over."""
         end = math.inf if seconds is None else time.monotonic() + seconds
-        while not done():
-            left = end - time.monotonic()
-            if left <= 0:
+        while not is_done():
+            rest = end - time.monotonic()
+            if rest <= 0:
                 return False
-            self._spin_once(left)
+            self._spin_once(rest)
         return True
 
     def _spin_once(self, seconds: float) -> None:
@@ -240,22 +240,22 @@ class Replayer:
 
     def _endpoints(self) -> list[Any]:
         """Return the subscriptions to our topics and the publishers of results."""
-        found = [
+        endpoints = [
             info
             for each in self._publishers
             for info in self.node.get_subscriptions_info_by_topic(each.topic_name)
         ]
         if self.options.lossless:
-            found += self.node.get_publishers_info_by_topic(self._match_topic)
-        return found
+            endpoints += self.node.get_publishers_info_by_topic(self._match_topic)
+        return endpoints
 
     def _wait_until_due(self, time_ns: int) -> None:
-        notified = False
-        while (left := self.playback.seconds_until(time_ns)) > 0:
-            if 10 < left < math.inf and not notified:
-                self.notify(f'the next image is due in {left:.0f} s, as recorded (see --rate)')
-                notified = True
-            self._spin_once(left)
+        has_notified = False
+        while (seconds := self.playback.seconds_until(time_ns)) > 0:
+            if 10 < seconds < math.inf and not has_notified:
+                self.notify(f'the next image is due in {seconds:.0f} s, as recorded (see --rate)')
+                has_notified = True
+            self._spin_once(seconds)
 
     def _send_until_answered(self, message: Image) -> None:
         """
@@ -272,9 +272,9 @@ class Replayer:
                 self.resent += 1
                 self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
             self.publisher.publish(message)
-            if self._spin_until(self.receipts.complete, timeout):
-                follow = self.receipts.closures_follow
-                self.receipts.expects_closures &= self._spin_until(follow, timeout)
+            if self._spin_until(self.progress.complete, timeout):
+                follow = self.progress.keeps_up
+                self.progress.expects_closures &= self._spin_until(follow, timeout)
                 break
         else:
             raise NoResultError(
@@ -282,7 +282,7 @@ class Replayer:
                 f'{timeout:g} s: expected one message per image; check that the node runs and '
                 f'subscribes to {self.publisher.topic_name}, or give a slow one a longer --timeout'
             )
-        if self.receipts.status == PlaceMatch.DROPPED:
+        if self.progress.status == PlaceMatch.DROPPED:
             self.dropped += 1
             self.notify(
                 f'image {self.published + 1} was dropped by the node: check for another publisher'
@@ -307,7 +307,7 @@ class Replayer:
         self.notify('paused' if self.playback.paused else 'resumed')
 
     def _serve(self) -> None:
-        """Serve the services, with the names of those of ``ros2 bag play``."""
+        """Serve the services of ``ros2 bag play``, by the same names."""
         playback = self.playback
         for name, act in (
             ('pause', lambda: playback.pause(True)),

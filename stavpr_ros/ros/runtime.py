@@ -79,7 +79,7 @@ class Runtime:
         self.odometry: OdometryInput | None = None
         self.camera: CameraInput | None = None
         self._epoch = self._pipeline_epoch = 0
-        self._explained: set[str] = set()
+        self._logged_reasons: set[str] = set()
         self.last_match = PlaceMatch()  # published for the last image in the window
         self.last_frame = ''  # of the poses of its places
         self.problem = ''
@@ -204,14 +204,14 @@ class Runtime:
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
         places, settings = self.pipeline.places, self.settings
-        needed = settings.needs_odometry or (  # edges to places of a map, and their paths
+        needs_odometry = settings.needs_odometry or (  # edges to places of a map, and their paths
             (settings.relative_pose in ('auto', 'aligned') or settings.pipeline.compares_odometry)
             and isinstance(places, PlaceMap)
             and places.has_poses
         )
-        if needed and self.odometry is None:
+        if needs_odometry and self.odometry is None:
             self.odometry = OdometryInput(self._node, self.settings.odometry_timeout)
-        elif not needed and self.odometry is not None:
+        elif not needs_odometry and self.odometry is not None:
             self.odometry.close()
             self.odometry = None
 
@@ -244,7 +244,7 @@ class Runtime:
         """
         Load a map and use it; meanwhile the old one stays in use.
 
-        :param lock, verify: those of :meth:`stavpr_ros.ros.map_loading.MapLoader.load`.
+        :param lock, verify: see :meth:`stavpr_ros.ros.map_loading.MapLoader.load`.
         :raises StavprError: an invalid file, model or setting, or a file that takes too long; the
             old map stays in use.
         """
@@ -318,7 +318,7 @@ class Runtime:
 
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
-        self._statistics.dropped(cause)
+        self._statistics.add_drop(cause)
         threshold = self.pipeline.operation.threshold
         result = ImageResult(status, reason, math.nan if threshold is None else threshold)
         self._output.publish(message.header, result, self.pipeline.places)
@@ -328,7 +328,7 @@ class Runtime:
         if item.epoch != self._pipeline_epoch:
             self._pipeline_epoch = item.epoch
             self.pipeline.operation.reset()
-        operation, waited = self.pipeline.operation, time.monotonic() - item.arrival
+        operation, waiting = self.pipeline.operation, time.monotonic() - item.arrival
         header, places, view = item.message.header, operation.places, operation.view
         pose, frames = self._pose_at(nanoseconds(header.stamp))
         camera_input = self.camera  # another thread may unsubscribe
@@ -344,14 +344,14 @@ class Runtime:
         message = self._output.publish(header, result, places, frames, edge)
         for closure in closures:
             self._edges.put(closure)
-        stages = {WAITING: waited, **result.stages, 'publishing': time.monotonic() - began}
+        stages = {WAITING: waiting, **result.stages, 'publishing': time.monotonic() - began}
         if result.cause:
-            self._statistics.dropped(result.cause)
+            self._statistics.add_drop(result.cause)
             self._log_cause(result)
             return
         self.last_match, self.last_frame, status = message, frames.frame, result.status
         place = message.newest_index if status is Status.MAPPED else message.place_index
-        self._statistics.answered(status.name, result.reason, place, message.distance, stages)
+        self._statistics.add_match(status.name, result.reason, place, message.distance, stages)
 
     def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
         """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""
@@ -391,8 +391,8 @@ class Runtime:
 
     def _log_cause(self, result: ImageResult) -> None:
         """Log why an image is in no window: an invalid one once for each cause."""
-        if result.status is Status.INVALID_IMAGE and result.cause not in self._explained:
-            self._explained.add(result.cause)
+        if result.status is Status.INVALID_IMAGE and result.cause not in self._logged_reasons:
+            self._logged_reasons.add(result.cause)
             self._node.get_logger().warning(
                 f'invalid image: {result.reason} (logged once; /diagnostics counts '
                 f'"{result.cause}")'

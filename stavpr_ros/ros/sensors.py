@@ -71,7 +71,7 @@ def misdirected(node: Node, topic: str) -> str:
     """
     Return why no odometry can arrive on a topic; empty if it can, or if there is none anywhere.
 
-    Odometry beside a topic ``map_to_odom`` is that of a pose graph: its corrections, made from the
+    Odometry beside a topic ``map_to_odom`` is from a pose graph: its corrections, made from the
     loop closures, must not come back as odometry.
 
     :param topic: after remapping.
@@ -80,7 +80,7 @@ def misdirected(node: Node, topic: str) -> str:
     types = sorted({info.topic_type for info in publishers})
     if ODOMETRY in types:
         return ''
-    found = f'{", ".join(types)} is published' if types else 'nothing is published'
+    topics_text = f'{", ".join(types)} is published' if types else 'nothing is published'
     topics = dict(node.get_topic_names_and_types())
     others = [
         name
@@ -92,14 +92,14 @@ def misdirected(node: Node, topic: str) -> str:
     if not (types or others):
         return ''
     hint = f', odometry is on {", ".join(others)}' if others else ''
-    return f'{found} on {topic}{hint}: remap odom to the topic of the odometry'
+    return f'{topics_text} on {topic}{hint}: remap odom to the topic of the odometry'
 
 
 class CameraInput:
     """
     The subscription to camera_info, and the transform from the camera to the base.
 
-    The transform is that of the parameter, else of tf where tf2_ros is installed, else of a camera
+    The transform is from the parameter, else from tf where tf2_ros is installed, else of a camera
     at the base that looks ahead.
 
     :param transform: parameter camera_transform.
@@ -182,7 +182,7 @@ class CameraInput:
 
     def _from_tf(self, base: str, frame: str) -> tuple[float, ...] | None:
         try:
-            found = self._tf.lookup_transform(base, frame, Time()).transform
+            transform = self._tf.lookup_transform(base, frame, Time()).transform
         except Exception as error:  # tf2_ros is not importable everywhere, nor are its errors
             self.problem = (
                 f'no transform from {frame!r} to {base!r} on tf ({error}): publish it, or set '
@@ -190,7 +190,7 @@ class CameraInput:
             )
             self._node.get_logger().warning(self.problem, throttle_duration_sec=REPORT_PERIOD)
             return None
-        p, o = found.translation, found.rotation
+        p, o = transform.translation, transform.rotation
         return p.x, p.y, p.z, o.x, o.y, o.z, o.w
 
 

@@ -21,7 +21,7 @@ from stavpr_ros.ros.runtime import Runtime
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-# waiting requests of each service: of the default depth of 10, those of 50 clients were dropped
+# waiting requests of each service: with the default, 10, requests of 50 clients were dropped
 REQUESTS = QoSProfile(depth=1000)
 
 

@@ -42,7 +42,7 @@ class Visualization:
     :param on_subscriber: called on another thread when the route has a new subscriber; it calls
         :meth:`publish_route` on the worker.
 
-    ``frame`` is that of the last image.
+    ``frame`` is the last image's.
     """
 
     def __init__(self, node: Node, on_subscriber: Callable[[], object]) -> None:
@@ -80,9 +80,9 @@ class Visualization:
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
         places = operation.places
-        fixed = places if isinstance(places, PlaceMap) else None
-        if frame != self.frame or fixed is not self._map:
-            self.frame, self._map, self._correction = frame, fixed, None
+        place_map = places if isinstance(places, PlaceMap) else None
+        if frame != self.frame or place_map is not self._map:
+            self.frame, self._map, self._correction = frame, place_map, None
             self._poses.clear()
             self._lines.clear()
         self._note(header, result, places, odometry)
@@ -94,8 +94,8 @@ class Visualization:
             if self._is_requested(self._markers):
                 self._markers.publish(self._markers_message(header, result, places))
             if result.image is not None and self._is_requested(self._image):
-                drawn = cv2.cvtColor(draw_match(result, places), cv2.COLOR_RGB2BGR)
-                _, jpeg = cv2.imencode('.jpg', drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+                bgr = cv2.cvtColor(draw_match(result, places), cv2.COLOR_RGB2BGR)
+                _, jpeg = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
                 image = CompressedImage(header=header, format='jpeg', data=jpeg.tobytes())
                 self._image.publish(image)
             if self._is_requested(self._window) or self._is_requested(self._distances):
@@ -113,9 +113,9 @@ class Visualization:
         message = Path(header=Header(frame_id=frame, stamp=self._node.get_clock().now().to_msg()))
         poses = None if places is None else places.poses
         if poses is not None:
-            known = poses[np.isfinite(poses).all(axis=1)]
+            poses_known = poses[np.isfinite(poses).all(axis=1)]
             message.poses = [
-                PoseStamped(header=message.header, pose=pose_message(pose)) for pose in known
+                PoseStamped(header=message.header, pose=pose_message(pose)) for pose in poses_known
             ]
         self._route.publish(message)
 
@@ -139,10 +139,10 @@ class Visualization:
         if not row.size:
             return
         first = places.first if isinstance(places, GrowingMap) else 0
-        shown = places_to_draw(result, first, len(row))
+        near = places_to_draw(result, first, len(row))
         if self._is_requested(self._window):
-            rows = recognizer.window_columns(shown)
-            self._window.publish(image_message(header, draw_window(rows, int(shown[0]), result)))
+            rows = recognizer.window_columns(near)
+            self._window.publish(image_message(header, draw_window(rows, int(near[0]), result)))
         if self._is_requested(self._distances):
             row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]
             numbers = np.arange(first, first + row.size)[None]

@@ -16,15 +16,15 @@ MAX_BEHIND = 8  # loop closures that may follow their matches later; a node drop
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
 
 
-class Receipts:
+class SubscriberProgress:
     """
-    Compares the headers of published images with those of the results on ``stavpr/match``.
+    Compares the headers of published images with the headers of results on ``stavpr/match``.
 
     The recognition node publishes one result for each image that it receives, processed or not.
 
     :param node: for the subscription; the caller spins it.
 
-    ``status`` is that of the last result; ``expects_closures``: one loop closure for each match.
+    ``status`` is the last result's; ``expects_closures``: one loop closure for each match.
     """
 
     def __init__(self, node: Node) -> None:
@@ -50,7 +50,7 @@ class Receipts:
         """Return whether each image has its result."""
         return self._received == self._sent
 
-    def closures_follow(self) -> bool:
+    def keeps_up(self) -> bool:
         """Return whether a node in operation loop_closure keeps up with its edges."""
         return not self.expects_closures or self._matches - self._closures <= MAX_BEHIND
 
@@ -65,8 +65,8 @@ class Receipts:
         if not self._received and not self._node.count_publishers(self._topic):
             return ''
         text = f'{self._received} of {self._sent} received by the node'
-        lost = self._sent - self._received
-        return text + (f', {lost} lost: see docs/troubleshooting.md' if lost else '')
+        losses = self._sent - self._received
+        return text + (f', {losses} lost: see docs/troubleshooting.md' if losses else '')
 
     def _on_match(self, match: PlaceMatch) -> None:
         key = _key(match.header)
