@@ -66,7 +66,7 @@ class Operation(ABC):
     """
     Base of the operations: from one image message to one result; the window of the images.
 
-    All calls must come from one thread, but not those of properties.
+    Properties aside, all calls must come from one thread.
 
     :param place_map: the map to localize on or to extend; loop closure has a route of its own.
     :param extractor: of the map; None = of the settings, for growing maps.

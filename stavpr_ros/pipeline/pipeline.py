@@ -44,7 +44,7 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
 
 class Pipeline:
     """
-    Holds one operation. All calls except those of properties must come from one thread.
+    Runs one operation. Properties aside, all calls must come from one thread.
 
     :param operation: name of the first one, of ``OPERATIONS``.
     :param open_journal: of recorded places; None = they are in memory only.

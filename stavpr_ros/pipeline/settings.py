@@ -137,20 +137,18 @@ class PipelineSettings:
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""
-        found = (
-            'torch has a CUDA device' if torch_has_cuda() else 'torch finds no CUDA device here'
-        )
-        why = f' ({found})' if self.backend == 'auto' else ''
-        stages = f'backend {self.backend}{why}: networks on {choose_backend(self.backend)}'
+        cuda = 'torch has a CUDA device' if torch_has_cuda() else 'torch finds no CUDA device here'
+        why = f' ({cuda})' if self.backend == 'auto' else ''
+        summary = f'backend {self.backend}{why}: networks on {choose_backend(self.backend)}'
         if operation == 'mapping':
-            return stages
+            return summary
         matching = self.matching_backend(operation)
         precision = self.precision
         if precision == 'int8' and matching == 'cpu':
             from stavpr_ros.alignment.cpu.int8 import INSTRUCTION
 
             precision = f'int8, {INSTRUCTION} kernel'
-        return f'{stages}, image distances on {matching} ({precision}), sequences on {matching}'
+        return f'{summary}, image distances on {matching} ({precision}), sequences on {matching}'
 
     def extractor(self) -> FeatureExtractor:
         """
