@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-from stavpr_ros.alignment import holistic_distances, strip_distances
+from stavpr_ros.alignment import strip_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features.extractor import cut_strips, normalize
 
@@ -103,22 +103,6 @@ def test_strip_distances_at_vgg_size_are_precise():
     np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE)
 
 
-@settings(max_examples=25)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    W=st.integers(1, 9),
-    n=st.integers(0, 6),
-    zeros=st.sampled_from([0.0, 0.3, 1.0]),
-)
-def test_holistic_distances_equal_oracle(seed, W, n, zeros):
-    query, reference = random_strips(seed, W, 1, 5, zeros), random_strips(seed + 1, W, n, 5, zeros)
-    (x, x_weights), (y, y_weights) = unit(query), unit(reference)
-    result = np.asarray(holistic_distances(x[:, 0], x_weights[:, 0], y, y_weights))
-    expected = [oracle.holistic_distance(query[:, 0], reference[:, image]) for image in range(n)]
-    assert result.shape == (n,)
-    np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE)
-
-
 @pytest.mark.parametrize(
     ('query', 'reference', 'named'),
     [
@@ -132,17 +116,6 @@ def test_distances_of_other_shapes_are_rejected(query, reference, named):
     query, reference = np.zeros(query, np.float32), np.zeros(reference, np.float32)
     with pytest.raises(InputError, match=named):
         strip_distances(query, reference)
-    with pytest.raises(InputError, match=named):
-        holistic_distances(query, query[:, 0], reference, reference.sum(-1))
-
-
-@pytest.mark.parametrize(('first', 'second', 'named'), [(6, 3, r'\(6,\)'), (7, 4, r'\(7, 4\)')])
-def test_holistic_distances_of_other_weights_are_rejected(first, second, named):
-    strips, reference = np.zeros((7, 5), np.float32), np.zeros((7, 3, 5), np.float32)
-    with pytest.raises(InputError, match=named):
-        holistic_distances(
-            strips, np.zeros(first, np.float32), reference, np.zeros((7, second), np.float32)
-        )
 
 
 def test_strip_distances_of_other_dtype_are_rejected():

@@ -14,7 +14,7 @@ from stavpr_ros.alignment.settings import (
     SpatialSettings,
     STRATEGIES,
 )
-from stavpr_ros.alignment.similarity import holistic_distances, strip_distances
+from stavpr_ros.alignment.similarity import strip_distances
 from stavpr_ros.alignment.spatial import image_distances
 
 __all__ = [
@@ -25,7 +25,6 @@ __all__ = [
     'SpatialSettings',
     'aligned_index',
     'best_match',
-    'holistic_distances',
     'image_distances',
     'match_sequence',
     'strip_distances',

@@ -27,8 +27,8 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
 
     :param d: strip distances, shape (W, W, n), float32 or float64; row = query strip. +inf bans a
         pair.
-    :param settings: strategy ``adaptive``, ``vanilla`` or ``sliding_window``. ``none`` is no
-        function of d: see :func:`stavpr_ros.alignment.holistic_distances`.
+    :param settings: strategy ``adaptive``, ``vanilla`` or ``sliding_window``. ``none``, of
+        whole images, is no function of d.
     :returns: shape (n,), of d's type.
     :raises InputError: wrong shape or type, NaN, fewer strips than the sliding window has.
     :raises SettingsError: xi > W, or the strategy ``none``.
@@ -40,7 +40,7 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     W, _, n = d.shape
     band = settings.band(W)
     if settings.strategy == 'none':
-        raise SettingsError("strategy 'none' compares whole images: call holistic_distances")
+        raise SettingsError("strategy 'none' compares whole images, not strips: take another")
     if settings.strategy == 'sliding_window':
         if W < WINDOW:
             raise InputError(f'W = {W} strips: the sliding window needs at least {WINDOW}')

@@ -132,11 +132,6 @@ def whole_number_distances(
     return d
 
 
-def holistic_distance(query: Array, reference: Array, dtype: type = np.float64) -> Any:
-    """No alignment: cosine distance of the whole flattened maps, (W, d) each."""
-    return cosine_distance(query.reshape(-1), reference.reshape(-1), dtype)
-
-
 # ------------------------------------------------ the recursion (section 2)
 
 
