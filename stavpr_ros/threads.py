@@ -42,7 +42,7 @@ def limit_threads(count: int) -> None:
     most = numba.config.NUMBA_NUM_THREADS
     # before torch: the start of numba's threads sets the number of OpenMP's, which is torch's
     numba.set_num_threads(min(count or most, most))
-    cv2.setNumThreads(count or _of_opencv())
+    cv2.setNumThreads(count or -1)  # -1 = the number before the first limit
     if torch := sys.modules.get('torch'):
         torch.set_num_threads(count or _of_torch())
 
@@ -57,14 +57,6 @@ def thread_count() -> int:
     import numba
 
     return int(numba.get_num_threads())
-
-
-@cache
-def _of_opencv() -> int:
-    """Return how many threads OpenCV takes before the first limit."""
-    import cv2
-
-    return int(cv2.getNumThreads())
 
 
 @cache

@@ -80,8 +80,8 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
     }
 
 
-def _part(name: str, array: np.ndarray, dtype: str = '') -> Part:
-    dtype = dtype or PARTS[name][0][0]
+def _part(name: str, array: np.ndarray) -> Part:
+    dtype = PARTS[name][0][0]
     return Part(dtype, array.shape, content=[array.astype(DTYPES[dtype], copy=False)])
 
 

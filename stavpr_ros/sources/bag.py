@@ -102,7 +102,7 @@ class BagSource:
     ) -> Iterator[Item]:
         with open_bag(self.path) as bag:
             index = -1
-            connections = [each for each in bag.connections if each.topic == self.topic]
+            connections = [each for each in bag.reader.connections if each.topic == self.topic]
             messages = bag.messages(connections, start, duration)
             for index, (_, time_ns, raw) in enumerate(messages):
                 try:
@@ -210,7 +210,7 @@ def _connections(bag: OpenBag, path: Path, topic: str) -> list[Any]:
     topics = _topics(bag)
     name = next((name for name in topics if name.strip('/') == topic.strip('/')), None)
     if name is not None and topics[name][0] == ODOMETRY:
-        return [each for each in bag.connections if each.topic == name]
+        return [each for each in bag.reader.connections if each.topic == name]
     where = 'is not in' if name is None else f'is of type {topics[name][0]}, not {ODOMETRY}, in'
     others = ', '.join(other for other in topics if topics[other][0] == ODOMETRY) or 'none'
     raise SourceError(f'odometry topic {topic!r} {where} {path}: topics of that type are {others}')

@@ -38,11 +38,6 @@ class OpenBag:
     reader: Ros1Reader | Ros2Reader
     deserialize: Callable[[bytes, str], Any]
 
-    @property
-    def connections(self) -> list[Connection]:
-        """Return the recorded connections, one per topic and publisher."""
-        return list(self.reader.connections)
-
     def messages(
         self, connections: list[Connection], start: float = 0.0, duration: float = math.inf
     ) -> Iterator[tuple[Connection, int, bytes]]:

@@ -46,7 +46,7 @@ def read_messages(
     :raises SourceError: the bag is damaged, or a message cannot be converted.
     """
     with open_bag(path) as bag:
-        connections = [each for each in bag.connections if each.topic in topics]
+        connections = [each for each in bag.reader.connections if each.topic in topics]
         convert = _Ros1() if isinstance(bag.reader, Ros1Reader) else None
         for connection, time_ns, raw in bag.messages(connections, start, duration):
             kind = message_type(connection)
