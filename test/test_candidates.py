@@ -61,15 +61,6 @@ def test_ranked_candidates_equal_plain_loop(case):
     np.testing.assert_array_equal(costs, before)
 
 
-def test_ranked_candidates_by_hand():
-    costs = np.array([0.5, 0.1, 0.2, 0.3, 0.2, np.inf], np.float32)
-    places = np.array([0, 10, 12, 13, 14, 30])
-    nearest = nearest_of(costs, places, 0.05)
-    ranked = ranked_candidates(nearest, WindowSequences(costs, places), 9, 2)
-    # 12 is within two places of the nearest, and 13 of 14, which is nearer
-    assert known(ranked) == [(10, 0.05), (14, float(np.float32(0.2))), (0, 0.5)]
-
-
 @pytest.mark.parametrize('mode', ['paper', 'robust', 'dtw'])
 def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
     settings = RecognizerSettings(

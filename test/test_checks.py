@@ -12,22 +12,6 @@ from stavpr_ros.errors import InputError, SettingsError
 
 
 @pytest.mark.parametrize(
-    ('check', 'arguments'),
-    [
-        ('choice', ('b', 'abc')),
-        ('at_least', (2, 2)),
-        ('between', (1.0, 0, 1)),
-        ('between', (0, 0, 1)),
-        ('above', (1e-9, 0)),
-        ('above', (0.5, 0, 1)),
-        ('whole', (3.0, 3)),
-    ],
-)
-def test_values_in_range_pass(check, arguments):
-    getattr(checks, f'require_{check}')('x', *arguments)
-
-
-@pytest.mark.parametrize(
     ('check', 'arguments', 'text'),
     [
         ('choice', ('d', 'abc'), "x = 'd' is unknown: take one of a, b, c"),

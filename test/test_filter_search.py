@@ -11,10 +11,7 @@ import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.filter import choice
-from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.filter.motion import MAX_LAG
-from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.filter.refine import BAND, OFFSETS, refine, smooth, straight_offsets
 from stavpr_ros.prepare.blocks import PlaceChanges
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
@@ -135,12 +132,6 @@ def test_smoothed_offsets_equal_sums_over_all_sequences(images, offsets, seed):
     assert log == pytest.approx(np.log(expected[0].sum()))
 
 
-def test_smoothed_offsets_without_any_likely_one_are_equal():
-    masses = np.ones((3, 4))
-    smooth(np.zeros((3, 4)), np.ones((3, 5)), masses)
-    np.testing.assert_allclose(masses, 0.25)
-
-
 def offset_errors(true_offsets, gaps=None, images=20, seeds=200):
     """
     Return the mean errors of places by both models and by the filter's alone, in faint light.
@@ -224,21 +215,6 @@ def test_stamps_show_where_images_were_lost():
         return np.mean(errors)
 
     assert mean_error(10**9) < 0.95 * mean_error(0)
-
-
-def test_faint_light_leaves_the_evidence_between_near_places(recognizer, route, monkeypatch):
-    evidence = []
-
-    def spied(*arguments):
-        evidence.append(arguments[-1])
-        return refine(*arguments)
-
-    monkeypatch.setattr(choice, 'refine', spied)
-    for level in FilterSettings().levels:
-        monkeypatch.setattr(PlaceFilter, 'mean_z', lambda *_, level=level: level)
-        drive(recognizer, route[:, 20:50])
-        ratios = {evidence.pop() for _ in range(len(evidence))}
-        assert ratios == {min(level, -2.3) / level}
 
 
 def test_path_follows_images_whose_speed_changes(recognizer, route):
@@ -340,21 +316,3 @@ def test_drive_in_reverse_is_not_matched_wrongly(recognizer, route):
     for i, answer in enumerate(answers, LENGTH):
         there = 200 - i + LENGTH - 1 - MIDDLE
         assert not answer.accepted or abs(answer.place_index - there) <= LENGTH
-
-
-def test_places_are_counted_from_first_ever():
-    """After eviction, too."""
-    rng = np.random.default_rng(0)
-    rows = rng.standard_normal((9, 30)).astype(np.float32)
-    rows[np.arange(9), np.arange(12, 21)] = -6
-    whole, evicted = (FilterWindow(SequenceSettings(5), 30) for _ in range(2))
-    for i, row in enumerate(rows):
-        z = row
-        whole.add(z, i, 1.0)
-        if i == 8:
-            evicted.evict(4)
-        evicted.add(z[4:] if i >= 8 else z, i, 1.0)
-    one, other = whole.match(3), evicted.match(3)
-    assert one.nearest.middle == other.nearest.middle == 18
-    assert one.path.tolist() == other.path.tolist()
-    assert other.sequences().places.tolist() == list(range(4, 30))

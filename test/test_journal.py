@@ -299,20 +299,6 @@ def test_recover_to_a_file_that_exists_fails_and_keeps_both(written, small_map, 
 # -------------------------------------------------------------------------------------- recording
 
 
-def test_killed_recording_is_recovered_with_all_places(start, route, target):
-    pipeline = start()
-    process(pipeline, route[:9])
-    assert journals(target) == [target.with_name('route.stavpr.journal')]
-    expected = pipeline.snapshot().places
-    killed(pipeline)
-    log = Mock()
-    assert recover_maps(target, log) == str(target)
-    assert '9 places of an earlier recording were recovered' in log.method_calls[0].args[0]
-    assert stamps(target) == seconds(*range(1, 10))
-    assert np.array_equal(load_map(target).features.strips, expected.features.strips)
-    assert journals(target) == []
-
-
 def test_saving_deletes_the_journal_and_later_places_open_another(start, route, target):
     pipeline = start()
     process(pipeline, route[:3])

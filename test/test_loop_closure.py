@@ -20,10 +20,9 @@ from stavpr_ros.filter.paths import CLOSE
 from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare import route_features
 from stavpr_ros.prepare.centering import unit_norm
-from stavpr_ros.prepare.cpu_matcher import CpuMatcher, CpuRouteMatcher
-from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.prepare.route_features import GROWTH, ROOM, RouteFeatures
+from stavpr_ros.prepare.route_features import ROOM, RouteFeatures
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import (
     AROUND,
@@ -188,18 +187,6 @@ def test_route_features_are_original_less_mean(laps, centering, limit):
     assert not original.strips[zero].any()
     assert np.array_equal(original.weights, added.weights)
     assert route.room == (limit or 512)
-
-
-def test_route_features_are_centered_by_recent_mean(laps):
-    """By one that is at most an eighth old."""
-    route = RouteFeatures(laps.settings, True, False, None)
-    for i in range(100):
-        route.append(laps[i : i + 1])
-    counts = [1]
-    while counts[-1] < 100:
-        counts.append(int(counts[-1] * GROWTH) + 1)
-    last = max(count for count in counts if count <= 100)
-    np.testing.assert_allclose(route.mean, laps.strips[:, :last].mean(axis=1), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(('centering', 'limit'), [(True, None), (False, 90)])
@@ -519,23 +506,3 @@ def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
     kept = laps[less.first :]
     np.testing.assert_allclose(less.features().strips, kept.strips, atol=0.05, rtol=0)
     np.testing.assert_allclose(less.features().weights, kept.weights, rtol=1e-5, atol=1e-5)
-
-
-def test_settled_route_holds_its_places_through_growth_and_eviction(laps, monkeypatch):
-    """Distances are those to the places' own features, rounded."""
-    monkeypatch.setattr(route_features, 'SETTLED', 20)
-    monkeypatch.setattr(route_features, 'ROOM', 16)
-    route = RouteFeatures(laps.settings, False, False, 75, 'int8')
-    matcher, evicted = CpuRouteMatcher(7, SpatialSettings()), 0
-    for i in range(200):
-        if route.count == 75:
-            route.evict(9)
-            evicted += 9
-        route.append(laps[i : i + 1])
-    held = laps[evicted:200]
-    newest = route.newest
-    found = matcher.to_oldest(route.strips, newest, route.count - 3)
-    expected = make_matcher(held, SpatialSettings(), 'cpu', 'int8').distances(
-        newest[:, 0], np.ones(7, np.float32)
-    )
-    np.testing.assert_allclose(found, expected[:-3], atol=1e-6, rtol=0)

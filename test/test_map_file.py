@@ -29,7 +29,6 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import (
     descriptor_map,
-    is_map,
     load_map,
     open_map,
     PlaceMap,
@@ -112,30 +111,25 @@ def test_saved_map_is_a_safetensors_file_and_one_made_by_that_library_loads(
     assert_same(load_map(tmp_path / 'theirs'), example)
 
 
-def test_threshold_is_a_section_that_older_readers_ignore(example, tmp_path):
-    path = tmp_path / 'route.stavpr'
-    save_map(dataclasses.replace(example, threshold=0.25), path)
-    assert load_map(path).threshold == 0.25
-    manifest, _ = parts_of(path.read_bytes())
-    assert manifest['sections']['threshold'] == {'version': 1, 'required': False, 'data': 0.25}
-    with pytest.raises(InputError, match=r'threshold = 0\.0: expected a distance above 0'):
-        dataclasses.replace(example, threshold=0.0)
+RISKS = ErrorRisks('robust', 3, (0.2, 0.9), (1.5, 0.0))
 
 
-def test_error_risks_are_a_section_that_older_readers_ignore(example, tmp_path):
-    path, risks = tmp_path / 'route.stavpr', ErrorRisks('robust', 3, (0.2, 0.9), (1.5, 0.0))
-    save_map(dataclasses.replace(example, error_risks=risks), path)
-    assert load_map(path).error_risks == risks
+@pytest.mark.parametrize(
+    ('name', 'value', 'data'),
+    [
+        ('threshold', 0.25, 0.25),
+        ('error_risks', RISKS, json.loads(json.dumps(vars(RISKS)))),
+    ],
+)
+def test_optional_value_is_a_section_that_older_readers_ignore(
+    example, tmp_path, name, value, data
+):
+    path, half = tmp_path / 'route.stavpr', tmp_path / 'half'
+    save_map(dataclasses.replace(example, **{name: value}), path)
     manifest, _ = parts_of(path.read_bytes())
-    assert manifest['sections'] == {
-        'error_risks': {
-            'version': 1,
-            'required': False,
-            'data': json.loads(json.dumps(vars(risks))),
-        }
-    }
-    save_map(open_map(path), tmp_path / 'half', 'float16')  # as map compact
-    assert open_map(tmp_path / 'half').error_risks == risks
+    assert manifest['sections'] == {name: {'version': 1, 'required': False, 'data': data}}
+    save_map(open_map(path), half, 'float16')  # as map compact
+    assert getattr(load_map(half), name) == value
 
 
 def test_reader_written_from_the_documentation_finds_the_same(example, saved):
@@ -286,33 +280,6 @@ def test_sparse_file_is_rejected_before_memory_is_taken(saved):
         load_map(saved)
 
 
-@pytest.mark.parametrize(
-    'content',
-    [
-        b'',
-        b'hello',
-        bytes(range(256)) * 4,
-        b'\x02' + bytes(7) + b'{}',
-        (18).to_bytes(8, 'little') + b'{"__metadata__":{}}',
-        (9000).to_bytes(8, 'little') + b'[' * 9000,
-        pickle.dumps([1, 2]),
-    ],
-)
-def test_other_file_is_no_map(tmp_path, content):
-    (tmp_path / 'other').write_bytes(content)
-    with pytest.raises(MapFileError, match='no map'):
-        load_map(tmp_path / 'other')
-
-
-def test_is_map_recognizes_maps_and_no_other_file(tmp_path, saved):
-    assert is_map(saved)
-    for other in (b'', b'PK\3\4', b'\x89PNG' + bytes(9)):
-        saved.write_bytes(other)
-        assert not is_map(saved)
-    assert not is_map(tmp_path / 'missing')
-    assert not is_map(tmp_path)
-
-
 @pytest.mark.parametrize('part', ['strips', 'thumbnails', 'stamps'])
 def test_damage_is_named_by_part_and_offset(example, saved, part):
     content = bytearray(saved.read_bytes())
@@ -327,22 +294,6 @@ def test_damage_is_named_by_part_and_offset(example, saved, part):
             verify_map(opened)
     with pytest.raises(MapFileError, match=expected):
         load_map(saved)
-
-
-def test_damage_of_a_large_part_is_named_to_four_megabytes(example, tmp_path):
-    strips = np.zeros((2, 70_000, 32), np.float32)
-    features = dataclasses.replace(
-        example.features, strips=strips, weights=np.zeros((2, 70_000), np.float32)
-    )
-    stamps = np.zeros(70_000, np.int64)
-    save_map(PlaceMap(features, None, stamps, ('',) * 70_000), tmp_path / 'map')
-    with (tmp_path / 'map').open('r+b') as file:
-        file.seek(5 * 2**20)
-        file.write(b'x')
-    with pytest.raises(MapFileError) as caught:
-        load_map(tmp_path / 'map')
-    first, last = map(int, re.search(r'bytes (\d+) to (\d+)', str(caught.value)).groups())
-    assert first <= 5 * 2**20 < last == first + 2**22
 
 
 def _setting(name, value):
@@ -369,11 +320,8 @@ def _poses(row) -> dict[str, np.ndarray]:
     return {'poses': np.tile(np.array(row, float), (24, 1))}
 
 
-RISKS = {'method': 'robust', 'units': 3, 'probabilities': [0.2, 0.9], 'risks': [1.5, 0]}
-
-
-def _error_risks(data):
-    section = {'version': 1, 'required': False, 'data': data}
+def _error_risks(**changes):
+    section = {'version': 1, 'required': False, 'data': vars(RISKS) | changes}
     return lambda manifest: manifest['sections'].update(error_risks=section)
 
 
@@ -382,20 +330,15 @@ HAND_MADE = [
     ({'stamps': np.full(24, 2**62)}, None, 'a stamp is out of range'),
     ({'stamps': np.zeros(23, np.int64)}, None, 'expected 24 for n'),
     ({'stamps': None}, None, 'part stamps is missing'),
-    ({'weights': np.full((2, 24), -1, np.float32)}, None, 'weights is not between 0 and 1'),
-    ({'weights': np.full((2, 24), np.nan, np.float32)}, None, 'weights is not between 0 and 1'),
     ({'weights': np.full((2, 24), 1.5, np.float32)}, None, 'weights is not between 0 and 1'),
     ({'strips': np.full((2, 24, 32), np.nan, np.float32)}, None, 'strip 0, from place 0 on'),
     ({'strips': np.full((2, 24, 32), 1, np.float16)}, None, 'longer than 1'),
     ({'strips': np.zeros((2, 24, 33), np.float32)}, None, 'strips of 33 dimensions'),
-    ({'strips': np.zeros((2, 24, 0), np.float32)}, None, 'no dimensions'),
     (_poses([0, 0, 0, 0, 0, 0, 0]), None, 'quaternion of place 0'),
     (_poses([np.inf, 0, 0, 0, 0, 0, 1]), None, 'pose of place 0'),
     ({'ids': np.full(24, 255, np.uint8), 'id_ends': np.arange(1, 25)}, None, 'utf-8'),
     ({'ids': np.zeros(24, np.uint8), 'id_ends': np.arange(1, 25)}, None, 'identifier of place 0'),
     ({'id_ends': np.array([200, *range(1, 23), 182])}, None, 'id_ends does not increase'),
-    ({'id_ends': np.arange(24)}, None, 'id_ends does not increase'),
-    ({'id_ends': None}, None, 'ids and id_ends, one is missing'),
     (_thumbnail(_jpeg(20000, 20000)), None, 'thumbnail of place 0 has 400000000 pixels'),
     (_thumbnail(b'\x89PNG\r\n\x1a\n' + bytes(40)), None, 'thumbnail of place 0 is no JPEG'),
     ({'session': np.full(24, 2, np.int32)}, None, 'session index is not between 0 and 1'),
@@ -409,10 +352,8 @@ HAND_MADE = [
     ({}, lambda m: m.update(cells=[0, 4]), r'cells\[0\] is 0'),
     ({}, lambda m: m.update(cells=[3, 1]), 'cells .3, 1. of strips of 32'),
     ({}, lambda m: m.update(sessions=[{'id': 'a'}]), "lacks '"),
-    ({}, lambda m: m['sessions'][0].update(id='b'), 'different ones'),
     ({}, lambda m: m['sessions'][0].update(id='\ud800'), 'no JSON|session|hash'),
     ({}, lambda m: m['sessions'][0].update(start=-1), 'start is -1'),
-    ({}, lambda m: m['sessions'][0].update(start=True), 'start is True'),
     ({}, lambda m: m.update(projection='gaussian'), 'whether there is a projection'),
     ({}, _setting('kind', 'teleport'), 'teleport'),
     ({}, _setting('strips', 2.0), r'strips is 2\.0'),
@@ -420,22 +361,15 @@ HAND_MADE = [
     ({}, _setting('projection', 'mine'), 'projection None is not that of the features, mine'),
     ({}, _backbone('size', 10**6), 'size = 1000000 must be 1 to'),
     ({}, _backbone('signed', 1), 'signed is 1'),
-    ({}, _backbone('orientations', 2**31), 'orientations'),
     ({}, network(model='/dev/zero'), "unknown 'model'"),
     ({}, network(sha256=''), 'lack the sha256 of the model'),
-    ({}, network(sha256='abc'), '64 digits'),
     ({}, network(scale=float('inf')), 'no number'),
     ({}, network(std=[0, 0, 0]), 'std not 0'),
-    ({}, network(mean=['a', 'b', 'c']), r'mean\[0\]'),
-    ({}, _error_risks(None), 'section error_risks is None'),
-    ({}, _error_risks(RISKS | {'more': 1}), "unknown 'more'"),
-    ({}, _error_risks(RISKS | {'units': True}), r'units is True'),
-    ({}, _error_risks(RISKS | {'method': 'a' * 257}), 'at most 256 characters'),
-    ({}, _error_risks(RISKS | {'risks': ['0', '0']}), r"risks\[0\] is '0'"),
-    ({}, _error_risks(RISKS | {'risks': [0.0]}), 'as many risks'),
-    ({}, _error_risks(RISKS | {'probabilities': [0.5] * 2**16}), 'a list of 1 to 256'),
-    ({}, _error_risks(RISKS | {'probabilities': [0.5, 10**400]}), 'between 0 and 1|too large'),
-    ({}, _error_risks(RISKS | {'units': 1}), 'at most 1 each'),
+    ({}, _error_risks(more=1), "unknown 'more'"),
+    ({}, _error_risks(method='a' * 257), 'at most 256 characters'),
+    ({}, _error_risks(risks=['0', '0']), r"risks\[0\] is '0'"),
+    ({}, _error_risks(probabilities=[0.5] * 2**16), 'a list of 1 to 256'),
+    ({}, _error_risks(probabilities=[0.5, 10**400]), 'between 0 and 1|too large'),
 ]
 
 
@@ -468,7 +402,18 @@ def _without_hashes(content):
         (lambda content: content[:-1], r'tensors end at byte \d+, the file at byte \d+'),
         (
             lambda _: b'PK\3\4' + bytes(26),
-            'is no map of this program .*: build one with build_map',
+            'is no map of this program .*: build one',
+        ),
+        *(
+            (lambda _, other=other: other, 'no map')
+            for other in (
+                b'',
+                b'hello',
+                b'\x02' + bytes(7) + b'{}',
+                pickle.dumps([1, 2]),
+                (18).to_bytes(8, 'little') + b'{"__metadata__":{}}',
+                (9000).to_bytes(8, 'little') + b'[' * 9000,
+            )
         ),
     ],
 )

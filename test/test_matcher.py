@@ -11,18 +11,15 @@ import numpy as np
 from places import features_of
 import pytest
 from stavpr_ros.alignment import (
-    best_match,
     image_distances,
     match_sequence,
     SequenceSettings,
     SpatialSettings,
     strip_distances,
 )
-from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
-from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.threads import limit_threads
 
 ADAPTIVE = SpatialSettings()
@@ -112,38 +109,6 @@ def test_kernels_of_one_and_two_threads_return_same_bits():
 
 
 # ------------------------------------------------ the window
-
-
-@pytest.mark.parametrize('n', [1, 7, 100])
-def test_lm_dtw_window_equals_plain_functions(n):
-    """At every turn of the ring buffer."""
-    query = LmDtwWindow(SequenceSettings(5), n)
-    buffer = query.buffer
-    rows = np.random.default_rng(0).random((23, n), np.float32)
-    for i, row in enumerate(rows):
-        buffer.push(row)
-        if buffer.full:
-            found = query.match(3)
-            window = rows[i - 4 : i + 1]
-            matches = match_sequence(window, SequenceSettings(5))
-            expected = best_match(matches, 3)
-            assert repr(found.nearest) == repr(expected)  # a second best's distance may be NaN
-            path = trace_sequence(window, expected.first, SequenceSettings(5).k)
-            np.testing.assert_array_equal(found.path, path)
-            for one, other in zip(
-                found.sequences()[:2], (matches.distances, matches.middles), strict=True
-            ):
-                np.testing.assert_array_equal(one, other)
-
-
-def test_lm_dtw_window_without_places_has_no_match():
-    one = LmDtwWindow(SequenceSettings(5), 0)
-    for _ in range(5):
-        one.buffer.push(np.empty(0, np.float32))
-    found = one.match(3)
-    assert found.nearest is None
-    assert found.path.shape == (0, 2)
-    assert [len(values) for values in found.sequences()[:2]] == [0, 0]
 
 
 def test_make_matcher_of_unknown_precision_is_rejected():

@@ -83,24 +83,6 @@ def test_opened_map_whose_file_changes_is_an_error(path, small_map):
         _ = opened.features.strips
 
 
-def test_growing_map_may_leave_the_features_to_another_owner(small_map):
-    kept = small_map.features
-    growing = GrowingMap(
-        small_map.settings,
-        small_map.projection,
-        50,
-        held_features=lambda: kept[2 : 2 + len(growing)],
-    )
-    for i in range(40):
-        growing.add(kept[i : i + 1], i + 1)
-    growing.forget(2)
-    snapshot = growing.snapshot()
-    assert np.shares_memory(growing.features.strips, kept.strips)  # not a copy
-    assert np.array_equal(snapshot.features.strips, kept.strips[:, 2:40])
-    assert snapshot.stamps.tolist() == list(range(3, 41))
-    assert growing.dimension == kept.dimension
-
-
 @pytest.mark.skipif(
     not Path('/proc/self/statm').exists(), reason='resident memory is read from /proc'
 )

@@ -15,7 +15,6 @@ import pytest
 from stavpr_ros.errors import OutputError, OutputTakenError
 from stavpr_ros.output_file import (
     atomic_output,
-    AtomicFile,
     csv_kind,
     HTML,
     JSON,
@@ -114,16 +113,6 @@ def test_atomic_output_error_in_the_block_leaves_what_was_there(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert (path.read_text(), names(tmp_path)) == ('{}', ['a.json'])
-
-
-def test_atomic_output_target_that_came_meanwhile_stays(tmp_path):
-    path = tmp_path / 'a.json'
-    file = AtomicFile(path, JSON, force=True)
-    path.write_text('mine')
-    with pytest.raises(OutputTakenError, match='no JSON'):
-        file.commit()
-    file.abandon()
-    assert (path.read_text(), names(tmp_path)) == ('mine', ['a.json'])
 
 
 def test_atomic_output_is_locked_until_the_end_committed_or_not(tmp_path):

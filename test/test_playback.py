@@ -55,12 +55,6 @@ def playing(rate, *times):
     return playback
 
 
-def test_playback_at_twice_the_pace_halves_the_time_left():
-    playback = playing(2.0, 5, 6, 6)
-    assert playback.now_ns() == FIRST + 2 * SECOND
-    assert playback.seconds_until(FIRST + 6 * SECOND) == 2.0
-
-
 def test_playback_after_a_pause_continues_where_it_stopped():
     playback = playing(1.0, 5, 6, 6, 66, 67)
     playback.pause(True)
@@ -68,19 +62,6 @@ def test_playback_after_a_pause_continues_where_it_stopped():
     assert playback.now_ns() == FIRST + SECOND
     playback.pause(False)
     assert playback.now_ns() == FIRST + 2 * SECOND
-
-
-def test_playback_step_passes_all_up_to_the_next_image():
-    playback = Playback(1.0, True)
-    playback.start(FIRST)
-    assert playback.step()
-    for time_ns, is_image in ((FIRST, False), (FIRST + SECOND, True)):
-        assert playback.seconds_until(time_ns) == 0
-        playback.passed(time_ns, is_image)
-        assert playback.now_ns() == time_ns
-    assert playback.seconds_until(FIRST + 2 * SECOND) == math.inf
-    playback.pause(False)
-    assert not playback.step()
 
 
 # parts of a source, and its other topics

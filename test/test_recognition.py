@@ -18,7 +18,6 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.window import SequenceBuffer
 from stavpr_ros.sources import open_source
 
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -165,54 +164,6 @@ def test_recognizer_settings_out_of_range_are_rejected(small_map):
         recognizer(small_map, spatial=SpatialSettings(xi=8))
     with pytest.raises(SettingsError, match='threshold'):
         recognizer(small_map).set_limits(0.0, 0.5)
-
-
-@pytest.mark.parametrize('copies', [1, 2])
-def test_sequence_buffer_holds_last_rows_in_order(copies):
-    buffer = SequenceBuffer(3, 2, 4, copies=copies)
-    assert len(buffer.memory) == 3 * copies
-    for value in range(8):
-        buffer.push(np.array([value, -value], dtype=np.float32))
-        assert len(buffer) == min(value + 1, 3)
-        assert buffer.newest().tolist() == [value, -value]
-        if buffer.full:
-            columns = np.array([[0, 1], [1, 0], [1, 1]])
-            expected = [[value - 2, 2 - value], [1 - value, value - 1], [-value, -value]]
-            assert buffer.at(columns).tolist() == expected
-            rows = buffer.rows()
-            assert rows[:, 0].tolist() == [value - 2, value - 1, value]
-            assert rows.flags.c_contiguous
-            assert np.isinf(rows[:, 2:]).all()
-    buffer.clear()
-    assert (len(buffer), buffer.known) == (0, 0)
-    assert np.isinf(buffer.rows()).all()
-
-
-@pytest.mark.parametrize('copies', [1, 2])
-def test_sequence_buffer_that_grows_and_evicts_keeps_rows(copies):
-    buffer = SequenceBuffer(2, 3, 4, copies=copies)
-    buffer.push(np.array([1.0, 2.0], np.float32))
-    assert buffer.known == 2
-    buffer.grow(5)
-    buffer.push(np.array([3.0, 4.0, 5.0, 6.0], np.float32))
-    assert buffer.rows()[:, :5].tolist() == [[1, 2, np.inf, np.inf, np.inf], [3, 4, 5, 6, np.inf]]
-    buffer.evict(1)
-    assert (buffer.first, buffer.known, buffer.places) == (1, 3, 5)
-    assert buffer.rows()[:, :5].tolist() == [
-        [2, np.inf, np.inf, np.inf, np.inf],
-        [4, 5, 6, np.inf, np.inf],
-    ]
-
-
-@pytest.mark.parametrize('value', [np.nan, -np.inf])
-def test_sequence_buffer_with_invalid_row_is_unchanged(value):
-    buffer = SequenceBuffer(2, 3, 4)
-    buffer.push(np.array([1.0, np.inf, 2.0], np.float32))
-    before = buffer.rows().copy()
-    with pytest.raises(InputError, match='1 NaN or -inf among 3'):
-        buffer.push(np.array([1.0, value, 2.0], np.float32))
-    assert np.array_equal(buffer.rows(), before)
-    assert len(buffer) == 1
 
 
 @pytest.mark.parametrize('mode', ['paper', 'robust'])

@@ -53,15 +53,6 @@ def test_finalized_node_after_a_signal_ends(robot, run, map_file):
     assert ends_well(process, signal.SIGTERM)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize('labels', [[], ['configure']])
-def test_node_after_an_interrupt_before_it_is_active_ends(robot, run, map_file, labels):
-    process = run(autostart=False, map_path=map_file)
-    robot.until_state('unconfigured')
-    assert all(robot.transition(label) for label in labels)
-    assert ends_well(process, signal.SIGINT)
-
-
 def test_node_after_two_signals_during_an_image_ends(robot, run, map_file, route):
     """`ros2 launch` sends a second interrupt."""
     process = run(map_path=map_file, queue_size=1000)

@@ -9,43 +9,11 @@ from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.features.extractor import cut_strips
-from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, load_map, save_map
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.recognition import Status
 from stavpr_ros.sources.frame import Frame
-
-
-def test_as_maps_of_tokens_by_hand():
-    """A class token, a register, then patches row by row: patch 2 is below patch 0."""
-    tokens = np.array([[[9.0, 9], [8, 8], [0, 10], [1, 11], [2, 12], [3, 13]]], np.float32)
-    maps = as_maps(tokens, 1, 2, 'net')
-    assert maps.tolist() == [[[[0, 1], [2, 3]], [[10, 11], [12, 13]]]]
-
-
-def test_as_maps_leaves_maps_and_vectors():
-    for shape in ((2, 5, 3, 4), (2, 5)):
-        assert as_maps(np.zeros(shape, np.float32), 2, 1, 'net').shape == shape
-    assert as_maps(np.zeros((2, 5, 1, 1), np.float32), 2, 1, 'net').shape == (2, 5)
-
-
-@pytest.mark.parametrize(
-    ('output', 'named'),
-    [
-        (
-            np.zeros((2, 261, 8), np.float32),
-            r'261 tokens, 260 without the first 1.*prefix_tokens = 5 .*16',
-        ),
-        (np.zeros((1, 8), np.float32), r'\(1, 8\) for 2 images'),
-        (np.zeros(2, np.float32), r'\(2,\)'),
-        (np.zeros((2, 0, 3, 3), np.float32), r'\(2, 0, 3, 3\)'),
-        ({'x': 1}, 'type dict'),
-    ],
-)
-def test_as_maps_of_other_outputs_is_rejected(output, named):
-    with pytest.raises(SettingsError, match=named):
-        as_maps(output, 2, 1, 'net')
 
 
 @pytest.mark.parametrize('pooling', ['mean', 'gem'])
@@ -101,12 +69,6 @@ def network(tmp_path_factory):
 def extractor(path, layer='global', strips=None, **changes):
     settings = settings_class('onnx')(model=str(path), layer=layer, size=64, **changes)
     return FeatureExtractor('onnx', settings, strips)
-
-
-def test_extractor_of_vectors_has_one_strip(network, route):
-    features = extractor(network).extract(route[:3])
-    assert features.strips.shape == (1, 3, 32)
-    assert (features.settings.strips, features.cells) == (1, (1, 1))
 
 
 def test_extractor_of_tokens_equals_that_of_their_map(network, route):

@@ -201,20 +201,3 @@ def test_view_that_is_not_the_most_probable_one_in_a_row_is_not_adopted(between)
     assert (bank.view, followed(bank)) == (AS_THEY_ARE, 5)
     feed(bank, 1, other=0.8)
     assert (bank.view, followed(bank)) == (LEFT, 1)
-
-
-def test_other_views_count_again_when_their_windows_are_full():
-    bank = ViewBank(Scripted(), None)
-    feed(bank, IN_A_ROW, 0.9)
-    for _ in range(2):
-        feed(bank, 2 * FULL - 1)
-        feed(bank, 1, 0.51)
-        assert followed(bank) == 1
-    feed(bank, 2 * FULL - 1)
-    assert followed(bank) == 1
-    feed(bank, 1)
-    assert followed(bank) == 5
-    feed(bank, FULL - 1 + IN_A_ROW - 1, other=0.9)
-    assert bank.view == AS_THEY_ARE
-    feed(bank, 1, other=0.9)
-    assert bank.view == LEFT

@@ -15,14 +15,14 @@ from fixtures import route_images
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 import numpy as np
-from pipelines import LENGTH, localizing, message, process, recorded, SECOND
+from pipelines import LENGTH, localizing, process, recorded
 import pytest
 from robot import LATCHED
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap
 from stavpr_ros.pipeline import ImageResult
-from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
+from stavpr_ros.pipeline.overlay import draw_match, draw_window, places_to_draw
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
 from std_msgs.msg import Header
@@ -219,15 +219,6 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     np.testing.assert_array_equal(numbers, values + 3000)
 
 
-def test_distances_of_a_window_that_fills_are_those_of_its_images(map_file, route):
-    pipeline, rows = localizing(map_file), []
-    for i in range(LENGTH + 2):
-        pipeline.operation.process(message(route[i]), (i + 1) * SECOND)
-        rows = [*rows, pipeline.operation.recognizer.newest_row()][-LENGTH:]
-        window = pipeline.operation.recognizer.window_columns(np.arange(60))
-        np.testing.assert_array_equal(window, rows)
-
-
 @pytest.mark.parametrize(
     ('middle', 'count', 'left', 'right'),
     [(3000, 1200, 3000, 3300), (3600, 1200, 3450, 3750), (4190, 1200, 3900, 4200),
@@ -238,13 +229,6 @@ def test_places_to_draw_are_around_the_nearest_sequence(middle, count, left, rig
     assert places_to_draw(ImageResult.of_match(match), 3000, count).tolist() == list(
         range(left, right)
     )
-
-
-def test_least_of_each_part_by_hand():
-    rows = np.array([[3, 1, 2, 5, 4, np.inf]], np.float32)
-    np.testing.assert_array_equal(least_of_each(rows, 3), [[1, 2, 4]])
-    np.testing.assert_array_equal(least_of_each(rows, 6), rows)
-    assert least_of_each(np.zeros((2, 1000), np.float32), 512).shape == (2, 512)
 
 
 @pytest.mark.parametrize('places', [1, 40, 300])

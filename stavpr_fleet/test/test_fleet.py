@@ -16,7 +16,7 @@ from robot import image_message
 from stavpr_fleet import CityMap, FleetRecognizer, open_city_map, upload
 from stavpr_fleet.neighborhoods import Votes
 from stavpr_fleet.qdrant_store import EdgePoints
-from stavpr_fleet.store import map_vectors, MapIndex, place_vectors, sample_places
+from stavpr_fleet.store import map_vectors, MapIndex, place_vectors
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
 from stavpr_ros.commands import map as map_command
@@ -137,24 +137,6 @@ def test_fetch_returns_places_of_every_store(store, tmp_path, server):
     assert nearest.shape[0] == 4
     assert nearest[:, 0].tolist() == places.tolist()
     assert set(nearest.ravel().tolist()) <= set(range(-1, 24))
-
-
-def test_sample_places_holds_runs_of_neighbors():
-    assert sample_places(3).tolist() == [0, 1, 2]
-    some = sample_places(1_000_000)
-    assert len(some) == 2048
-    assert some[0] == 0
-    assert some[-1] == 999_999
-    assert (np.diff(some.reshape(-1, 8), axis=1) == 1).all()
-
-
-def test_place_vectors_of_one_strip_and_of_seven():
-    strips = walk(4).strips[:1]
-    np.testing.assert_allclose(place_vectors(strips), strips[0], atol=1e-6)
-    seven = np.concatenate([walk(4, seed).strips for seed in range(3)])[:7]
-    vectors = place_vectors(seven)
-    assert vectors.shape == (4, 72)
-    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
 
 
 def test_votes_follow_the_speed():

@@ -21,11 +21,10 @@ from stavpr_lab.commands import demo
 from stavpr_lab.demonstration.loops import read_result
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.records import evaluate_records
-from stavpr_msgs.msg import AlignedPlaces, LoopClosure, PlaceMatch
+from stavpr_msgs.msg import AlignedPlaces, LoopClosure
 from stavpr_ros.commands import build_map, node, record, replay, stavpr
-from stavpr_ros.commands.record import loop_closure_record, match_record
+from stavpr_ros.commands.record import loop_closure_record
 from stavpr_ros.mapping import load_map
-from stavpr_ros.recognition import Status
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -287,12 +286,6 @@ def test_loop_closure_record_is_plain_json():
     message.has_poses = True
     message.place_pose.position.y = 2.0
     assert loop_closure_record(message)['place_pose']['position'] == {'x': 0, 'y': 2, 'z': 0}
-
-
-def test_match_record_names_every_status():
-    for status in Status:
-        plain = match_record(PlaceMatch(status=status, inliers=12))
-        assert (plain['status'], plain['inliers']) == (status.name, 12)
 
 
 @pytest.mark.parametrize(

@@ -122,17 +122,6 @@ def test_open_dataset_not_found_names_the_searched_folders(tmp_path):
         open_dataset('alderley', tmp_path)
 
 
-def test_open_dataset_found_twice_raises(tmp_path):
-    for folder in ('nordland', 'Nordland3584'):
-        fill(tmp_path / folder / 'summer', 1)
-        fill(tmp_path / folder / 'winter', 1)
-    with pytest.raises(SourceError, match=r'more than once.*name one'):
-        open_dataset('nordland', tmp_path)
-    fill(tmp_path / 'nordland' / 'Winter_images', 1)
-    with pytest.raises(SourceError, match=r'several folders .*: Winter_images, winter'):
-        open_dataset('nordland', tmp_path / 'nordland')
-
-
 @pytest.mark.parametrize(('name', 'count'), [('gardens_point', 200), ('nordland', 1788)])
 def test_open_dataset_of_real_data_has_the_known_length(data_folder, name, count):
     dataset = open_dataset(name, data_folder)

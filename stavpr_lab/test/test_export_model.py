@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Networks to ONNX files: local repositories with the signatures of published networks."""
 
-from collections import OrderedDict
 import hashlib
 import re
 
@@ -10,7 +9,6 @@ from evaluation_commands import runner
 import numpy as np
 import pytest
 from stavpr_lab.commands import export_model
-from stavpr_lab.features.export import one_of
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
@@ -160,15 +158,6 @@ def batch_of(images):
 def features(path, layer):
     settings = settings_class('onnx')(model=str(path), layer=layer, size=SIZE)
     return backbone_class('onnx')(settings).feature_maps(images())
-
-
-def test_one_of_several_outputs_by_number_and_key():
-    a, b = np.zeros(1, np.float32), np.ones(1, np.float32)
-    assert one_of(a, '0', 'net') is a
-    assert one_of((a, b), '1', 'net') is b
-    assert one_of(OrderedDict(x_norm=a, tokens=b), 'tokens', 'net') is b
-    with pytest.raises(SettingsError, match=r"no output '2': its outputs are 0, 1"):
-        one_of([a, b], '2', 'net')
 
 
 @pytest.mark.parametrize(

@@ -57,14 +57,6 @@ def test_history_has_no_number_that_json_lacks(history):
     assert changes == {'pose': [1.0, None], 'samples': [{'probability': None}]}
 
 
-def test_history_when_closed_wakes_those_who_wait(history):
-    waiting = threading.Thread(target=lambda: history.since(0, TIMEOUT))
-    waiting.start()
-    history.close()
-    waiting.join(TIMEOUT)
-    assert not waiting.is_alive()
-
-
 @pytest.mark.parametrize(
     ('places', 'span'),
     [([0], (0, 1)), (range(7), (0, 7)), (range(40, 70), (40, 70)), ([100, 104, 108], (100, 112))],
@@ -126,16 +118,6 @@ def test_server_serves_the_page_the_events_and_the_image(served, history):
     assert served('GET', '/../setup.py')[0] == 404
 
 
-def test_server_counts_the_pages_that_are_open(served, history):
-    connection = HTTPConnection('127.0.0.1', served.server.server_port, timeout=TIMEOUT)
-    connection.request('GET', '/events')
-    history.set('state', 'active')
-    connection.getresponse().readline()
-    assert history.viewers == 1
-    served.server.stop()
-    connection.close()
-
-
 def test_server_runs_commands_and_returns_their_errors(served):
     sent = {'Content_Type': 'application/json'}
     body = json.dumps({'name': 'operation', 'value': 'mapping'})
@@ -175,15 +157,6 @@ def test_server_on_a_port_in_use_is_rejected(served, history):
     port = served.server.server_port
     with pytest.raises(UnavailableError, match=f'127.0.0.1:{port} cannot be used: .*--port'):
         MonitorServer('127.0.0.1', port, history, None)
-
-
-def test_server_prints_no_error_of_a_browser_that_has_gone(served, capsys):
-    for error, is_printed in ((ConnectionResetError(), False), (KeyError('defect'), True)):
-        try:
-            raise error
-        except Exception:
-            served.server.handle_error(None, ('127.0.0.1', 1))
-        assert ('Traceback' in capsys.readouterr().err) == is_printed
 
 
 # the node

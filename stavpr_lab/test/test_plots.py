@@ -15,7 +15,6 @@ from stavpr_lab.demonstration.plots import demo_sheet
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, ImageMatches, Ranking
 from stavpr_lab.evaluation.plots import (
-    distance_histogram,
     drive,
     MatchPair,
     precision_recall,
@@ -105,17 +104,6 @@ def test_precision_recall_draws_each_curve_and_its_best_point(path):
     row, column = top + height * (1 - best.precision), left + width * best.recall
     center = plot[round(row * plot.shape[0]), round(column * plot.shape[1])]
     assert center.tolist() == [255, 255, 255]  # inside the ring
-
-
-def test_distance_histogram_shows_groups_and_threshold(path):
-    groups = {
-        'correct': ('#2e8b57', np.array([0.1, 0.2, 0.2, np.inf])),
-        'wrong': ('#c8402f', np.array([0.3, 0.3])),
-    }
-    distance_histogram(path, groups, 0.25)
-    assert colors_of(path, GREEN, RED, AMBER) == [True, True, False]
-    distance_histogram(path, {'correct': ('#2e8b57', np.array([np.inf]))}, np.nan)
-    colors_of(path, spread=1.0)
 
 
 def test_demo_sheet_shows_matches_and_ground_truth_as_far_as_known(path, results):

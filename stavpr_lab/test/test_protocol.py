@@ -74,16 +74,6 @@ def test_error_rate_and_recall_by_hand():
 
 
 @pytest.mark.parametrize('run_length', [1, 40])
-def test_interval_of_the_error_rate_has_the_width_of_independent_runs(run_length):
-    wrong = np.repeat(np.random.default_rng(0).random(4000 // run_length) < 0.2, run_length)
-    every = np.ones(4000, bool)
-    (rate, low, high), _ = error_rate_and_recall(every, ~wrong, every)
-    assert low < rate < high
-    width = 3.92 * np.sqrt(0.2 * 0.8 * run_length / 4000)
-    assert high - low == pytest.approx(width, rel=0.35)
-
-
-@pytest.mark.parametrize('run_length', [1, 40])
 def test_interval_has_the_width_of_independent_runs(run_length):
     """4000 images, half of them wrong in runs: the deviation is that of the number of runs."""
     runs = 4000 // run_length

@@ -22,12 +22,6 @@ def test_preprocess_patches_by_hand():
     )
 
 
-def test_preprocess_weights_red_more_than_blue():
-    gray = np.array([[0, 2, 5, 5], [2, 4, 5, 5]], np.uint8) * 40
-    color = np.stack([gray, gray * 0, 200 - gray], axis=2)  # red as the gray image, blue against
-    np.testing.assert_allclose(preprocess([color], SMALL), preprocess([gray], SMALL), atol=0.05)
-
-
 def naive(D, settings):
     """Compute the paper's method in plain loops."""
     N, n = D.shape

@@ -34,10 +34,6 @@ def view(world, along, conditions, size=SIZE):
     return Traverse(world, np.array([along]), np.array([False]), conditions, size=size)[0].image
 
 
-def difference(a, b):
-    return float(np.abs(a.astype(float) - b.astype(float)).mean())
-
-
 def test_world_with_same_seed_renders_same_bytes():
     one, same, other = (second_traverse(World(seed), 40, SIZE) for seed in (3, 3, 4))
     assert all(np.array_equal(one[k].image, same[k].image) for k in (0, 17, 39))
@@ -65,17 +61,6 @@ def test_render_with_lateral_step_shows_parallax(world):
     assert abs(np.median(near)) >= 2 * abs(np.median(far))
 
 
-@pytest.mark.parametrize(
-    'change',
-    [{'fog': 0.03}, {'exposure': 0.5}, {'warmth': 0.2}, {'rain': 1.0}, {'noise': 0.05},
-     {'sun_azimuth': 250.0}, {'lane': -1.0}, {'traffic': 5}, {'lamps': 0.5}, {'autumn': 1.0},
-     {'clouds': 1.0}, {'sun': 0.0}, {'ambient': 0.3}],
-)  # fmt: skip
-def test_conditions_change_the_image(world, change):
-    base = replace(STILL, lamps=0.01)  # with lamps at all, those of the street are lit
-    assert difference(view(world, 60.0, base), view(world, 60.0, replace(base, **change))) > 0.3
-
-
 def test_default_traverses_have_expected_lengths_and_detour(world):
     first, second = first_traverse(world), second_traverse(world)
     assert len(first) == 300
@@ -86,17 +71,6 @@ def test_default_traverses_have_expected_lengths_and_detour(world):
     assert np.all(np.diff(np.flatnonzero(truth < 0)) == 1)  # one stretch
     assert second[0].stamp > first[len(first) - 1].stamp
     assert np.all(np.diff(second.stamps) > 0)
-
-
-def test_second_traverse_stops_once_and_varies_speed(world):
-    second = second_traverse(world)
-    step = np.diff(second.position)
-    step = step[np.isfinite(step) & (step < 20)]  # not across the detour
-    assert np.all(step >= 0)
-    assert 8 <= np.count_nonzero(step == 0) <= 20
-    driving = step[step > 0.9]
-    assert driving.min() < 1.3
-    assert 3.0 < driving.max() < 4.5
 
 
 def test_nearest_places_by_hand(world):
