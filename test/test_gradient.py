@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.features.extractor import cut_strips, normalize
-from stavpr_ros.features.gradient import (
-    _on_threads,
-    FLOOR,
-    Gradient,
-    GradientSettings,
-    PER_THREAD,
-)
+from stavpr_ros.features.gradient import _on_threads, FLOOR, Gradient, GradientSettings, PER_THREAD
 from stavpr_ros.features.registry import RESIZE_METHODS
 from stavpr_ros.threads import limit_threads
 

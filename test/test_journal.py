@@ -16,14 +16,7 @@ from pipelines import process, save, settings_of
 import pytest
 from stavpr_ros.errors import JournalError, OutputTakenError
 from stavpr_ros.mapping import journal_writer, load_map, save_map
-from stavpr_ros.mapping.journal import (
-    Base,
-    frame,
-    header,
-    JournalPlace,
-    JournalReader,
-    row_of,
-)
+from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, JournalReader, row_of
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.place_map import Place

@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.mapping import (
-    image_change,
-    KeyframeSelector,
-    KeyframeSettings,
-    small_gray,
-)
+from stavpr_ros.mapping import image_change, KeyframeSelector, KeyframeSettings, small_gray
 from stavpr_ros.sources import open_source
 
 SECOND = 10**9
@@ -171,8 +166,7 @@ def test_image_change_of_dark_noise_is_zero():
 
 
 @pytest.mark.parametrize(
-    'traverse',
-    ['gardens_point/day_right', 'corridor/ref', 'rtabmap_hallway_loop/samples'],
+    'traverse', ['gardens_point/day_right', 'corridor/ref', 'rtabmap_hallway_loop/samples']
 )
 def test_image_change_separates_moving_from_standing_camera(data_folder, traverse):
     frames = list(islice(open_source(data_folder / traverse), 40))

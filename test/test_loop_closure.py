@@ -10,11 +10,7 @@ from places import features_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence, SequenceMatch
-from stavpr_ros.errors import (
-    FeatureMismatchError,
-    InputError,
-    SettingsError,
-)
+from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.filter.choice import MIN_CANDIDATE
 from stavpr_ros.filter.paths import CLOSE
 from stavpr_ros.filter.refine import BAND
@@ -110,11 +106,7 @@ class PlainCloser:
 
 @pytest.mark.parametrize(
     ('options', 'limit', 'exclude', 'sequence'),
-    [
-        (PAPER, 64, 12, SHORT),
-        (LM_DTW, 41, 12, SHORT),
-        (LM_DTW, 48, 2, SequenceSettings()),
-    ],
+    [(PAPER, 64, 12, SHORT), (LM_DTW, 41, 12, SHORT), (LM_DTW, 48, 2, SequenceSettings())],
     ids=['paper', 'z-normalized', 'z-normalized, default sequence'],
 )
 def test_loop_closer_with_limit_equals_plain_loop_with_bans(

@@ -116,10 +116,7 @@ RISKS = ErrorRisks('robust', 3, (0.2, 0.9), (1.5, 0.0))
 
 @pytest.mark.parametrize(
     ('name', 'value', 'data'),
-    [
-        ('threshold', 0.25, 0.25),
-        ('error_risks', RISKS, json.loads(json.dumps(vars(RISKS)))),
-    ],
+    [('threshold', 0.25, 0.25), ('error_risks', RISKS, json.loads(json.dumps(vars(RISKS))))],
 )
 def test_optional_value_is_a_section_that_older_readers_ignore(
     example, tmp_path, name, value, data
@@ -400,10 +397,7 @@ def _without_hashes(content):
         (_without_hashes, 'tensor strips has 0 hashes'),
         (lambda content: content + b'\0', r'tensors end at byte \d+, the file at byte \d+'),
         (lambda content: content[:-1], r'tensors end at byte \d+, the file at byte \d+'),
-        (
-            lambda _: b'PK\3\4' + bytes(26),
-            'is no map of this program .*: build one',
-        ),
+        (lambda _: b'PK\3\4' + bytes(26), 'is no map of this program .*: build one'),
         *(
             (lambda _, other=other: other, 'no map')
             for other in (

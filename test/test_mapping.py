@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 from stavpr_ros.errors import ImageError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import (
-    build_map,
-    encode_thumbnail,
-    KeyframeSettings,
-    Trajectory,
-)
+from stavpr_ros.mapping import build_map, encode_thumbnail, KeyframeSettings, Trajectory
 from stavpr_ros.sources.frame import Frame
 
 SECOND = 10**9

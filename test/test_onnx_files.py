@@ -11,12 +11,7 @@ from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
-from stavpr_ros.errors import (
-    FeatureMismatchError,
-    ImageError,
-    SettingsError,
-    UnavailableError,
-)
+from stavpr_ros.errors import FeatureMismatchError, ImageError, SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
 import torch

@@ -10,13 +10,7 @@ import pytest
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
-from stavpr_ros.pipeline import (
-    node_settings,
-    NodeSettings,
-    OPERATIONS,
-    PipelineSettings,
-    read_map,
-)
+from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings, read_map
 from stavpr_ros.prepare.matcher import PRECISIONS
 from stavpr_ros.recognition.robust import MODES
 from stavpr_ros.recognition.verification import METHODS

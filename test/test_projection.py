@@ -26,9 +26,7 @@ def test_apply_equals_matrix_product():
     result = projection.apply(strips)
     assert result.dtype == np.float32
     np.testing.assert_allclose(
-        result,
-        np.einsum('ind,dm->inm', strips.astype(float), projection.matrix),
-        atol=1e-5,
+        result, np.einsum('ind,dm->inm', strips.astype(float), projection.matrix), atol=1e-5
     )
     assert not result[1, 2].any()
 

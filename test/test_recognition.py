@@ -7,12 +7,7 @@ from dataclasses import replace
 import numpy as np
 from places import recognize_all
 import pytest
-from stavpr_ros.alignment import (
-    best_match,
-    match_sequence,
-    SequenceSettings,
-    SpatialSettings,
-)
+from stavpr_ros.alignment import best_match, match_sequence, SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures

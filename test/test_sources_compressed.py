@@ -140,8 +140,7 @@ def test_decode_compressed_of_mpo_reads_first_image():
 
 
 @pytest.mark.parametrize(
-    'transport',
-    ['', 'jpeg', 'rgb8; jpeg compressed bgr8', '16UC1; png compressed ', 'h264'],
+    'transport', ['', 'jpeg', 'rgb8; jpeg compressed bgr8', '16UC1; png compressed ', 'h264']
 )
 def test_compressed_message_format_is_taken_from_bytes(transport):
     rgb = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)

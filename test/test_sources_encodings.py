@@ -96,8 +96,7 @@ def test_decode_image_with_wrong_header_is_rejected(change, kind, text):
 
 
 @pytest.mark.parametrize(
-    'encoding',
-    [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 4)],
+    'encoding', [f'{kind}C{n}' for kind in ('8S', '16S', '32S', '32F', '64F') for n in (1, 4)]
 )
 def test_decode_image_of_measurements_is_rejected(encoding):
     with pytest.raises(ImageError, match=f'{encoding!r} is depth or measurements') as caught:

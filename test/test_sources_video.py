@@ -38,10 +38,7 @@ def test_video_yields_images_at_the_rate(tmp_path, suffix, codec):
     assert isinstance(source, VideoSource)
     assert len(frames) == len(source) == 20
     np.testing.assert_allclose(seconds(frames), np.arange(20) / 10, atol=0.001)
-    assert [frame.identifier for frame in frames[:2]] == [
-        f'phone.{suffix}#0',
-        f'phone.{suffix}#1',
-    ]
+    assert [frame.identifier for frame in frames[:2]] == [f'phone.{suffix}#0', f'phone.{suffix}#1']
     for i, frame in enumerate(frames):
         left, right = (np.median(half, (0, 1)) for half in np.split(frame.image, 2, 1))
         np.testing.assert_allclose(left, (255, 0, 0), atol=12)

@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.recognition import verification
-from stavpr_ros.recognition.verification import (
-    GeometricEvidence,
-    GeometricSettings,
-    PlaceVerifier,
-)
+from stavpr_ros.recognition.verification import GeometricEvidence, GeometricSettings, PlaceVerifier
 from stavpr_ros.sources import open_source
 
 METHODS = ['orb', 'sift']
@@ -135,11 +131,7 @@ def test_inliers_after_query_memory_is_reused_are_of_new_query():
 
 
 @pytest.mark.parametrize(
-    ('changes', 'words'),
-    [
-        ({'method': 'none'}, "'none'"),
-        ({'min_inliers': 7}, 'min_inliers = 7'),
-    ],
+    ('changes', 'words'), [({'method': 'none'}, "'none'"), ({'min_inliers': 7}, 'min_inliers = 7')]
 )
 def test_geometric_settings_out_of_range_are_rejected(changes, words):
     with pytest.raises(SettingsError, match=words):

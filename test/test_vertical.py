@@ -40,8 +40,7 @@ def test_cut_cells_are_those_of_feature_map():
 
 
 @pytest.mark.parametrize(
-    ('n', 'strategy', 'xi'),
-    [(1, 'adaptive', None), (15, 'vanilla', None), (65, 'adaptive', 2)],
+    ('n', 'strategy', 'xi'), [(1, 'adaptive', None), (15, 'vanilla', None), (65, 'adaptive', 2)]
 )
 def test_vertical_distances_equal_oracle(n, strategy, xi):
     """The inner alignment has its own central cell and no band."""

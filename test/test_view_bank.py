@@ -71,8 +71,7 @@ def matched(matches):
 
 
 @pytest.mark.parametrize(
-    ('roll', 'shift', 'view'),
-    [(10, 0, RIGHT), (-10, 0, LEFT), (0, 0.1, UP), (0, -0.1, DOWN)],
+    ('roll', 'shift', 'view'), [(10, 0, RIGHT), (-10, 0, LEFT), (0, 0.1, UP), (0, -0.1, DOWN)]
 )
 def test_rolled_or_tilted_camera_is_matched_by_the_view_that_undoes_it(
     night_map, roll, shift, view

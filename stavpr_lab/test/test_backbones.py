@@ -11,11 +11,7 @@ import networks
 import numpy as np
 import pytest
 from scipy.spatial.distance import cosine
-from stavpr_lab.features.paper_networks import (
-    DenseNet161,
-    VGG16,
-    VGG16Fc6,
-)
+from stavpr_lab.features.paper_networks import DenseNet161, VGG16, VGG16Fc6
 from stavpr_lab.features.weights import load_parameters
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.registry import backbone_class, settings_class

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 from stavpr_lab.features import descriptors
-from stavpr_lab.features.descriptors import (
-    is_descriptors,
-    read_descriptors,
-    require_comparable,
-)
+from stavpr_lab.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.errors import FeatureMismatchError, SourceError
 
 D = 24

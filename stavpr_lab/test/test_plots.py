@@ -14,12 +14,7 @@ from stavpr_lab.demonstration.animation import write_animation
 from stavpr_lab.demonstration.plots import demo_sheet
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, ImageMatches, Ranking
-from stavpr_lab.evaluation.plots import (
-    drive,
-    MatchPair,
-    precision_recall,
-    reduced_matrix,
-)
+from stavpr_lab.evaluation.plots import drive, MatchPair, precision_recall, reduced_matrix
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.mapping import save_map
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
