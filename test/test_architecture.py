@@ -149,12 +149,3 @@ def test_modules_import_each_other_without_cycles():
         for module, path in MODULES.items()
     }
     TopologicalSorter(arrows).prepare()  # raises CycleError
-
-
-def test_classes_have_unique_names():
-    found: dict[str, list[str]] = {}
-    for module, path in MODULES.items():
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ClassDef):
-                found.setdefault(node.name, []).append(module)
-    assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}

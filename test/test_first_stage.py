@@ -101,17 +101,6 @@ def test_image_shifted_by_strips_is_among_candidates(few, shift):
     assert np.argmin(found) == 3333
 
 
-def test_distances_of_chunks_end_with_map():
-    features = random_features(70)
-    matcher = CpuMatcher(features, SpatialSettings())
-    query = random_features(1, seed=3)
-    found = matcher.distances_at(query.strips[:, 0], np.array([64, 32]), CHUNK)
-    expected = matcher.distances(query.strips[:, 0], query.weights[:, 0])
-    np.testing.assert_array_equal(found[0, :6], expected[64:])
-    assert np.isinf(found[0, 6:]).all()
-    np.testing.assert_array_equal(found[1], expected[32:64])
-
-
 def recognizer(features, sessions=1, **changes):
     index = (np.arange(len(features)) * sessions // len(features)).astype(np.int32)
     names = tuple(Session(str(i)) for i in range(sessions))

@@ -2,15 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The gradient features against their definition in plain float64."""
 
-import threading
-
 import cv2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from stavpr_ros.features.extractor import cut_strips, normalize
-from stavpr_ros.features.gradient import _on_threads, FLOOR, Gradient, GradientSettings, PER_THREAD
+from stavpr_ros.features.gradient import FLOOR, Gradient, GradientSettings, PER_THREAD
 from stavpr_ros.features.registry import RESIZE_METHODS
 from stavpr_ros.threads import limit_threads
 
@@ -109,21 +107,6 @@ def test_gradient_on_threads_equals_single_images(route, n):
     assert together.shape == (n, 8, 14, 14)
     for i in range(n):
         assert np.array_equal(together[i], gradient.feature_maps([route[i]])[0])
-
-
-@pytest.mark.usefixtures('two_threads')
-@pytest.mark.parametrize(('count', 'threads'), [(PER_THREAD, 1), (2 * PER_THREAD, 2)])
-def test_on_threads_with_large_batch_uses_several(count, threads):
-    """They meet at every image, which one thread alone could not."""
-    meeting, seen = threading.Barrier(threads), set()
-
-    def work(i: int) -> None:
-        meeting.wait(timeout=30)
-        seen.add((i, threading.get_ident()))
-
-    _on_threads(work, count)
-    assert sorted(i for i, _ in seen) == list(range(count))
-    assert len({thread for _, thread in seen}) == threads
 
 
 @pytest.mark.usefixtures('two_threads')

@@ -398,26 +398,20 @@ def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch)
     assert np.allclose(found.features.strips[:, -n:], held.features.strips, atol=1e-6)
 
 
-def test_operation_changes_keep_the_journal_of_unsaved_places(start, route, target):
+def test_changes_keep_the_journal_of_unsaved_places(start, small_map, route, target, tmp_path):
+    """Of the operation, and of the map, which discards them."""
+    other = tmp_path / 'other.stavpr'
+    save_map(small_map, other)
     pipeline = start()
     process(pipeline, route[:6])
     pipeline.change(operation='localization')
     process(pipeline, route[:6], first=50)
     pipeline.change(operation='mapping')
     process(pipeline, route[6:8], first=6)
-    killed(pipeline)
-    assert recover(journals(target)[0]).places == 8
-    assert stamps(target) == seconds(*range(1, 9))
-
-
-def test_discarded_places_stay_in_their_journal(start, small_map, route, target, tmp_path):
-    other = tmp_path / 'other.stavpr'
-    save_map(small_map, other)
-    pipeline = start()
-    process(pipeline, route[:6])
     pipeline.change(operation='localization')
     pipeline.change(loaded=read_map(str(other), pipeline.settings))
-    assert recover(journals(target)[0]).places == 6
+    assert recover(journals(target)[0]).places == 8
+    assert stamps(target) == seconds(*range(1, 9))
 
 
 # ---------------------------------------------------------------------------------------- the disk

@@ -15,7 +15,6 @@ from stavpr_ros.commands.build_map import main as build_map_main
 from stavpr_ros.commands.map import main as map_main
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import load_map, open_map, save_map
 from stavpr_ros.prepare import prepared_map
 from stavpr_ros.prepare.centering import MeanCentering
@@ -86,16 +85,6 @@ def test_several_threads_learn_the_same_as_one(place_map):
         found.append(statistics_of_map(place_map).parts())
     for name, array in found[0].items():
         np.testing.assert_array_equal(array, found[1][name])
-
-
-def test_changes_are_those_of_neighbors_up_to_five_places_apart(place_map):
-    found = statistics_of_map(place_map)
-    centered = MeanCentering(place_map.features).places(place_map.features).strips
-    assert found.changes.shape == (MAX_LAG, 600)
-    for place, apart in ((8, 1), (256, 1), (258, 4), (599, 5), (3, 3)):
-        similarity = np.einsum('jd,jd->j', centered[:, place], centered[:, place - apart])
-        assert found.changes[apart - 1, place] == pytest.approx(1 - similarity.mean(), abs=1e-5)
-    assert found.changes[4, :5].tolist() == [0] * 5
 
 
 def test_small_map_keeps_none(place_map, monkeypatch):

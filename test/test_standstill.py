@@ -8,7 +8,6 @@ import pytest
 from stavpr_ros.features import FeatureSettings
 from stavpr_ros.filter.motion import change_weights
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.prepare.route_features import RouteFeatures
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
 
@@ -108,23 +107,6 @@ def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():
     assert min(found) >= back
     assert len(found) > PLACES - 60
     assert all(abs(places[place] - (image - back)) <= 2 for image, place in found.items())
-
-
-@pytest.mark.parametrize('limit', [None, 300])
-def test_mean_of_a_route_counts_a_standstill_once(limit):
-    strips, places = with_stop(route(1), images=150)
-    features = noisy(strips)
-    held = RouteFeatures(features.settings, True, False, limit)
-    for i in range(len(features)):
-        if held.count == limit:
-            held.evict(40)
-        held.append(features[i : i + 1])
-    held._learn(0)
-    kept = slice(len(places) - held.count, None)
-    once = np.flatnonzero(np.diff(places[kept], prepend=-1)) + kept.start
-    expected = features.strips[:, once].mean(axis=1)
-    far = abs(features.strips[:, kept].mean(axis=1) - expected).max()
-    assert abs(held.mean - expected).max() < 0.05 * far
 
 
 def test_change_weights_are_small_at_standstills_alone():

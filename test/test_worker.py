@@ -51,28 +51,6 @@ def test_worker_busy_drops_oldest_items(make):
     assert busy.seen == [0, 3, 4]
 
 
-def test_clear_returns_waiting_items(make):
-    busy = Busy()
-    worker = make(busy, capacity=3)
-    for item in range(3):
-        worker.put(item)
-        assert busy.begun.wait(TIMEOUT)
-    assert worker.clear() == [1, 2]
-    busy.go_on.set()
-    worker.run(lambda: None)
-    assert busy.seen == [0]
-
-
-def test_failing_item_does_not_end_the_thread(make):
-    seen = []
-    worker = make(lambda item: seen.append(1 / item), capacity=5)
-    for item in (1, 0, 2):
-        worker.put(item)
-    while len(seen) < 2:
-        worker.run(lambda: None)
-    assert seen == [1, 0.5]
-
-
 def test_run_returns_and_raises_on_the_thread(make):
     worker = make()
     assert worker.run(threading.current_thread).name == 'recognition'

@@ -79,21 +79,6 @@ def test_open_dataset_berlin_reads_its_ground_truth_file(
     assert open_dataset('berlin_a100', tmp_path).tolerance == 2
 
 
-def test_open_dataset_with_text_and_array_reads_the_text(tmp_path):
-    fill(tmp_path / 'ref', 3)
-    fill(tmp_path / 'query', 2)
-    rows = np.empty((1, 2), object)
-    rows[0] = [0, [1, 2]]
-    np.save(tmp_path / 'ground_truth_new.npy', rows, allow_pickle=True)
-    with pytest.raises(SourceError, match='contains Python objects'):
-        open_dataset('berlin_a100', tmp_path)
-    (tmp_path / 'ground_truth.csv').write_text('0,1\n1,2\n')
-    assert open_dataset('berlin_a100', tmp_path, 0).ground_truth.pairs.tolist() == [[0, 1], [1, 2]]
-    (tmp_path / 'gt.csv').write_text('0,1\n')
-    with pytest.raises(SourceError, match=r'several ground truths: ground_truth\.csv, gt\.csv'):
-        open_dataset('berlin_a100', tmp_path)
-
-
 def test_open_dataset_synth_crops_both_traverses(tmp_path):
     fill(tmp_path / 'summer', 5)
     fill(tmp_path / 'winter', 5, 100)

@@ -89,13 +89,6 @@ def results_of(places, scores):
     return TraverseResults(matches, matches, np.zeros(len(places)), (), reduced, accepted, unknown)
 
 
-def test_false_alarm_rate_counts_unknown_images_below_the_threshold():
-    known = results_of([0, 1, 2], [0.1, 0.2, 0.3])
-    unknown = results_of([0, 0, 0, -1], [0.1, 0.2, 0.25, np.inf])
-    evaluation = evaluate_traverse(known, GroundTruth.identity(3, 3), 3, unknown)
-    assert evaluation.false_alarm_rates['sequence'] == 0.75  # at the threshold of the best F1
-
-
 def test_worst_mistakes_are_ordered_and_apart():
     """Other places before near misses, then by distance; none near another one."""
     places, scores = np.arange(60), np.full(60, 0.05)

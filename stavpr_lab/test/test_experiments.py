@@ -98,14 +98,6 @@ def test_paper_table_has_all_systems_of_the_paper(nordland, tmp_path, run):
     assert (code, 'of (20, 24) images: expected (24, 24)' in errors) == (1, True)
 
 
-def test_paper_table_of_missing_data_sets_has_the_published_rows(nordland, tmp_path, run):
-    lines = run('paper', *nordland[:2], '--gradient-cell', 32)[1].splitlines()
-    empty = lines.index(next(line for line in lines if line.startswith('ua ')))
-    assert lines[empty].split() == ['ua', 'gradient', *8 * '-']
-    assert lines[empty + 1].split()[:3] == ['published,', 'DenseNet161', '0.687']
-    assert any(line.startswith('- ua: no data: ') for line in lines)
-
-
 def test_ssm_vpr_is_a_column_of_the_paper(tmp_path, squeezenet_settings):
     images = route_images(6, size=(120, 160))
     source = FolderSource(write_images(tmp_path / 'images', images))

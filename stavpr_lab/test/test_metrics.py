@@ -131,14 +131,6 @@ def test_evaluate_ranking_takes_nan_and_infinity_as_no_match():
     assert (none.best.f1, none.average_precision, none.recall_at_full_precision) == (0, 0, 0)
 
 
-def test_evaluate_ranking_takes_negative_scores():
-    """-3 and -2 are correct, -1 is wrong, the last query has no match."""
-    scores = [-3.0, -2.0, -1.0, np.inf]
-    metrics = evaluate_ranking(ranking([0, 1, 0, 3], scores), GroundTruth.identity(4, 4))
-    assert metrics.best.f1 == pytest.approx(2 * 2 / (2 * 2 + 2))
-    assert metrics.average_precision == pytest.approx(1 / 3 + 1 / 3 + 1 / 3 * 3 / 4)
-
-
 def test_smallest_indices_are_ordered_by_value_then_index():
     row = np.array([3, 1, np.inf, 1, 2, np.nan, 1], np.float32)
     assert smallest_indices(row, 2).tolist() == [1, 3]
