@@ -23,12 +23,7 @@ def choose_device(requested: str) -> str:
     :raises UnavailableError: ``cuda`` was requested and is not available.
     """
     require_choice('device', requested, DEVICES)
-    available = torch_has_cuda()
-    if requested == 'cuda' and not available:
-        raise UnavailableError(
-            "device 'cuda': torch finds no CUDA device here; take 'cpu' or 'auto'"
-        )
-    return ('cuda' if available else 'cpu') if requested == 'auto' else requested
+    return str(choose_backend(requested))
 
 
 def choose_backend(requested: 'str | torch.device') -> 'str | torch.device':
@@ -49,7 +44,7 @@ def choose_backend(requested: 'str | torch.device') -> 'str | torch.device':
             return 'cpu'
     if str(requested).startswith('cuda') and not torch_has_cuda():
         raise UnavailableError(
-            f"backend '{requested}': torch finds no CUDA device here; take 'cpu' or 'auto'"
+            f"device '{requested}': torch finds no CUDA device here; take 'cpu' or 'auto'"
         )
     import torch
 

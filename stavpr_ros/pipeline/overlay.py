@@ -6,7 +6,6 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_shape
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.result import ImageResult
 
@@ -55,9 +54,6 @@ def match_image(
     :param label: of the place.
     :returns: RGB, shape (h + bar, 2 w + gap, 3), uint8.
     """
-    for name, image in (('query', query), ('place', place)):
-        if image is not None:
-            require_shape(name, image, 'H W 3', 'uint8')
     height, width = query.shape[:2]
     gap, bar = max(2, width // 80), max(18, height // 9)
     sheet = np.full((height + bar, 2 * width + gap, 3), _PAPER, np.uint8)

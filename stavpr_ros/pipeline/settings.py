@@ -92,11 +92,6 @@ class PipelineSettings:
             max_error=self.max_error,
         )
 
-    @property
-    def compares_odometry(self) -> bool:
-        """Whether odometry is compared with the paths of matches, where places have poses."""
-        return self.recognition().compares_odometry
-
     def require_operation(self, operation: str) -> None:
         """
         Reject an operation that these settings exclude.

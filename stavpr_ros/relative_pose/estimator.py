@@ -103,21 +103,35 @@ class EdgeEstimator:
         place_camera: Camera | None,
         obstacle: str,
     ) -> Edge:
-        if self.method == 'none':
-            return Edge(Source.NONE, 'parameter relative_pose is none')
-        if self.method == 'aligned':
-            return replace(align(pair), reason='parameter relative_pose is aligned')
+        if (edge := self.without_pnp(pair, query_camera, place_camera)) is not None:
+            return edge
+        if obstacle:
+            return Edge(Source.DROPPED, f'PnP: {obstacle}')
+        assert query_camera is not None
+        assert place_camera is not None
         try:
-            cameras = needed_by_pnp(pair, query_camera, place_camera)
-            if obstacle:
-                return Edge(Source.DROPPED, f'PnP: {obstacle}')
-            return self._pnp(pair, *cameras)
+            return self._pnp(pair, query_camera, place_camera)
         except InputError as error:
-            reason = f'PnP: {error}'
-        if self.method == 'pnp':
+            return self._other(pair, f'PnP: {error}')
+
+    def without_pnp(
+        self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
+    ) -> Edge | None:
+        """Return the edge where PnP is not wanted, or lacks something; None = neither."""
+        reason = f'parameter relative_pose is {self.method}'
+        if self.method in ('auto', 'pnp'):
+            missing = _missing_for_pnp(pair, query_camera, place_camera)
+            if not missing:
+                return None
+            reason = f'PnP: {missing}'
+        return self._other(pair, reason)
+
+    def _other(self, pair: MatchedPair, reason: str) -> Edge:
+        """Return the edge by odometry where the method permits it, else one without a pose."""
+        if self.method in ('none', 'pnp'):
             return Edge(Source.NONE, reason)
-        other = align(pair)
-        return replace(other, reason=f'{reason}; {other.reason}' if other.reason else reason)
+        edge = align(pair)
+        return replace(edge, reason=f'{reason}; {edge.reason}' if edge.reason else reason)
 
     def _pnp(self, pair: MatchedPair, query_camera: Camera, place_camera: Camera) -> Edge:
         """
@@ -205,22 +219,18 @@ class EdgeEstimator:
         return _cached(self._views, index, VIEWS, make)
 
 
-def needed_by_pnp(
+def _missing_for_pnp(
     pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None
-) -> tuple[Camera, Camera]:
-    """
-    Return the cameras of query and place.
-
-    :raises InputError: something that PnP needs is unknown.
-    """
+) -> str:
+    """Return what PnP needs and is unknown, '' = nothing."""
     if query_camera is None or place_camera is None:
         of = 'the camera' if query_camera is None else 'the camera of the map'
-        raise InputError(f'the intrinsics of {of} are unknown')
+        return f'the intrinsics of {of} are unknown'
     if np.isnan(pair.pose(pair.place)).any():
-        raise InputError('the place has no pose')
+        return 'the place has no pose'
     if pair.query is None or not pair.thumbnails.get(pair.place):
-        raise InputError('query or place has no thumbnail')
-    return query_camera, place_camera
+        return 'query or place has no thumbnail'
+    return ''
 
 
 def _cached(

@@ -3,7 +3,7 @@
 """Loop closures are completed with their relative poses on a thread of its own, in order."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import threading
 import time
 import traceback
@@ -11,15 +11,13 @@ import traceback
 import numpy as np
 from rclpy.logging import get_logger
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.relative_pose.edge import Edge, Source
-from stavpr_ros.relative_pose.estimator import EdgeEstimator, needed_by_pnp
-from stavpr_ros.relative_pose.odometry import align
+from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.pair import MatchedPair
 from stavpr_ros.ros.messages import (
     loop_closure_message,
@@ -122,17 +120,8 @@ class EdgePublisher:
             return Edge(Source.NONE, NO_POSE)
         if self._estimator.verifier is not None:
             return Edge(Source.NONE, 'the loop closure of this header has it, verified')
-        reason = f'parameter relative_pose is {self._estimator.method}'
-        if self._estimator.method == 'auto':
-            try:
-                needed_by_pnp(pair, query_camera, place_camera)
-                return Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
-            except InputError as error:
-                reason = f'PnP: {error}'
-        if self._estimator.method == 'pnp':
-            return Edge(Source.NONE, reason)
-        edge = align(pair)
-        return replace(edge, reason=f'{reason}; {edge.reason}' if edge.reason else reason)
+        edge = self._estimator.without_pnp(pair, query_camera, place_camera)
+        return edge or Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
 
     def put(self, closure: WaitingClosure) -> None:
         """Publish a closure when its edge is ready."""
