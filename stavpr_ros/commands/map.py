@@ -362,7 +362,3 @@ def main(args: list[str] | None = None) -> int:
         return exit_code
 
     return run_program('map', work)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -53,7 +53,3 @@ def _run(args: list[str] | None) -> int:
     from stavpr_ros.ros.process import run_node
 
     return run_node(PlaceRecognitionNode, args, BY_NAME)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

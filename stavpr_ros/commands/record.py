@@ -155,7 +155,3 @@ def _write_messages(
     except KeyboardInterrupt:
         pass  # the usual end
     return count
-
-
-if __name__ == '__main__':
-    sys.exit(main())

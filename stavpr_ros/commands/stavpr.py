@@ -96,7 +96,3 @@ def main(args: list[str] | None = None) -> int:
         return 2
     exit_code: int = importlib.import_module(command.module).main(rest)
     return exit_code
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -43,7 +43,3 @@ def _run(_: object) -> None:
             Localizer(settings, route, extractor, SaveState())
             RouteCloser(settings, None, extractor, SaveState())
     print(f'the kernels are in {CACHE}')
-
-
-if __name__ == '__main__':
-    sys.exit(main())
