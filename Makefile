@@ -8,6 +8,7 @@ SHELL := bash
 PYTHON ?= python3
 TORCH_INDEX ?=
 EXTRAS ?=
+FEATURES ?=
 MAP ?=
 QUERY ?=
 LOOP ?=
@@ -23,6 +24,7 @@ export MAP QUERY LOOP SLAM TRUTH
 SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
+LEARNED = $(filter learned hybrid efficientnet_lite1,$(FEATURES))
 TESTS := test stavpr_fleet/test stavpr_slam/test stavpr_lab/test
 PYTEST = pytest -n 2 --dist loadfile $(TESTS)
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN)
@@ -40,9 +42,10 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx slam"         optional packages: onnx, hdf5, faiss, fleet, ray, slam, evaluation, bench, dev, docs'
+	@echo '  EXTRAS="onnx slam"         optional packages: onnx, learned, hdf5, faiss, fleet, ray, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your images, videos, bags or saved maps'
 	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'
+	@echo '  FEATURES=learned           demo: features hybrid, of the extra learned (default: gradient)'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
 	@echo '  SLAM=world                 demo: three laps, odometry corrected by a pose graph'
 	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
@@ -56,8 +59,12 @@ build: ## setup, then build the packages with colcon
 ifdef SLAM
 demo: override EXTRAS += slam
 endif
+ifneq ($(LEARNED),)
+demo: override EXTRAS += learned
+endif
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
-	@$(RUN) $(LAB)/demo $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
+	@$(if $(LEARNED),$(RUN) $(LAB)/weights efficientnet_lite1)
+	@$(RUN) $(LAB)/demo $(if $(FEATURES),--features $(FEATURES:learned=hybrid)) $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") \
 		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
 
@@ -129,4 +136,4 @@ distclean: clean ## also remove .venv and the caches of tools
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 development:
-	@$(SETUP) build $(OPTIONS) onnx hdf5 faiss fleet slam evaluation dev docs
+	@$(SETUP) build $(OPTIONS) onnx learned hdf5 faiss fleet slam evaluation dev docs

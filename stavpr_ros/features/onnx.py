@@ -42,8 +42,8 @@ def import_onnx() -> tuple[ModuleType, ModuleType]:
         import onnxruntime
     except ImportError as error:
         raise UnavailableError(
-            f"features 'onnx' need the packages onnx and onnxruntime ({error}): pip install onnx "
-            'onnxruntime'
+            f'networks in ONNX files need the packages onnx and onnxruntime ({error}): pip '
+            'install onnx onnxruntime'
         ) from error
     return onnx, onnxruntime
 

