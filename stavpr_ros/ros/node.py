@@ -179,7 +179,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._runtime = Runtime(self, settings, self.statistics, self._publish_map_info)
         if missing := self._runtime.pipeline.operation.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
-        extractor = self._runtime.pipeline.extractor
+        extractor = self._runtime.pipeline.operation.extractor
         if extractor is not None and (better := recommendation(extractor.settings.kind)):
             self.get_logger().info(better)
         self._publish_map_info()
