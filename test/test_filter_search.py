@@ -256,13 +256,6 @@ def test_equal_places_of_the_map_are_one_place_of_the_path(route):
     assert np.min(shares[118:135]) > 0.95
 
 
-def test_path_at_start_of_map_stays_on_it(recognizer, route):
-    answers = drive(recognizer, route[:, :30])
-    for answer in answers[LENGTH - 1 :]:
-        assert answer.path[:, 1].min() >= 0
-    assert answers[LENGTH + 2].place_index == pytest.approx(3 + MIDDLE, abs=2)
-
-
 def test_standing_camera_changes_no_probability(recognizer, route):
     features = features_of(route[:, 50:90], 1.0)
     for i in range(40):

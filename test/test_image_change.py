@@ -158,14 +158,6 @@ def test_speed_likelihoods_are_highest_at_speed_of_query(apart):
     assert abs(SETTINGS.speeds[int(np.argmax(np.sum(logs, axis=0)))] - apart) <= 0.5
 
 
-def test_speed_likelihoods_of_first_images_are_equal():
-    change, query = learned(drive_strips(100)), drive_strips(MAX_LAG + 2)
-    np.testing.assert_array_equal(likelihoods_of(change, query[:, :MAX_LAG]), 1)
-    assert likelihoods_of(change, query).min() < 0.9
-    change.reset()
-    np.testing.assert_array_equal(likelihoods_of(change, query[:, :MAX_LAG]), 1)
-
-
 def test_speed_likelihoods_reject_a_path_that_stands_while_images_change():
     found = likelihoods_of(learned(drive_strips(300)), drive_strips(30, seed=2))
     assert found[SETTINGS.speeds.index(0.0)] < 0.5
@@ -196,22 +188,3 @@ def test_dark_stretch_is_where_places_of_map_are_equal_or_soon_will_be():
     assert not change.is_dark_stretch(np.zeros(60))
     change.evict(5)
     assert [change.is_dark_stretch(probable_at(place, 55)) for place in range(55)] == dark[5:]
-
-
-def test_dark_stretch_needs_probability_of_such_places():
-    strips = drive_strips(60)
-    strips[:, 30:41] = 0
-    change, by_place = learned(strips), np.zeros(60)
-    by_place[5], by_place[35] = 0.72, 0.28
-    assert not change.is_dark_stretch(by_place)
-    by_place[5], by_place[35] = 0.68, 0.32
-    assert change.is_dark_stretch(by_place)
-    assert change.is_dark_stretch(by_place / 100)  # relative to the probability on the map
-
-
-def test_dark_stretch_of_route_knows_its_newest_places():
-    strips = drive_strips(30)
-    strips[:, 20:26] = 0
-    route = learned_on_route(strips, 30)
-    assert route.is_dark_stretch(probable_at(22, 30))
-    assert not route.is_dark_stretch(probable_at(28, 30))

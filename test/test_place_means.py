@@ -30,17 +30,6 @@ def test_means_are_weighted_ones_of_earlier_rows_with_unknown_places_as_the_last
         np.testing.assert_allclose(less, row - expected_means(counted, len(row)), atol=1e-5)
 
 
-def test_images_at_a_standstill_do_not_count():
-    rng = np.random.default_rng(1)
-    rows = rng.normal(0, 1, (20, 8)).astype(np.float32)
-    one, other = PlaceMeans(), PlaceMeans()
-    for row in rows:
-        one.subtracted(row, False)
-        other.subtracted(row, False)
-        other.subtracted(row - 3, True)
-    np.testing.assert_array_equal(one.subtracted(rows[0], False), other.subtracted(rows[0], False))
-
-
 def test_places_that_are_excluded_count_as_mean_0():
     means = PlaceMeans()
     for _ in range(10):

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Features that are one vector an image (W = 1), tokens, pooled strips."""
+"""Features that are one vector an image (W = 1), and pooled strips."""
 
 import numpy as np
 from pipelines import localizing, process
@@ -71,15 +71,6 @@ def extractor(path, layer='global', strips=None, **changes):
     return FeatureExtractor('onnx', settings, strips)
 
 
-def test_extractor_of_tokens_equals_that_of_their_map(network, route):
-    tokens = extractor(network, 'tokens', prefix_tokens=0).extract(route[:2])
-    maps = extractor(network, 'map').extract(route[:2])
-    assert tokens.strips.shape == (7, 2, 16 * 8)
-    np.testing.assert_allclose(tokens.strips, maps.strips, rtol=1e-5, atol=1e-5)
-    pooled = extractor(network, 'map', pooling='mean').extract(route[:2])
-    assert pooled.strips.shape == (7, 2, 16)
-
-
 @pytest.mark.parametrize(
     ('changes', 'text'),
     [
@@ -94,25 +85,6 @@ def test_extractor_of_tokens_equals_that_of_their_map(network, route):
 def test_unusable_layers_are_rejected_before_any_image(network, changes, text):
     with pytest.raises((InputError, SettingsError), match=text):
         extractor(network, **changes)
-
-
-def test_onnx_file_of_batch_one_is_run_image_by_image(network, tmp_path, route, monkeypatch):
-    import onnx
-    from onnxruntime import InferenceSession
-
-    model = onnx.load(network)
-    onnx.helper.set_model_props(model, {'stavpr_batch': '1'})
-    onnx.save(model, tmp_path / 'one.onnx')
-    expected = extractor(network).extract(route[:3]).strips
-    made, run, batches = extractor(tmp_path / 'one.onnx'), InferenceSession.run, []
-
-    def counted(session, names, feed):
-        batches.extend(map(len, feed.values()))
-        return run(session, names, feed)
-
-    monkeypatch.setattr(InferenceSession, 'run', counted)
-    np.testing.assert_allclose(made.extract(route[:3]).strips, expected, rtol=1e-5, atol=1e-5)
-    assert batches == [1, 1, 1]
 
 
 def test_map_of_vectors_localizes_in_the_pipeline(network, route, tmp_path):

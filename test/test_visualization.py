@@ -22,7 +22,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap
 from stavpr_ros.pipeline import ImageResult
-from stavpr_ros.pipeline.overlay import draw_match, draw_window, places_to_draw
+from stavpr_ros.pipeline.overlay import draw_match, draw_window
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
 from std_msgs.msg import Header
@@ -174,15 +174,6 @@ def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     assert 5 < len(sizes) < 20
 
 
-def test_visualization_in_another_frame_starts_again(localized):
-    pipeline, match = localized
-    views, publishers = views_of('matched_path', 'map_path')
-    for frame in ('map', 'map', 'odom'):
-        views.publish(header(), match, pipeline.operation, frame)
-    assert [len(m.poses) for m in publishers.messages('matched_path')] == [1, 2, 1]
-    assert [m.header.frame_id for m in publishers.messages('map_path')] == ['map', 'odom']
-
-
 def test_visualization_of_distances_is_the_newest_row(localized):
     pipeline, match = localized
     views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
@@ -217,18 +208,6 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
     assert (message.width, numbers[0]) == (512, 3000)
     np.testing.assert_array_equal(numbers, values + 3000)
-
-
-@pytest.mark.parametrize(
-    ('middle', 'count', 'left', 'right'),
-    [(3000, 1200, 3000, 3300), (3600, 1200, 3450, 3750), (4190, 1200, 3900, 4200),
-     (3020, 40, 3000, 3040), (None, 1200, 3000, 3300)],
-)  # fmt: skip
-def test_places_to_draw_are_around_the_nearest_sequence(middle, count, left, right):
-    match = Match(Status.MATCH, sequence=middle and SimpleNamespace(middle=middle))
-    assert places_to_draw(ImageResult.of_match(match), 3000, count).tolist() == list(
-        range(left, right)
-    )
 
 
 @pytest.mark.parametrize('places', [1, 40, 300])

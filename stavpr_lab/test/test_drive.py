@@ -8,7 +8,6 @@ from scores import truth_matrix
 from stavpr_lab.evaluation.drive import cropped, DriveChanges, INTERVAL
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.sources.frame import Frame
 
 # four images in six places: 0 -> 1; 1 -> 2, 3; 2 -> nothing; 3 -> 0, 5
 PAIRS = [(0, 1), (1, 2), (1, 3), (3, 0), (3, 5)]
@@ -156,23 +155,7 @@ def test_changes_out_of_range_raise(changes, message):
         DriveChanges(**changes).apply(GroundTruth.identity(7, 7))
 
 
-def test_unknown_name_raises():
-    with pytest.raises(SettingsError, match="'fast' is unknown: take same, 2x, "):
-        DriveChanges.named('fast', 7)
-
-
 # ---------------------------------------------------------------------------------- cropping
-
-
-def test_cropped_images_by_hand():
-    """Of 10 columns 1 and 3 are cut off; of 15 the rounded 1.5 and 4.5: 2 and 5."""
-    ramps = [np.tile(np.arange(width, dtype=np.uint8)[:, None], (2, 1, 3)) for width in (10, 15)]
-    frames = list(cropped([Frame(ramps[0], 7, 'a'), Frame(ramps[1], 8, 'b')], 0.1, 0.3))
-    assert frames[0].image[0, :, 0].tolist() == list(range(1, 7))
-    assert frames[1].image[0, :, 0].tolist() == list(range(2, 10))
-    assert [(frame.stamp, frame.identifier) for frame in frames] == [(7, 'a'), (8, 'b')]
-    assert all(frame.image.flags.c_contiguous and frame.image.shape[2] == 3 for frame in frames)
-    assert ramps[0].shape == (2, 10, 3)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from scipy.io import savemat
 from scipy.signal import correlate2d
 from stavpr_lab.features.netvlad import STAGES
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
-from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
 import torch
 
@@ -156,15 +155,6 @@ def test_netvlad_of_each_layout_equals_its_equations(tmp_path, numbers, image, l
     assert whole.shape == (K * D,)
     expected = oracle(image, numbers, layout, whitening=False)
     np.testing.assert_allclose(whole, expected, atol=1e-5)
-
-
-def test_netvlad_extractor_makes_one_strip_of_each_image(tmp_path, numbers, route):
-    settings = settings_class('netvlad')(model=str(write(tmp_path, 'mat', numbers)), size=64)
-    extractor = FeatureExtractor('netvlad', settings)
-    features = extractor.extract(route[:6])
-    assert features.strips.shape == (1, 6, OUT)
-    alone = extractor.extract(route[5:6])
-    np.testing.assert_allclose(features.strips[:, 5:], alone.strips, atol=1e-5, rtol=0)
 
 
 def test_netvlad_without_whitening_or_of_another_hash_is_rejected(tmp_path, numbers, image):

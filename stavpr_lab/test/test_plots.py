@@ -12,9 +12,8 @@ from PIL import Image
 import pytest
 from stavpr_lab.demonstration.animation import write_animation
 from stavpr_lab.demonstration.plots import demo_sheet
-from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.metrics import evaluate_ranking, ImageMatches, Ranking
-from stavpr_lab.evaluation.plots import drive, MatchPair, precision_recall, reduced_matrix
+from stavpr_lab.evaluation.metrics import ImageMatches
+from stavpr_lab.evaluation.plots import drive, MatchPair, reduced_matrix
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.mapping import save_map
 from stavpr_ros.pipeline.overlay import match_image, NO_MATCH, RIGHT
@@ -86,19 +85,6 @@ def test_reduced_matrix_returns_where_its_axes_are(path):
 
     assert np.abs(around(100, 200) - BRIGHT_GREEN).max(axis=2).min() < 12
     assert np.abs(around(300, 50) - BRIGHT_RED).max(axis=2).min() < 12
-
-
-def test_precision_recall_draws_each_curve_and_its_best_point(path):
-    truth = GroundTruth.identity(20, 20)
-    places = np.where(np.arange(20) % 4 == 3, 0, np.arange(20))  # every fourth is wrong
-    metrics = evaluate_ranking(Ranking(places[:, None], np.arange(20.0)), truth)
-    curves = {'a': ('#2e8b57', metrics)}
-    left, top, width, height = precision_recall(path, curves)
-    assert colors_of(path, GREEN) == [True]
-    plot, best = cv2.imread(str(path)), metrics.best
-    row, column = top + height * (1 - best.precision), left + width * best.recall
-    center = plot[round(row * plot.shape[0]), round(column * plot.shape[1])]
-    assert center.tolist() == [255, 255, 255]  # inside the ring
 
 
 def test_demo_sheet_shows_matches_and_ground_truth_as_far_as_known(path, results):

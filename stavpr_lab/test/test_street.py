@@ -12,7 +12,6 @@ from stavpr_lab.demonstration.street.objects import _from_camera
 from stavpr_lab.demonstration.street.rendering import _on_ground, center_line_ahead
 from stavpr_lab.demonstration.street.street import CELL
 from stavpr_lab.demonstration.street.traverses import (
-    first_traverse,
     GOOD_LIGHT,
     nearest_places,
     second_traverse,
@@ -59,18 +58,6 @@ def test_render_with_lateral_step_shows_parallax(world):
     assert -9 <= np.median(near) <= -3
     assert abs(np.median(far)) <= 2
     assert abs(np.median(near)) >= 2 * abs(np.median(far))
-
-
-def test_default_traverses_have_expected_lengths_and_detour(world):
-    first, second = first_traverse(world), second_traverse(world)
-    assert len(first) == 300
-    np.testing.assert_allclose(np.diff(first.position), 2.0)
-    truth = nearest_places(first, second)
-    assert 300 <= len(second) <= 350
-    assert 40 <= np.count_nonzero(truth < 0) <= 60
-    assert np.all(np.diff(np.flatnonzero(truth < 0)) == 1)  # one stretch
-    assert second[0].stamp > first[len(first) - 1].stamp
-    assert np.all(np.diff(second.stamps) > 0)
 
 
 def test_nearest_places_by_hand(world):
