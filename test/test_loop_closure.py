@@ -15,7 +15,6 @@ from stavpr_ros.filter.choice import MIN_CANDIDATE
 from stavpr_ros.filter.paths import CLOSE
 from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare import route_features
-from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.prepare.route_features import ROOM, RouteFeatures
@@ -179,31 +178,6 @@ def test_route_features_are_original_less_mean(laps, centering, limit):
     assert not original.strips[zero].any()
     assert np.array_equal(original.weights, added.weights)
     assert route.room == (limit or 512)
-
-
-@pytest.mark.parametrize(('centering', 'limit'), [(True, None), (False, 90)])
-def test_route_features_whitened_give_back_the_original(laps, centering, limit):
-    """Whitening is learned again on the way, and features are as if it had been known before."""
-    route, evicted = RouteFeatures(laps.settings, centering, True, limit), 0
-    for i in range(len(laps)):
-        if route.count == limit:
-            evicted += limit // EVICTED
-            route.evict(limit // EVICTED)
-        route.append(laps[i : i + 1])
-        if route.count == 1:
-            first = route.strips[:, :1].copy()
-    added = laps[evicted:]
-    np.testing.assert_allclose(route.original().strips, added.strips, atol=2e-5, rtol=0)
-    zero = (added.strips == 0).all(axis=2)
-    norms = np.linalg.norm(route.strips[:, : route.count], axis=2)
-    np.testing.assert_allclose(norms, (~zero).astype(np.float32), atol=1e-5, rtol=0)
-    plain = added.strips - route.mean[:, None]
-    plain[zero] = 0
-    kept = route.strips[:, : route.count]
-    assert not np.allclose(kept, unit_norm(plain))
-    again = RouteFeatures(laps.settings, centering, True, limit)
-    again.append(laps[:1])
-    np.testing.assert_allclose(again.strips[:, :1], first, rtol=1e-5, atol=1e-5)
 
 
 def of_sequence(belief, best):

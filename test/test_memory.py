@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import GrowingMap, load_map, open_map, save_map, verify_map
+from stavpr_ros.mapping import load_map, open_map, save_map, verify_map
 from stavpr_ros.memory import is_aligned
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
@@ -48,15 +48,6 @@ def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, prec
     for i in range(25):
         image = features[i : i + 1]
         assert repr(opened.update(image).sequence) == repr(loaded.update(image).sequence)
-
-
-def test_opened_map_saves_and_grows_bit_for_bit(path, small_map, tmp_path):
-    opened = open_map(path)
-    PlaceRecognizer(opened, RecognizerSettings(mode='robust'), precision='int8')
-    save_map(opened, tmp_path / 'copy')
-    assert np.array_equal(load_map(tmp_path / 'copy').features.strips, small_map.features.strips)
-    grown = GrowingMap.from_map(opened, 100).snapshot()
-    assert np.array_equal(grown.features.strips, small_map.features.strips)
 
 
 @pytest.mark.parametrize('change', ['replace', 'delete'])
