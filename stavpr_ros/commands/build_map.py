@@ -11,13 +11,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from stavpr_ros.commands.jobs import (
-    add_job_options,
-    Job,
-    job_names,
-    other_arguments,
-    run_jobs,
-)
+from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import add_fps, make_parser, run_program
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.output_file import MAP, require_replaceable

@@ -162,10 +162,7 @@ def _others(
 
 
 def _replay(
-    replayer: Replayer,
-    options: argparse.Namespace,
-    source: Source,
-    count: Callable[[], object],
+    replayer: Replayer, options: argparse.Namespace, source: Source, count: Callable[[], object]
 ) -> str:
     """Publish the records; return a summary."""
 
@@ -232,12 +229,7 @@ def _parser() -> argparse.ArgumentParser:
         help='publish these topics under their names; without a name: all (cameras, tf, ...)',
     )
     pace = parser.add_mutually_exclusive_group()
-    pace.add_argument(
-        '--rate',
-        type=positive,
-        metavar='R',
-        help='factor on the recorded pace (1)',
-    )
+    pace.add_argument('--rate', type=positive, metavar='R', help='factor on the recorded pace (1)')
     pace.add_argument(
         '--lossless', action='store_true', help='send each image after the result of the last one'
     )

@@ -99,9 +99,8 @@ class KeyframeSelector:
         self._stamp = 0
         self._pose: np.ndarray | None = None
         self._gray: np.ndarray | None = None
-        self._compared: tuple[np.ndarray, np.ndarray] | None = (
-            None  # last compared image, its gray
-        )
+        # last compared image, its gray
+        self._compared: tuple[np.ndarray, np.ndarray] | None = None
 
     def too_soon(self, stamp: int, pose: np.ndarray | None) -> str:
         """

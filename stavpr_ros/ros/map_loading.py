@@ -49,10 +49,7 @@ class MapLoader:
         self.path = self.problem = ''
 
     def load(
-        self,
-        path: str,
-        lock: AbstractContextManager[object] | None = None,
-        verify: bool = False,
+        self, path: str, lock: AbstractContextManager[object] | None = None, verify: bool = False
     ) -> None:
         """
         Load a map and use it.

@@ -48,11 +48,7 @@ class ImageRecord:
 
     @classmethod
     def of_image(
-        cls,
-        image: np.ndarray,
-        time_ns: int,
-        stamp_ns: int | None = None,
-        frame_id: str = '',
+        cls, image: np.ndarray, time_ns: int, stamp_ns: int | None = None, frame_id: str = ''
     ) -> Self:
         """
         Make a record of an RGB image.
