@@ -252,7 +252,7 @@ def test_equal_places_of_the_map_are_one_place_of_the_path(route):
     shares = []
     for i in range(len(query)):
         recognizer.update(query[i : i + 1])
-        shares.append(recognizer._newest.found.shares)
+        shares.append(recognizer._newest.match.shares)
     assert np.min(shares[118:135]) > 0.95
 
 

@@ -116,8 +116,8 @@ def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
         np.testing.assert_array_equal(
             match.path, matches[nearest].path + np.array([0, first], np.int32)
         )
-        costs, middles, _ = together._newest.found.sequences()
-        alone_costs = np.concatenate([one._newest.found.sequences().costs for one in alone])
+        costs, middles, _ = together._newest.match.sequences()
+        alone_costs = np.concatenate([one._newest.match.sequences().costs for one in alone])
         assert sorted(costs[np.isfinite(costs)]) == sorted(alone_costs[np.isfinite(alone_costs)])
         assert middles.max() < len(merged)
 

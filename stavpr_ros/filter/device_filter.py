@@ -6,7 +6,7 @@ The place filter in torch operations: its state stays on the device, one copy an
 An image is a linear map of the states a[k, v, y]: products with the probabilities that the level
 and that the speed change, and a convolution along the places with the probabilities of steps of 0
 to R places. No origins of states are kept, but the states from which each of the latest images
-made the next ones: those of the few paths that are followed back are found again in them::
+made the next ones: the origins of the few paths that are followed back follow from them::
 
     states    (K V, P + n), float32: P = lag R columns of zeros, then the places
     before    (lag, P + n, K, V): ring of the latest images; states after the change of level
@@ -191,8 +191,8 @@ class DevicePlaceFilter(Filter):
         on_map = by_level.sum(dim=1, dtype=torch.float64)
         sums, places = self._by_place.topk(min(COPIED, n))
         top = places[:TOP] + pad
-        found = on_map, lost, sums, self._states.index_select(1, top).T.reshape(-1)
-        on_map, lost, sums, of_top = (each.view(torch.int32) for each in found)
+        results = on_map, lost, sums, self._states.index_select(1, top).T.reshape(-1)
+        on_map, lost, sums, of_top = (each.view(torch.int32) for each in results)
         parts = on_map, lost, sums, places.int(), of_top, self._followed_back(slots, top)
         torch.cat(parts, out=self._out)
 
@@ -250,10 +250,10 @@ class DevicePlaceFilter(Filter):
         self._read()
         (K, V), then = self._shape, self._paths[images_ago]
         least = NEGLIGIBLE * self._top_states.max()
-        kept = np.flatnonzero((self._top_states >= max(least, 1e-300)) & (then >= 0))
-        now = kept % (K * V) // V, kept % V, self._top[kept // (K * V)]
-        states = np.stack([then[kept] // 16, *now, then[kept] % 16], axis=1).astype(np.int64)
-        return belief_of(states, self._top_states[kept].astype(np.float64))
+        rows = np.flatnonzero((self._top_states >= max(least, 1e-300)) & (then >= 0))
+        now = rows % (K * V) // V, rows % V, self._top[rows // (K * V)]
+        states = np.stack([then[rows] // 16, *now, then[rows] % 16], axis=1).astype(np.int64)
+        return belief_of(states, self._top_states[rows].astype(np.float64))
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """See :meth:`PlaceFilter.most_probable`."""

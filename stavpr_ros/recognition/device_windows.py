@@ -182,10 +182,10 @@ class DeviceLmDtwWindow(QueryWindow):
             second_best_index=(2 * second + second_length - 1) // 2 if has_second else -1,
             second_best_distance=second_distance if has_second else float('nan'),
         )
-        found = WindowMatch(nearest, path, self._sequences)
-        return in_places(found, self.layout, nms_radius)
+        match = WindowMatch(nearest, path, self._sequences)
+        return in_places(match, self.layout, nms_radius)
 
     def _sequences(self) -> WindowSequences:
         """Copy distances and lengths of all starts to the host."""
-        found = SequenceDistances(self._distances.cpu().numpy(), self._lengths.cpu().numpy())
-        return WindowSequences(found.distances, found.middles)
+        matches = SequenceDistances(self._distances.cpu().numpy(), self._lengths.cpu().numpy())
+        return WindowSequences(matches.distances, matches.middles)

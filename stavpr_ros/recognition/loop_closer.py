@@ -141,7 +141,7 @@ class LoopCloser(SequenceRecognizer):
         :param oldest: the match of the oldest image, or none.
         :param image: number of the newest one.
         """
-        nearest = verdict.found.nearest
+        nearest = verdict.match.nearest
         if verdict.status is not Status.MATCH or math.isnan(verdict.probability):
             return self._built(verdict, image_index=image)
         assert nearest is not None
@@ -169,7 +169,7 @@ class LoopCloser(SequenceRecognizer):
 
     def _late(self, verdict: Verdict, image: int, is_oldest: bool = False) -> Match:
         """Build a match of the present window with all that is needed of it later."""
-        path = verdict.found.path[:, 1]
+        path = verdict.match.path[:, 1]
         first = max(int(path.min()) - BAND, self.first)
         end = min(int(path.max()) + BAND + 1, self.first + len(self))
         columns = super().window_columns(np.arange(first, end))

@@ -55,11 +55,11 @@ class Verdict(NamedTuple):
     """
     What a window showed, and the limits that were applied.
 
-    :param found: by the images alone.
+    :param match: by the images alone.
     :param distance, probability: also by odometry; NaN without a sequence.
     """
 
-    found: WindowMatch
+    match: WindowMatch
     limits: Limits
     status: Status
     reason: str
@@ -160,7 +160,7 @@ class SequenceRecognizer(ABC):
 
         :returns: places, int64, and the costs of their sequences, at most ``count`` of each.
         """
-        return distinct_places(self._newest.found.sequences(), count)
+        return distinct_places(self._newest.match.sequences(), count)
 
     def ranked(self, count: int) -> list[Candidate]:
         """
@@ -174,10 +174,10 @@ class SequenceRecognizer(ABC):
         :raises InputError: count below 0.
         """
         newest, nearest = self._newest, None
-        if (sequence := newest.found.nearest) is not None:
+        if (sequence := newest.match.nearest) is not None:
             nearest = Candidate(sequence.middle, newest.distance, newest.probability)
         positions, radius = self._window.layout.positions, self._settings.nms_radius
-        return ranked_candidates(nearest, newest.found.sequences(), count, radius, positions)
+        return ranked_candidates(nearest, newest.match.sequences(), count, radius, positions)
 
     def newest_row(self) -> np.ndarray:
         """
@@ -268,19 +268,19 @@ class SequenceRecognizer(ABC):
         :param is_oldest: of the oldest image of the window, not of the middle one.
         :param fields: of a match in loop closure.
         """
-        window, found = self._window, verdict.found
-        images = found.images or len(window.images)
+        window, match = self._window, verdict.match
+        images = match.images or len(window.images)
         position = 0 if is_oldest else (images - 1) // 2
         return Match(
             verdict.status,
             verdict.reason,
             verdict.limits.threshold,
-            found.nearest,
-            found.path,
+            match.nearest,
+            match.path,
             verdict.distance,
             verdict.probability,
             verdict.limits.probability,
-            found.path_ratios(position),
+            match.path_ratios(position),
             window_stamps=tuple(image.stamp for image in window.images)[-images:],
             window_changes=window.changes[-images:],
             is_oldest=is_oldest,
