@@ -117,8 +117,16 @@ def make_node(context):
         node.destroy_node()
 
 
+@pytest.fixture(scope='session')
+def kernels():
+    """Compile the kernels: on a busy machine, this takes longer than tests wait for a node."""
+    from stavpr_ros.commands.warm import main
+
+    assert main([]) == 0
+
+
 @pytest.fixture(scope='module')
-def robot():
+def robot(kernels):
     """Yield a robot with a camera: a ROS node beside the tested one."""
     from robot import Robot
 
