@@ -299,7 +299,7 @@ def test_loop_closure_record_is_plain_json():
         ('--map x --query y --truth file.csv', 'expected identity'),
         ('--map x --query y --geometric-check sift', 'go with --loop'),
         ('--loop --map x --query y', 'leave --map'),
-        ('--loop synthetic --truth file.csv', 'is known'),
+        ('--loop synthetic --truth file.csv', 'has its own'),
         ('--loop x --truth identity', 'takes a file'),
         ('--loop --sequence-length 1', '--sequence-length'),
         ('--loop --mode paper', '--threshold'),
