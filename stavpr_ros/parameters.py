@@ -106,9 +106,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'features',
             'gradient',
-            'Kind of the features of a map that is recorded without map_path: gradient; hybrid, '
-            'recommended where the extra learned is installed; efficientnet_lite1, onnx, or one '
-            'that another package adds, such as densenet161_places365 of stavpr_lab.',
+            'Kind of the features of a map that is recorded without map_path: gradient; hybrid '
+            'or efficientnet_lite1, of the extra learned; onnx, or one that another package adds, '
+            'such as densenet161_places365 of stavpr_lab.',
         ),
         NodeParameter(
             'exclude_places',

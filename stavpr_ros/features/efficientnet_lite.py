@@ -73,17 +73,3 @@ def find_file() -> Path:
         f'there is no {cache}: `{COMMAND}` makes it, with the extra learned; or copy it from a '
         f'machine that has it to {models}, or give its path'
     )
-
-
-def recommendation(kind: str) -> str:
-    """Return a sentence for the log of a node with features of a kind, '' = none."""
-    if kind != 'gradient':
-        return ''
-    try:
-        path = find_file()
-    except UnavailableError:
-        return ''
-    return (
-        f'features hybrid are recommended instead of gradient, since {path} is there: they know '
-        'places in other light and seasons; they need a map of their own (features: hybrid)'
-    )

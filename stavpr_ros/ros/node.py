@@ -20,7 +20,6 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.compilation import progress
 from stavpr_ros.errors import SettingsError, StavprError
-from stavpr_ros.features.efficientnet_lite import recommendation
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
@@ -179,9 +178,6 @@ class PlaceRecognitionNode(ManagedNode):
         self._runtime = Runtime(self, settings, self.statistics, self._publish_map_info)
         if missing := self._runtime.pipeline.operation.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
-        extractor = self._runtime.pipeline.operation.extractor
-        if extractor is not None and (better := recommendation(extractor.settings.kind)):
-            self.get_logger().info(better)
         self._publish_map_info()
         # objects of the map and the model are permanent: scanning them again and again takes the
         # garbage collector half a second each time, during an image
