@@ -450,7 +450,10 @@ def running(robot: Robot, drive: Drive, **parameters: Any) -> Iterator[Any]:
         robot.wait_for_node()
         first = len(robot.answers)
         yield thread.node
-        drive.matches = robot.answers[first:]
+        # the last one of each image: it is shown again while the node has no odometry of its time
+        drive.matches = list(
+            {nanoseconds(match.header.stamp): match for match in robot.answers[first:]}.values()
+        )
         count = sum(map(matched, drive.matches))
         robot.until(lambda: len(candidates) >= count, 'candidates of each match')
         if drive.operation != 'mapping' and drive.x:
