@@ -86,6 +86,16 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     robot.until(lambda: not robot.odometry.get_subscription_count(), 'the end of odometry')
 
 
+def test_a_rule_that_skips_every_image_is_a_warning_and_so_is_the_missing_map(robot, start, route):
+    """By the stamps, in a replay that is faster; once for each such stretch."""
+    start(map_path='', operation='mapping', keyframe_distance=0.5)
+    robot.drive(route[:8])
+    robot.until_logged('every image is skipped, 6 so far: no odometry')
+    assert sum('every image is skipped' in line for line in robot.log) == 1
+    assert robot.transition('deactivate')
+    robot.until_logged('no map written, because none of')
+
+
 def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(robot, start, publish, route):
     """The topic with odometry is named, not that of a pose graph; a topic of another type too."""
     publish(Odometry, '/pose_graph/odometry')

@@ -22,6 +22,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
+from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.commands import replay
 from stavpr_ros.errors import SourceError, UnavailableError
 from stavpr_ros.ros import process
@@ -32,7 +33,7 @@ from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_messages import list_topics, read_messages
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord, RecordedTopic
-from std_msgs.msg import String
+from std_msgs.msg import Empty, String
 from std_srvs.srv import Trigger
 
 DOMAIN = 101  # another one than that of the processes of other tests
@@ -234,6 +235,29 @@ def test_replay_clock_advances_with_the_records_and_restarts_with_a_loop():
     assert len(backward) == 1
     assert times[backward[0]] < 125  # of seconds 100 to 149
     assert once > 50  # with each image, and between them
+
+
+def test_replay_lossless_waits_for_a_recorder_until_it_is_ready():
+    notices = []
+    with (
+        spinning('stavpr') as node,
+        spinning('stavpr_record') as recorder,
+        replayer(ReplayOptions(lossless=True)) as made,
+    ):
+
+        def notify(text):
+            notices.append(text)
+            if 'stavpr_record' in text:
+                recorder.create_publisher(Empty, '~/recording', 1)
+
+        made.notify = notify
+        node.create_subscription(Image, 'image', lambda image: None, 10)
+        node.create_publisher(PlaceMatch, '~/match', 10)
+        recorder.create_subscription(PlaceMatch, 'stavpr/match', lambda match: None, 10)
+        while not made.node.get_subscriptions_info_by_topic('/stavpr/match')[1:]:
+            pass  # its own, and the recorder's
+        made.wait_for_subscribers()
+    assert notices[-1] == 'waiting for /stavpr_record to be ready'
 
 
 def test_replay_services_pause_step_and_resume():

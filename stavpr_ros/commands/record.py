@@ -115,6 +115,8 @@ def _write_messages(
     from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
     from stavpr_ros.ros.process import Discovery, ros_node, spin_until
+    from stavpr_ros.ros.subscriber_progress import READY, RECORDER
+    from std_msgs.msg import Empty
 
     count = 0
     kinds: dict[str, Any] = {
@@ -141,7 +143,7 @@ def _write_messages(
         count += 1
 
     try:
-        with ros_node(lambda: rclpy.create_node('stavpr_record'), ros_arguments) as node:
+        with ros_node(lambda: rclpy.create_node(RECORDER), ros_arguments) as node:
             subscription = node.create_subscription(
                 message_type, TOPICS[arguments.kind], write, QoSProfile(depth=1000)
             )
@@ -150,8 +152,10 @@ def _write_messages(
             print(f'waiting for a publisher of {topic}', flush=True)
             spin_until(node, lambda: subscription.get_publisher_count() > 0)
             spin_until(node, discovery.done)
+            ready = node.create_publisher(Empty, READY, 1)  # replay --lossless waits for it
             print(f'recording {topic}', flush=True)  # no message is missed from now on
             spin_until(node)
+            node.destroy_publisher(ready)
     except KeyboardInterrupt:
         pass  # the usual end
     return count

@@ -19,6 +19,7 @@ WAITING = 'waiting'  # stage before the worker takes an image: in the total, not
 REORDERING_SECONDS = 0.1  # images less than this out of order were reordered in transport
 INTERVALS = 40  # pauses between images for the period of a camera, which needs half of them
 REGULAR = 0.75  # share of them near a multiple of the period, from which on a camera has one
+SKIP_SECONDS, MIN_SKIPS = 5.0, 5  # that all images are skipped, from which on it is reported
 LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
 
 
@@ -234,6 +235,30 @@ class StampWatch:
         if near < REGULAR * len(multiples) or interval > LONGEST_LOSS * period:
             return 0
         return max(round(interval / period) - 1, 0)
+
+
+class SkipWatch:
+    """Finds out that every image is left out; for one thread. ``reason``: of the last one."""
+
+    def __init__(self) -> None:
+        self.count, self.reason = 0, ''
+        self._first = 0, 0.0
+        self._is_due = True
+
+    def update(self, stamp: int, now: float) -> bool:
+        """
+        Count an image that is left out; return whether this has become worth a warning.
+
+        :param stamp: nanoseconds, 0 = unknown; now: of the steady clock, seconds. The longer time
+            counts: a replay may be faster than the camera.
+        """
+        if not self.count:
+            self._first = stamp, now
+        self.count += 1
+        elapsed = max((stamp - self._first[0]) / SECOND, now - self._first[1])
+        is_due, many = self._is_due, self.count >= MIN_SKIPS and elapsed >= SKIP_SECONDS
+        self._is_due = is_due and not many
+        return is_due and many
 
 
 def _evict(events: deque[Any], now: float) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes the records of a bag at a pace, or each image after the result of the last one."""
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +26,7 @@ from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.ros.messages import record_message, time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
-from stavpr_ros.ros.subscriber_progress import SubscriberProgress
+from stavpr_ros.ros.subscriber_progress import READY, RECORDER, SubscriberProgress
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_srvs.srv import Trigger
@@ -144,13 +145,15 @@ class Replayer:
                 last_notice = missing
             return not missing
 
-        if not self._spin_until(complete, self.options.wait):
+        for _ in range(2):  # a recorder may be discovered with the others
+            if self._spin_until(complete, self.options.wait):
+                self._wait_for_discovery()
+                continue
             raise NoSubscriberError(
                 f'waited {self.options.wait:g} s for {self._missing()}: expected a running node; '
                 'start it, compare the topics (`ros2 topic list`) and ROS_DOMAIN_ID, or wait '
                 'longer (--wait)'
             )
-        self._wait_for_discovery()
 
     def play(self, records: Iterable[ImageRecord | MessageRecord]) -> None:
         """
@@ -231,6 +234,21 @@ class Replayer:
             return f'a subscriber of {self.publisher.topic_name}'
         if self.options.lossless and not self.node.count_publishers(self._match_topic):
             return f'a publisher of {self._match_topic}'
+        return self._unready_recorder() if self.options.lossless else ''
+
+    def _unready_recorder(self) -> str:
+        """Return the recorder that would still miss results; empty = none."""
+        recorders = [
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            for topic in ('stavpr/match', 'stavpr/loop_closure')
+            for info in self.node.get_subscriptions_info_by_topic(
+                self.node.resolve_topic_name(topic)
+            )
+            if info.node_name == RECORDER
+        ]
+        for name, count in Counter(recorders).items():
+            if self.node.count_publishers(READY.replace('~', name)) < count:
+                return f'{name} to be ready'
         return ''
 
     def _wait_for_discovery(self) -> None:

@@ -4,7 +4,7 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
 import time
@@ -24,7 +24,7 @@ from stavpr_ros.pipeline.saving import (
     recover_maps,
     save_recorded_map,
 )
-from stavpr_ros.pipeline.statistics import Statistics, WAITING
+from stavpr_ros.pipeline.statistics import SkipWatch, Statistics, WAITING
 from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
@@ -44,6 +44,7 @@ from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
 
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
+SKIP_PERIOD = 60.0  # seconds between two warnings of skipped images in the log
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,8 @@ class Runtime:
         self.camera: CameraInput | None = None
         self._epoch = self._pipeline_epoch = 0
         self._logged_reasons: set[str] = set()
+        self._skips = SkipWatch()
+        self._may_lack_map = False  # active since the end of a recording was last logged
         self.last_match = PlaceMatch()  # published for the last image in the window
         self.last_frame = ''  # of the poses of its places
         self.problem = ''
@@ -144,6 +147,7 @@ class Runtime:
     def activate(self) -> None:
         """Subscribe, with an empty window: the camera may have been moved since the last image."""
         self.reset()
+        self._skips, self._may_lack_map = SkipWatch(), True
         self._update_odometry()
         if self.settings.relative_pose in ('auto', 'pnp'):
             self.camera = CameraInput(self._node, self.settings.camera_transform)
@@ -188,6 +192,20 @@ class Runtime:
             log, path = self._node.get_logger(), self.settings.save_path
             if not save_recorded_map(self._pipeline, on_worker, path, log):
                 self._node.failed = True
+            places = self._pipeline.save_state.recorded
+            if self._may_lack_map and self.settings.operation == 'mapping' and not places:
+                log.warning(f'no map written, because {self._why_no_place()}')
+            self._may_lack_map = False
+
+    def _why_no_place(self) -> str:
+        """Return why no image became a place."""
+        counts = self._statistics.counts()
+        if not counts.received.count:
+            topic = self._node.resolve_topic_name('image')
+            return f'no image was received on {topic}: compare `ros2 topic list`, set image:=TOPIC'
+        causes = ', '.join(f'{n} {cause}' for cause, n in counts.dropped.total.most_common())
+        text = f'none of {counts.received.count} images became a place ({causes})'
+        return f'{text}; the last one: {self._skips.reason}' if self._skips.reason else text
 
     def _unsubscribe(self) -> None:
         for subscription in (self.images, self.odometry, self.camera):
@@ -349,7 +367,9 @@ class Runtime:
         if result.cause:
             self._statistics.add_drop(result.cause)
             self._log_cause(result)
+            self._log_skips(result, nanoseconds(header.stamp))
             return
+        self._skips = SkipWatch()
         self.last_match, self.last_frame, status = message, frames.frame, result.status
         place = message.newest_index if status is Status.MAPPED else message.place_index
         self._statistics.add_match(status.name, result.reason, place, message.distance, stages)
@@ -389,6 +409,26 @@ class Runtime:
             in_map = self.pipeline.operation.name == 'localization'
             frame = self.settings.map_frame if in_map else self._views.frame
             self._views.publish_route(self.pipeline.places, frame)
+
+    def _log_skips(self, result: ImageResult, stamp: int) -> None:
+        """Log that a rule of keyframes skips every image, and the remedy."""
+        self._skips.reason = result.reason
+        if result.status is not Status.SKIPPED or not self._skips.update(stamp, time.monotonic()):
+            return
+        if result.cause == 'no odometry':
+            topic, odometry = self._node.resolve_topic_name('odom'), self.odometry
+            start = f"publish nav_msgs/Odometry on {topic}, with stamps of the camera's clock"
+            fault = odometry.fault() if odometry is not None else ''
+            remedy = f'{fault or start}; or, without odometry, set keyframe_distance and '
+            remedy += 'keyframe_angle to 0 (keyframe_change needs none)'
+        else:
+            rules = asdict(self.settings.pipeline.keyframes).items()
+            names = ' or '.join(f'keyframe_{name}' for name, value in rules if value)
+            remedy = f'right while the camera stands, otherwise lower {names}'
+        self._node.get_logger().warning(
+            f'every image is skipped, {self._skips.count} so far: {result.reason}; {remedy}',
+            throttle_duration_sec=SKIP_PERIOD,
+        )
 
     def _log_cause(self, result: ImageResult) -> None:
         """Log why an image is in no window: an invalid one once for each cause."""

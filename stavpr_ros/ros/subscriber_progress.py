@@ -14,6 +14,7 @@ from std_msgs.msg import Header
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 MAX_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
+RECORDER, READY = 'stavpr_record', '~/recording'  # node; its topic from when it misses nothing
 
 
 class SubscriberProgress:
