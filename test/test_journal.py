@@ -5,10 +5,12 @@
 from dataclasses import asdict, replace
 import json
 import os
+import struct
 import subprocess
 import sys
 import time
 from unittest.mock import Mock
+import zlib
 
 from map_files import changed
 import numpy as np
@@ -16,7 +18,15 @@ from pipelines import process, save, settings_of
 import pytest
 from stavpr_ros.errors import JournalError, OutputTakenError
 from stavpr_ros.mapping import journal_writer, load_map, save_map
-from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, JournalReader, row_of
+from stavpr_ros.mapping.journal import (
+    Base,
+    frame,
+    JournalPlace,
+    JournalReader,
+    MAGIC,
+    PIECE,
+    row_of,
+)
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.place_map import Place
@@ -111,7 +121,7 @@ def test_recover_returns_every_part_of_every_place(written, small_map, target):
     assert os.listdir(target.parent) == ['route.stavpr']
 
 
-def test_vectors_in_an_older_journal_are_ignored(written, small_map, target, caplog):
+def test_journal_of_version_2_with_vectors_is_recovered(written, small_map, target, caplog):
     """They are in the map of its header, and behind the strips of each place but the last."""
     section = {'vectors': {'version': 1, 'required': False, 'data': None}}
     with JournalReader(written) as reader:
@@ -123,7 +133,7 @@ def test_vectors_in_an_older_journal_are_ignored(written, small_map, target, cap
     end = row_of(small_map.features).itemsize
     *records, last = [place.encode() for place in places_of(small_map)]
     frames = [frame(record[:end] + bytes(8) + record[end:]) for record in records]
-    written.write_bytes(b''.join([header(Base(), template), *frames, frame(last)]))
+    written.write_bytes(b''.join([header_with(), frame(template), *frames, frame(last)]))
     assert recover(written).places == 60
     assert_equal(target, small_map)
     assert caplog.messages == [f'the vectors of whole images in {written} are ignored']
@@ -221,6 +231,70 @@ def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, targ
     assert f'{kept} is kept' in log.method_calls[1].args[0]
     assert set(os.listdir(target.parent)) == {target.name, kept.name}
     assert recover_maps(target, log) == ''  # the next start
+
+
+def places_in(path):
+    with JournalReader(path) as reader:
+        return [place.number for place in reader.places()]
+
+
+def test_flipped_bit_costs_at_most_one_record(small_map, target):
+    """One in each byte of the heads, and in bytes all over the file; none in the header."""
+    writer = JournalWriter.create(target, Base(), small_map, print)
+    for place in list(places_of(small_map))[:4]:
+        writer.append(place)
+    writer.close()
+    content, rng = writer.path.read_bytes(), np.random.default_rng(0)
+    with JournalReader(writer.path) as reader:
+        ends = [reader.begin // 2, reader.begin, *(reader.end for _ in reader.places())]
+    heads = {at for end in (0, *ends[:-1]) for at in range(end, end + 16)}
+    numbers, spread = set(range(4)), range(0, len(content), len(content) // 250)
+    with writer.path.open('r+b', buffering=0) as file:
+        for at in heads | {each + int(rng.integers(20)) for each in spread[:-1]}:
+            os.pwrite(file.fileno(), bytes([content[at] ^ 1 << int(rng.integers(8))]), at)
+            lost = set() if at < ends[1] else {np.searchsorted(ends[2:], at, 'right')}
+            assert set(places_in(writer.path)) == numbers - lost, at
+            os.pwrite(file.fileno(), content[at : at + 1], at)
+    assert writer.path.read_bytes() == content
+
+
+def claim(length):
+    """Return a valid head of a record that is not there."""
+    head = struct.pack('<4sII', MAGIC, length, 0)
+    return head + zlib.crc32(head).to_bytes(4, 'little')
+
+
+@pytest.mark.parametrize(
+    'inserted',
+    [MAGIC, MAGIC + bytes(4), claim(2**24), claim(2**24) + bytes(5000), frame(b'x')],
+    ids=['magic', 'short magic', 'claims', 'spread claims', 'records'],
+)
+def test_whole_records_between_any_bytes_are_read_in_linear_time(written, monkeypatch, inserted):
+    content, pread, read = written.read_bytes(), os.pread, 0
+    with JournalReader(written) as reader:
+        middle = [reader.end for _ in reader.places()][29]
+    inserted *= 2 * 10**6 // len(inserted)
+    written.write_bytes(content[:middle] + inserted + content[middle:] + inserted)
+
+    def counted(*arguments):
+        nonlocal read
+        read += len(piece := pread(*arguments))
+        return piece
+
+    monkeypatch.setattr(os, 'pread', counted)
+    assert places_in(written) == list(range(60))
+    assert read <= 2 * (written.stat().st_size + PIECE)
+
+
+def test_journal_with_half_a_header_is_resumed_and_mended(written):
+    content = written.read_bytes()
+    with JournalReader(written) as reader:
+        begin = reader.begin
+    for at in (50, begin - 50):
+        written.write_bytes(content[:at] + bytes(9) + content[at + 9 :])
+        writer, last = JournalWriter.resume(JournalReader(written), print)
+        writer.close()
+        assert (last, written.read_bytes()) == (59, content)
 
 
 def test_journal_that_ends_with_zeros_and_a_hole_is_read_at_once(written):

@@ -3,19 +3,22 @@
 """
 The journal of a recorded map: every place on disk while it is recorded.
 
-The file is a sequence of records, see :func:`frame`. The first one is a JSON object (format,
-version, the map that the places continue), the second a map file of one place, which has the
-settings of the features; each other record is a place, and their numbers increase. A damaged
-record costs no other one: the reader continues at the next ``MAGIC``.
+The file is a sequence of records, see :func:`frame`. The first two are equal: a JSON object
+(format, version, the map that the places continue), a newline, and a map file of one place, which
+has the settings of the features. Each other record is a place, and their numbers increase. A
+damaged record costs no other one: a record ends before the next valid head, whatever length its
+own head claims.
 """
 
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 import fcntl
+from itertools import chain, pairwise
 import json
 import os
 from pathlib import Path
+import re
 import struct
 import tempfile
 from typing import NamedTuple, Self
@@ -31,12 +34,14 @@ from stavpr_ros.mapping.place_map import Place, PlaceMap
 from stavpr_ros.mapping.stored_features import require_normalized
 from stavpr_ros.regular_file import open_regular
 
-FORMAT, VERSION = 'stavpr-journal', 2
+FORMAT, VERSION = 'stavpr-journal', 3
 SUFFIX = '.journal'
 MAGIC = b'\x93SVJ'
-LONGEST = 2**28  # bytes of a record; a longer one is damaged
 PIECE = 2**20  # bytes searched at a time
+SECTOR = 4096  # bytes skipped where the disk has an error
 _HEAD = struct.Struct('<4sII')  # MAGIC, length and CRC-32 of the content; its own CRC-32 follows
+_HEAD_BYTES = _HEAD.size + 4
+_HEADS = re.compile(MAGIC + rb'(?=...[\0-\x0f])', re.DOTALL)  # of records of at most 2**28 bytes
 
 
 @dataclass(frozen=True)
@@ -140,13 +145,13 @@ def _checksum(head: bytes) -> bytes:
 
 def header(base: Base, template: bytes, source: str = '') -> bytes:
     """
-    Return the two records that begin a journal.
+    Return the two equal records that begin a journal.
 
     :param template: file of a map of one place, with the settings of the features.
     :param source: of the places, so that only the same work is resumed.
     """
     about = {'format': FORMAT, 'version': VERSION, 'source': source} | asdict(base)
-    return frame(json.dumps(about).encode()) + frame(template)
+    return 2 * frame(json.dumps(about).encode() + b'\n' + template)
 
 
 class JournalReader:
@@ -193,7 +198,7 @@ class JournalReader:
     def places(self) -> Iterator[JournalPlace]:
         """Yield the places in the order in which they were recorded; skip what is damaged."""
         last = -1
-        for content in self._records(self._begin):
+        for content in self._records(self.begin):
             try:
                 place = JournalPlace.decode(content, self.template)
                 if place.number <= last:
@@ -206,16 +211,18 @@ class JournalReader:
             yield place
 
     def _read_header(self) -> None:
-        """Read the two records of the header."""
+        """Read the first of the two equal records that is whole."""
         records = self._records(0)
-        about, self.template_content = next(records, b''), next(records, b'')
-        self._begin = self.end
+        content = next(records, b'')
+        about, _, self.template_content = content.partition(b'\n')
+        if not self.template_content:  # version 2: two records, one each
+            self.template_content = next(records, b'')
         try:
             match read_json(about, 'its first record'):
                 case {
-                    'format': found, 'version': version, 'source': str(source),
+                    'format': found, 'version': 2 | 3 as version, 'source': str(source),
                     'path': str(path), 'places': int(places), 'checksum': int(checksum),
-                } if (found, version) == (FORMAT, VERSION):  # fmt: skip
+                } if found == FORMAT:  # fmt: skip
                     self.source, self.base = source, Base(path, places, checksum)
                 case _:
                     raise ValueError('another format or version')
@@ -226,36 +233,39 @@ class JournalReader:
             raise JournalError(
                 f'{self.path} is no journal, or its header is damaged ({error}): move it elsewhere'
             ) from error
+        self.begin = self.end if version == 2 else 2 * len(frame(content))
+        self.end, self.problem = self.begin, ''  # one of two records is enough
 
     def _records(self, at: int) -> Iterator[bytes]:
-        """Yield the contents of whole records; time and memory are bounded for any file."""
-        wasted = 0  # bytes of damaged records: only as many as the file has are searched again
-        while at < self._size:
-            head = self.read(at, _HEAD.size + 4)
-            start, length, checksum = at + len(head), 0, 0
-            if head.startswith(MAGIC) and head[-4:] == _checksum(head[:-4]):
-                _, length, checksum = _HEAD.unpack_from(head)
-            content = self.read(start, length) if length <= LONGEST else b''
-            if content and zlib.crc32(content) == checksum:
-                self.start, self.end = start, start + length
-                at = self.end
-                yield content
-            else:
+        """Yield the contents of whole records; each byte of the file is read at most twice."""
+        heads = chain(self._heads(at), ((self._size, 0, 0),))
+        for (begin, length, checksum), (following, _, _) in pairwise(heads):
+            start = begin + _HEAD_BYTES
+            content = self.read(start, length) if start + length <= following else b''
+            if not content or zlib.crc32(content) != checksum:
+                continue
+            if begin > at:
                 self.problem = self.problem or f'no whole record at byte {at}'
-                wasted += len(content)
-                at = self._find(at + 1 if wasted <= self._size else start + len(content))
+            self.start, self.end = start, start + length
+            at = self.end
+            yield content
+        if at < self._size:
+            self.problem = self.problem or f'no whole record at byte {at}'
 
-    def _find(self, at: int) -> int:
-        """Return the position of the next ``MAGIC``, or the end of the file."""
-        file = self._file.fileno()
-        with suppress(OSError):  # a hole up to the end, or an error of the disk
-            while at < self._size:
-                at = os.lseek(file, at, os.SEEK_DATA)
-                piece = os.pread(file, PIECE, at)
-                if (offset := piece.find(MAGIC)) >= 0:
-                    return at + offset
-                at += max(1, len(piece) - len(MAGIC) + 1)
-        return self._size
+    def _heads(self, at: int) -> Iterator[tuple[int, int, int]]:
+        """Yield positions, lengths and checksums of the valid heads from a position on."""
+        while at < self._size:
+            try:
+                at = os.lseek(self._file.fileno(), at, os.SEEK_DATA)
+            except OSError:  # a hole up to the end
+                return
+            piece = self.read(at, PIECE)
+            for found in _HEADS.finditer(piece):
+                head = piece[found.start() : found.start() + _HEAD_BYTES]
+                if head[_HEAD.size :] == _checksum(head[: _HEAD.size]):
+                    _, length, checksum = _HEAD.unpack_from(head)
+                    yield at + found.start(), length, checksum
+            at += max(len(piece) - _HEAD_BYTES + 1, 1) if piece else SECTOR
 
     def read(self, at: int, count: int) -> bytes:
         """Return the bytes from a position on, fewer at the end or where the disk has an error."""

@@ -99,18 +99,21 @@ class JournalWriter:
         :returns: the writer, and the number of that place, -1 = none.
         :raises OutputError: it cannot be written.
         """
-        ends, last = [reader.end], -1
+        ends, last = [reader.begin], -1
         for place in reader.places():
             if reader.problem:
                 break
             ends.append(reader.end)
             last = place.number
+        begin = partial(header, template=reader.template_content, source=reader.source)
+        head = begin(reader.base)
         with explained(reader.path):
             file = os.open(reader.path, os.O_RDWR | os.O_CLOEXEC)
             reader.close()
             fcntl.flock(file, fcntl.LOCK_EX)
             os.ftruncate(file, ends[-1])
-        begin = partial(header, template=reader.template_content, source=reader.source)
+            if len(head) == ends[0]:  # not of version 2; half of it may be damaged
+                write_at(file, head, 0)
         return cls(reader.path, file, ends, reader.base, begin, log), last
 
     def append(self, place: JournalPlace) -> None:
