@@ -1,34 +1,75 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of poses: three or seven numbers a line."""
+"""Files of poses, as other programs write them, and tables of numbers of the wrong kind."""
 
+import numpy as np
 import pytest
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.pose_file import read_poses
 
+POSITIONS = [[0, 0, 0], [10, 0.5, -1.25]]
+TURNED = [[0, 1, 0, 0, 0, 1, 0], [2, 1, 0, 0, 0, 0.6, 0.8]]  # half a turn, then less
+TUM = '# timestamp tx ty tz qx qy qz qw\n5.5 0 1 0 0 0 1 0\n5.6 2 1 0 0 0 .6 .8\n'
+KITTI = '-1 0 0 0 0 -1 0 1 0 0 1 0\n.28 -.96 0 2 .96 .28 0 1 0 0 1 0\n'
+EUROC = (
+    '#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], '
+    'q_RS_z [], v_RS_R_x [m s^-1]\n1403636580838555648,0,1,0,0,0,0,1,9\n'
+    '1403636580843555648,2,1,0,.8,0,0,.6,9\n'
+)
+
 
 @pytest.mark.parametrize(
-    ('text', 'rows', 'oriented'),
+    'text',
     [
-        ('# x,y,z\n0,0,0\n10,0,0\n', [[0, 0, 0, 0, 0, 0, 1], [10, 0, 0, 0, 0, 0, 1]], False),
-        ('0,1,0,0,0,1,0\n', [[0, 1, 0, 0, 0, 1, 0]], True),
+        '# x,y,z\n0,0,0\n10,.5,-1.25\n',
+        '\ufeffx,y,z\r\n0,0,0\r\n10,.5,-1.25\r\n',
+        '0,0,0,\n  \n10,.5,-1.25,\n,,,\n',
+        'sep=;\n0,0;0,0;0,0\n10,0;0,5;-1,25\n',
+        '0,0\t0,0\t0,0\n10,0\t0,5\t-1,25\n',
+        '  0  0 0\n 10 .5   -1.25',
+        ',x,y,z\n0,0,0,0\n1,10,.5,-1.25\n',
+        'name;z;y;x\na 1.png;0;0;0\na 2.png;-1.25;.5;10\n',
+        ',0,1,2\n0,0,0,0\n1,10,.5,-1.25\n',
+        '1700000000.1 0 0 0\n1700000000.2 10 .5 -1.25\n',
+        '"position.x","position.y","position.z","linear.x"\n0,0,0,7\n10,.5,-1.25,7\n',
     ],
 )
-def test_read_poses_of_three_or_seven_numbers(tmp_path, text, rows, oriented):
+@pytest.mark.parametrize('encoding', ['utf-8', 'utf-16'])
+def test_read_poses_of_positions(tmp_path, text, encoding):
     path = tmp_path / 'poses.csv'
+    path.write_text(text, encoding)
+    poses, has_rotations = read_poses(path)
+    assert poses.tolist() == [[*row, 0, 0, 0, 1] for row in POSITIONS]
+    assert not has_rotations
+
+
+@pytest.mark.parametrize(
+    'text', ['0,1,0,0,0,1,0\n2,1,0,0,0,.6,.8\n', TUM, TUM.partition('\n')[2], KITTI, EUROC]
+)
+def test_read_poses_with_rotations(tmp_path, text):
+    path = tmp_path / 'poses.txt'
     path.write_text(text)
-    poses, found = read_poses(path)
-    assert (poses.tolist(), found) == (rows, oriented)
+    poses, has_rotations = read_poses(path)
+    np.testing.assert_allclose(poses, TURNED, atol=1e-9)
+    assert has_rotations
 
 
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
-        ('0,1\n', '3 or 7 numbers'),
-        ('0,0,0\n0,0,0,0,0,0,1\n', '3 or 7 numbers'),
-        ('', '3 or 7 numbers'),
-        ('a,b,c\n', 'cannot be read'),
-        ('0,nan,0\n', 'finite numbers'),
+        ('0,1\n', '2 numbers in a line: expected a line an image, in meters: x y z; '),
+        ('0,0,0\n\n0,0,0,0,0,0,1\n', 'line 3: the number of columns changed from 3 to 7'),
+        ('', 'is empty: expected a line an image'),
+        ('x,y,z\n', 'no line of numbers'),
+        ('0,0,0\n0,one,0\n', "line 2: could not convert string 'one' to float64: expected a line"),
+        ('0,0,0\n0,nan,0\n', 'line 2: a number is not finite'),
+        ('.' + '1' * 200_000 + ',0\n', '2 numbers in a line'),
+        ('0,0,0,10,20,30\n', '6 numbers in a line; angles must be a quaternion'),
+        ('0,0,0,10,20,30,0\n', 'line 1: a quaternion of norm 37.4 instead of 1'),
+        ('0 0 0 0 0 0 0 1 0 1 0 0\n', 'line 1: its 12 numbers have no rotation matrix'),
+        ('5,0,0,0,0,0,0,1\n4,0,0,0,0,0,0,1\n', 'the first one falls and is no stamp'),
+        ('1700000000,0,0\n1700000001,1,0\n', 'number 1 of its positions is a stamp'),
+        ('Latitude,Longitude,alt\n47.3,8.5,400\n', 'latitudes and longitudes, project them'),
         (None, 'cannot be read'),
     ],
 )
@@ -36,5 +77,19 @@ def test_read_poses_of_an_invalid_file_raises(tmp_path, text, message):
     path = tmp_path / 'poses.csv'
     if text is not None:
         path.write_text(text)
-    with pytest.raises(SourceError, match=message):
+    with pytest.raises(SourceError, match=f'poses {path}.*{message}'):
         read_poses(path)
+
+
+def test_read_poses_of_degrees_raises(tmp_path):
+    """A drive of 200 m at 47.3 degrees north and 8.5 degrees east."""
+    path, meters = tmp_path / 'poses.csv', np.linspace(0, 200, 40)[:, None] * [1, 0.2, 0]
+    np.savetxt(
+        path, np.array([47.3, 8.5, 400]) + meters / [111e3, 75e3, 1], delimiter=',', fmt='%.7f'
+    )
+    with pytest.raises(SourceError, match='less than a millimeter an image, as latitudes'):
+        read_poses(path)
+    np.savetxt(path, np.array([47.3, 8.5, 400]) + meters)
+    assert len(read_poses(path)[0]) == 40
+    np.savetxt(path, [(0, 1, 2), (3, 4, 5)], '%d', ',')
+    assert read_poses(path)[0][:, :3].tolist() == [[0, 1, 2], [3, 4, 5]]

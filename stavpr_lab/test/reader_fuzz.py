@@ -108,7 +108,8 @@ def originals(reader: str, folder: Path) -> Iterator[Path]:
         np.savez_compressed(folder / 'truth.npz', truth=pairs)
         cv2.imwrite(str(folder / 'truth.png'), np.eye(20, 30, dtype=np.uint8) * 255)
     elif reader == 'poses':
-        np.savetxt(folder / 'poses.csv', np.eye(20, 7), delimiter=',')
+        poses = np.eye(20, 7) * [1, 1, 1, 0, 0, 0, 0] + [0, 0, 0, 0, 0, 0, 1]
+        np.savetxt(folder / 'poses.csv', poses, delimiter=',')
     elif reader == 'closures':
         rows = [json.dumps({'query_stamp': i, 'place_stamp': i + 9}) for i in range(20)]
         (folder / 'closures.jsonl').write_text('\n'.join(rows))

@@ -103,6 +103,8 @@ def test_from_pairs_outside_the_range_raises():
         '# by hand\n\n2 4\n0 1\n0 2\n0 2',
         '\ufeff"Live"\t"Reference"\tmeters\n0\t1\t0.3\n0\t2.0\t1\n2\t4\t0\n',
         '\ufeff"0","1"\n"0","2"\n"2","4"\n',
+        'image;query;place;\r\na.jpg;0;1;\r\n  \r\n;;;\r\na.jpg;0;2;\r\nb.jpg;2;4;\r\n',
+        '% query place\n0\t1\n0\t2\n2\t4\n',
     ],
 )
 def test_from_file_reads_text(tmp_path, text):
@@ -126,9 +128,14 @@ def test_from_file_reads_a_place_a_line(tmp_path):
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
-        ('query,place\n0,1\n0,one\n', "line 3: '0,one' has no whole number in column 2"),
-        ('0,1e19\n', "line 1: '0,1e19' has no whole number in column 2"),
-        ('0,1,2\n', '3 columns'),
+        (
+            'query,place\n0,1\n0,one\n',
+            "line 3: could not convert string 'one'.*two columns",
+        ),
+        ('0,1\n\n0,1e19\n', r'line 3: column 2 has no whole number, 1e\+19: expected two columns'),
+        ('0,1.5\n', r'line 1: column 2 has no whole number, 1\.5'),
+        ('1700000000,1700000009\n', 'column 1 has stamps instead of the numbers of images'),
+        ('0,1,2\n', '3 columns, without a header of these names: expected two columns'),
         ('query,place\n', 'no line of numbers'),
         ('0,-1\n', 'accepts no pair'),
         ('0,5\n', r'truth\.csv: ground truth pairs query 0 with place 5.*counted from 1'),

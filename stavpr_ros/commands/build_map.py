@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--poses',
         metavar='CSV',
-        help='one line an image: x,y,z or x,y,z,qx,qy,qz,qw (meters, quaternion)',
+        help='one line an image: x y z, x y z qx qy qz qw, TUM or KITTI (meters, quaternion)',
     )
     parser.add_argument(
         '--odometry',

@@ -2,34 +2,96 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of poses: a line an image."""
 
-import csv
 from pathlib import Path
+import re
 
 import numpy as np
-from stavpr_ros.errors import SourceError
-from stavpr_ros.regular_file import require_regular
+from stavpr_ros.sources.table import is_counted, is_stamps, Table
+
+EXPECTED = (
+    'a line an image, in meters: x y z; x y z qx qy qz qw; stamp x y z qx qy qz qw (TUM); or a '
+    '3x4 matrix in rows, 12 numbers (KITTI)'
+)
+NUMBERS = 3, 7, 12  # of a pose
+POSITION = re.compile(r'((.*[._])?(position|pos|translation|p|t)(_.*)?[._]?)?([xyz])')
+ROTATION = re.compile(r'(.*[._])?(orientation|quaternion|quat|rotation|rot|q)(_.*)?[._]?([xyzw])')
+DEGREES = re.compile(r'(.*[._])?(lat|lon|lng|long)(itude)?')
+NORMS = 0.9, 1.1  # of a quaternion in text, of a few digits
+MAX_STEP, MAX_EXTENT = 1e-3, 0.5  # median and extent of positions in degrees; in meters, too small
 
 
 def read_poses(path: Path) -> tuple[np.ndarray, bool]:
     """
-    Read poses as ``build_map --poses`` takes them: x,y,z or x,y,z,qx,qy,qz,qw a line, meters.
+    Read the poses of images from a table, :data:`EXPECTED` a line, or with names of its columns.
 
     :returns: shape (images, 7), float64, and whether the file has orientations.
-    :raises SourceError: the file cannot be read.
+    :raises SourceError: the file cannot be read, or has numbers of another unit or kind.
     """
-    try:
-        require_regular(path)
-        with path.open(newline='') as file:
-            lines = [row for row in csv.reader(file) if row and row[0][:1] != '#']
-            rows = [[float(value) for value in row] for row in lines]
-    except (OSError, ValueError) as error:
-        raise SourceError(f'poses {path} cannot be read: {error}') from error
-    if {len(row) for row in rows} not in ({3}, {7}):
-        raise SourceError(f'poses {path}: expected 3 or 7 numbers on every line')
-    poses = np.array(rows)
-    if not np.isfinite(poses).all():
-        raise SourceError(f'poses {path}: expected finite numbers')
-    has_rotations = poses.shape[1] == 7
-    if not has_rotations:
-        poses = np.hstack([poses, np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1))])
-    return poses, has_rotations
+    table = Table(path, 'poses', EXPECTED)
+    names = [re.sub(r'\s*[\[(].*', '', name).replace(' ', '_').casefold() for name in table.names]
+    if any(map(DEGREES.fullmatch, names)):
+        raise table.error('it has latitudes and longitudes, project them to meters (UTM)')
+    columns = _columns(names)
+    rows = table.numbers(columns)
+    if not np.isfinite(rows).all():
+        raise table.error('a number is not finite', int(np.argmin(np.isfinite(rows).all(axis=1))))
+    if columns is None:
+        first, width = rows[:, 0], rows.shape[1]
+        numbered = is_stamps(first) or is_counted(first)
+        if width == 8 and (np.diff(first) < 0).any():
+            raise table.error('it has 8 columns, but the first one falls and is no stamp')
+        if width - 1 in NUMBERS and (numbered or width == 8):
+            rows = rows[:, 1:]
+        elif width not in NUMBERS:
+            angles = '; angles must be a quaternion' if width == 6 else ''
+            raise table.error(f'it has {width} numbers in a line{angles}')
+    if stamps := [i for i in range(3) if is_stamps(rows[:, i])]:
+        raise table.error(f'number {stamps[0] + 1} of its positions is a stamp')
+    if _in_degrees(rows[:, :2]):
+        raise table.error(
+            'its positions move by less than a millimeter an image, as latitudes and longitudes '
+            'do, project them to meters (UTM); if they are meters, subtract the first one'
+        )
+    if rows.shape[1] == 12:
+        return _of_matrices(table, rows.reshape(-1, 3, 4)), True
+    if rows.shape[1] == 3:
+        return np.hstack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))]), False
+    norms = np.linalg.norm(rows[:, 3:], axis=1)
+    if ((norms < NORMS[0]) | (norms > NORMS[1])).any():
+        row = int(np.argmax(abs(norms - 1)))
+        raise table.error(f'a quaternion of norm {norms[row]:.3g} instead of 1', row)
+    return rows, True
+
+
+def _columns(names: list[str]) -> list[int] | None:
+    """Return the columns of a pose by their names; None = they name none."""
+    found: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if match := ROTATION.fullmatch(name):
+            found.setdefault(f'q{match[4]}', i)
+        elif match := POSITION.fullmatch(name):
+            found.setdefault(match[5], i)
+    if not found.keys() >= set('xyz'):
+        return None
+    rotation = [found.get(f'q{axis}', -1) for axis in 'xyzw']
+    return [found[axis] for axis in 'xyz'] + (rotation if min(rotation) >= 0 else [])
+
+
+def _of_matrices(table: Table, matrices: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    turns = matrices[:, :, :3]
+    errors = abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    bad = (errors > 1 - NORMS[0]) | (np.linalg.det(turns) < 0)
+    if bad.any():
+        raise table.error('its 12 numbers have no rotation matrix', int(np.argmax(bad)))
+    return np.hstack([matrices[:, :, 3], Rotation.from_matrix(turns).as_quat()])
+
+
+def _in_degrees(positions: np.ndarray) -> bool:
+    """Return whether x and y of a drive are latitudes and longitudes in any order."""
+    if len(positions) < 10 or (abs(positions) > 180).any() or abs(positions).max() < 1:
+        return False
+    step = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
+    extent = float(np.ptp(positions, axis=0).max())
+    return 0 < step < MAX_STEP and 5 * step < extent < MAX_EXTENT

@@ -38,7 +38,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--input', required=True, metavar='ARRAY', help=arrays)
     add('--output', required=True, metavar='MAP', help='the file to write')
     add('--force', action='store_true', help='replace an existing map')
-    poses = 'one line a row: x,y,z or x,y,z,qx,qy,qz,qw (meters, quaternion)'
+    poses = 'one line a row: x y z, x y z qx qy qz qw, TUM or KITTI (meters, quaternion)'
     add('--poses', metavar='CSV', help=poses)
     add_descriptor_options(parser)
     return parser

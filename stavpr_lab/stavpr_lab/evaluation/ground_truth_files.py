@@ -3,13 +3,13 @@
 """Files of ground truth: text, arrays, black and white images."""
 
 from pathlib import Path
-import re
 
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.folder import SUFFIXES
+from stavpr_ros.sources.table import is_stamps, Table
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
 NAME = 'truth'  # of the array to read from an .npz with several
@@ -50,22 +50,9 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
 # ------------------------------------------------------------------------------------------ text
 
 
-def _cells(line: str) -> list[str]:
-    separator = r'[,;\t]' if re.search(r'[,;\t]', line) else r'\s+'
-    return [cell.strip().strip('"') for cell in re.split(separator, line.strip())]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | None, int]:
+def _columns(table: Table) -> tuple[int | None, int]:
     """Return the columns of query and place; None = the query is the line's number."""
-    if names is not None:
+    if names := table.names:
         positions = []
         for words in (QUERY_WORDS, PLACE_WORDS):
             columns = [
@@ -75,60 +62,33 @@ def _columns(names: list[str] | None, width: int, path: Path) -> tuple[int | Non
         query, place = positions
         if place is not None and query != place:
             return query, place
-    if width == 1:
+    if table.width == 1:
         return None, 0
-    if width == 2:
+    if table.width == 2:
         return 0, 1
-    raise SourceError(
-        f'ground truth {path} has {width} columns: expected two, query and place, or a header '
-        'with these names'
-    )
+    raise table.error(f'it has {table.width} columns, without a header of these names')
 
 
 def _from_text(path: Path, N: int) -> Pairs:
-    try:
-        require_regular(path)
-        lines = path.read_text(encoding='utf-8-sig').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f'ground truth {path} cannot be read: {error}') from error
-    rows = [
-        (number, _cells(line))
-        for number, line in enumerate(lines, 1)
-        if line.strip() and line.lstrip()[0] != '#'
-    ]
-    names = None
-    if rows and not all(_is_number(cell) for cell in rows[0][1]):
-        names = rows.pop(0)[1]
-    if not rows:
-        raise SourceError(f'ground truth {path} has no line of numbers: expected query,place')
-    query_column, place_column = _columns(names, len(rows[0][1]), path)
-    if query_column is None and len(rows) != N:
-        raise InputError(
-            f'ground truth {path} has a place for {len(rows)} queries, but there are {N}'
-        )
-    queries, places = [], []
-    for index, (number, cells) in enumerate(rows):
-        place = _whole(cells, place_column, number, path)
-        if place == -1:  # not in the map
-            continue
-        queries.append(
-            index if query_column is None else _whole(cells, query_column, number, path)
-        )
-        places.append(place)
-    return np.array(queries, np.int64), np.array(places, np.int64)
-
-
-def _whole(cells: list[str], column: int, number: int, path: Path) -> int:
-    try:
-        value = float(cells[column])
-        if value.is_integer() and abs(value) < LARGEST:
-            return int(value)
-    except (ValueError, IndexError):
-        pass
-    raise SourceError(
-        f'ground truth {path}, line {number}: {",".join(cells)!r} has no whole number in column '
-        f'{column + 1}'
-    )
+    table = Table(path, 'ground truth', 'two columns, query and place, whole numbers from 0')
+    query_column, place_column = _columns(table)
+    columns = [place_column] if query_column is None else [query_column, place_column]
+    rows = table.numbers(columns)
+    for column, values in zip(columns, rows.T, strict=True):
+        whole = (abs(values) < LARGEST) & (values == np.floor(values))
+        if not whole.all():
+            row = int(np.argmin(whole))
+            raise table.error(f'column {column + 1} has no whole number, {values[row]:g}', row)
+        if is_stamps(values):
+            raise table.error(f'column {column + 1} has stamps instead of the numbers of images')
+    if query_column is None:
+        if len(rows) != N:
+            raise InputError(
+                f'ground truth {path} has a place for {len(rows)} queries, but there are {N}'
+            )
+        rows = np.column_stack([np.arange(N), rows])
+    pairs = rows[rows[:, 1] != -1].astype(np.int64)  # -1: not in the map
+    return pairs[:, 0], pairs[:, 1]
 
 
 # ------------------------------------------------------------------------------------------ arrays

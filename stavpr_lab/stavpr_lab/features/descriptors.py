@@ -8,8 +8,7 @@ right. Arrays of uint8 are binary descriptors, D bytes of 8 bits, and never read
 Nothing in a file is executed: no pickles, no MATLAB objects.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
+from collections.abc import Callable
 from pathlib import Path
 import re
 import zipfile
@@ -19,10 +18,12 @@ from stavpr_ros.errors import SourceError
 from stavpr_ros.features.extractor import FeatureSettings, LocalFeatures, normalize
 from stavpr_ros.features.registry import DescriptorSettings
 from stavpr_ros.regular_file import require_regular
+from stavpr_ros.sources.table import is_counted, is_stamps, Table
 
 _PATH = re.compile(r'(?P<file>.*\.(npy|npz|csv|mat))(:(?P<name>.+))?', re.IGNORECASE)
 _NUMERIC = ('double', 'single', *(f'{u}int{bits}' for u in ('', 'u') for bits in (8, 16, 32, 64)))
 MAX_STRIPS = 1024
+EXPECTED = 'real numbers (n, D) or (n, W, D), one row an image'
 AT_ONCE = 1024  # images converted together
 MAPPED = 2**26  # bytes of a .npy file from which on it is not read as a whole
 
@@ -60,14 +61,16 @@ def read_descriptors(path: str, source: str = '', bits: bool = False) -> LocalFe
             reason = 'it has Python objects, or is of another format; save an array of numbers'
         raise SourceError(f'descriptors {file} cannot be read: {reason}') from error
     if array.dtype.kind not in 'fiu' or array.ndim not in (2, 3) or 0 in array.shape:
-        raise SourceError(
-            f'descriptors {path}: {array.dtype} {array.shape}: expected real numbers (n, D) or '
-            '(n, W, D), one row an image'
-        )
+        raise SourceError(f'descriptors {path}: {array.dtype} {array.shape}: expected {EXPECTED}')
     if (array.dtype == np.uint8) != bits:
         raise SourceError(
             f'descriptors {path}: {array.dtype} {array.shape}: expected uint8 for bits, 8 a '
             'number, with --descriptors-bits true, and another type, such as float32, for numbers'
+        )
+    if array.ndim == 2 and (is_stamps(array[:, 0]) or is_counted(array[:, 0])):
+        raise SourceError(
+            f'descriptors {path}: its first column is stamps or numbers of images: leave it out; '
+            f'expected {EXPECTED}'
         )
     n, W = len(array), 1 if array.ndim == 2 else array.shape[1]
     if W > MAX_STRIPS:
@@ -183,61 +186,9 @@ def _chosen(file: Path, name: str, shapes: dict[str, tuple[int, ...]]) -> str:
 
 
 def _from_csv(file: Path, name: str) -> np.ndarray:
-    """
-    Read a table: separators, a line and a column of names are recognized by the first two lines.
-
-    Pandas writes column numbers 0, 1, 2 ... as the first line, and a first column without a name.
-    """
     if name:
         raise SourceError(f'descriptors {file} is one table: leave :{name} out')
-    with file.open(encoding='utf-8-sig') as text:
-        lines = _lines(text)
-        first, second = next(lines, ''), next(lines, '')
-    if not first:
-        raise SourceError(f'descriptors {file} is empty')
-    separator = next((mark for mark in ';,\t' if mark in first), None)
-    point = ',' if separator == ';' else '.'  # as German programs write numbers
-    names, cells = (
-        [cell.strip(' "').replace(point, '.') for cell in line.strip('\r\n').split(separator)]
-        for line in (first, second or first)
-    )
-    ended = len(cells) > 1 and not cells[-1]  # a separator ends each line
-    width = len(cells) - ended
-    labels = _is_name(cells[0]) or (
-        _is_header(names[1:], width - 1) and (not names[0] or len(names) < width)
-    )
-    header = _is_header(names[labels:], width - labels)
-    if header and not second:
-        raise SourceError(f'descriptors {file} has names, but no numbers')
-
-    def numbers(line: str) -> str:
-        line = line.strip().replace(point, '.')
-        line = line.removesuffix(separator or '') if ended else line
-        return line.split(separator, 1)[1] if labels else line
-
-    with file.open(encoding='utf-8-sig') as text:
-        rows = map(numbers, islice(_lines(text), int(header), None))
-        return np.loadtxt(rows, delimiter=separator, ndmin=2, quotechar='"')
-
-
-def _lines(text: Iterable[str]) -> Iterator[str]:
-    """Yield the lines that are neither empty nor comments."""
-    return (line for line in text if line.strip() and line[0] != '#')
-
-
-def _is_header(cells: list[str], width: int) -> bool:
-    """Return whether cells are names, or the numbers of more than two columns."""
-    counted = width > 2 and cells == [str(i) for i in range(width)]
-    return counted or any(map(_is_name, cells[:width]))
-
-
-def _is_name(cell: str) -> bool:
-    """Return whether a cell is neither empty nor a number."""
-    try:
-        float(cell or 0)
-    except ValueError:
-        return True
-    return False
+    return Table(file, 'descriptors', EXPECTED, counted=True).numbers()
 
 
 _READERS: dict[str, Callable[[Path, str], np.ndarray]] = {

@@ -1,0 +1,135 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of numbers that other programs wrote as text: poses, ground truth, descriptors."""
+
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from pathlib import Path
+import re
+
+import numpy as np
+from stavpr_ros.errors import SourceError
+from stavpr_ros.regular_file import require_regular
+
+SEPARATORS = ';\t,'  # else blanks
+COMMENTS = ('#', '%', 'sep=')  # a spreadsheet writes the last one
+MIN_STAMP = 1e8  # seconds of 1973; no meters on Earth, and no number of an image
+LONGEST_REASON = 120  # characters
+
+
+class Table:
+    """
+    The lines of a text file, each with the same columns.
+
+    Encoding, separator, decimal comma, a line and a first column of names, comments, blank lines
+    and separators at the ends of lines are recognized by the first lines of the file. A comment
+    above the numbers may name their columns.
+
+    :param path: the file, UTF-8 or UTF-16 with a byte order mark.
+    :param what: what the file is, as ``poses``, for errors.
+    :param expected: what a line must have, for errors.
+    :param counted: a first line 0, 1, 2 ... is names of columns; else behind a blank cell only.
+    :raises SourceError: the file cannot be read, or has no line of numbers.
+
+    ``names`` are empty where the file names no columns, ``width`` is the number of columns; a
+    first column of names, such as of image files, does not count.
+    """
+
+    def __init__(self, path: Path, what: str, expected: str, counted: bool = False) -> None:
+        self.path, self._what, self._expected = path, f'{what} {path}', expected
+        self.lines: list[int] = []  # number of each line that :meth:`numbers` has read
+        self._comment = ''
+        try:
+            require_regular(path)
+            first, second = [*(line for _, line in islice(self._lines(), 2)), '', ''][:2]
+        except OSError as error:
+            raise SourceError(f'{self._what} cannot be read: {error}') from error
+        if not first:
+            raise self.error('it is empty')
+        self._separator = next((mark for mark in SEPARATORS if mark in first), None)
+        in_spreadsheet = self._separator in (';', '\t') and '.' not in (second or first)
+        self._point = ',' if in_spreadsheet else '.'  # as German programs write numbers
+        names, cells = self._cells(first), self._cells(second or first)
+        self._ended = len(cells) > 1 and not cells[-1]  # a separator ends each line
+        width = len(cells) - self._ended
+        unnamed = not names[0] or len(names) < width
+        self._labels = _is_name(cells[0]) or (unnamed and _is_header(names[1:], width - 1, True))
+        self.width = width - self._labels
+        self._header = _is_header(names[self._labels :], self.width, counted or unnamed)
+        if self._header and not second:
+            raise self.error('it has names, but no line of numbers')
+        names = names[-self.width :] if len(names) < width else names[self._labels :][: self.width]
+        comment = self._cells(self._comment)
+        if not self._header:
+            names = comment[self._labels :] if len(comment) == width else []
+        self.names = names
+
+    def error(self, reason: str, row: int | None = None) -> SourceError:
+        """Return the error of the table, or of a row of :meth:`numbers`, and what it expected."""
+        where = '' if row is None else f', line {self.lines[row]}'
+        return SourceError(f'{self._what}{where}: {reason}: expected {self._expected}')
+
+    def numbers(self, columns: Sequence[int] | None = None) -> np.ndarray:
+        """
+        Read the numbers, all or of chosen columns, shape (rows, columns), float64.
+
+        :raises SourceError: a cell is no number, or a line has other columns.
+        """
+        try:
+            return np.loadtxt(
+                self._rows(), delimiter=self._separator, ndmin=2, quotechar='"',
+                comments=None, usecols=columns,
+            )  # fmt: skip
+        except (OSError, ValueError) as error:
+            reason = str(error).partition(' at row ')[0][:LONGEST_REASON]
+            raise self.error(reason, -1 if self.lines else None) from error
+
+    def _rows(self) -> Iterator[str]:
+        """Yield the lines of numbers, without labels, as NumPy reads them."""
+        self.lines = []
+        for number, line in islice(self._lines(), int(self._header), None):
+            self.lines.append(number)
+            row = line.replace(self._point, '.')
+            row = row.removesuffix(self._separator or '') if self._ended else row
+            yield row.split(self._separator, 1)[-1] if self._labels else row
+
+    def _lines(self) -> Iterator[tuple[int, str]]:
+        """Yield the lines that are neither empty nor comments, and their numbers from 1."""
+        with self.path.open('rb') as file:
+            encoding = 'utf-16' if file.read(2) in (b'\xff\xfe', b'\xfe\xff') else 'utf-8-sig'
+        with self.path.open(encoding=encoding, errors='replace') as text:
+            for number, line in enumerate(text, 1):
+                row = line.strip(' \r\n')
+                if row.startswith(COMMENTS):
+                    self._comment = row.strip('#% ')
+                elif row.replace(';', '').replace(',', '').strip():
+                    yield number, row
+
+    def _cells(self, line: str) -> list[str]:
+        return [cell.strip(' "').replace(self._point, '.') for cell in line.split(self._separator)]
+
+
+def is_stamps(column: np.ndarray) -> bool:
+    """Return whether numbers are stamps: of seconds or less, since 1970, that do not fall."""
+    values = np.asarray(column, np.float64)
+    return bool(len(values) and values.min() >= MIN_STAMP and (np.diff(values) >= 0).all())
+
+
+def is_counted(column: np.ndarray) -> bool:
+    """Return whether numbers count the lines, from any number on."""
+    return len(column) > 2 and bool((np.diff(column) == 1).all())
+
+
+def _is_header(cells: list[str], width: int, counted: bool) -> bool:
+    """Return whether cells are names, or the numbers of more than two columns."""
+    numbers = counted and width > 2 and cells == [str(i) for i in range(width)]
+    return numbers or any(map(_is_name, cells[:width]))
+
+
+def _is_name(cell: str) -> bool:
+    """Return whether a cell is neither empty nor a number."""
+    try:
+        float(re.sub(r'\s', '', cell) or 0)
+    except ValueError:
+        return True
+    return False
