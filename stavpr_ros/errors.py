@@ -2,6 +2,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every error that the package raises on purpose; all of them are a :class:`StavprError`."""
 
+from collections import Counter
+from collections.abc import Mapping
+
+CAUSES = {
+    'encoding': 'images of an encoding that is not read',
+    'depth': 'images of depth or measurements',
+    'size': 'images of a size that their encoding cannot have',
+    'step': 'images whose rows are too short',
+    'cut off': 'images that are cut off',
+    'damaged': 'images that are damaged',
+    'too large': 'images that are too large',
+    'unreadable': 'files that cannot be opened',
+    'features': 'images whose features are not finite',
+    'image': 'images that cannot be decoded',
+    'format': 'images of a format that is not read (convert them to JPEG)',
+    'beside': 'images beside the sub-folders of the drive',
+    'below': 'images in sub-folders of the drive',
+    'foreign': 'folders of a NAS, an archive program or a viewer',
+    'odometry': 'messages of odometry without a valid pose',
+}
+"""What readers of foreign files leave out, by the cause that they count."""
+
+
+def left_out(*counts: Mapping[str, int]) -> str:
+    """Return what was left out and why, by the causes of several readers; '' = nothing."""
+    total = sum(map(Counter, counts), Counter())
+    parts = (f'{n} {CAUSES.get(cause, f"images ({cause})")}' for cause, n in total.items())
+    return f'left out: {", ".join(parts)}' if total else ''
+
 
 class StavprError(Exception):
     """
@@ -28,10 +57,8 @@ class ImageError(StavprError):
     One image cannot be decoded; the next one may be fine.
 
     :param text: what came, what was expected and what to do.
-    :param kind: what is wrong in a word or two, to count by and to explain each kind only once:
-        ``encoding`` (not read), ``depth`` (not a color or gray image), ``size``, ``step``, ``cut
-        off``, ``damaged``, ``too large``, ``unreadable`` (a file), ``features`` (not finite), or
-        just ``image``.
+    :param kind: what is wrong in a word or two, one of :data:`CAUSES`, to count by and to explain
+        each only once.
     """
 
     def __init__(self, text: str, *, kind: str = 'image') -> None:

@@ -6,10 +6,12 @@ import os
 import random
 import resource
 
+from nav_msgs.msg import Odometry
 from processes import node_process, SECOND
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
 from robot import image_message, PARAMETERS
+from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import OutputError
 from stavpr_ros.mapping import load_map
@@ -45,6 +47,17 @@ def record(node, images, first=0):
 def end(node):
     node.destroy_node()
     return node.failed
+
+
+def test_node_states_at_the_end_what_it_left_out(make, route, monkeypatch):
+    logged, node = [], make()
+    monkeypatch.setattr(node.get_logger(), 'warning', lambda text, **_: logged.append(text))
+    node.runtime.odometry._on_odometry(Odometry())
+    node.runtime.images.on_image(Image(encoding='rgb8'))
+    record(node, route[:1])
+    assert not end(node)
+    expected = '1 images of a size that their encoding cannot have, 1 messages of odometry without'
+    assert logged[-1] == f'left out: {expected} a valid pose'
 
 
 def test_node_without_save_path_continues_its_recording_at_the_next_start(make, route, tmp_path):

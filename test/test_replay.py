@@ -218,6 +218,7 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
     assert code == 0
     assert '1 skipped' in output
     assert '2.png: 7 bytes are no image' in errors
+    assert errors.endswith('left out: 1 images that are damaged\n')
     assert subscriber.milliseconds() == [50, 100, 200]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.errors import ImageError, InputError, SourceError
+from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource, natural_key
 
@@ -20,8 +20,14 @@ def fill(folder, names):
 
 def test_natural_key_sorts_numbers():
     names = ['10.jpg', 'a2b10.png', '2.jpg', '1.jpg', 'a2b9.png', 'A1.png', '01.jpg', 'a.png']
-    expected = ['01.jpg', '1.jpg', '2.jpg', '10.jpg', 'A1.png', 'a2b9.png', 'a2b10.png', 'a.png']
+    expected = ['01.jpg', '1.jpg', '2.jpg', '10.jpg', 'a.png', 'A1.png', 'a2b9.png', 'a2b10.png']
     assert sorted(names, key=natural_key) == expected
+
+
+@pytest.mark.parametrize('mark', [' (1)', '(0)', '-1', '_2', ' copy'])
+def test_natural_key_sorts_numbered_copies_behind_their_name(mark):
+    expected = ['IMG_9.jpg', f'IMG_9{mark}.jpg', 'IMG_10.jpg', f'IMG_10{mark}.JPG']
+    assert sorted({*expected}, key=natural_key) == expected
 
 
 def test_folder_yields_frames_in_order(tmp_path):
@@ -75,7 +81,7 @@ def test_open_source_of_no_source_fails(tmp_path):
         open_source(tmp_path, '/image')
 
 
-@pytest.mark.parametrize('method', ['exists', 'is_dir', 'iterdir'])
+@pytest.mark.parametrize('method', ['exists', 'is_dir', 'is_file'])
 def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
     """As user root, permissions forbid nothing."""
 
@@ -106,5 +112,41 @@ def test_folder_without_images_yields_those_of_sub_folders(tmp_path):
     fill(tmp_path, ['10/1.png', '9/b/1.png', '.hidden/1.png', '9/2.png', '9/a.png'])
     expected = ['9/2.png', '9/a.png', '9/b/1.png', '10/1.png']
     assert [frame.identifier for frame in FolderSource(tmp_path)] == expected
-    fill(tmp_path, ['own.png'])
-    assert [frame.identifier for frame in FolderSource(tmp_path)] == ['own.png']
+
+
+def test_folder_with_more_images_in_sub_folders_yields_the_drive(tmp_path):
+    """Stray images beside the drive, or sub-folders beside it: the others are counted."""
+    (tmp_path / 'drive').mkdir()
+    fill(tmp_path, ['overview.png', *(f'drive/{i}.png' for i in range(5))])
+    source = FolderSource(tmp_path)
+    assert [frame.identifier for frame in source] == [f'drive/{i}.png' for i in range(5)]
+    assert source.left_out == {'beside': 1}
+    fill(tmp_path, ['1.png'])
+    source = FolderSource(tmp_path)
+    assert [frame.identifier for frame in source] == ['1.png', 'overview.png']
+    assert left_out(source.left_out) == 'left out: 5 images in sub-folders of the drive'
+
+
+def test_folder_ignores_folders_that_other_programs_add(tmp_path):
+    foreign = ('@eaDir', '#recycle', '$RECYCLE.BIN', '__MACOSX', 'lost+found', 'Thumbnails')
+    for name in (*foreign, '.@__thumb', 'a/@eaDir'):
+        (tmp_path / name).mkdir(parents=True)
+        fill(tmp_path, [f'{name}/{i}.png' for i in range(9)])
+    fill(tmp_path, ['a/1.png', 'a/2.png'])
+    source = FolderSource(tmp_path)
+    assert [frame.identifier for frame in source] == ['a/1.png', 'a/2.png']
+    assert source.left_out == {'foreign': 7}
+
+
+def test_folder_counts_images_of_other_formats_once(tmp_path):
+    """A raw image beside its JPEG is not missing, and of HEIC and JPEG the JPEG is read."""
+    fill(tmp_path, ['1.jpg', '2.jpg'])
+    for name in ('1.ARW', '2.heic', '3.avif', '4.dng', 'notes.txt'):
+        (tmp_path / name).write_bytes(b'content')
+    source = FolderSource(tmp_path)
+    assert [frame.identifier for frame in source] == ['1.jpg', '2.jpg']
+    assert left_out(source.left_out, {'damaged': 1}).startswith('left out: 2 images of a format')
+    for image in ('1.jpg', '2.jpg', '2.heic'):
+        (tmp_path / image).unlink()
+    with pytest.raises(SourceError, match='left out: 3 images of a format that is'):
+        FolderSource(tmp_path)

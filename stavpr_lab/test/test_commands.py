@@ -133,6 +133,7 @@ def test_build_map_continues_after_a_bad_image_with_the_option_that_skips_it(
     monkeypatch.setattr('stavpr_ros.mapping.builder.JournalWriter.create', None)  # no new one
     result = run(build_map, '--input', folder, '--output', output, '--skip-bad-images')
     assert (result.code, load_map(output).ids[36:]) == (0, ('037.png', '038.png', '039.png'))
+    assert 'left out: 1 images that are damaged' in result.err
     assert not journal.exists()
 
 

@@ -3,6 +3,7 @@
 """``ros2 run stavpr_ros build_map``: make a reference map from images, a video or a bag."""
 
 import argparse
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import add_fps, make_parser, run_program
-from stavpr_ros.errors import ImageError, SettingsError, SourceError
+from stavpr_ros.errors import ImageError, left_out, SettingsError, SourceError
 from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.sources import open_source
 
-    skipped = []
+    skipped: Counter[str] = Counter()
 
     def bad_image(error: ImageError) -> None:
         if arguments.poses:
@@ -206,7 +207,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         if not arguments.skip_bad_images:
             text = f'{error}; the same command with --skip-bad-images continues without it'
             raise ImageError(text, kind=error.kind)
-        skipped.append(error)
+        skipped[error.kind] += 1
         print(f'skipped: {error}', file=sys.stderr)
 
     _check(arguments)
@@ -231,8 +232,8 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
             f'--odometry {arguments.odometry}: no image has a pose; are the stamps of both from '
             'one clock?'
         )
-    if skipped:
-        print(f'{len(skipped)} images skipped', file=sys.stderr)
+    if unread := left_out(skipped, getattr(source, 'left_out', {})):
+        print(unread, file=sys.stderr)
     print(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
     return place_map, journal
 

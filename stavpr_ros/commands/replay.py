@@ -3,6 +3,7 @@
 """``replay``: publish images of a bag, video or folder, at a pace or after the last result."""
 
 import argparse
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 import heapq
 import math
@@ -11,7 +12,7 @@ import time
 
 import rclpy
 from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run_program
-from stavpr_ros.errors import ImageError, SourceError, StavprError, UnavailableError
+from stavpr_ros.errors import ImageError, left_out, SourceError, StavprError, UnavailableError
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import (
     message_class,
@@ -80,10 +81,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
-    skipped: list[ImageError] = []
+    skipped: Counter[str] = Counter()
 
     def skip(error: ImageError) -> None:
-        skipped.append(error)
+        skipped[error.kind] += 1
         notify(f'skipped: {error}')
         bar.update()
 
@@ -117,7 +118,9 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
             f'{options.bag} has no image from second {options.start_offset:g} on, for '
             f'{options.duration:g} s: choose another --start-offset or --duration'
         )
-    print(f'{report}, {len(skipped)} skipped')
+    print(f'{report}, {skipped.total()} skipped')
+    if unread := left_out(skipped, getattr(source, 'left_out', {})):
+        notify(unread)
     return DONE if replayer.published else FAILED
 
 

@@ -62,6 +62,7 @@ class ImageCounts:
     times: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     gaps: int = 0  # pauses in the stamps
     longest_gap: float = 0.0  # seconds
+    odometry_rejected: int = 0  # messages with an invalid pose or stamp
     jumps_back: int = 0  # of the stamps
     longest_jump_back: float = 0.0  # seconds
 
@@ -124,6 +125,11 @@ class Statistics:
         """Count images without a result, by cause: ``'queue full'``, ``'invalid: encoding'``."""
         with self._lock:
             self._add('dropped', cause, count)
+
+    def add_odometry_rejected(self) -> None:
+        """Count a message of odometry with an invalid pose or stamp."""
+        with self._lock:
+            self._counts.odometry_rejected += 1
 
     def add_edge(self, source: str, reason: str) -> None:
         """Count a loop closure by the source of its edge; reason: why it is not PnP."""

@@ -19,12 +19,12 @@ from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.compilation import progress
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import left_out, SettingsError, StavprError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
-from stavpr_ros.ros.health import Health
+from stavpr_ros.ros.health import Health, INVALID
 from stavpr_ros.ros.output import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
@@ -352,6 +352,9 @@ class PlaceRecognitionNode(ManagedNode):
         counts = self.statistics.counts()
         drops = sorted(counts.dropped.total.items())
         losses = ''.join(f', {count} {cause}' for cause, count in drops)
+        invalid = {k.removeprefix(INVALID): n for k, n in drops if k.startswith(INVALID)}
+        if unread := left_out(invalid, {'odometry': counts.odometry_rejected}):
+            self.get_logger().warning(unread)
         self.get_logger().info(
             f'{counts.received.count} images received, {counts.answered.count} processed{losses}'
         )

@@ -229,7 +229,11 @@ class Runtime:
             and places.has_poses
         )
         if needs_odometry and self.odometry is None:
-            self.odometry = OdometryInput(self._node, self.settings.odometry_timeout)
+            self.odometry = OdometryInput(
+                self._node,
+                self.settings.odometry_timeout,
+                self._statistics.add_odometry_rejected,
+            )
         elif not needs_odometry and self.odometry is not None:
             self.odometry.close()
             self.odometry = None

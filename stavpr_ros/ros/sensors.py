@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The subscriptions to odometry and to camera_info, and the camera's place on the robot."""
 
+from collections.abc import Callable
 import importlib
 import time
 from typing import Any
@@ -27,14 +28,17 @@ class OdometryInput:
     The subscription to odometry, on the topic ``odom``.
 
     :param timeout: seconds for which the newest pose is valid.
+    :param on_rejected: called for each message with an invalid pose or stamp.
 
     ``frame`` is the frame of the poses, ``child_frame`` the one whose poses they are.
     """
 
-    def __init__(self, node: Node, timeout: float) -> None:
+    def __init__(
+        self, node: Node, timeout: float, on_rejected: Callable[[], None] = lambda: None
+    ) -> None:
         importlib.import_module('scipy.spatial.transform')  # loads slowly: not at the first pose
         self.trajectory = Trajectory(timeout)
-        self._node, self._timeout = node, timeout
+        self._node, self._timeout, self._on_rejected = node, timeout, on_rejected
         self._arrived: float | None = None
         self.frame = self.child_frame = ''
         qos = QoSProfile(depth=50, reliability=BEST_EFFORT)
@@ -59,6 +63,7 @@ class OdometryInput:
         try:
             self.trajectory.add(nanoseconds(message.header.stamp), odometry_pose(message))
         except InputError as error:
+            self._on_rejected()
             self._node.get_logger().warning(
                 f'odometry rejected: {error}', throttle_duration_sec=REPORT_PERIOD
             )

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder of image files as a sequence."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 import math
 import os
@@ -9,19 +10,37 @@ from pathlib import Path
 import re
 
 import numpy as np
-from stavpr_ros.errors import ImageError, InputError, SourceError
+from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
 from stavpr_ros.sources.files import decode_file
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.units import SECOND
 
-SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp'})
+HEIF = frozenset({'.heic', '.heif', '.hif'})
+SUFFIXES = HEIF | {
+    '.jpg', '.jpeg', '.jpe', '.jfif', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.pnm',
+    '.webp',
+}  # fmt: skip
+OTHER_IMAGES = frozenset({
+    '.arw', '.avif', '.cr2', '.cr3', '.dng', '.exr', '.gif', '.hdr', '.jp2', '.jxl', '.nef',
+    '.orf', '.raf', '.raw', '.rw2',
+})  # fmt: skip
+FOREIGN = re.compile(
+    r'@.*|#recycle|#snapshot|\$recycle\.bin|lost\+found|__macosx|system volume information|'
+    r'_*thumb(nail)?s?',
+    re.IGNORECASE,
+)
+"""Names of sub-folders that a NAS, an archive program or a viewer adds."""
+FEW = 5  # times as many images in sub-folders: images beside these are not the drive
+
+NaturalKey = tuple[list[str | int], list[str | int], str]
 
 
-def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Return a sort key with ``2.jpg`` before ``10.jpg`` (and ``01`` before ``1``)."""
+def natural_key(name: str) -> NaturalKey:
+    """Return a sort key: ``01.jpg``, ``1.jpg``, ``2.jpg``, ``2 (1).jpg``, ``10.jpg``."""
     # the parts alternate between text and number: equal positions have equal types
-    parts = re.split(r'(\d+)', name)
-    return [int(part) if i % 2 else part.casefold() for i, part in enumerate(parts)], name
+    stem, suffix = (re.split(r'(\d+)', part.casefold()) for part in os.path.splitext(name))
+    stem[1::2], suffix[1::2] = map(int, stem[1::2]), map(int, suffix[1::2])
+    return stem, suffix, name
 
 
 def text_of(path: str | Path) -> str:
@@ -31,11 +50,12 @@ def text_of(path: str | Path) -> str:
 
 class FolderSource:
     """
-    The images of a folder in natural order, or of its sub-folders if it has none itself.
+    The images of a folder in natural order, or of its sub-folders if it has few or none itself.
 
     Sub-folders, at any depth, are in natural order too, one after the other. Hidden files and
-    folders are left out. Iterating yields :class:`Frame` with an unknown stamp and, as identifier,
-    the file's name, in a sub-folder its path from the folder.
+    folders are ignored; ``left_out`` counts other images and folders by their
+    :data:`stavpr_ros.errors.CAUSES`. Iterating yields :class:`Frame` with an unknown stamp and,
+    as identifier, the file's name, in a sub-folder its path from the folder.
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
@@ -48,8 +68,7 @@ class FolderSource:
         self.path = Path(path)
         self.on_error = on_error
         try:
-            files = [file for file in self.path.iterdir() if _is_image(file)]
-            files = files or _images_below(self.path)
+            files, self.left_out = _images_of(self.path)
         except OSError as error:
             raise SourceError(
                 f'{self.path} cannot be listed: {error.strerror}; check its name and permissions'
@@ -58,7 +77,7 @@ class FolderSource:
             expected = ' '.join(sorted(SUFFIXES))
             raise SourceError(
                 f'{self.path} has no images: expected files ending in {expected}, there or in '
-                'sub-folders'
+                f'sub-folders. {left_out(self.left_out)}'.rstrip('. ')
             )
         self.files: list[Path] = sorted(files, key=self._order)
 
@@ -91,7 +110,7 @@ class FolderSource:
         for i, frame in self._numbered(max(first, 0), last):
             yield ImageRecord.of_image(frame.image, round((i + 1) * SECOND / frames_per_second))
 
-    def _order(self, file: Path) -> list[tuple[list[str | int], str]]:
+    def _order(self, file: Path) -> list[NaturalKey]:
         return [natural_key(part) for part in file.relative_to(self.path).parts]
 
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
@@ -106,21 +125,32 @@ class FolderSource:
             yield i, frame
 
 
-def _images_below(folder: Path) -> list[Path]:
-    """List the images in sub-folders; symbolic links to folders are not followed."""
+def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
+    """List the images of a folder, and count what is left out; links to folders are ignored."""
+    own: list[Path] = []
+    below: list[Path] = []
 
     def fail(error: OSError) -> None:
-        raise error
+        if not own:  # else the sub-folders are not needed
+            raise error
 
-    images = []
-    for name, folders, files in os.walk(folder, onerror=fail):
-        folders[:] = [each for each in folders if not each.startswith('.')]
-        images += [file for file in (Path(name, each) for each in files) if _is_image(file)]
-    return images
-
-
-def _is_image(file: Path) -> bool:
-    return file.suffix.lower() in SUFFIXES and not file.name.startswith('.') and file.is_file()
+    unread: Counter[str] = Counter()
+    for name, folders, files in os.walk(top, onerror=fail):
+        visible = [each for each in folders if not each.startswith('.')]
+        folders[:] = [each for each in visible if not FOREIGN.fullmatch(each)]
+        unread['foreign'] += len(visible) - len(folders)
+        paths = [Path(name, each) for each in files if not each.startswith('.')]
+        images = [path for path in paths if path.suffix.lower() in SUFFIXES and path.is_file()]
+        # of an image in two formats, the one that every program reads
+        names = {path.stem for path in images if path.suffix.lower() not in HEIF}
+        images = [p for p in images if p.suffix.lower() not in HEIF or p.stem not in names]
+        names |= {path.stem for path in images}
+        others = (path for path in paths if path.suffix.lower() in OTHER_IMAGES)
+        unread['format'] += sum(path.stem not in names for path in others)
+        (own if Path(name) == top else below).extend(images)
+    is_drive = len(own) * FEW > len(below)
+    unread['below' if is_drive else 'beside'] = len(below if is_drive else own)
+    return own if is_drive else below, +unread
 
 
 def _read(file: Path) -> np.ndarray:

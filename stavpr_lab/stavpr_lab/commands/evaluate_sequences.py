@@ -3,8 +3,10 @@
 """The inputs of the command ``evaluate``: images, maps, data sets, ground truth, settings."""
 
 import argparse
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+import sys
 import time
 from typing import Any
 
@@ -15,7 +17,7 @@ from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_lab.features.descriptors import is_descriptors, read_descriptors, require_comparable
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.commands.feature_options import kind_options, make_extractor
-from stavpr_ros.errors import SettingsError, SourceError
+from stavpr_ros.errors import left_out, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.recognition import RecognizerSettings
@@ -73,6 +75,8 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
             if path is not None
         }
         sequences = _of_paths(arguments, opened, loader.times)
+    if unread := left_out(loader.left_out):
+        print(unread, file=sys.stderr)
     return _changed(sequences, arguments)
 
 
@@ -133,6 +137,7 @@ class _Loader:
         self._extractor: FeatureExtractor | None = None
         self._saved: PlaceMap | None = None
         self.times: dict[str, float] = {}
+        self.left_out: Counter[str] = Counter()
 
     def load(self, name: str, path: str) -> PlaceMap:
         """Open a folder, a video, a bag, a saved map or descriptors."""
@@ -148,6 +153,7 @@ class _Loader:
             return load_map(path)  # raises the reason why it is none
         topic = self._arguments.topic if is_bag(Path(path)) else None
         source = open_source(path, topic, fps=self._arguments.fps)
+        self.left_out.update(getattr(source, 'left_out', {}))
         return self.extract(name, source)
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
