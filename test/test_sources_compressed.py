@@ -3,8 +3,10 @@
 """Image files and compressed messages to RGB: formats, mosaics, depth, damage, garbage."""
 
 from io import BytesIO
+import sys
 from types import SimpleNamespace
 from unittest import mock
+import zlib
 
 import cv2
 from hypothesis import given
@@ -66,6 +68,7 @@ def test_decode_compressed_of_too_large_image_is_rejected_first(monkeypatch):
 
 
 NOISE = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
+SMOOTH = cv2.GaussianBlur(NOISE, (0, 0), 5)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +81,7 @@ NOISE = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
         (b'\xff\xd8\xff\xe0', '4 bytes are no image'),
         (bytes([0, 0, 0, 1, 0x67] * 4), "format 'h264': 20 bytes are no image"),
         (encoded('.png', NOISE)[:-30], 'is damaged or cut off: copy or record it again'),
-        (b'P5 2000000 1 255 ' + bytes(2_000_000), 'image of 2000017 bytes is damaged: '),
+        (b'P5 2000000 1 255 ' + bytes(2_000_000), 'image of 2000017 bytes is damaged or cut off'),
     ],
     ids=['empty', 'byte', 'text', 'png', 'jpeg', 'video', 'cut off', 'wider than OpenCV reads'],
 )
@@ -86,6 +89,91 @@ def test_decode_compressed_of_damaged_image_fails(data, message):
     with pytest.raises(ImageError, match=message) as caught:
         decode_message(compressed('h264', data))
     assert caught.value.kind == 'damaged'
+
+
+def chunk(key, content):
+    size = len(content).to_bytes(4, 'big')
+    return size + key + content + zlib.crc32(key + content).to_bytes(4, 'big')
+
+
+def with_turn(name, turn):
+    """Return a file that states an orientation by EXIF, where different programs write it."""
+    exif, file = Image.Exif(), BytesIO()
+    exif[0x0112] = turn
+    late, options = name == 'PNG late', {'lossless': True, 'quality': 100}
+    Image.fromarray(SMOOTH).save(file, name.split()[0], exif=b'' if late else exif, **options)
+    data, content = file.getvalue(), exif.tobytes().removeprefix(b'Exif\0\0')
+    if late:
+        return data[:-12] + chunk(b'eXIf', content) + data[-12:]
+    if name == 'WEBP prefixed':
+        content = b'Exif\0\0' + content
+        body = data[12 : data.rfind(b'EXIF')] + b'EXIF' + len(content).to_bytes(4, 'little')
+        body += content + b'\0' * (len(content) % 2)
+        return b'RIFF' + (len(body) + 4).to_bytes(4, 'little') + b'WEBP' + body
+    return data
+
+
+@pytest.mark.parametrize('name', ['JPEG', 'PNG', 'PNG late', 'TIFF', 'WEBP', 'WEBP prefixed'])
+@pytest.mark.parametrize('turn', range(10))
+def test_decode_compressed_applies_the_orientation_of_exif(name, turn):
+    turns = {
+        2: SMOOTH[:, ::-1], 3: SMOOTH[::-1, ::-1], 4: SMOOTH[::-1], 5: SMOOTH.swapaxes(0, 1),
+        6: np.rot90(SMOOTH, -1), 7: SMOOTH[::-1, ::-1].swapaxes(0, 1), 8: np.rot90(SMOOTH),
+    }  # fmt: skip
+    expected = turns.get(turn, SMOOTH)
+    image = decode_compressed(with_turn(name, turn))
+    assert image.shape == expected.shape
+    mean_error = np.abs(image.astype(int) - expected).mean()
+    assert mean_error < (3 if name == 'JPEG' else 1e-9)
+
+
+@pytest.mark.parametrize('suffix', ['.png', '.tiff', '.pgm', '.ppm'])
+def test_decode_compressed_of_16_bits_takes_the_upper_byte_as_opencv_does(suffix):
+    shape = (30, 40) if suffix == '.pgm' else (30, 40, 3)
+    data = encoded(suffix, np.random.default_rng(0).integers(0, 65536, shape).astype(np.uint16))
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_array_equal(decode_compressed(data), expected)
+
+
+@pytest.mark.parametrize('compression', [None, 'tiff_lzw', 'tiff_deflate', 'packbits'])
+def test_decode_compressed_of_sound_tiff_that_opencv_does_not_read(compression):
+    """Of 32 bits; what has no range of its own is not called damaged."""
+
+    def tiff(values):
+        file = BytesIO()
+        Image.fromarray(values).save(file, 'TIFF', compression=compression)
+        return file.getvalue()
+
+    gray = np.tile(np.linspace(0, 1, 160, dtype=np.float32), (120, 1))
+    expected = np.repeat((np.round(gray * 65535).astype(np.uint16) >> 8)[..., None], 3, axis=2)
+    np.testing.assert_array_equal(decode_compressed(tiff(gray)), expected)
+    counts = np.round(gray * 65535).astype(np.int32)
+    np.testing.assert_array_equal(decode_compressed(tiff(counts)), expected)
+    for values in (gray * 300, gray - 1, gray * np.nan, counts * 2, -counts):
+        with pytest.raises(ImageError, match='TIFF with values from') as caught:
+            decode_compressed(tiff(values))
+        assert caught.value.kind == 'depth'
+
+
+def test_decode_compressed_of_heic(monkeypatch):
+    heif = pytest.importorskip('pillow_heif', reason='the extra heif is not installed')
+    file = BytesIO()
+    heif.from_pillow(Image.fromarray(SMOOTH)).save(file, quality=95)
+    assert np.abs(decode_compressed(file.getvalue()).astype(int) - SMOOTH).mean() < 3
+    with pytest.raises(ImageError, match='are no image, or damaged'):
+        decode_compressed(file.getvalue()[:200])
+    monkeypatch.setitem(sys.modules, 'pillow_heif', None)
+    with pytest.raises(ImageError, match='not installed: pip install pillow-heif') as caught:
+        decode_compressed(file.getvalue())
+    assert caught.value.kind == 'format'
+
+
+def test_errors_of_files_name_no_python_object():
+    head = b'II*\0\x08\0\0\0'
+    for data in (b'no image', head, b'RIFF\x08\0\0\0WEBPVP8 ', encoded('.png', NOISE)[:40]):
+        with pytest.raises(ImageError) as caught:
+            decode_compressed(data)
+        assert '<' not in str(caught.value)
 
 
 @pytest.mark.parametrize('length', [2**31 - 1, 2**32 - 1, 1000])

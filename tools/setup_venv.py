@@ -33,8 +33,8 @@ LAST_LINES = 25  # of the log of a failed command
 # torch is not locked: its builds depend on the index.
 BASE = ('runtime', 'ros', 'build')
 LOCKED_EXTRAS = (
-    'onnx', 'learned', 'hdf5', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench', 'dev',
-    'docs',
+    'onnx', 'learned', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam', 'evaluation', 'bench',
+    'dev', 'docs',
 )  # fmt: skip
 
 # The files that a package is built from, in build order: each depends on earlier ones.

@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps, UnidentifiedImageError
 from stavpr_ros.errors import ImageError
 
 MAX_PIXELS = 64_000_000
@@ -32,6 +32,12 @@ REDUCED_JPEG = {
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
 """Decoders of a JPEG at a fraction of its size; they skip most of the work."""
+
+ToBytes = Callable[[np.ndarray], np.ndarray]
+"""Converts values of 16 bits, uint16, to uint8, of the same shape."""
+ORIENTATION = 0x0112  # tag of EXIF
+HEIF = re.compile(rb'....ftyp(hei[cfmsx]|hev[cmsx]|mif1|msf1)', re.DOTALL)
+WIDE_TIFF = ('TIFF', 'F'), ('TIFF', 'I')  # Pillow's modes of 32 bits, which OpenCV does not read
 
 COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
 """The supported files, in Pillow's names."""
@@ -82,43 +88,75 @@ def decode_file(
     data: Any,
     demosaic: Callable[[np.ndarray], np.ndarray] | None = None,
     least: tuple[int, int] | None = None,
+    to_bytes: ToBytes | None = None,
 ) -> np.ndarray:
     """
-    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP.
+    Decode the bytes of an image file: JPEG, PNG, BMP, TIFF, PNM, WebP, HEIC (extra ``heif``).
 
-    Gray, 16 bit and transparent images become RGB uint8 too; a rotation in the EXIF data is
-    applied.
+    Gray and transparent images become RGB too; a rotation in the EXIF data is applied.
 
     :param data: the file's bytes: anything with the buffer protocol.
     :param demosaic: converts a gray image (height, width), a Bayer mosaic, to RGB; not called if
         the file has color.
     :param least: rows and columns that are needed of a large image, which is reduced then; None =
         all.
+    :param to_bytes: converts images of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
         pixels.
     """
     flat = flat_bytes(data)
-    header = _check_file(flat)
-    mode, flag = header.mode, cv2.IMREAD_COLOR
+    header, turn = _check_file(flat)
+    flag = cv2.IMREAD_COLOR  # OpenCV rounds color TIFF of 16 bits, and takes the upper byte else
     if header.format in JPEG_FORMATS:
         flag = REDUCED_JPEG[min(8, reduction(header.height, header.width, least))]
-    try:
-        # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
-        if demosaic is not None and (mode == 'L' or mode.startswith('I')):
-            return reduce(demosaic(_unpack(flat, cv2.IMREAD_GRAYSCALE)), least)
-        return np.asarray(cv2.cvtColor(reduce(_unpack(flat, flag), least), cv2.COLOR_BGR2RGB))
-    except cv2.error as error:
-        raise ImageError(
-            f'compressed image of {flat.size} bytes is damaged: {error}', kind='damaged'
-        ) from error
-
-
-def _unpack(flat: np.ndarray, mode: int) -> np.ndarray:
-    image = cv2.imdecode(flat, mode)
+    # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
+    if is_mosaic := demosaic is not None and (header.mode == 'L' or header.mode.startswith('I')):
+        flag = cv2.IMREAD_GRAYSCALE
+    image = _unpack(flat, flag if to_bytes is None else flag | cv2.IMREAD_ANYDEPTH, header)
     if image is None:
         raise _damaged(flat.size)
-    return np.asarray(image)
+    if image.dtype == np.uint16:
+        image = to_bytes(image) if to_bytes else (image >> 8).astype(np.uint8)
+    image = _turned(image, turn)
+    if demosaic is not None and is_mosaic:
+        return reduce(demosaic(image), least)
+    code = cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB
+    return np.asarray(cv2.cvtColor(reduce(image, least), code))
+
+
+def _unpack(flat: np.ndarray, flag: int, header: Image.Image) -> np.ndarray | None:
+    """Return gray or BGR, uint8 or uint16, as stored; None = it cannot be decoded."""
+    if header.format != 'HEIF' and (header.format, header.mode) not in WIDE_TIFF:
+        try:
+            image = cv2.imdecode(flat, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+        except cv2.error:  # beyond a limit of OpenCV
+            image = None
+        if image is not None or header.format != 'TIFF':
+            return image
+    try:
+        with Image.open(BytesIO(flat.data), formats=[str(header.format)]) as file:
+            upright = ImageOps.exif_transpose(file)
+        if upright.mode not in ('F', 'I'):
+            return np.asarray(upright.convert('RGB'))[..., ::-1]
+    except Exception:  # damage raises errors of any type
+        return None
+    values, limit = np.asarray(upright), 1 if upright.mode == 'F' else 65535
+    if not (values.min() >= 0 and values.max() <= limit):
+        raise ImageError(
+            f'{header.format} with values from {values.min():g} to {values.max():g}: expected 0 '
+            f'to {limit}; convert it to 16 bits',
+            kind='depth',
+        )
+    return np.round(values * (65535 / limit)).astype(np.uint16)
+
+
+def _turned(image: np.ndarray, turn: int) -> np.ndarray:
+    """Apply the orientation of EXIF, 1 to 8."""
+    if turn >= 5:
+        image = image.swapaxes(0, 1)
+    rows, columns = -1 if turn in (3, 4, 7, 8) else 1, -1 if turn in (2, 3, 6, 7) else 1
+    return np.ascontiguousarray(image[::rows, ::columns])
 
 
 def _damaged(size: int) -> ImageError:
@@ -128,20 +166,35 @@ def _damaged(size: int) -> ImageError:
     )
 
 
-def _check_file(flat: np.ndarray) -> Image.Image:
-    """Check the header and return it, closed, before the decoder allocates the image."""
+def _check_file(flat: np.ndarray) -> tuple[Image.Image, int]:
+    """Check the header before the decoder allocates the image; return it, closed, and its turn."""
+    formats: tuple[str, ...] = COMPRESSED_FORMATS
+    kind = 'damaged'
+    if HEIF.match(flat[:12].tobytes()):
+        formats, kind = ('HEIF',), 'format'
+        try:
+            from pillow_heif import register_heif_opener
+        except ImportError as error:
+            raise ImageError(
+                'HEIC is read by pillow-heif, which is not installed: pip install pillow-heif, or '
+                'convert the images to JPEG',
+                kind=kind,
+            ) from error
+        register_heif_opener()
     try:
-        with Image.open(BytesIO(flat.data), formats=COMPRESSED_FORMATS) as header:
+        with Image.open(BytesIO(flat.data), formats=formats) as header:
             width, height = header.size
+            turn = _turn_of(header, flat) if width * height <= MAX_PIXELS else 1
     except Image.DecompressionBombError as error:
         raise ImageError(
             f'{error}: expected at most {MAX_PIXELS}; scale it down', kind='too large'
         ) from error
     except Exception as error:  # a damaged header raises errors of any type
+        reason = '' if isinstance(error, UnidentifiedImageError) else f': {error}'
         raise ImageError(
-            f'{flat.size} bytes are no image, or damaged: expected '
-            f'{", ".join(COMPRESSED_FORMATS)}: {error}',
-            kind='damaged',
+            f'{flat.size} bytes are no image, or damaged, or of a kind that is not read: expected '
+            f'{", ".join(formats)} of 8 or 16 bits{reason}',
+            kind=kind,
         ) from error
     if width * height > MAX_PIXELS:
         raise too_large(width, height)
@@ -149,7 +202,19 @@ def _check_file(flat: np.ndarray) -> Image.Image:
         _check_end_of_jpeg(flat.tobytes())
     if header.format == 'PNG':
         _check_chunks_of_png(flat.data)
-    return header
+    return header, turn
+
+
+def _turn_of(header: Image.Image, flat: np.ndarray) -> int:
+    """Return the orientation by EXIF, 1 to 8; decoders turn TIFF and HEIC themselves."""
+    late = header.format == 'PNG' and b'eXIf' in flat.tobytes()  # it may be behind the pixels
+    if header.format in ('TIFF', 'HEIF') or not ('exif' in header.info or late):
+        return 1
+    try:
+        turn = header.getexif().get(ORIENTATION, 1)
+    except Exception:  # damage raises errors of any type
+        return 1
+    return turn if turn in range(2, 9) else 1
 
 
 def _check_end_of_jpeg(data: bytes) -> None:
