@@ -5,9 +5,12 @@
 from collections.abc import Iterable
 import math
 import numbers
+import re
 
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
+
+MAX_TEXT = 4096  # characters of names and paths, as many as bytes in a path of Linux
 
 
 def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
@@ -21,6 +24,15 @@ def require_type(name: str, value: object, kind: type | tuple[type, ...], remedy
     """Raise InputError if an argument is of another type; the remedy is what to give."""
     if not isinstance(value, kind):
         raise InputError(f'{name} is of type {type(value).__name__}: expected {remedy}')
+
+
+def require_plain(name: str, text: str) -> None:
+    """Raise SettingsError if a text, which goes into logs, is long or has control characters."""
+    if len(text) > MAX_TEXT or re.search('[\0-\x1f\x7f-\x9f]', text):
+        raise SettingsError(
+            f'{name} = {text[:80]!r} has {len(text)} characters: expected at most {MAX_TEXT}, '
+            'none of them a control character'
+        )
 
 
 def require_number(name: str, value: object) -> None:

@@ -32,12 +32,20 @@ def left_out(*counts: Mapping[str, int]) -> str:
     return f'left out: {", ".join(parts)}' if total else ''
 
 
+def printable(text: str) -> str:
+    """Return a text with control characters and lone surrogates escaped: names are of anyone."""
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 class StavprError(Exception):
     """
     Root of all errors raised on purpose.
 
-    Its text names the value that came, what was expected and what to do.
+    Its text, :func:`printable`, names the value that came, what was expected and what to do.
     """
+
+    def __init__(self, text: str = '') -> None:
+        super().__init__(printable(text))
 
 
 class InputError(StavprError, ValueError):

@@ -19,6 +19,7 @@ from stavpr_ros.errors import OutputError, OutputTakenError
 from stavpr_ros.regular_file import open_regular
 
 HEAD = 4096  # first bytes of a file, enough to recognize its kind
+MAX_NAME = 220  # bytes of a file's name; Linux takes 255, with the suffixes of journals
 
 
 @dataclass(frozen=True)
@@ -163,8 +164,12 @@ def require_room(path: str | Path) -> None:
     """
     Reject a path at which no file can be made.
 
-    :raises OutputError: it is a folder, or its folder is missing or write-protected.
+    :raises OutputError: it is a folder, its folder is missing or write-protected, or its name is
+        too long.
     """
+    if (size := len(os.fsencode(os.path.basename(path)))) > MAX_NAME:
+        name = os.path.basename(path)[:60]
+        raise OutputError(f'the name {name}... has {size} bytes: expected at most {MAX_NAME}')
     if os.path.isdir(path):
         raise OutputError(f'{path} is a folder: name a file in it')
     folder = os.path.dirname(os.path.realpath(path))

@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command map, and merging maps into sessions."""
 
+from contextlib import suppress
 from dataclasses import replace
+import os
+import sys
 
 import cv2
 from map_examples import example_map
@@ -10,6 +13,7 @@ from map_files import parts_of, version2
 import numpy as np
 import pytest
 from stavpr_ros.commands.map import main
+from stavpr_ros.commands.program import until_unread
 from stavpr_ros.errors import FeatureMismatchError, InputError
 from stavpr_ros.mapping import (
     GrowingMap,
@@ -68,6 +72,29 @@ def test_map_info_escapes_control_characters(folder, capsys):
     shown = capsys.readouterr().err
     assert r'part \x1b[2J is unknown' in shown
     assert escape not in shown
+
+
+def test_names_of_any_characters_harm_no_terminal(folder, drive, capsys):
+    name = '\x1b[2J\n[ERROR] \udcff.stavpr'
+    save_map(drive, name)
+    for arguments in (['info'], ['verify'], ['verify', 'missing' + name], ['--' + name]):
+        with suppress(SystemExit):
+            main([*arguments, name])
+        shown = ''.join(capsys.readouterr())
+        assert r'\x1b[2J\n[ERROR] \udcff.stavpr' in shown
+        assert '\x1b' not in shown
+        assert '\n[ERROR]' not in shown
+
+
+def test_command_whose_reader_has_ended_ends_quietly(monkeypatch, capsys):
+    for ends in (lambda: None, sys.exit):  # after --help
+        reader, writer = os.pipe()
+        os.close(reader)
+        with open(writer, 'w') as output:
+            monkeypatch.setattr(sys, 'stdout', output)
+            assert until_unread(lambda ends=ends: (print('a line'), ends())) == 141
+            output.write('more\n')
+            output.flush()
 
 
 @pytest.mark.parametrize('name', ['both.stavpr', 'night.stavpr'])

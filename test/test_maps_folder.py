@@ -38,7 +38,7 @@ def test_inside_of_names_in_the_folder_is_their_absolute_path(tmp_path, monkeypa
 
 @pytest.mark.parametrize(
     'name',
-    ['..', '.', '', '/etc/passwd', '../a', 'town/../../a', 'out', 'out/a', 'loop', 'a\0b', '~/a'],
+    ['..', '.', '', '/etc/passwd', '../a', 'town/../../a', 'out', 'out/a', 'loop', '~/a'],
 )
 def test_inside_of_names_that_lead_outside_fails(name, tmp_path):
     folder = tmp_path / 'maps'
@@ -47,3 +47,9 @@ def test_inside_of_names_that_lead_outside_fails(name, tmp_path):
     (folder / 'loop').symlink_to('/dev/zero')
     with pytest.raises(SettingsError, match='no file in the maps folder'):
         inside(folder, name)
+
+
+@pytest.mark.parametrize('name', ['a\0b', 'a\nb', '\x1b[2Ja', 'a' * 20_000])
+def test_inside_of_names_that_harm_a_log_fails(name, tmp_path):
+    with pytest.raises(SettingsError, match='at most 4096, none of them a control character'):
+        inside(tmp_path, name)

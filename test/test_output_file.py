@@ -170,6 +170,13 @@ def test_write_output_on_a_full_disk_leaves_what_was_there(tmp_path):
     assert (path.read_text(), names(tmp_path)) == ('{}', ['a.json'])
 
 
+def test_name_without_room_for_suffixes_is_refused_before_the_work(tmp_path):
+    for name in ('r' * 221, 'ü' * 120, 'r' * 20_000):
+        with pytest.raises(OutputError, match=r'the name .{60}\.\.\. has \d+ bytes: expected at'):
+            require_replaceable(tmp_path / name, JSON)
+    require_replaceable(tmp_path / ('r' * 220), JSON)
+
+
 def test_require_replaceable_names_what_is_wrong(tmp_path):
     os.mkfifo(tmp_path / 'fifo')
     (tmp_path / 'loop').symlink_to('loop')

@@ -3,10 +3,13 @@
 """Parameters of any name, type and value: each is set, or rejected with a reason."""
 
 import math
+import re
 
 from hypothesis import given, HealthCheck, settings, strategies
+import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+import rclpy
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
 
 NESTED = '[' * 2000
@@ -55,6 +58,17 @@ def test_nested_text_is_rejected_with_a_reason(make_node):
     )
     assert 'expected a JSON object' in response.results[0].reason
     assert len(response.results[0].reason) < 1000
+
+
+@pytest.mark.parametrize('value', ['a' * 20_000, 'a\nb', '\x1b[2J'])
+def test_text_that_harms_a_log_is_rejected_by_name(make_node, value):
+    node = make_node(map_path='')
+    for name in ('save_path', 'robot_id'):
+        (result,) = node.set_parameters([rclpy.Parameter(name, value=value)])
+        assert re.match(
+            f'{name} = .* expected at most 4096, none of them a control', result.reason
+        )
+        assert len(result.reason) < 300
 
 
 def test_any_parameter_is_set_or_rejected_with_a_reason(make_node):

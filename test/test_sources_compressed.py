@@ -3,6 +3,7 @@
 """Image files and compressed messages to RGB: formats, mosaics, depth, damage, garbage."""
 
 from io import BytesIO
+import struct
 import sys
 from types import SimpleNamespace
 from unittest import mock
@@ -185,6 +186,31 @@ def test_decode_compressed_of_png_with_long_chunk_allocates_nothing(monkeypatch,
     with pytest.raises(ImageError, match='is damaged or cut off') as caught:
         decode_compressed(bytes(data[:500]))
     assert caught.value.kind == 'damaged'
+    for size in (first_chunk + 9, first_chunk + 8, first_chunk + 4):  # the last, incomplete chunk
+        with pytest.raises(ImageError, match='damaged'):
+            decode_compressed(bytes(data[:size]))
+
+
+def test_decode_compressed_of_png_ignores_what_follows_its_end():
+    for extra in (b'\0', b'\n' * 8, b'\x7f\xff\xff\xffextra data'):
+        np.testing.assert_array_equal(
+            decode_compressed(encoded('.png', NOISE) + extra), NOISE[..., ::-1]
+        )
+
+
+@pytest.mark.parametrize('tags', [{278: 2**23}, {322: 16, 323: 2**23}])
+def test_decode_compressed_of_tiff_with_large_parts_allocates_nothing(monkeypatch, tags):
+    """OpenCV allocates a strip, or a tile, of up to a gigabyte before it reads the pixels."""
+    file = BytesIO()
+    Image.fromarray(NOISE).save(file, 'TIFF', tiffinfo={278: 3})
+    data = bytearray(file.getvalue())
+    strips = data.index(struct.pack('<H', 278), 8)  # the entry of this tag
+    for i, (tag, value) in enumerate(tags.items()):
+        struct.pack_into('<HHII', data, strips + 12 * i, tag, 4, 1, value)
+    monkeypatch.setattr(files.cv2, 'imdecode', lambda *_: pytest.fail('decoded'))
+    with pytest.raises(ImageError, match='x8388608 pixels: expected at most') as caught:
+        decode_compressed(bytes(data))
+    assert caught.value.kind == 'too large'
 
 
 def test_decode_compressed_of_cut_off_jpeg_fails():

@@ -210,9 +210,11 @@ def test_from_file_of_an_invalid_image_raises(tmp_path):
     cv2.imwrite(str(path), (MATRIX * 128).astype(np.uint8))
     with pytest.raises(InputError, match='3 gray pixels'):
         GroundTruth.from_file(path, 3, 5)
-    path.write_bytes(b'')
-    with pytest.raises(SourceError, match='no image that can be decoded'):
-        GroundTruth.from_file(path, 3, 5)
+    claim = path.read_bytes()[:33] + b'\x7f\xff\xff\xffIDAT'  # of 2 GB
+    for content in (b'', claim):
+        path.write_bytes(content)
+        with pytest.raises(SourceError, match='damaged'):
+            GroundTruth.from_file(path, 3, 5)
 
 
 @pytest.mark.parametrize('name', ['truth.csv', 'truth.npy', 'truth.npz', 'truth.png', 'truth.pkl'])

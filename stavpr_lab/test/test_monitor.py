@@ -138,6 +138,8 @@ def test_server_runs_commands_and_returns_their_errors(served):
         ('[]', {}, 400),
         ('[' * 9000, {}, 400),
         ('no JSON', {}, 400),
+        (r'{"name": "operation", "value": "\ud800"}', {}, 400),
+        (r'{"name": "\ud800"}', {}, 400),
         ('{}', {'Content_Length': '99999'}, 400),
         ('{}', {'Content_Length': 'x'}, 400),
     ],

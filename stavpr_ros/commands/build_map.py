@@ -13,7 +13,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
-from stavpr_ros.commands.program import add_fps, make_parser, run_program
+from stavpr_ros.commands.program import add_fps, make_parser, run_program, say
 from stavpr_ros.errors import ImageError, left_out, SettingsError, SourceError
 from stavpr_ros.output_file import MAP, require_replaceable
 
@@ -208,7 +208,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
             text = f'{error}; the same command with --skip-bad-images continues without it'
             raise ImageError(text, kind=error.kind)
         skipped[error.kind] += 1
-        print(f'skipped: {error}', file=sys.stderr)
+        say(f'skipped: {error}', sys.stderr)
 
     _check(arguments)
     keyframes = KeyframeSettings(*(getattr(arguments, f'keyframe_{rule}') for rule in RULES))
@@ -233,8 +233,8 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
             'one clock?'
         )
     if unread := left_out(skipped, getattr(source, 'left_out', {})):
-        print(unread, file=sys.stderr)
-    print(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
+        say(unread, sys.stderr)
+    say(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
     return place_map, journal
 
 
@@ -263,16 +263,16 @@ def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float |
     try:
         return suggest_threshold(place_map, model)
     except InputError as error:
-        print(f'no threshold is suggested for mode paper: {error}')
+        say(f'no threshold is suggested for mode paper: {error}')
         return None
 
 
 def _report(place_map: 'PlaceMap', output: str) -> None:
     megabytes = Path(output).stat().st_size / 1e6
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
-    print(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+    say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
     if place_map.threshold is not None:
-        print(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
+        say(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
 
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:

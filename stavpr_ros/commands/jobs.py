@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 
-from stavpr_ros.commands.program import DONE, FAILED
+from stavpr_ros.commands.program import DONE, FAILED, say
 from stavpr_ros.errors import SettingsError, UnavailableError
 
 RETRIES = 3  # of a job whose process is killed, or whose machine is lost
@@ -106,7 +106,7 @@ def run_jobs(jobs: Sequence[Job], processes: int | None, ray: str | None) -> int
                 waiting[submit(job.again())] = job, retries - 1
                 continue
             code, text = future.result() if error is None else (FAILED, f'{error}\n')
-            print(f'--- {job.name}: {"done" if code == DONE else f"failed, exit code {code}"}')
+            say(f'--- {job.name}: {"done" if code == DONE else f"failed, exit code {code}"}')
             print(text, end='', flush=True)
             worst = max(worst, code)
     return worst

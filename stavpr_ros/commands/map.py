@@ -10,8 +10,8 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros import plugins
-from stavpr_ros.commands.program import make_parser, run_program
-from stavpr_ros.errors import MapFileError, SettingsError, SourceError, UnavailableError
+from stavpr_ros.commands.program import make_parser, run_program, say
+from stavpr_ros.errors import MapFileError, printable, SettingsError, SourceError, UnavailableError
 from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import SECOND
 
@@ -156,7 +156,7 @@ def _info(arguments: argparse.Namespace) -> None:
     print(describe(place_map, Path(arguments.map)))
     if arguments.plot:
         _tool('plot')(place_map, Path(arguments.plot))
-        print(f'plot       {arguments.plot}')
+        say(f'plot       {arguments.plot}')
 
 
 def _tool(name: str) -> Callable[..., Any]:
@@ -174,7 +174,6 @@ def _tool(name: str) -> Callable[..., Any]:
 def describe(place_map: 'PlaceMap', path: Path) -> str:
     """Return the contents of an opened map, a line each."""
     import numpy as np
-    from stavpr_ros.mapping.map_container import printable
     from stavpr_ros.mapping.map_version2 import VERSION
     from stavpr_ros.mapping.stored_features import StoredFeatures
 
@@ -234,10 +233,10 @@ def _verify(arguments: argparse.Namespace) -> int:
     for path in arguments.maps:
         try:
             place_map = load_map(path)
-            print(f'{path}: sound, {len(place_map)} places, id {place_map.map_id}')
+            say(f'{path}: sound, {len(place_map)} places, id {place_map.map_id}')
         except MapFileError as error:
             bad += 1
-            print(f'map: {error}', file=sys.stderr)
+            say(f'map: {error}', sys.stderr)
     return 1 if bad else 0
 
 
@@ -262,16 +261,16 @@ def _compact(arguments: argparse.Namespace) -> None:
     storage, n = place_map.features.storage, len(place_map)
     if arguments.drop_duplicates:
         place_map = without_duplicates(place_map)
-        print(f'{n - len(place_map)} of {n} places dropped: they show what the one before shows')
+        say(f'{n - len(place_map)} of {n} places dropped: they show what the one before shows')
     if arguments.pca is not None:
-        print(f'strips of {place_map.dimension} dimensions become {arguments.pca}')
+        say(f'strips of {place_map.dimension} dimensions become {arguments.pca}')
         place_map = with_principal_components(place_map, arguments.pca)
     if arguments.drop_thumbnails:
         size = sum(map(len, place_map.thumbnails)) / 1e6
         place_map = replace(place_map, thumbnails=())
-        print(f'thumbnails of {size:.1f} MB dropped')
+        say(f'thumbnails of {size:.1f} MB dropped')
     if arguments.storage != storage:
-        print(f'features: {storage} becomes {arguments.storage}')
+        say(f'features: {storage} becomes {arguments.storage}')
     _write(place_map, arguments)
 
 
@@ -306,7 +305,7 @@ def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
         statistics = with_codes(statistics, place_map, storage)
     map_id = save_map(place_map, arguments.output, storage, arguments.force, statistics)
     size = Path(arguments.output).stat().st_size / 1e6
-    print(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
+    say(f'{arguments.output}: {len(place_map)} places, {size:.1f} MB, id {map_id}')
 
 
 def _colmap(arguments: argparse.Namespace) -> None:
@@ -314,7 +313,7 @@ def _colmap(arguments: argparse.Namespace) -> None:
 
     export, place_map = _tool('colmap'), load_map(arguments.map)
     options = arguments.images, arguments.topic, arguments.closures
-    print(export(place_map, arguments.folder, *options))
+    say(export(place_map, arguments.folder, *options))
 
 
 def _recover(arguments: argparse.Namespace) -> int:
@@ -325,8 +324,9 @@ def _recover(arguments: argparse.Namespace) -> int:
     if arguments.output is None and not journal.endswith(SUFFIX):
         raise SourceError(f'{journal} does not end with {SUFFIX}: name the map, --output')
     recovery = recover(journal, arguments.output)
-    print(f'{recovery.path}: {recovery.places} places, {recovery.recorded} of them from {journal}')
-    print(*recovery.problems, sep='\n', end='\n' if recovery.problems else '')
+    say(f'{recovery.path}: {recovery.places} places, {recovery.recorded} of them from {journal}')
+    for problem in recovery.problems:
+        say(problem)
     return int(bool(recovery.problems))
 
 
@@ -336,7 +336,7 @@ def _upload(arguments: argparse.Namespace) -> None:
     store = store_of(arguments.address)
     place_map = _verified(arguments.map)
     store.upload(place_map, arguments.address, arguments.force)
-    print(f'{arguments.address}: {len(place_map)} places')
+    say(f'{arguments.address}: {len(place_map)} places')
 
 
 def _check_output(arguments: argparse.Namespace) -> None:

@@ -6,18 +6,22 @@ import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import difflib
 import math
+import os
 from pathlib import Path
 import shutil
 import sys
 from types import MappingProxyType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO, TypeVar
 
-from stavpr_ros.errors import SettingsError, StavprError
+from stavpr_ros.errors import printable, SettingsError, StavprError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.signals import interrupted, obey_signals
 from stavpr_ros.threads import wait_passively
 
-DONE, FAILED, BAD_USAGE, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED, BAD_USAGE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
+
+
+T = TypeVar('T')
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -52,7 +56,7 @@ class _Parser(argparse.ArgumentParser):
             for action in self._actions:
                 if f'invalid choice: {word!r}' in message:
                     message += suggestion(word, map(str, action.choices or ()))
-        super().error(f'{message} (options: {self.prog} --help)')
+        super().error(printable(f'{message} (options: {self.prog} --help)'))
 
 
 def suggestion(word: str, names: Iterable[str]) -> str:
@@ -107,6 +111,23 @@ def add_fps(group: Any) -> None:
     group.add_argument('--fps', type=positive, metavar='HZ', help=text)
 
 
+def say(line: str, file: TextIO | None = None) -> None:
+    """Print a line, whatever characters its names have."""
+    print(printable(line), file=file)
+
+
+def until_unread(work: Callable[[], T]) -> T | int:
+    """Return what a function returns; 141 if no one reads its output any more, as of ``head``."""
+    try:
+        try:
+            return work()
+        finally:
+            print(end='', flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes at its end
+        return UNREAD
+
+
 def run_program(
     name: str,
     work: Callable[[], int | None],
@@ -119,19 +140,19 @@ def run_program(
     :param work: returns the exit code, None = 0.
     :param interruption: returns the text that is printed after an interrupt.
     :param codes: exit codes of types of errors, besides 2 for invalid settings.
-    :returns: the exit code: 0 done, 1 failed, 2 invalid settings, 130 interrupted.
+    :returns: the exit code: 0 done, 1 failed, 2 invalid settings, 130 interrupted, 141 unread.
     """
     obey_signals()
     wait_passively()
     try:
-        return work() or DONE
+        return until_unread(work) or DONE
     except StavprError as error:
-        print(f'{name}: {error}', file=sys.stderr)
+        say(f'{name}: {error}', sys.stderr)
         exit_codes: dict[type[StavprError], int] = {SettingsError: BAD_USAGE, **codes}
         return next((code for kind, code in exit_codes.items() if isinstance(error, kind)), FAILED)
     except BaseException as error:
         # an interrupt within a foreign library comes out as another exception
         if not (isinstance(error, KeyboardInterrupt) or interrupted()):
             raise
-        print(f'{name}: {interruption()}', file=sys.stderr)
+        say(f'{name}: {interruption()}', sys.stderr)
         return INTERRUPTED

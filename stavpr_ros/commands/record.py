@@ -12,7 +12,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import make_parser, run_program, say
 from stavpr_ros.errors import OutputError
 from stavpr_ros.output_file import atomic_output, AtomicFile, RECORDING
 from stavpr_ros.units import SECOND
@@ -81,7 +81,7 @@ def _run(args: list[str]) -> None:
         count = _write_messages(arguments, file, args)
         if not count and os.path.exists(arguments.output):
             file.abandon()  # an earlier recording is replaced by the first message
-    print(f'{count} {arguments.kind} written to {arguments.output}')
+    say(f'{count} {arguments.kind} written to {arguments.output}')
 
 
 def _parser() -> argparse.ArgumentParser:

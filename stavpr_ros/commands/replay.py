@@ -11,7 +11,7 @@ import sys
 import time
 
 import rclpy
-from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run_program
+from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run_program, say
 from stavpr_ros.errors import ImageError, left_out, SourceError, StavprError, UnavailableError
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import (
@@ -118,7 +118,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
             f'{options.bag} has no image from second {options.start_offset:g} on, for '
             f'{options.duration:g} s: choose another --start-offset or --duration'
         )
-    print(f'{report}, {skipped.total()} skipped')
+    say(f'{report}, {skipped.total()} skipped')
     if unread := left_out(skipped, getattr(source, 'left_out', {})):
         notify(unread)
     return DONE if replayer.published else FAILED

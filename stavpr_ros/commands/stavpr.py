@@ -9,7 +9,7 @@ import sys
 import stavpr_ros
 from stavpr_ros import plugins
 from stavpr_ros.commands import Command, COMMANDS
-from stavpr_ros.commands.program import suggestion
+from stavpr_ros.commands.program import suggestion, until_unread
 
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
@@ -68,7 +68,10 @@ def main(args: list[str] | None = None) -> int:
     :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
     """
     forget_requirements()
-    arguments = sys.argv[1:] if args is None else args
+    return until_unread(lambda: _main(sys.argv[1:] if args is None else args))
+
+
+def _main(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ('-h', '--help'):
         print(usage(), file=sys.stdout if arguments else sys.stderr)
         return 0 if arguments else 2

@@ -4,7 +4,7 @@
 
 import sys
 
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import make_parser, run_program, say
 
 EPILOG = """The folder is NUMBA_CACHE_DIR, or else the package's or, if it cannot be
 written, ~/.cache/stavpr.
@@ -42,4 +42,4 @@ def _run(_: object) -> None:
             route = build_map(frames, extractor, progress=False)
             Localizer(settings, route, extractor, SaveState())
             RouteCloser(settings, None, extractor, SaveState())
-    print(f'the kernels are in {CACHE}')
+    say(f'the kernels are in {CACHE}')

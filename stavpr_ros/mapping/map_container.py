@@ -198,13 +198,8 @@ def errors_of(path: Path) -> Iterator[None]:
     except Exception as error:
         raise MapFileError(
             f'map {path} is damaged or was not written by this program '
-            f'({type(error).__name__}: {printable(str(error))}): {BUILD_AGAIN}'
+            f'({type(error).__name__}: {error}): {BUILD_AGAIN}'
         ) from error
-
-
-def printable(text: str) -> str:
-    """Return a text from a file with control characters escaped, for a terminal or a log."""
-    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def read_json(text: bytes, what: str) -> Any:

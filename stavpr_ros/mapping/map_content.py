@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from stavpr_ros.errors import InputError
+from stavpr_ros.errors import InputError, printable
 from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
@@ -122,7 +122,7 @@ def map_content(file: MapFile) -> PlaceMap:
 
 @cache  # once for each file
 def _note_vectors(path: Path) -> None:
-    _log.warning('the vectors of whole images in %s are ignored', path)
+    _log.warning('the vectors of whole images in %s are ignored', printable(str(path)))
 
 
 def _threshold(data: Any) -> float:

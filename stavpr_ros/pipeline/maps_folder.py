@@ -5,6 +5,7 @@
 import os
 from pathlib import Path
 
+from stavpr_ros.checks import require_plain
 from stavpr_ros.errors import SettingsError
 
 
@@ -27,11 +28,13 @@ def inside(folder: Path, name: str) -> str:
     Return the absolute path of a file in a folder, without symbolic links.
 
     :param name: relative to the folder; an absolute path, or one with ``~``, must lead into it.
-    :raises SettingsError: it leads outside, also by ``..`` or a symbolic link.
+    :raises SettingsError: it leads outside, also by ``..`` or a symbolic link, or has control
+        characters.
     """
+    require_plain('a name in the maps folder', name)
     root = Path(os.path.realpath(folder))
     expanded = os.path.expanduser(name)
-    path = Path('\0') if '\0' in name else Path(os.path.realpath(root / expanded))
+    path = Path(os.path.realpath(root / expanded))
     if root not in path.parents:
         raise SettingsError(
             f'{name!r} is no file in the maps folder {folder}: from the ROS graph, name one in '

@@ -9,6 +9,7 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.parameter import Parameter
+from stavpr_ros.checks import require_plain
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS
@@ -42,9 +43,12 @@ def typed(parameter: Parameter) -> Parameter:
     """
     Return a parameter with the type of its row; rclpy rejects an integer in place of a double.
 
-    :raises SettingsError: another type; names the parameter.
+    :raises SettingsError: another type, or a text that is too long or has control characters;
+        names the parameter.
     """
     row, value = BY_NAME.get(parameter.name), parameter.value
+    if isinstance(value, str) and parameter.name != 'feature_settings':  # JSON of any layout
+        require_plain(parameter.name, value)
     if row is None or type(value) is type(row.default):
         return parameter
     if isinstance(row.default, float) and type(value) is int:

@@ -19,6 +19,9 @@ JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
 """Markers before a segment (length and bytes), and the end; never within compressed pixels."""
 END_OF_JPEG = b'\xff\xd9'
 PNG_SIGNATURE, PNG_CHUNK = 8, 12  # bytes before the first chunk; of a chunk without its data
+END_OF_PNG = b'IEND'
+TIFF_ROWS, TIFF_TILE = 278, (322, 323)  # tags: rows of a strip; width and height of a tile
+ALL_ROWS = 2**24  # and more: the strip is the image
 
 JPEG_FORMATS = ('JPEG', 'MPO')  # MPO: several images, the first is read
 
@@ -106,7 +109,7 @@ def decode_file(
         pixels.
     """
     flat = flat_bytes(data)
-    header, turn = _check_file(flat)
+    header, turn = checked_header(flat, MAX_PIXELS)
     flag = cv2.IMREAD_COLOR  # OpenCV rounds color TIFF of 16 bits, and takes the upper byte else
     if header.format in JPEG_FORMATS:
         flag = REDUCED_JPEG[min(8, reduction(header.height, header.width, least))]
@@ -166,8 +169,14 @@ def _damaged(size: int) -> ImageError:
     )
 
 
-def _check_file(flat: np.ndarray) -> tuple[Image.Image, int]:
-    """Check the header before the decoder allocates the image; return it, closed, and its turn."""
+def checked_header(flat: np.ndarray, max_pixels: int) -> tuple[Image.Image, int]:
+    """
+    Check what a file claims, which OpenCV allocates before it reads.
+
+    :param flat: the file's bytes, shape (size,), uint8.
+    :returns: the header, closed, and the orientation by EXIF, 1 to 8.
+    :raises ImageError: see :func:`decode_file`.
+    """
     formats: tuple[str, ...] = COMPRESSED_FORMATS
     kind = 'damaged'
     if HEIF.match(flat[:12].tobytes()):
@@ -183,8 +192,9 @@ def _check_file(flat: np.ndarray) -> tuple[Image.Image, int]:
         register_heif_opener()
     try:
         with Image.open(BytesIO(flat.data), formats=formats) as header:
-            width, height = header.size
-            turn = _turn_of(header, flat) if width * height <= MAX_PIXELS else 1
+            sizes = header.size, _part_of_tiff(header)
+            is_large = max(width * height for width, height in sizes) > max_pixels
+            turn = 1 if is_large else _turn_of(header, flat)
     except Image.DecompressionBombError as error:
         raise ImageError(
             f'{error}: expected at most {MAX_PIXELS}; scale it down', kind='too large'
@@ -196,8 +206,9 @@ def _check_file(flat: np.ndarray) -> tuple[Image.Image, int]:
             f'{", ".join(formats)} of 8 or 16 bits{reason}',
             kind=kind,
         ) from error
-    if width * height > MAX_PIXELS:
-        raise too_large(width, height)
+    for width, height in sizes:
+        if width * height > max_pixels:
+            raise too_large(width, height)
     if header.format in JPEG_FORMATS:
         _check_end_of_jpeg(flat.tobytes())
     if header.format == 'PNG':
@@ -215,6 +226,15 @@ def _turn_of(header: Image.Image, flat: np.ndarray) -> int:
     except Exception:  # damage raises errors of any type
         return 1
     return turn if turn in range(2, 9) else 1
+
+
+def _part_of_tiff(header: Image.Image) -> tuple[int, int]:
+    """Return width and height of the strips or tiles that a TIFF claims, (0, 0) = none."""
+    tags = getattr(header, 'tag_v2', {})
+    if TIFF_TILE[0] in tags:
+        return int(tags[TIFF_TILE[0]]), int(tags[TIFF_TILE[1]])
+    rows = int(tags.get(TIFF_ROWS, 0))
+    return header.width, rows if rows < ALL_ROWS else 0
 
 
 def _check_end_of_jpeg(data: bytes) -> None:
@@ -235,9 +255,9 @@ def _check_end_of_jpeg(data: bytes) -> None:
 
 def _check_chunks_of_png(data: memoryview) -> None:
     """Reject chunks longer than the file: OpenCV allocates a chunk before it reads it."""
-    at = PNG_SIGNATURE
-    while at + PNG_CHUNK <= len(data):
-        length = int.from_bytes(data[at : at + 4], 'big')
+    at, kind = PNG_SIGNATURE, b''
+    while kind != END_OF_PNG and at < len(data):
+        length, kind = int.from_bytes(data[at : at + 4], 'big'), bytes(data[at + 4 : at + 8])
         at += PNG_CHUNK + length
         if at > len(data):
             raise _damaged(len(data))

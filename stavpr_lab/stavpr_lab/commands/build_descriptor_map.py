@@ -7,7 +7,7 @@ from dataclasses import replace
 import sys
 
 from stavpr_ros.commands.feature_options import boolean
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import make_parser, run_program, say
 
 EPILOG = """
 examples:
@@ -60,7 +60,7 @@ def _build(arguments: argparse.Namespace) -> None:
     statistics = statistics_of_map(place_map)
     save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
-    print(f'{arguments.output}: {len(place_map)} places, {shape}')
+    say(f'{arguments.output}: {len(place_map)} places, {shape}')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -10,7 +10,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
-from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program
+from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program, say
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, require_replaceable
 from stavpr_ros.parameters import default
@@ -311,7 +311,7 @@ def _truth_text(kind: str, tolerance: int) -> str:
 
 
 def _print_report(report: 'Report') -> None:
-    print(report.title)
+    say(report.title)
     if report.has_truth:
         _print_metrics(report)
     decision = report.decision()
@@ -380,9 +380,9 @@ def _run(arguments: argparse.Namespace) -> None:
         export(arguments, report, recognizer_settings(arguments))
     if arguments.json:
         write_json(report, Path(arguments.json), arguments.force)
-        print(f'numbers: {arguments.json}')
+        say(f'numbers: {arguments.json}')
     if folder:
-        print(f'report: {write_folder(report, Path(folder), arguments.force)}')
+        say(f'report: {write_folder(report, Path(folder), arguments.force)}')
 
 
 def _run_each(

@@ -14,6 +14,7 @@ from stavpr_lab.commands.evaluate_sequences import (
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks
+from stavpr_ros.commands.program import say
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import open_map, save_map, select_places, verify_map
 from stavpr_ros.mapping.error_risks import ErrorRisks
@@ -67,13 +68,13 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         matches = recognize_all(recognizer, features[drive.images])
         driven.append((drive, image_matches(matches, settings.sequence.length)))
     risks = measured_risks(driven, block, settings.method)
-    print(
+    say(
         f'{sequences.title}: {risks.units} blocks of {block} images, as recorded, at other speeds '
         'and with detours'
     )
     risks = risks if before is None else joined(risks, before)
     _print(risks)
-    print(f'calibration in {path}, id {_store(path, version, reference.map_id, risks)}')
+    say(f'calibration in {path}, id {_store(path, version, reference.map_id, risks)}')
 
 
 def _print(risks: ErrorRisks) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from stavpr_ros.commands.program import say
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import ANY, atomic_output, NPY, require_replaceable, write_output
 
@@ -54,7 +55,7 @@ def export(
         _write_npy(folder / 'query.npy', image_strips(report.query.features), force)
         if report.reference is not report.query:
             _write_npy(folder / 'map.npy', image_strips(report.reference.features), force)
-    print(f'{arguments.export_format}: {folder}')
+    say(f'{arguments.export_format}: {folder}')
 
 
 def image_strips(features: 'LocalFeatures') -> np.ndarray:

@@ -13,6 +13,7 @@ from stavpr_lab.commands.evaluate_sequences import (
 )
 from stavpr_lab.evaluation.protocol import evaluate_protocol, text, TOLERANCES
 from stavpr_lab.evaluation.report import jsonable
+from stavpr_ros.commands.program import say
 from stavpr_ros.output_file import JSON, require_replaceable, write_output
 
 OF_REPORTS = (
@@ -43,7 +44,7 @@ def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace)
     truths = {t: drive.recorded.widened(t).on_places(drive.places) for t in TOLERANCES}
     backend = arguments.backend, arguments.precision
     rows = list(evaluate_protocol(reference, query, truths, settings, backend=backend))
-    print(f'{sequences.title}, with 95 % intervals')
+    say(f'{sequences.title}, with 95 % intervals')
     for t in TOLERANCES:
         print(f'\n+- {t:<9}{"images":>6}{"F1":>7}  {"recall@1":21}  at 100 % precision')
         for row in rows:
@@ -55,4 +56,4 @@ def run_protocol(parser: argparse.ArgumentParser, arguments: argparse.Namespace)
         document = {'settings': settings_json(arguments, sequences), 'protocol': table}
         numbers = json.dumps(jsonable(document), indent=2) + '\n'
         write_output(arguments.json, numbers, JSON, arguments.force)
-        print(f'numbers: {arguments.json}')
+        say(f'numbers: {arguments.json}')

@@ -9,7 +9,7 @@ from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import make_parser, run_program, say
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.output_file import atomic_output, ONNX, require_replaceable
 
@@ -96,7 +96,7 @@ def _export(arguments: argparse.Namespace) -> 'Exported':
     if maps is None:
         maps = '0' if module else ''
     network = load_hub(arguments.repository, arguments.commit, arguments.entry, hub_arguments)
-    print(f'license of {arguments.repository}: {_license(arguments)}')
+    say(f'license of {arguments.repository}: {_license(arguments)}')
     outputs = Chosen(network, arguments.vector, module, maps, arguments.prefix_tokens)
     return export_network(outputs, arguments.size)
 
@@ -125,14 +125,14 @@ def main(args: list[str] | None = None) -> int:
         with atomic_output(arguments.output, ONNX, arguments.force) as file:
             file.write(exported.content)
         for name, shape in exported.shapes.items():
-            print(f'output {name}: {shape}')
+            say(f'output {name}: {shape}')
         print(
             f'verified on random images: largest difference {exported.difference:.1e} of the '
             f'largest value; {"batches" if exported.batch else "one image at a time"}'
         )
         digest = hashlib.sha256(exported.content).hexdigest()
         size = len(exported.content) / 1e6
-        print(f'{arguments.output}: {size:.1f} MB, sha256 {digest}')
+        say(f'{arguments.output}: {size:.1f} MB, sha256 {digest}')
         layer = 'global' if 'global' in exported.shapes else 'map'
         print(
             f'use: --features onnx --onnx-model {arguments.output} --onnx-layer {layer} '

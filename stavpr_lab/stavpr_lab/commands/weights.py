@@ -8,7 +8,7 @@ import socket
 import sys
 
 from stavpr_lab.features import PublishedSettings
-from stavpr_ros.commands.program import make_parser, run_program
+from stavpr_ros.commands.program import make_parser, run_program, say
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import backbone_class, kinds, settings_class
 
@@ -44,7 +44,7 @@ def main(args: list[str] | None = None) -> int:
             path, sha256 = _convert()
         else:
             path, sha256 = _download(arguments.features, arguments.sha256.lower())
-        print(f'{path}: sha256 {sha256}')
+        say(f'{path}: sha256 {sha256}')
 
     return run_program('weights', work)
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from stavpr_ros.errors import InputError, SourceError
+from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.regular_file import require_regular
+from stavpr_ros.sources.files import checked_header, MAX_PIXELS
 from stavpr_ros.sources.folder import SUFFIXES
 from stavpr_ros.sources.table import is_stamps, Table
 
@@ -158,9 +159,10 @@ def _wrong_shape(shape: tuple[int, ...], path: Path, N: int, n: int) -> str:
 def _from_image(path: Path, N: int, n: int) -> Pairs:
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
+        checked_header(content, max(MAX_PIXELS, N * n))
+        image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
+    except (OSError, ImageError) as error:
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error
-    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
     if image is None:
         raise SourceError(f'ground truth {path} is no image that can be decoded')
     if image.shape != (N, n):

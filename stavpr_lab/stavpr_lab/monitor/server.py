@@ -116,6 +116,7 @@ class _Handler(BaseHTTPRequestHandler):
                 raise ValueError(f'{size} bytes')
             request = json.loads(self.rfile.read(size))
             name, value = str(request['name']), str(request.get('value', ''))
+            (name + value).encode()  # JSON has lone surrogates, ROS has UTF-8
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             self.close_connection = True
             self._send(HTTPStatus.BAD_REQUEST, 'text/plain', f'no command: {error}'.encode())
