@@ -19,6 +19,7 @@ from stavpr_ros.errors import OutputError, OutputTakenError
 from stavpr_ros.regular_file import open_regular
 
 HEAD = 4096  # first bytes of a file, enough to recognize its kind
+WRITABLE = 0o222  # bits of a mode
 MAX_NAME = 220  # bytes of a file's name; Linux takes 255, with the suffixes of journals
 
 
@@ -183,7 +184,8 @@ def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) 
     """
     Reject a file that must not, or cannot, be written; for a check before long work.
 
-    :raises OutputTakenError: it exists, and is no file of this kind or ``force`` is not given.
+    :raises OutputTakenError: it exists, and is no file of this kind, write-protected, or ``force``
+        is not given.
     :raises OutputError: its folder is missing or write-protected.
     """
     target = os.path.realpath(path)
@@ -191,8 +193,11 @@ def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) 
     if not os.path.lexists(target):
         return
     with explained(path):
-        if not stat.S_ISREG(os.stat(target).st_mode):
+        mode = os.stat(target).st_mode
+        if not stat.S_ISREG(mode):
             raise OutputTakenError(f'{path} exists and is no regular file: it is never replaced')
+        if force and not (mode & WRITABLE and os.access(target, os.W_OK)):  # root may write all
+            raise OutputTakenError(f'{path} is write-protected: chmod u+w, or name another file')
         with open_regular(target) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -37,6 +37,7 @@ from stavpr_ros.mapping import (
     verify_map,
 )
 from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.map_file import save_error_risks
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 
@@ -82,6 +83,31 @@ def test_map_id_is_that_of_the_content(example, saved, tmp_path):
     assert open_map(saved).map_id == load_map(tmp_path / 'again').map_id == map_id
     other = dataclasses.replace(example, ids=('other',) * len(example))
     assert save_map(other, tmp_path / 'other') != map_id
+
+
+def test_error_risks_are_replaced_in_a_file_that_stays_the_same_map(example, saved, tmp_path):
+    """The id names the places; risks of today have no recordings."""
+    path, before = tmp_path / 'route', Path(saved).read_bytes()
+    path.write_bytes(before)
+    map_id = open_map(path).map_id
+    for risks in (
+        ErrorRisks('m', 2, (0.5,), (1.0,), ('a', 'b')),
+        ErrorRisks('m', 1, (0.6,), (0.0,)),
+    ):
+        assert save_error_risks(risks, path, True) == map_id
+        found = load_map(path)
+        assert (found.map_id, found.error_risks) == (map_id, risks)
+        assert_same(found, dataclasses.replace(example, error_risks=risks))
+    assert save_map(found, tmp_path / 'again') == map_id
+
+    def without_recordings(manifest):
+        del manifest['sections']['error_risks']['data']['recordings']
+
+    path.write_bytes(changed(path.read_bytes(), without_recordings))
+    assert (load_map(path).map_id, load_map(path).error_risks) == (map_id, risks)
+    path.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
+    with pytest.raises(MapFileError, match='do not match their hash'):
+        save_error_risks(risks, path, True)
 
 
 def test_float16_storage_halves_the_features_and_rounds_them(example, saved, tmp_path):

@@ -16,6 +16,7 @@ from stavpr_ros.errors import OutputError, OutputTakenError
 from stavpr_ros.output_file import (
     atomic_output,
     csv_kind,
+    FileVersion,
     HTML,
     JSON,
     MAP,
@@ -87,6 +88,16 @@ def test_write_output_keeps_mode_of_the_replaced_file(mode, tmp_path):
         assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode  # before there is content
         file.write(b'[]')
     assert (stat.S_IMODE(path.stat().st_mode), path.read_text()) == (mode, '[]')
+
+
+def test_write_output_never_replaces_a_write_protected_file(tmp_path):
+    path = tmp_path / 'a.json'
+    path.write_text('{}')
+    path.chmod(0o444)
+    for force in (True, FileVersion.of(path)):
+        with pytest.raises(OutputTakenError, match=r'a.json is write-protected: chmod u\+w'):
+            write_output(path, '[]', JSON, force)
+    assert path.read_text() == '{}'
 
 
 @pytest.mark.parametrize('exists', [False, True])

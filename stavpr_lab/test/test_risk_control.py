@@ -3,8 +3,10 @@
 """Risks of blocks by hand, the guarantee on simulated blocks, and ``evaluate --calibrate``."""
 
 from dataclasses import replace
+import stat
 from unittest.mock import patch
 
+import cv2
 from evaluation_commands import read_json, runner, write_images
 from fixtures import route_images
 import numpy as np
@@ -131,7 +133,7 @@ def command(traverses, tmp_path, monkeypatch, capsys):
     return path, lambda *options: run(*pair, '--sequence-length', 5, *options)
 
 
-def test_calibration_in_a_map_is_that_of_max_error(command, tmp_path):
+def test_calibration_in_a_map_is_that_of_max_error(command, traverses, tmp_path):
     path, run = command
     before = open_map(path)
     code, output, errors = run('--calibrate')
@@ -143,6 +145,7 @@ def test_calibration_in_a_map_is_that_of_max_error(command, tmp_path):
     assert tuple(after.thumbnails) == tuple(before.thumbnails)
     assert np.array_equal(after.features.strips, before.features.strips)
     assert (risks.units, f'id {after.map_id}' in output) == (6, True)
+    assert after.map_id == before.map_id  # it names the places
     for options, probability, is_noted in (
         (['--max-error', 0.2], least_probability(0.2, risks), False),
         (['--max-error', 0.1], least_probability(0.1, risks), True),
@@ -153,12 +156,21 @@ def test_calibration_in_a_map_is_that_of_max_error(command, tmp_path):
         found = read_json((tmp_path / 'out.json').read_text())['default_threshold']
         assert found['threshold'] == pytest.approx(1 - probability)
     assert least_probability(0.2, risks) != pytest.approx(0.15)
-    code, output, errors = run('--calibrate', 'add')
-    assert (code, '12 blocks in all keep 0.0769' in output) == (0, True), errors
-    doubled = open_map(path).error_risks
-    assert doubled.risks == pytest.approx(2 * np.array(risks.risks))
+    content = path.read_bytes()
+    code, output, errors = run('--calibrate', 'add')  # the same recording counts once
+    assert (code, 'is in the calibration already' in output) == (0, True), errors
+    assert path.read_bytes() == content
     assert run('--calibrate')[0] == 0
-    assert open_map(path).error_risks == risks
+    assert path.read_bytes() == content
+    other = [cv2.imread(str(file))[..., ::-1] for file in sorted(traverses.glob('query/*'))]
+    write_images(tmp_path / 'other', [image // 2 for image in other])
+    code, output, errors = run('--query', tmp_path / 'other', '--calibrate', 'add')
+    assert (code, '12 blocks in all keep 0.0769' in output) == (0, True), errors
+    both = open_map(path)
+    assert (both.map_id, both.error_risks.units) == (before.map_id, 12)
+    assert (both.error_risks.recordings[0],) == risks.recordings
+    code, output, errors = run('--calibrate', 'add')
+    assert (code, 'is in the calibration already' in output) == (0, True), errors
 
 
 def test_calibration_that_fails_leaves_the_map_as_it_is(command, monkeypatch, traverses):
@@ -174,6 +186,11 @@ def test_calibration_that_fails_leaves_the_map_as_it_is(command, monkeypatch, tr
     assert (code, 'what was there is untouched' in errors) == (1, True), errors
     assert path.read_bytes() == content
     assert list(path.parent.iterdir()) == [path]
+    path.chmod(0o444)
+    code, _, errors = run('--calibrate')
+    assert (code, 'is write-protected: chmod u+w' in errors) == (1, True), errors
+    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (content, 0o444)
+    path.chmod(0o644)
     other = replace(load_map(path), threshold=0.5)
 
     def replaced(*arguments):

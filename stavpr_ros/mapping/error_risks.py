@@ -17,6 +17,7 @@ class ErrorRisks:
     :param units: blocks of images n that were driven, at least 1.
     :param probabilities: above which images are matched, ascending, between 0 and 1, k of them.
     :param risks: for each of these, the sum of the n blocks' rates; never ascending, k.
+    :param recordings: hashes of the queries that were driven.
     :raises InputError: other values.
     """
 
@@ -24,6 +25,7 @@ class ErrorRisks:
     units: int
     probabilities: tuple[float, ...]
     risks: tuple[float, ...]
+    recordings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         p, risks = np.array(self.probabilities, float), np.array(self.risks, float)

@@ -97,10 +97,10 @@ def map_content(file: MapFile) -> PlaceMap:
         features.statistics = statistics_of(file, arrays)
         features.has_stale_statistics = features.statistics is None
 
-    def section(name: str, check: Check, make: Callable[..., T]) -> T | None:
+    def section(name: str, check: Check, make: Callable[..., T], **missing: Any) -> T | None:
         if name not in readable:
             return None
-        check(data := sections[name]['data'], f'section {name}')
+        check(data := missing | sections[name]['data'], f'section {name}')
         return make(**{k: tuple(v) if type(v) is list else v for k, v in data.items()})
 
     return PlaceMap(
@@ -116,7 +116,7 @@ def map_content(file: MapFile) -> PlaceMap:
         same_as=arrays.get('same_places/same_as'),
         threshold=_threshold(sections['threshold']['data']) if 'threshold' in readable else None,
         map_id=file.map_id,
-        error_risks=section('error_risks', ERROR_RISKS, ErrorRisks),
+        error_risks=section('error_risks', ERROR_RISKS, ErrorRisks, recordings=[]),
     )
 
 

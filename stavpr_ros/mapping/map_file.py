@@ -14,11 +14,18 @@ from typing import Any
 import numpy as np
 from stavpr_ros.checks import require_choice, require_type
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
 from stavpr_ros.mapping.map_schema import identity_fields
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
-from stavpr_ros.mapping.map_version2 import MAX_HEADER, read_header, write_parts
+from stavpr_ros.mapping.map_version2 import (
+    copy_with,
+    ERROR_RISKS,
+    MAX_HEADER,
+    read_header,
+    write_parts,
+)
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.output_file import atomic_output, Force, MAP
@@ -64,7 +71,7 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
     if place_map.threshold is not None:
         data['threshold'] = place_map.threshold
     if place_map.error_risks is not None:
-        data['error_risks'] = asdict(place_map.error_risks)
+        data[ERROR_RISKS] = asdict(place_map.error_risks)
     if statistics is not None:  # the writer knows the hash of the features
         data[STATISTICS] = {'method': statistics.method, 'features': '0' * 64}
     settings, projection = place_map.settings, place_map.projection
@@ -74,10 +81,29 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
         'cells': place_map.features.cells,
         'projection': projection.name if projection else None,
         'sessions': [asdict(session) for session in place_map.sessions],
-        'sections': {
-            name: {'version': 1, 'required': False, 'data': each} for name, each in data.items()
-        },
+        'sections': {name: _section(each) for name, each in data.items()},
     }
+
+
+def _section(data: Any) -> dict[str, Any]:
+    return {'version': 1, 'required': False, 'data': data}
+
+
+def save_error_risks(risks: ErrorRisks, path: str | Path, force: Force) -> str:
+    """
+    Write a map file again with other error risks; all else, also its id, stays as it is.
+
+    :param force: see :func:`save_map`.
+    :returns: the id.
+    :raises MapFileError: see :func:`load_map`.
+    :raises OutputError: it cannot be written, or is another version now.
+    """
+    with errors_of(path := Path(path)):
+        map_of(file := MapFile(open_regular(path), path))
+        file.verify()
+    sections = file.manifest['sections'] | {ERROR_RISKS: _section(asdict(risks))}
+    with atomic_output(path, MAP, force) as output:
+        return copy_with(sections, file, output)
 
 
 def _part(name: str, array: np.ndarray) -> Part:

@@ -163,6 +163,7 @@ ERROR_RISKS = record(
         'units': integer(1),
         'probabilities': list_of(number, 1, 256),
         'risks': list_of(number, 1, 256),
+        'recordings': list_of(text(64), 0, 1024),
     }
 )
 _SETTING_TYPES: dict[Any, Check] = {

@@ -15,8 +15,9 @@ from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, te
 FORMAT, VERSION = 'stavpr-map', 2
 MAX_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 # name: highest known version
+ERROR_RISKS = 'error_risks'
 KNOWN_SECTIONS = dict.fromkeys(
-    ('error_risks', 'intrinsics', 'same_places', 'statistics', 'threshold'), 1
+    (ERROR_RISKS, 'intrinsics', 'same_places', 'statistics', 'threshold'), 1
 )
 _METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MAX_HEADER)))
 _TENSOR = record(
@@ -58,9 +59,9 @@ def read_header(file: MapFile) -> None:
     digest = hashlib.sha256(manifest).hexdigest()
     if digest != metadata['sha256']:
         raise ValueError('bytes 8 on, the manifest in the header, do not match their hash')
-    file.map_id = digest[:16]
     file.manifest = read_json(manifest, 'the manifest')
     MANIFEST(file.manifest, 'manifest')
+    file.map_id = _id_of(file.manifest, digest)
     file.parts = _parts(header, file.manifest['parts'], 8 + length, file.size)
     for name, section in file.manifest['sections'].items():
         if section['required'] and section['version'] > KNOWN_SECTIONS.get(name, 0):
@@ -68,6 +69,18 @@ def read_header(file: MapFile) -> None:
                 f'it requires section {name}, version {section["version"]}, which this program '
                 'does not know: update it'
             )
+
+
+def _id_of(manifest: dict[str, Any], digest: str) -> str:
+    """
+    Return the id of a map, whatever drives on it have shown.
+
+    :param digest: SHA-256 of the manifest.
+    """
+    if ERROR_RISKS in manifest['sections']:
+        sections = {n: each for n, each in manifest['sections'].items() if n != ERROR_RISKS}
+        digest = hashlib.sha256(_json({**manifest, 'sections': sections}).encode()).hexdigest()
+    return digest[:16]
 
 
 def features_key(hashes: Sequence[str]) -> str:
@@ -131,6 +144,18 @@ def write_parts(file: IO[bytes], manifest: dict[str, Any], parts: dict[str, Part
     return map_id
 
 
+def copy_with(sections: dict[str, Any], source: MapFile, file: IO[bytes]) -> str:
+    """Write an opened map to a new file with other sections; returns its id."""
+    hashes = {name: list(part.hashes) for name, part in source.parts.items()}
+    header, map_id = _header({**source.manifest, 'sections': sections}, source.parts, hashes)
+    file.write(header)
+    for at in range(min(part.start for part in source.parts.values()), source.size, PIECE):
+        piece = np.empty(min(PIECE, source.size - at), np.uint8)
+        source.fill(piece, at)
+        file.write(piece.data)
+    return map_id
+
+
 def _write(file: IO[bytes], arrays: Iterable[np.ndarray]) -> list[str]:
     """Write arrays one after the other; return the hash of every ``PIECE`` bytes."""
     hashes, digest, room = [], hashlib.sha256(), PIECE
@@ -161,7 +186,8 @@ def _header(
         entry = {'dtype': part.dtype, 'shape': part.shape}
         header[name] = entry | {'data_offsets': [start, end]}
         entries[name] = entry | {'sha256': hashes[name]}
-    content = _json({**manifest, 'parts': entries})
+    manifest = {**manifest, 'parts': entries}
+    content = _json(manifest)
     digest = hashlib.sha256(content.encode()).hexdigest()
     header['__metadata__'] = {
         'format': FORMAT,
@@ -171,7 +197,7 @@ def _header(
     }
     encoded = _json(header).encode()
     encoded += b' ' * (-len(encoded) % 8)
-    return len(encoded).to_bytes(8, 'little') + encoded, digest[:16]
+    return len(encoded).to_bytes(8, 'little') + encoded, _id_of(manifest, digest)
 
 
 def _json(value: Any) -> str:

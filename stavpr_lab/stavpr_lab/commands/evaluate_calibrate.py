@@ -4,8 +4,10 @@
 
 import argparse
 from dataclasses import replace
+import hashlib
 import math
 
+import numpy as np
 from stavpr_lab.commands.evaluate_sequences import (
     is_saved_map,
     load_sequences,
@@ -16,11 +18,10 @@ from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks
 from stavpr_ros.commands.program import say
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import open_map, save_map, select_places, verify_map
+from stavpr_ros.mapping import open_map, select_places
 from stavpr_ros.mapping.error_risks import ErrorRisks
-from stavpr_ros.mapping.stored_features import StoredFeatures
+from stavpr_ros.mapping.map_file import save_error_risks
 from stavpr_ros.output_file import FileVersion, MAP, require_replaceable
-from stavpr_ros.prepare.prepared_map import statistics_of_map, with_codes
 from stavpr_ros.recognition import PlaceRecognizer
 from stavpr_ros.recognition.error_rate import ERRORS, least_probability
 from tqdm import tqdm
@@ -60,6 +61,10 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
             f'--calibrate add: {path} has no calibration of these settings ({settings.method}): '
             'leave add out'
         )
+    recording = hashlib.sha256(np.ascontiguousarray(features.strips).data).hexdigest()[:16]
+    if before is not None and recording in before.recordings:
+        say(f'{sequences.title}: this recording is in the calibration already, which stays')
+        return
     block, driven = WINDOWS * settings.sequence.length, []
     drives = list(made_drives(sequences.drive.truth, block))
     for drive in tqdm(drives, desc='calibrating', unit='drive', disable=None):
@@ -68,6 +73,7 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         matches = recognize_all(recognizer, features[drive.images])
         driven.append((drive, image_matches(matches, settings.sequence.length)))
     risks = measured_risks(driven, block, settings.method)
+    risks = replace(risks, recordings=(recording,))
     say(
         f'{sequences.title}: {risks.units} blocks of {block} images, as recorded, at other speeds '
         'and with detours'
@@ -93,12 +99,7 @@ def _print(risks: ErrorRisks) -> None:
 
 
 def _store(path: str, version: FileVersion | None, map_id: str, risks: ErrorRisks) -> str:
-    """Write a map again, with risks; return its id."""
-    place_map = open_map(path)
-    verify_map(place_map)
-    if version is None or place_map.map_id != map_id:
+    """Write the file of a map again, with risks; return its id."""
+    if version is None or open_map(path).map_id != map_id:
         raise SettingsError(f'{path} was replaced meanwhile: start again')
-    learned, features = statistics_of_map(place_map), place_map.features
-    if learned is not None and isinstance(features, StoredFeatures) and features.has_codes:
-        learned = with_codes(learned, place_map, features.storage)
-    return save_map(replace(place_map, error_risks=risks), path, '', version, learned)
+    return save_error_risks(risks, path, version)

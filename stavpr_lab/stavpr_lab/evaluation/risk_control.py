@@ -75,4 +75,5 @@ def joined(one: ErrorRisks, other: ErrorRisks) -> ErrorRisks:
     # below the least probability of the other one, each of its blocks may be wrong
     risks = np.array(one.risks) + np.array([other.units, *other.risks])[at]
     both = one.units + other.units
-    return ErrorRisks(one.method, both, one.probabilities, tuple(risks.round(6).tolist()))
+    sums = tuple(risks.round(6).tolist())
+    return ErrorRisks(one.method, both, one.probabilities, sums, other.recordings + one.recordings)
