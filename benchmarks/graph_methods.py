@@ -12,7 +12,6 @@ counts. Writes benchmarks/results/graph_methods.json, and prints the table.
 import argparse
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 import json
@@ -33,23 +32,24 @@ from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import drive_laps
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_slam.pose_graph import (
-    acceptance,
+    breaks,
     Closure,
-    consistency,
+    decision,
     false_places,
-    GraphSettings,
+    network,
     OdometryNoise,
     optimize,
+    PoseGraph,
     runs,
 )
-from stavpr_slam.pose_graph.clusters import ConsistencySettings
 from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
 from tqdm import tqdm
 
 SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
 NEARBY = np.diag([3.0] * 3 + [np.radians(20)] * 3) ** 2  # of KITTI's closures
 RIGHT = {'kitti': 10.0, 'world': 6.0}  # meters between the images of a right closure
-KITTI = ('00', '05', '06', '09')
+KITTI = ('00', '05', '06', '08', '09')
+GROUPS = (1, 10, 50, 900)  # closures between two updates
 DRIVES = {  # of a world: factor on the errors of the odometry, and what is special
     'large drift': (1.0, {}), 'small drift': (0.06, {}),
     'sessions': (1.0, {'sessions': 2}), 'carried': (1.0, {'carried': True}),
@@ -136,19 +136,49 @@ def worlds(seed: int, draw: int, folder: Path) -> Iterator[Drive]:
     SharedViews.views.clear()
 
 
-@contextmanager
-def without(target: Any, name: str, replacement: Any) -> Iterator[None]:
-    """Replace a part of the graph."""
-    with patch.object(target, name, replacement):
-        yield
-
-
-def ours(drive: Drive, settings: GraphSettings | None = None, *replaced: Any) -> np.ndarray:
+def ours(drive: Drive, *replaced: Any) -> np.ndarray:
     """Return the poses by this graph, perhaps with a part replaced, (N, 7)."""
     if replaced:
-        with without(*replaced):
-            return ours(drive, settings)
-    return optimize(drive.stamps, drive.odometry, drive.closures, settings)[0]
+        with patch.object(*replaced):
+            return ours(drive)
+    return optimize(drive.stamps, drive.odometry, drive.closures)[0]
+
+
+def driven(drive: Drive, group: int) -> dict[str, Any]:
+    """
+    Return the errors of a drive as a robot drives it: an update after each group of closures.
+
+    ``above`` is by how much the path so far is at most worse than the odometry so far, m; ``ms``
+    the processor time of an update, median and 90 %.
+    """
+    graph, at, above, times = PoseGraph(), 0, 0.0, []
+    closures = sorted(drive.closures, key=lambda each: each.query_stamp)
+    for number, first in enumerate(range(0, len(closures), group)):
+        for each in closures[first : first + group]:
+            while at < len(drive.stamps) and drive.stamps[at] <= each.query_stamp:
+                graph.add_odometry(int(drive.stamps[at]), drive.odometry[at])
+                at += 1
+            graph.add_closure(each)
+        began = time.process_time()
+        graph.update()
+        times.append((time.process_time() - began) * 1e3)
+        if number % 10 == 9 or group >= 50:
+            above = max(above, _error(drive, graph, at) - _error(drive, None, at))
+    for stamp, pose in zip(drive.stamps[at:].tolist(), drive.odometry[at:], strict=True):
+        graph.add_odometry(stamp, pose)
+    graph.update(final=True)
+    count = len(drive.stamps)
+    return {'kind': drive.kind, 'drive': drive.name, 'group': group,
+            'odometry': _error(drive, None, count), 'error': _error(drive, graph, count),
+            'above': above, 'ms': np.percentile(times, [50, 90]).tolist()}  # fmt: skip
+
+
+def _error(drive: Drive, graph: PoseGraph | None, count: int) -> float:
+    poses = drive.odometry[:count]
+    if graph is not None:
+        poses = np.array([graph.at(t) for t in drive.stamps[:count].tolist()])
+    truth = planar_poses(drive.truth[:count])
+    return float(trajectory_errors(drive.stamps[:count], poses, truth)[0])
 
 
 def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
@@ -186,40 +216,22 @@ def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
 ESTIMATORS = gtsam.noiseModel.mEstimator
 
 
-def settings(**options: Any) -> GraphSettings:
-    """Return settings of the graph with other ones of the consistency."""
-    return GraphSettings(consistency=ConsistencySettings(**options))
-
-
 Method = Callable[[Drive], np.ndarray]
 METHODS: dict[str, Method] = {
     'this graph': ours,
     'GNC (GTSAM, odometry as known inliers)': lambda drive: plain(drive, gnc=True),
     'Cauchy kernel': lambda drive: plain(drive, ESTIMATORS.Cauchy.Create(1.0)),
     'dynamic covariance scaling': lambda drive: plain(drive, ESTIMATORS.DCS.Create(1.0)),
-    'pairwise consistency alone (PCM)': lambda drive: ours(
-        drive, replace(settings(support=1), adapt=False), acceptance, 'refuted', lambda *_: []
+    'without evidence: each correction is published': lambda drive: ours(
+        drive, decision, 'CERTAIN', -np.inf
     ),
-    'without clusters': lambda drive: ours(drive, settings(support=1)),
-    'without pairwise consistency': lambda drive: ours(
-        drive, None, consistency.ConsistentSet, 'conflicts',
-        lambda _, clusters, session: np.zeros((len(clusters), len(clusters)), bool),
-    ),
-    'without comparing all together': lambda drive: ours(
-        drive, None, acceptance, 'refuted', lambda *_: []
-    ),
-    'without confirming what is left': lambda drive: ours(
-        drive, None, acceptance.Acceptance, 'confirm', lambda *_: False
-    ),
-    'without estimating the odometry': lambda drive: ours(drive, GraphSettings(adapt=False)),
-    'without a bias of the heading': lambda drive: ours(
-        drive, GraphSettings(noise=OdometryNoise(bias=0.0))
-    ),
-    'without breaks': lambda drive: ours(
-        drive, None, acceptance, 'candidates', lambda *_: []
-    ),
-    'sessions joined by one closure': lambda drive: ours(drive, settings(join_support=1)),
-    'every keyframe a variable': lambda drive: ours(drive, None, runs, 'LONGEST', 1),
+    'each closure is an event': lambda drive: ours(drive, decision, 'GAP', -1.0),
+    'a tight odometry only': lambda drive: ours(drive, decision, 'SCALES', decision.SCALES[:1]),
+    'an odometry of the default errors': lambda drive: ours(drive, decision, 'TIGHT', 1.0),
+    'without a second robust solution': lambda drive: ours(drive, decision, 'AGAIN', 1e9),
+    'without breaks': lambda drive: ours(drive, breaks, 'SUPPORT', 10**6),
+    'slower steps of the robust solution': lambda drive: ours(drive, network, 'GROWTH', 1.4),
+    'every keyframe a variable': lambda drive: ours(drive, runs, 'LONGEST', 1),
 }  # fmt: skip
 
 
@@ -272,7 +284,20 @@ def main() -> None:
     parser.add_argument('--jobs', type=int, default=1, help='processes (%(default)s)')
     parser.add_argument('--folder', type=Path, help='keeps images and pairs')
     parser.add_argument('--gnc', action='store_true', help='GNC on worlds as well: 20 s a drive')
+    parser.add_argument('--drives', action='store_true', help='KITTI in groups alone')
     options = parser.parse_args()
+    if options.drives:
+        rows = [
+            driven(kitti(name, alpha), group)
+            for name in KITTI
+            for alpha in ('0.00', '0.30')
+            for group in GROUPS
+        ]
+        for row in rows:
+            print({k: np.round(v, 2) if k not in {'kind', 'drive'} else v for k, v in row.items()})
+        text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
+        (RESULTS / 'graph_drives.json').write_text(text + '\n')
+        return
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder or Path(scratch)
         drives = [kitti(name, alpha) for name in KITTI for alpha in ('0.00', '0.30')]

@@ -22,7 +22,10 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
-        (f'lib/{NAME}', ['scripts/bridge', 'scripts/pose_graph']),
+        (
+            f'lib/{NAME}',
+            [f'scripts/{each}' for each in ('bridge', 'optimize_graph', 'pose_graph')],
+        ),
     ],
     python_requires='>=3.11',
     install_requires=[

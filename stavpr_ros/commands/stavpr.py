@@ -22,6 +22,7 @@ PACKAGES = {
     'demo': 'stavpr_lab',
     'monitor': 'stavpr_lab',
     'pose_graph': 'stavpr_slam',
+    'optimize_graph': 'stavpr_slam',
     'bridge': 'stavpr_slam',
 }
 """Packages of the commands that are not in this one, for the message where one is missing."""

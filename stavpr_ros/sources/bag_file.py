@@ -19,7 +19,6 @@ from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import METADATA, reading, storage_files
-from stavpr_ros.sources.mcap import with_end
 from stavpr_ros.units import SECOND
 
 LOG_SUFFIXES = ('-wal', '-journal')
@@ -71,13 +70,11 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     with TemporaryDirectory(prefix='stavpr_bag_') as scratch:
         with reading(path):
             reader: Ros1Reader | Ros2Reader
-            if path.suffix.lower() == '.bag' and path.is_file():
+            if path.suffix == '.bag' and path.is_file():
                 reader = Ros1Reader(path)
                 deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
-                staged = _stage(path, Path(scratch))
-                staged = with_end(staged, path) if staged.suffix == '.mcap' else staged
-                reader = Ros2Reader(staged)
+                reader = Ros2Reader(_stage(path, Path(scratch)))
                 deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
             reader.open()
         try:
@@ -95,7 +92,7 @@ def _stage(path: Path, scratch: Path) -> Path:
     """
     if path.is_file() or not (path / METADATA).exists():
         file = path if path.is_file() else _only_storage_file(path)
-        return _stage_file(file, scratch / f'bag{file.suffix.lower()}')
+        return _stage_file(file, scratch / f'bag{file.suffix}')
     folder = scratch / 'bag'
     folder.mkdir()
     for file in path.iterdir():
@@ -123,7 +120,7 @@ def _stage_file(file: Path, target: Path) -> Path:
         for end in LOG_SUFFIXES
         if (log := Path(f'{file}{end}')).exists() and log.stat().st_size
     ]
-    if target.suffix != '.db3' or not logs:
+    if file.suffix != '.db3' or not logs:
         target.symlink_to(file.resolve())
         return target
     shutil.copyfile(file, target)

@@ -23,7 +23,7 @@ def errors(origin: np.ndarray, is_given: bool) -> np.ndarray:
     for i in range(10):
         grown = np.diag([0.001, 1.0, 0.001, 0.0, 0.0, 0.0]) * (i + 1)
         server.serve([odometry('a', i, grown.ravel().tolist() if is_given else None)], False, None)
-    return path_errors(server._graph.chain, np.array([0]), np.array([9]))[0][0]
+    return path_errors(server._graph.chain, np.array([0]), np.array([9]))[0]
 
 
 def test_server_uses_covariances_of_messages_in_the_frame_of_its_origin():

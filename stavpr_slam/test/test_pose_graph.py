@@ -13,7 +13,6 @@ from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import align_maps, Closure, optimize, PoseGraph
 from stavpr_slam.pose_graph import graph as graph_module
-from stavpr_slam.pose_graph.consistency import largest_consistent
 from stavpr_slam.pose_graph.files import save_graph
 from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
 from stavpr_slam.simulated_odometry import drifted
@@ -242,12 +241,12 @@ def test_update_without_solution_leaves_new_closures_out(drive, monkeypatch):
     for each in closures[:20]:
         graph.add_closure(each)
     graph.update()
-    accepted, solve_graph = graph.accepted, graph._solve
-    monkeypatch.setattr(graph, '_solve', Mock(side_effect=[RuntimeError, *[None] * 2]))
+    accepted, decide = graph.accepted, graph._decide
+    monkeypatch.setattr(graph, '_decide', Mock(side_effect=[RuntimeError, *[None] * 2]))
     graph.add_closure(closures[20])
     graph.update()
     assert graph.counts['failed'] == 1
-    monkeypatch.setattr(graph, '_solve', solve_graph)
+    monkeypatch.setattr(graph, '_decide', decide)
     graph.update()
     assert graph.accepted == accepted
 
@@ -277,16 +276,6 @@ def test_optimize_images_between_keyframes_have_their_odometry():
     poses = planar_poses(np.array([[0, 0, 0], [0.2, 0, 0], [0.3, 0.1, 0], [1.5, 0, 0.0]]))
     found, _ = optimize(SECOND * np.arange(1, 5), poses, [])
     np.testing.assert_allclose(found[:, :3], poses[:, :3], atol=1e-9)
-
-
-def test_largest_consistent_by_hand():
-    conflicts = np.zeros((4, 4), bool)
-    conflicts[0, 1] = conflicts[1, 0] = conflicts[1, 2] = conflicts[2, 1] = True
-    everyone = np.ones(4, bool)
-    light = largest_consistent(conflicts, np.array([3, 4, 3, 1]), everyone)
-    assert light.tolist() == [True, False, True, True]
-    heavy = largest_consistent(conflicts, np.array([3, 9, 3, 1]), everyone)
-    assert heavy.tolist() == [False, True, False, True]
 
 
 def test_body_covariance_turned_by_90_degrees_swaps_axes():

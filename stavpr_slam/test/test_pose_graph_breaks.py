@@ -3,11 +3,11 @@
 """Breaks of the odometry that closures prove: where they are, and when they end."""
 
 import numpy as np
-from stavpr_slam.pose_graph import acceptance, PoseGraph
+from stavpr_slam.pose_graph import PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.transforms import planar_poses
-from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
+from test_pose_graph import circle, closure, error, LAP, odometry_of, SECOND
 
 
 def chain_of(poses: np.ndarray) -> KeyframeChain:
@@ -52,33 +52,6 @@ def test_update_false_break_ends_when_closures_are_against_it():
                 splits.append(graph.splits)
     graph.update(final=True)
     found = np.array([graph.at((i + 1) * SECOND) for i in range(len(truth))])
-    assert max(splits) == 1
     assert splits[-1] == 0
     assert graph.chain.sessions == 1
     assert error(found, truth) < 1.5
-
-
-def test_update_break_that_only_refuted_closures_prove_ends_and_stays_ended(monkeypatch):
-    _, odometry, closures = carried_drive()
-    behind, splits = 140, []
-    monkeypatch.setattr(acceptance, 'refuted', lambda _, edges, __: [
-        i for i, edge in enumerate(edges) if edge.query >= behind
-    ])  # fmt: skip
-    monkeypatch.setattr(acceptance, 'predicted', lambda _, edges, __: (
-        np.full(len(edges), np.inf), np.zeros(len(edges))
-    ))  # fmt: skip
-    split = KeyframeChain.split
-    monkeypatch.setattr(KeyframeChain, 'split', lambda chain, node, stamp: (
-        splits.append(len(graph.edges)), split(chain, node, stamp)
-    ))  # fmt: skip
-    graph, waiting = PoseGraph(), list(closures)
-    for i, pose in enumerate(odometry):
-        graph.add_odometry((i + 1) * SECOND, pose)
-        while waiting and waiting[0].query_stamp <= (i + 1) * SECOND:
-            graph.add_closure(waiting.pop(0))
-        if i % 5 == 0:
-            graph.update()
-    graph.update(final=True)
-    assert splits
-    assert graph.splits == 0
-    assert (np.array(splits[1:]) >= 1.3 * np.array(splits[:-1])).all()

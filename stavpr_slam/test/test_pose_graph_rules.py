@@ -7,103 +7,110 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam import simulated_odometry
-from stavpr_slam.pose_graph import (
-    acceptance,
-    breaks,
-    ConsistencySettings,
-    GraphSettings,
-    keyframes,
-    OdometryNoise,
-    optimize,
-    PoseGraph,
-)  # fmt: skip
-from stavpr_slam.pose_graph.consistency import ConsistentSet
+from stavpr_slam.pose_graph import breaks, decision, keyframes, optimize, PoseGraph, sessions
+from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.false_places import FalsePlaces
 from stavpr_slam.pose_graph.transforms import adjoints, exponentials, planar_poses
 from stavpr_slam.simulated_odometry import drifted
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
 
-DEFAULT = GraphSettings()
 
-
-def rules(**changes) -> GraphSettings:
-    return replace(DEFAULT, consistency=ConsistencySettings(**changes))
-
-
-def ratio(truth, odometry, closures, settings=DEFAULT):
+def ratio(truth, odometry, closures):
     """Return the error after / before, and the graph."""
     stamps = (np.arange(len(truth)) + 1) * SECOND
-    found, graph = optimize(stamps, odometry, closures, settings)
+    found, graph = optimize(stamps, odometry, closures)
     return error(found, truth) / error(odometry, truth), graph
 
 
-def test_false_runs_without_comparison_of_all_together(monkeypatch):
-    """Four laps with closures for two of eight images, a third of them false in runs."""
+def false_drive(kind: str):
+    """Return three laps, their odometry, and closures that are false, all or in a way."""
+    truth, false, closures = circle(3) * [3.0, 3.0, 1.0], FalsePlaces(1.0, kind == 'runs', 9), []
+    for query in range(LAP, 3 * LAP):
+        place = query % LAP
+        known = [place, *((place + away) % LAP for away in range(31, 70))]
+        claimed = (place + 40) % LAP if kind == 'shift' else false.place(place, known)
+        if kind == 'laps':  # returning every lap, each time beside the lap before
+            place, claimed = query - LAP, max(query - LAP - 35, 0)
+        closures.append(closure(truth, query, place, claimed, independent=True))
+    return truth, slight(truth, 0.12), closures
+
+
+def slight(truth, drift, seed=9):
+    dice = np.random.default_rng(seed)
+    return planar_poses(drifted(truth, np.ones(len(truth), bool), dice, drift))
+
+
+@pytest.mark.parametrize('kind', ['random', 'runs', 'shift', 'laps'])
+def test_only_false_closures_leave_the_odometry(kind):
+    found, graph = ratio(*false_drive(kind))
+    assert found < 1.02
+    assert graph.accepted == 0
+
+
+def test_false_closures_and_the_right_half_that_comes_later():
+    truth, odometry, closures = false_drive('shift')
+    graph = PoseGraph()
+    for i, pose in enumerate(odometry):
+        graph.add_odometry((i + 1) * SECOND, pose)
+    for each in closures:
+        graph.add_closure(each)
+    graph.update()
+    assert graph.accepted == 0
+    for query in range(LAP, 3 * LAP):
+        graph.add_closure(closure(truth, query, query - LAP))
+    found = graph.update(final=True)
+    assert graph.accepted > 150
+    assert error(to_poses(found), truth) < 0.5 * error(odometry, truth)
+
+
+def test_false_shift_without_evidence(monkeypatch):
+    drive = false_drive('shift')
+    monkeypatch.setattr(decision, 'CERTAIN', -np.inf)
+    assert ratio(*drive)[0] > 2
+
+
+@pytest.mark.parametrize('drift', [0.06, 0.5, 2.0])
+def test_odometry_of_any_noise_is_never_made_worse(drift):
+    """A third of the closures are false in runs; the odometry is trusted too much at first."""
     truth, false, known, closures = circle(4), FalsePlaces(0.3, True, 9), set(), []
-    for query in range(LAP, 4 * LAP):
+    for query in range(LAP, 4 * LAP, 2):
         known |= {query, query % LAP}
-        claimed = false.place(query % LAP, known)
-        if query % 8 < 2:
-            closures.append(closure(truth, query, query % LAP, claimed))
-    dice = np.random.default_rng(9)
-    odometry = planar_poses(drifted(truth, np.ones(len(truth), bool), dice, 1.0))
-    assert ratio(truth, odometry, closures)[0] < 0.1
-    monkeypatch.setattr(acceptance, 'refuted', lambda *_: [])
-    assert ratio(truth, odometry, closures)[0] > 0.3
+        closures.append(closure(truth, query, query % LAP, false.place(query % LAP, known)))
+    assert ratio(truth, slight(truth, drift), closures)[0] < 1.0
 
 
-def test_carried_robot_without_pairwise_consistency_or_breaks(monkeypatch):
-    """With both, the error is below 5 %, see test_optimize_carried_robot_cuts_at_the_image."""
-    drive = carried_drive()
-    found, graph = ratio(*drive, rules(break_gain=10**6))
-    assert (found > 0.3, graph.splits) == (True, 0)
-    monkeypatch.setattr(
-        ConsistentSet, 'conflicts', lambda _, clusters, __: np.zeros((len(clusters),) * 2, bool)
-    )
+def test_large_drift_with_a_tight_odometry_only(monkeypatch):
+    truth = circle(4)
+    closures = [closure(truth, q, q - LAP) for q in range(LAP, 4 * LAP, 2)]
+    drive = truth, slight(truth, 2.0), closures
     found, graph = ratio(*drive)
-    assert (found > 0.3, graph.splits) == (True, 0)
+    assert found < 0.1
+    assert graph.scale > decision.TIGHT
+    monkeypatch.setattr(decision, 'SCALES', decision.SCALES[:1])
+    assert ratio(*drive)[0] > 0.3
 
 
-def _unknown(_, edges, __):
-    return np.full(len(edges), np.inf), np.zeros(len(edges))
-
-
-def test_closures_of_single_images_without_confirmation(monkeypatch):
-    truth = circle()
-    closures = [closure(truth, q, q - LAP) for q in (*range(100, 120), *range(130, 200, 10))]
-    drive = truth, odometry_of(truth), closures
-    found, graph = ratio(*drive)
-    monkeypatch.setattr(acceptance, 'predicted', _unknown)
-    less, without = ratio(*drive)
-    assert (graph.rejected, without.rejected) == (5, 7)
-    assert found < 0.6 * less
-
-
-def test_precise_odometry_without_estimate_of_its_errors():
-    """A tenth of the closures are off by 2 m."""
-    truth, closures = circle(), []
-    for q in range(LAP, 2 * LAP):
-        made = closure(truth, q, q - LAP)
-        closures.append(replace(made, pose=made.pose + np.eye(7)[0] * 2 * (140 <= q < 150)))
-    dice = np.random.default_rng(1)
-    odometry = planar_poses(drifted(truth, np.ones(len(truth), bool), dice, 0.02))
-    found, graph = ratio(truth, odometry, closures)
-    assert graph.scale < 0.1
-    less, _ = ratio(truth, odometry, closures, replace(DEFAULT, adapt=False))
-    assert found < 0.5 * less
-
-
-def test_heading_with_bias_without_its_covariance(monkeypatch):
-    monkeypatch.setattr(simulated_odometry, 'HEADING_BIAS', 0.0009)
-    monkeypatch.setattr(simulated_odometry, 'HEADING_NOISE', 0.001)
-    truth = circle(3)
-    known = [q for q in range(LAP, 3 * LAP) if q % LAP < 95]  # clusters end with a lap
-    drive = truth, odometry_of(truth), [closure(truth, q, q % LAP) for q in known]
-    found, graph = ratio(*drive)
-    assert graph.rejected == 0
-    less, _ = ratio(*drive, replace(DEFAULT, noise=OdometryNoise(bias=0.0)))
-    assert found < 0.5 * less
+@pytest.mark.parametrize('group', [1, 10, 50])
+def test_groups_of_closures_end_in_the_same_path(group):
+    truth, false, known, closures = circle(3), FalsePlaces(0.3, False, 4), set(), []
+    odometry = slight(truth, 0.3)
+    for query in range(LAP, 3 * LAP, 4):
+        known |= {query, query % LAP}
+        closures.append(closure(truth, query, query % LAP, false.place(query % LAP, known)))
+    graph, waiting = PoseGraph(), list(closures)
+    for i, pose in enumerate(odometry):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        while len(waiting) >= 1 and waiting[0].query_stamp <= (i + 1) * SECOND:
+            graph.add_closure(waiting.pop(0))
+        if graph.pending >= group:
+            graph.update()
+            now = to_poses(graph.solved)
+            assert (
+                error(now, truth[: i + 1]) < 1.02 * error(odometry[: i + 1], truth[: i + 1]) + 0.2
+            )
+    found = to_poses(graph.update(final=True))
+    whole, _ = optimize((np.arange(len(truth)) + 1) * SECOND, odometry, closures)
+    assert np.linalg.norm(found[:, :3] - whole[:, :3], axis=1).max() < 1e-6
 
 
 def slipping() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -138,14 +145,14 @@ def test_covariances_of_the_odometry_correct_the_stretch_that_slips(monkeypatch)
         return error(to_poses(graph.solved), truth)
 
     without = error_with(None)
-    assert error_with(covariances) < 0.5 * without
+    assert error_with(covariances) < 0.6 * without
     constant = np.tile(np.diag([0.01] * 6), (len(odometry), 1, 1))
     assert error_with(constant) == error_with(0 * constant) == without
     monkeypatch.setattr(keyframes, 'given_growth', lambda *_: None)
     assert error_with(covariances) == without
 
 
-def test_few_wrong_closures_join_no_session():
+def test_few_wrong_closures_join_no_session(monkeypatch):
     """The odometry stops for 10 s; behind it, six closures are of one wrong place."""
     truth = circle(1)
     stamps = (np.arange(LAP) + 1) * SECOND
@@ -153,7 +160,9 @@ def test_few_wrong_closures_join_no_session():
     made = [closure(truth, q, q, q - 50, stamps) for q in range(70, 76)]
     found, _ = optimize(stamps, odometry_of(truth), made)
     assert error(found, truth) < 2
-    found, _ = optimize(stamps, odometry_of(truth), made, rules(join_support=1))
+    for module in (sessions, graph_module):
+        monkeypatch.setattr(module, 'JOINS', 1)
+    found, _ = optimize(stamps, odometry_of(truth), made)
     assert error(found, truth) > 20
 
 
@@ -168,27 +177,17 @@ def wrong_at_the_end(count: int, laps: int = 2, size: float = 1.0):
     return truth, odometry_of(truth), closures
 
 
-@pytest.mark.parametrize(
-    ('given', 'rule'),
-    [((28,), 'break_support'), ((45, 3, 0.25), 'break_distance')],
-    ids=['few', 'short'],
-)
-def test_wrong_closures_prove_no_break(given, rule):
-    drive = wrong_at_the_end(*given)
-    found, graph = ratio(*drive)
+def test_wrong_closures_prove_no_break():
+    found, graph = ratio(*wrong_at_the_end(28))
     assert graph.splits == 0
-    more, graph = ratio(*drive, rules(**{rule: 1}))
-    assert graph.splits == 1
-    assert found < 0.5 * more
+    assert found < 1.02
 
 
-def test_wrong_closures_beside_right_ones_prove_no_break():
-    """At the end, 45 images have wrong closures, and 30 of these images right ones."""
-    truth, odometry, closures = wrong_at_the_end(45)
-    closures += [closure(truth, q, q % LAP) for q in range(2 * LAP - 30, 2 * LAP)]
-    closures.sort(key=lambda each: each.query_stamp)
-    assert ratio(truth, odometry, closures)[1].splits == 0
-    assert ratio(truth, odometry, closures, rules(break_gain=1))[1].splits == 1
+def test_carried_robot_without_breaks(monkeypatch):
+    """With breaks, see test_optimize_carried_robot_cuts_at_the_image."""
+    monkeypatch.setattr(breaks, 'SUPPORT', 10**6)
+    found, graph = ratio(*carried_drive())
+    assert (found > 0.3, graph.splits) == (True, 0)
 
 
 def unseen(closures):

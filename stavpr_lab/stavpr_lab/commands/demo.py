@@ -327,7 +327,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.recordings import Recording, TOPIC
     from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, drive_laps
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_slam.pose_graph.solver import load_gtsam
+    from stavpr_slam.pose_graph.network import load_gtsam
     from stavpr_slam.ros.graph_client import fetch_graph
 
     load_gtsam()

@@ -8,6 +8,10 @@ COMMANDS = {
     'pose_graph': Command(
         'stavpr_slam.commands.pose_graph', 'correct odometry by loop closures', True
     ),
+    'optimize_graph': Command(
+        'stavpr_slam.commands.optimize_graph',
+        'reject the false closures of a g2o file and solve it',
+    ),
     'bridge': Command(
         'stavpr_slam.commands.bridge', 'pass loop closures on to RTAB-Map and others', True
     ),

@@ -4,7 +4,6 @@
 
 from stavpr_slam.pose_graph.alignment import align_maps
 from stavpr_slam.pose_graph.closures import Closure
-from stavpr_slam.pose_graph.clusters import ConsistencySettings
 from stavpr_slam.pose_graph.graph import GraphEdge, GraphSettings, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings
 from stavpr_slam.pose_graph.offline import optimize
@@ -13,7 +12,6 @@ from stavpr_slam.pose_graph.path_errors import OdometryNoise
 __all__ = [
     'ChainSettings',
     'Closure',
-    'ConsistencySettings',
     'GraphEdge',
     'GraphSettings',
     'OdometryNoise',

@@ -4,19 +4,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 import math
 
 import numpy as np
-from stavpr_slam.pose_graph.clusters import Cluster, ConsistencySettings
-from stavpr_slam.pose_graph.cycles import Cycles
+from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph.closures import ResolvedClosure
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
+from stavpr_slam.pose_graph.transforms import logarithms
 
+GAIN = 24  # closures more that agree if there is a break, or
+EVIDENCE = 10.0  # so much more evidence
+SUPPORT, DISTANCE = 32, 40.0  # closures on each side of a break, and meters that they are along
+NEAR = 2.0  # meters, and deviations of two closures, that agreeing ones are apart
 STOPPED = math.log(10)  # evidence of a stop: elsewhere, one image in ten is of a stop
 PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
-MOST = 40  # places of a break that are tried
 CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
 WRONG_SIDE = 0.1  # cost of a closure on the wrong side of a break, in logarithms of a change
+GAP = 15.0  # meters before and behind the closures at a break where it may be
 
 
 @dataclass(frozen=True)
@@ -32,59 +36,98 @@ class Break:
     stamp: int
 
 
-def candidates(chain: KeyframeChain, clusters: Sequence[Cluster], least: int) -> list[int]:
-    """
-    Return nodes that a session could begin at: the first ones of clusters of a weight, in order.
-
-    Of many, :data:`MOST` in equal steps.
-    """
-    found = sorted({each.members[0].query for each in clusters if each.weight >= least})
-    nodes = [b for a, b in pairwise(found) if chain.session[a] == chain.session[b]]
-    return [nodes[i] for i in np.unique(np.linspace(0, len(nodes) - 1, MOST).astype(int)) if nodes]
-
-
-def neighbors(
-    chain: KeyframeChain, accepted: Sequence[Cluster], node: int, settings: ConsistencySettings
-) -> tuple[Cluster, Cluster] | None:
-    """
-    Return the last cluster before a break and the first one behind it.
-
-    :param accepted: clusters that agree if there is a break.
-    :returns: None without clusters enough on both sides.
-    """
-    session = chain.session
-    own = [each for each in accepted if session[each.members[0].query] == session[node]]
-    own.sort(key=lambda each: each.members[0].at)
-    sides = (
-        [each for each in own if each.members[0].query < node],
-        [each for each in own if each.members[0].query >= node],
-    )
-    for side in sides:
-        length = side[-1].members[-1].at - side[0].members[0].at if side else 0.0
-        weight = sum(each.weight for each in side)
-        if weight < settings.break_support or length < settings.break_distance:
-            return None
-    return sides[0][-1], sides[1][0]
-
-
-def locate(
+def find(
     chain: KeyframeChain,
-    clusters: Sequence[Cluster],
-    ends: tuple[Cluster, Cluster],
-    scale: float,
-    settings: ConsistencySettings,
+    solved: np.ndarray,
+    taken: np.ndarray,
+    closures: Sequence[ResolvedClosure],
+    changes: Mapping[int, float],
+) -> Break | None:
+    """
+    Return the break that lets most rejected closures agree; None = none.
+
+    :param solved: transforms of all nodes by the robust solution, (N, 4, 4).
+    :param taken: whether each closure agrees with it, shape (n,).
+    :param changes: see :func:`_locate`.
+    """
+    query, place = (
+        np.array([getattr(each, end) for each in closures], int) for end in ('query', 'place')
+    )
+    best, before = np.zeros(0, int), np.zeros(0, int)
+    for session in np.unique(chain.session[query]).tolist():
+        here = chain.session[query] == session
+        own = np.flatnonzero(~taken & here)
+        rows = [closures[i] for i in own.tolist()]
+        if len(own) < SUPPORT:
+            continue
+        Z = np.array([each.transform for each in rows])
+        moved = solved[place[own]] @ Z @ inverse(solved[query[own]])
+        points = solved[query[own], :3, 3]
+        at = np.einsum('nij,mj->nmi', moved[:, :3, :3], points) + moved[:, None, :3, 3]
+        wide = [np.linalg.eigvalsh(each.covariance[3:, 3:])[-1] ** 0.5 for each in rows]
+        away = np.linalg.norm(at - np.einsum('nni->ni', at)[None], axis=2)
+        agree = away < NEAR * (1 + np.maximum.outer(wide, wide))
+
+        def most(among: np.ndarray, agree: np.ndarray = agree) -> np.ndarray:
+            """Return the rejected closures among some that agree with most of them."""
+            counts = np.where(among, (agree & among).sum(axis=1), 0)
+            return agree[np.argmax(counts)] & among
+
+        for node in np.unique(query[own])[:: SUPPORT // 4].tolist():
+            # a closure across the break: its place is not behind, or of another session
+            across = (chain.session[place[own]] != session) | (place[own] < node)
+            members = most((query[own] >= node) & across)
+            if members.sum() > len(best):
+                best = own[members]
+                before = np.flatnonzero(taken & here & (query < query[best].min()))
+                if not len(before):
+                    before = own[most(query[own] < query[best].min())]
+    return _between(chain, closures, before, best, solved, changes)
+
+
+def strained(
+    chain: KeyframeChain, solved: np.ndarray, taken: np.ndarray,
+    closures: Sequence[ResolvedClosure], node: int, changes: Mapping[int, float],
+) -> Break | None:  # fmt: skip
+    """
+    Return the break between the closures beside a node that the solution bends the odometry at.
+
+    The parameters are those of :func:`find`.
+    """
+    query = np.array([each.query for each in closures], int)
+    own = taken & (chain.session[query] == chain.session[node])
+    before, behind = np.flatnonzero(own & (query < node)), np.flatnonzero(own & (query >= node))
+    return _between(chain, closures, before, behind, solved, changes)
+
+
+def _between(
+    chain: KeyframeChain, closures: Sequence[ResolvedClosure], before: np.ndarray,
+    behind: np.ndarray, solved: np.ndarray, changes: Mapping[int, float],
+) -> Break | None:  # fmt: skip
+    query = np.array([each.query for each in closures], int)
+    for side in (before, behind):
+        if len(side) < SUPPORT or np.ptp(chain.travelled[query[side]]) < DISTANCE:
+            return None
+    ends = before[np.argmax(query[before])], behind[np.argmin(query[behind])]
+    return _locate(chain, solved, closures, (int(ends[0]), int(ends[1])), changes)
+
+
+def _locate(
+    chain: KeyframeChain,
+    solved: np.ndarray,
+    closures: Sequence[ResolvedClosure],
+    ends: tuple[int, int],
     changes: Mapping[int, float],
 ) -> Break:
     """
-    Return the break between clusters: at a pause, else where it is most probable.
+    Return the break between closures: at a pause, else where it is most probable.
 
     There, the images change much, the odometry stops, as a robot that is carried does not drive,
     and few closures are on the wrong side. Changes are known in windows of closures only. Windows
     at the break have images of both sides, so that some closures are on the wrong side. Without
     any evidence, the break is in the middle.
     """
-    last = max(ends[0].members, key=lambda each: each.at)
-    first = min(ends[1].members, key=lambda each: each.at)
+    last, first = (closures[i] for i in ends)
     session = chain.session[first.query]
     nodes = np.arange(last.query + 1, first.query + 1)
     nodes = nodes[chain.session[nodes] == session]
@@ -92,7 +135,7 @@ def locate(
     if len(nodes) and pauses.max() > PAUSE * np.median(pauses):
         node = int(nodes[np.argmax(pauses)])
         return Break(node, int(chain.stamps[node]))
-    low, high = last.at - settings.gap, first.at + settings.gap
+    low, high = last.at - GAP, first.at + GAP
     own = np.flatnonzero((chain.session == session) & (chain.travelled >= low))
     own = own[chain.travelled[own] <= high]
     stamps = chain.stamps[own]
@@ -104,25 +147,43 @@ def locate(
         if time >= least:
             during = [t for t in changed if 0 < t - middle + time / 2 <= time] or [middle]
             evidence |= dict.fromkeys(during, STOPPED)
-    if evidence:
-        near = [
-            each
-            for cluster in clusters
-            for each in cluster.members
-            if stamps[0] <= each.stamp <= stamps[-1] and chain.session[each.query] == session
-        ]
-        old, new = (
-            Cycles(chain, [cluster.representative, *near]).deviations(0, scale)[1:]
-            for cluster in ends
-        )
-        at = np.array([each.stamp for each in near])
+    if not evidence:
+        node = int(nodes[len(nodes) // 2]) if len(nodes) else first.query
+        return Break(node, int(chain.stamps[node]))
+    near = [
+        each
+        for each in closures
+        if stamps[0] <= each.stamp <= stamps[-1] and chain.session[each.query] == session
+    ]
+    T = chain.transforms
+    at_ends = [solved[each.place] @ each.transform for each in (last, first)]
+    moved = [
+        pose @ inverse(T[end.query]) for pose, end in zip(at_ends, (last, first), strict=True)
+    ]
+    old, new = (_deviations(solved, near, each @ T) for each in moved)
+    at = np.array([each.stamp for each in near])
 
-        def probable(stamp: int) -> float:
-            wrong = np.where(at >= stamp, CLEAR * old < new, CLEAR * new < old).sum()
-            change = math.log(changed.get(stamp, usual) / usual)
-            return change + evidence[stamp] - WRONG_SIDE * float(wrong)
+    def probable(stamp: int) -> float:
+        wrong = np.where(at >= stamp, CLEAR * old < new, CLEAR * new < old).sum()
+        change = math.log(changed.get(stamp, usual) / usual)
+        return change + evidence[stamp] - WRONG_SIDE * float(wrong)
 
-        stamp = max(evidence, key=probable)
-        return Break(int(own[np.searchsorted(stamps, stamp)]), stamp)
-    node = int(nodes[len(nodes) // 2]) if len(nodes) else first.query
-    return Break(node, int(chain.stamps[node]))
+    stamp = max(evidence, key=probable)
+    return Break(int(own[np.searchsorted(stamps, stamp)]), stamp)
+
+
+def _deviations(
+    solved: np.ndarray, closures: Sequence[ResolvedClosure], queries: np.ndarray
+) -> np.ndarray:
+    """Return squared deviations of closures, the queries of which are elsewhere, shape (n,)."""
+    if not closures:
+        return np.zeros(0)
+    X = np.array([(solved[each.place], queries[each.query]) for each in closures])
+    Z, covariance = (
+        np.array([getattr(each, name) for each in closures])
+        for name in ('transform', 'covariance')
+    )
+    off = logarithms(inverse(Z) @ inverse(X[:, 0]) @ X[:, 1])
+    solution = np.linalg.solve(covariance, off[:, :, None])[:, :, 0]
+    result: np.ndarray = (off * solution).sum(axis=1)
+    return result

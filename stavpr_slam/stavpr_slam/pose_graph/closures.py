@@ -79,7 +79,6 @@ class ResolvedClosure:
     :param transform: of the query's node in the place's, shape (4, 4).
     :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
     :param at: distance travelled at the query, m.
-    :param number: of the closure, in the order of arrival.
     """
 
     query: int
@@ -87,6 +86,5 @@ class ResolvedClosure:
     transform: np.ndarray
     covariance: np.ndarray
     at: float
-    number: int
     stamp: int
     is_independent: bool

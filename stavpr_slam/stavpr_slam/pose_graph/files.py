@@ -1,17 +1,17 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pose graphs as text: g2o, and trajectories in the formats of TUM and KITTI."""
+"""Files of a pose graph: g2o, and trajectories in the formats of TUM and KITTI."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.output_file import FileKind, Force, write_output
 from stavpr_ros.units import SECOND
+from stavpr_slam.pose_graph.g2o import g2o_text
 from stavpr_slam.pose_graph.graph import PoseGraph
-from stavpr_slam.pose_graph.path_errors import path_errors
 
 TUM_HEADER = '# timestamp tx ty tz qx qy qz qw\n'
 TUM = FileKind('trajectory', lambda head: head.startswith(TUM_HEADER.encode()))
@@ -41,38 +41,8 @@ def kitti_text(poses: np.ndarray) -> str:
     :param poses: of the base (x ahead, z up) in the frame of the graph, shape (N, 7). The poses of
         the benchmark are of its left camera (z ahead, y down) in the frame of the first one.
     """
-    return '\n'.join(_numbers(row.ravel()) for row in matrices(poses)[:, :3]) + '\n'
-
-
-def g2o_text(graph: PoseGraph) -> str:
-    """Return the nodes as solved, the odometry and the accepted closures in the g2o format."""
-    count = len(graph.solved)
-    lines = ['# g2o: accepted closures only']
-    poses = to_poses(graph.solved)
-    lines += [f'VERTEX_SE3:QUAT {i} {_numbers(pose)}' for i, pose in enumerate(poses)]
-    chain = graph.chain
-    nodes = np.flatnonzero(chain.previous[:count] >= 0)
-    before, T = chain.previous[nodes], chain.transforms
-    spread, _ = path_errors(chain, nodes, before)
-    motions, covariances = inverse(T[before]) @ T[nodes], graph.scale**2 * spread
-    for row in zip(before.tolist(), nodes.tolist(), motions, covariances, strict=True):
-        lines.append(_edge(*row))
-    for edge in graph.used.values():
-        lines.append(_edge(edge.place, edge.query, edge.transform, edge.covariance))
-    return '\n'.join(lines) + '\n'
-
-
-def _edge(start: int, end: int, transform: np.ndarray, covariance: np.ndarray) -> str:
-    """Return an edge; g2o has the translation first, and half the rotation as a quaternion's."""
-    order = [3, 4, 5, 0, 1, 2]
-    information = np.linalg.inv(covariance)[np.ix_(order, order)]
-    half = np.diag([1, 1, 1, 2, 2, 2])
-    upper = (half @ information @ half)[np.triu_indices(6)]
-    return f'EDGE_SE3:QUAT {start} {end} {_numbers(to_poses(transform))} {_numbers(upper)}'
-
-
-def _numbers(values: np.ndarray) -> str:
-    return ' '.join(f'{value:.9g}' for value in values)
+    rows = matrices(poses)[:, :3].reshape(-1, 12)
+    return '\n'.join(' '.join(f'{value:.9g}' for value in row) for row in rows) + '\n'
 
 
 def save_graph(graph: PoseGraph, path: str, force: Force = False) -> int:

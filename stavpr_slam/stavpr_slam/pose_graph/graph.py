@@ -8,17 +8,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph.acceptance import Acceptance
+from stavpr_slam.pose_graph import breaks
 from stavpr_slam.pose_graph.closures import Closure, ResolvedClosure
-from stavpr_slam.pose_graph.clusters import ConsistencySettings, ends
+from stavpr_slam.pose_graph.decision import Decider, Decision, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.network import load_gtsam, Network
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
-from stavpr_slam.pose_graph.sessions import extended, placed, tie, Ties
-from stavpr_slam.pose_graph.solver import Problem, Solver
+from stavpr_slam.pose_graph.sessions import extended, JOINS, Pair, place, session_pairs, weights
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-ROUNDS = 50  # of comparing all clusters together at most
+GROWN = 1.5  # factor on the number of closures from which scales and breaks are searched anew
+MAX_BREAKS = 4  # that are searched
 
 
 @dataclass(frozen=True)
@@ -26,14 +27,14 @@ class GraphSettings:
     """
     Settings of a :class:`PoseGraph`.
 
-    :param noise: errors of the odometry where its messages have none; their factor is estimated
-        if ``adapt``.
+    :param noise: errors of the odometry where its messages have none; closures show the factor.
+    :param measured: each closure is a measurement that is right or wrong on its own, and the
+        errors of the odometry are as given: graphs of other programs.
     """
 
     keyframes: ChainSettings = field(default_factory=ChainSettings)
     noise: OdometryNoise = field(default_factory=OdometryNoise)
-    consistency: ConsistencySettings = field(default_factory=ConsistencySettings)
-    adapt: bool = True
+    measured: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,28 +57,37 @@ class PoseGraph:
     """
 
     def __init__(self, settings: GraphSettings | None = None) -> None:
+        load_gtsam()
         self.settings = settings or GraphSettings()
-        self._solver = Solver()
         self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
         self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
-        self._acceptance = Acceptance(self.chain, self.settings.consistency, self.settings.adapt)
-        self._solver.restart()
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
+        self._closures: list[ResolvedClosure] = []  # of them
         self._solved_closures = 0  # of them, in the last solution
+        self._searched_at = 0, 0  # closures, and rejected ones, of the last search
         self._changes: dict[int, float] = {}  # of images by their stamps
-        self._ties = Ties()
+        self._links: dict[int, int] = {}
+        self._decision: Decision | None = None
+        self._taken = np.zeros(0, bool)
+        self._solutions: list[tuple[np.ndarray, np.ndarray, int]] = []
         self._edges: dict[int, ResolvedClosure] = {}
+        self.scales = np.zeros(0)
         self.solved = np.zeros((0, 4, 4))
         self.counts: Counter[str] = Counter()
 
     @property
     def scale(self) -> float:
-        """Return the factor on the errors of the odometry that the closures have shown."""
-        return self._acceptance.scale
+        """Return the factor on the errors of the odometry that closures have shown, the worst."""
+        return float(self.scales.max(initial=TIGHT))
+
+    @property
+    def refused(self) -> float:
+        """Return the evidence against a correction that is not published; 0 = there is none."""
+        return self._decision.rejected if self._decision else 0.0
 
     def add_odometry(
         self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
@@ -110,6 +120,8 @@ class PoseGraph:
         self._changes |= closure.changes
         self._pending.append(replace(closure, changes=closure.changes[-1:]))
         if len(self._pending) > MAX_PENDING:
+            self._resolve()
+        if len(self._pending) > MAX_PENDING:
             del self._pending[0]
             self.counts['unknown stamp'] += 1
 
@@ -117,34 +129,36 @@ class PoseGraph:
         """Find the nodes of the closures that wait."""
         waiting = []
         for closure in self._pending:
-            query = self.chain.find(closure.query_stamp, closure.query_robot)
-            place = self._place(closure)
-            if query is None or place is None:
-                ahead = self.chain.is_ahead
-                if ahead(closure.query_stamp, closure.query_robot) or (
-                    not closure.map_id and ahead(closure.place_stamp, closure.place_robot)
-                ):
-                    waiting.append(closure)
-                else:
-                    self.counts['unknown stamp'] += 1
+            resolved = self._resolved(closure)
+            if resolved is not None:
+                self._known.append(closure)
+                self._closures.append(resolved)
                 continue
-            (i, to_query), (j, to_place) = query, place
-            if i == j:
+            ahead = self.chain.is_ahead
+            if ahead(closure.query_stamp, closure.query_robot) or (
+                not closure.map_id and ahead(closure.place_stamp, closure.place_robot)
+            ):
+                waiting.append(closure)
+            else:
                 self.counts['unknown stamp'] += 1
-                continue
-            measured = matrices(closure.pose)
-            newest = closure.changes[0][0] if closure.changes else closure.query_stamp
-            # the frame of the pose moves with the query: its covariance in these axes changes by
-            # the short motion between image and keyframe, which is left out
-            covariance = body_covariance(closure.covariance, measured)
-            resolved = ResolvedClosure(
-                i, j, to_place @ measured @ inverse(to_query), covariance,
-                float(self.chain.travelled[i] + np.linalg.norm(to_query[:3, 3])),
-                len(self._known), (closure.query_stamp + newest) // 2, closure.is_independent,
-            )  # fmt: skip
-            self._known.append(closure)
-            self._acceptance.add(resolved)
         self._pending = waiting
+
+    def _resolved(self, closure: Closure) -> ResolvedClosure | None:
+        query = self.chain.find(closure.query_stamp, closure.query_robot)
+        place = self._place(closure)
+        if query is None or place is None or query[0] == place[0]:
+            return None
+        (i, to_query), (j, to_place) = query, place
+        measured = matrices(closure.pose)
+        newest = closure.changes[0][0] if closure.changes else closure.query_stamp
+        # the frame of the pose moves with the query: its covariance in these axes changes by
+        # the short motion between image and keyframe, which is left out
+        return ResolvedClosure(
+            i, j, to_place @ measured @ inverse(to_query),
+            body_covariance(closure.covariance, measured),
+            float(self.chain.travelled[i] + np.linalg.norm(to_query[:3, 3])),
+            (closure.query_stamp + newest) // 2, closure.is_independent,
+        )  # fmt: skip
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
         if not closure.map_id:
@@ -166,117 +180,140 @@ class PoseGraph:
         if not len(self.chain):
             return self.solved
         try:
-            self._update(final)
-            self._solved_closures = len(self._known)
+            if final or len(self._known) != self._solved_closures:
+                self._update(final)
+            else:
+                self.solved = extended(self.chain, self.solved, self._links)
         except (RuntimeError, np.linalg.LinAlgError, FloatingPointError):
             # GTSAM raises RuntimeError for a system that it cannot solve
             failed = len(self._known) - self._solved_closures
             if not failed:
                 raise
             self.counts['failed'] += failed
-            del self._known[self._solved_closures :]
-            self._rebuild()
+            del self._known[self._solved_closures :], self._closures[self._solved_closures :]
             self._update(final)
+        self._solved_closures = len(self._known)
         return self.solved
 
     def _update(self, final: bool) -> None:
-        if self._acceptance.has_changed:
-            self._decide()
-        ties, initial = self._arranged()
-        for _ in range(ROUNDS):
-            if not self._acceptance.refute(initial, ties, final):
-                break
-            ended = self._acceptance.ended_break()
-            if ended is not None:
-                self._merge_session(ended)  # only refuted closures proved it
-            ties, initial = self._arranged()
-        self._solve(ties, initial, final)
-        if self._acceptance.confirm(self.solved, ties):
-            self._solve(ties, self.solved, final)
+        """Decide on all closures anew, and estimate."""
+        known, rejected = self._searched_at
+        if (
+            final or len(self._known) > GROWN * known
+            or self.rejected > max(GROWN * rejected, breaks.SUPPORT)
+        ):  # fmt: skip
+            for node in self.chain.splits[::-1]:
+                self._split(breaks.Break(node, 0), False)
+            self._decide(True)
+            for _ in range(0 if self.settings.measured else MAX_BREAKS):
+                if not self._search_break():
+                    break
+            self._searched_at = len(self._known), self.rejected
+        else:
+            self._decide(False)
 
-    def _decide(self) -> None:
-        """Accept and reject clusters; begin a session where they prove a break."""
-        self._acceptance.compare()
-        ended = self._acceptance.ended_break()
-        if ended is not None:
-            self._merge_session(ended)  # later closures are against it
-            return
-        found = self._acceptance.new_break(self._changes)
-        if found:
-            # closures on both sides of a break are no clusters any more
+    def _split(self, found: breaks.Break, begins: bool) -> None:
+        if begins:
             self.chain.split(found.node, found.stamp)
-            self._rebuild()
-        if self._acceptance.adapt():
-            self._solver.restart()
+        else:
+            self.chain.merge_session(found.node)
+        again = [self._resolved(closure) for closure in self._known]
+        self._closures = [
+            before if now is None else now
+            for before, now in zip(self._closures, again, strict=True)
+        ]
 
-    def _merge_session(self, node: int) -> None:
-        self.chain.merge_session(node)
-        self._rebuild()
+    def _search_break(self) -> bool:
+        """Begin a session where closures prove that the robot was carried."""
+        before = self._decision
+        assert before is not None
+        found: list[breaks.Break] = []
+        for number, (solved, agreeing, node) in enumerate(self._solutions):
+            if any(np.array_equal(agreeing, other) for _, other, _ in self._solutions[:number]):
+                continue
+            given = self.chain, solved, agreeing, self._closures
+            candidates = [breaks.find(*given, self._changes)]
+            if node >= 0:
+                candidates.append(breaks.strained(*given, node, self._changes))
+            for each in candidates:
+                if each and all(abs(each.node - other.node) > breaks.GAP for other in found):
+                    found.append(each)
+        for each in found[:MAX_BREAKS]:
+            self._split(each, True)
+            self._decide(True)
+            after = self._decision
+            assert after is not None
+            gain = after.evidence - after.chance - before.evidence + before.chance
+            more = int(after.taken.sum()) - int(before.taken.sum())
+            if more >= breaks.GAIN or gain > breaks.EVIDENCE:
+                return True
+            self._split(each, False)
+        if found:
+            self._decide(True)
+        return False
 
-    def _rebuild(self) -> None:
-        """Find the nodes and clusters of all closures again."""
-        self._solver.restart()
-        waiting, self._pending = self._pending, self._known
-        self._known, self._edges = [], {}
-        self._acceptance.restart()
-        self._resolve()
-        self._pending = waiting
-        self._acceptance.compare_all()
-
-    def _arranged(self) -> tuple[Ties, np.ndarray]:
-        """Tie the sessions by the accepted closures; return initial transforms of all nodes."""
-        accepted = self._acceptance.accepted
-        ties = tie(self.chain, accepted, self.settings.consistency.join_support)
-        if ties.moved_since(self._ties):
-            return ties, placed(self.chain, accepted, ties)
-        return ties, extended(self.chain, self.solved, ties)
-
-    def _solve(self, ties: Ties, initial: np.ndarray, final: bool) -> None:
+    def _decide(self, searches: bool) -> None:
         """
-        Estimate all nodes by the accepted closures.
+        Decide on the closures, and estimate all nodes.
 
-        Where even the least errors of the odometry explain the first loops, the closures measure
-        them less precisely than the odometry, and would add their own errors.
+        :param searches: the errors of the odometry as well.
         """
-        chain, accepted = self.chain, self._acceptance.accepted
-        query, place = (chain.session[each] for each in ends(accepted))
-        allowed = ties.allow(query, place)
-        allowed &= (query != place) | (not self._acceptance.is_precise)
-        edges = {
-            each.number: each
-            for cluster, counts in zip(accepted, allowed, strict=True) if counts
-            for each in cluster.independent
-        }  # fmt: skip
-        moved = ties.moved_since(self._ties)
-        problem = Problem(chain, initial, edges, self._acceptance.solution_scale, ties.links)
-        if final or moved:
-            self.solved = self._solver.solve(problem)
-            problem = replace(problem, initial=self.solved)
-        if not final:
-            self.solved = self._solver.update(problem)
-        self._ties, self._edges = ties, edges
+        chain, denied = self.chain, set[Pair]()
+        while True:
+            placement = place(chain, self._closures, denied)
+            of_pair = session_pairs(chain, self._closures)
+            allowed = np.array(
+                [a == b or (a, b) in placement.pairs for a, b in of_pair.tolist()], bool
+            )
+            used = [self._closures[i] for i in np.flatnonzero(allowed)]
+            network = Network(chain, placement.initial, used, placement.links)
+            decider = Decider(chain, network, placement.initial, self.settings.measured)
+            if searches or self._decision is None:
+                decision = decider.decide(len(chain.robots))
+            else:
+                decision = decider.at(self._decision.scales)
+            taken = [each for each, right in zip(used, decision.taken, strict=True) if right]
+            joined = weights(session_pairs(chain, taken), taken)
+            few = {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
+            if not few:
+                break
+            denied |= few
+        self._decision, self._links = decision, placement.links
+        self._taken = allowed.copy()
+        self._taken[allowed] = decision.taken
+        self._solutions = []
+        for each in decider.tried if searches else ():
+            agreeing = allowed.copy()
+            agreeing[allowed] = each.agreeing
+            self._solutions.append((network.nodes(each.corrected), agreeing, each.strained))
+        self.scales, values = decision.scales, decision.values
+        self._edges = {}
+        if decision.taken.any():
+            independent = np.array([each.is_independent for each in used], bool)
+            self.scales, values, counted = decider.estimate(decision, independent)
+            numbers = np.flatnonzero(allowed)[counted]
+            self._edges = {int(i): self._closures[i] for i in numbers}
+        self.solved = network.nodes(values)
 
     # results
 
     @property
     def edges(self) -> list[GraphEdge]:
         """Return all closures between nodes."""
-        found = self._acceptance
         return [
             GraphEdge(each.query, each.place, bool(taken))
-            for cluster, taken in zip(found.clusters, found.taken, strict=True)
-            for each in cluster.members
+            for each, taken in zip(self._closures, self._taken, strict=False)
         ]
 
     @property
     def accepted(self) -> int:
         """Return the number of accepted closures."""
-        return sum(len(cluster.members) for cluster in self._acceptance.accepted)
+        return int(self._taken.sum())
 
     @property
     def rejected(self) -> int:
         """Return the number of rejected closures."""
-        return len(self._known) - self.accepted
+        return len(self._taken) - self.accepted
 
     @property
     def used(self) -> dict[int, ResolvedClosure]:

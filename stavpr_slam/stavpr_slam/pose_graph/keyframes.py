@@ -71,8 +71,8 @@ class KeyframeChain:
     Arrays of N nodes: ``stamps`` (ns), ``transforms`` in the odometry of its session, or in the
     map, (N, 4, 4), ``travelled`` (m), ``session`` (negative = fixed), ``recording`` (the session
     before splits), ``previous`` (the node before in its session, -1 = none), ``stood`` (how long
-    the odometry stood before the node, and the middle of that time, (N, 2), ns), and for
-    :mod:`path_errors` ``origin`` (3,), ``spread`` (6, 6), and ``bent`` (6, 3).
+    the odometry stood before the node, and the middle of that time, (N, 2), ns), ``robot`` (number
+    in ``robots``), and for :mod:`path_errors` ``origin`` (3,) and ``spread`` (6, 6).
     """
 
     FIXED = -1
@@ -83,11 +83,12 @@ class KeyframeChain:
             ('stamps', np.int64), ('transforms', np.float64, (4, 4)), ('travelled', np.float64),
             ('session', np.int32), ('recording', np.int32), ('previous', np.int64),
             ('stood', np.int64, 2), ('origin', np.float64, 3), ('spread', np.float64, (6, 6)),
-            ('bent', np.float64, (6, 3)),
+            ('robot', np.int32),
         ])  # fmt: skip
         self._count = 0
         self._recordings: list[OdometryRecording] = []
         self._current: dict[str, OdometryRecording] = {}  # of each robot
+        self.robots: list[str] = []
         self.sessions = 0
         self._fixed: dict[tuple[str, int], int] = {}
         # first nodes after splits: the stamps, and the nodes before
@@ -129,6 +130,8 @@ class KeyframeChain:
             track = OdometryTrack(self._settings.distance, self._settings.angle)
             current = OdometryRecording(robot, track, (stamp, pose), (stamp, pose), covariance)
             self._current[robot] = current
+            if robot not in self.robots:
+                self.robots.append(robot)
             self._recordings.append(current)
             self.sessions += 1
             track.add(stamp, pose, True)
@@ -170,6 +173,7 @@ class KeyframeChain:
         node = self._extend(stamp, transform, self.sessions - 1, len(self._recordings) - 1)
         row, before = self._nodes[node], self._nodes[previous]
         row['previous'], row['stood'], row['origin'] = previous, current.stood, pose[:3]
+        row['robot'] = self.robots.index(current.robot)
         if previous >= 0:
             for name in ('session', 'recording', 'origin'):
                 row[name] = before[name]
@@ -177,12 +181,11 @@ class KeyframeChain:
             local[:, :3, 3] -= row['origin']
             length = np.linalg.norm(local[1, :3, 3] - local[0, :3, 3])
             row['travelled'] = before['travelled'] + length
-            grown, bent = step_errors(local, self._noise)
+            grown = step_errors(local, self._noise)
             given = given_growth(current.spread, covariance, local)
             if given is not None:
                 grown = LEAST * grown + given
             row['spread'] = before['spread'] + grown
-            row['bent'] = before['bent'] + bent
         current.spread, current.stood = covariance, (0, 0)
         current.stamps.append(stamp)
         current.nodes.append(node)

@@ -31,9 +31,6 @@ def optimize(
         graph.add_odometry(stamp, pose)
     for closure in closures:
         graph.add_closure(closure)
-        if graph.pending >= 100:
-            graph.update()
-    graph.update()
     graph.update(final=True)
     found = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
     missing = np.full(7, np.nan)

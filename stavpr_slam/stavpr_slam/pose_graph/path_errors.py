@@ -29,12 +29,10 @@ class OdometryNoise:
 
     :param translation: meters per square root of a meter.
     :param rotation: radians per square root of a meter.
-    :param bias: of the rotation, radians per meter: as much as its random error after a kilometer.
     """
 
     translation: float = 0.05
     rotation: float = 0.012
-    bias: float = 0.0004
 
 
 class Nodes(Protocol):
@@ -43,23 +41,20 @@ class Nodes(Protocol):
     transforms: np.ndarray
     origin: np.ndarray
     spread: np.ndarray
-    bent: np.ndarray
 
 
-def step_errors(ends: np.ndarray, noise: OdometryNoise) -> tuple[np.ndarray, np.ndarray]:
+def step_errors(ends: np.ndarray, noise: OdometryNoise) -> np.ndarray:
     """
-    Return the errors of a step in the axes of the start.
+    Return the covariance of the twist of a step in the axes of the start, rotation first, (6, 6).
 
     :param ends: the two keyframes in these axes, shape (2, 4, 4).
-    :returns: covariance of the twist, rotation first, (6, 6), and the twists by biases of the
-        rotation of one deviation about each axis, as columns, (6, 3).
     """
     lever = cross((ends[:1, :3, 3] + ends[1:, :3, 3]) / 2)[0]
     length = float(np.linalg.norm(ends[1, :3, 3] - ends[0, :3, 3]))
     moves = np.concatenate([np.eye(3), lever])
-    spread = noise.rotation**2 * moves @ moves.T
+    spread: np.ndarray = noise.rotation**2 * moves @ moves.T
     spread[3:, 3:] += noise.translation**2 * np.eye(3)
-    return max(length, SHORTEST) * spread, noise.bias * length * moves @ ends[1, :3, :3]
+    return max(length, SHORTEST) * spread
 
 
 def given_growth(
@@ -86,16 +81,16 @@ def given_growth(
     return grown if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None
 
 
-def path_errors(chain: Nodes, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def path_errors(chain: Nodes, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """
     Return the errors of the motion between nodes of one session, in the axes of the start.
 
     :param start, end: n nodes, in any order.
-    :returns: covariances, rotation first, (n, 6, 6); twists by biases, (n, 6, 3).
+    :returns: covariances, rotation first, (n, 6, 6).
     """
     local = chain.transforms[start].copy()
     local[:, :3, 3] -= chain.origin[start]
     turn = adjoints(inverse(local))
     sign = np.where(end >= start, 1.0, -1.0)[:, None, None]
-    spread = turn @ (sign * (chain.spread[end] - chain.spread[start])) @ turn.swapaxes(-1, -2)
-    return spread, turn @ (chain.bent[end] - chain.bent[start])
+    spread: np.ndarray = sign * (chain.spread[end] - chain.spread[start])
+    return turn @ spread @ turn.swapaxes(-1, -2)

@@ -60,7 +60,7 @@ class Runs:
         after[order] = np.where(inside, order[np.minimum(later, count - 1)], -1)
         T, at = chain.transforms, chain.travelled
         length = np.maximum(at[after] - at[since], 1e-9)
-        covariance, _ = path_errors(chain, number, since)
+        covariance = path_errors(chain, number, since)
         return cls(
             variable.astype(bool), before, after, inverse(T[since]) @ T,
             (at - at[since]) / length, covariance,

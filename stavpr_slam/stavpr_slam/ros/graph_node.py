@@ -35,7 +35,7 @@ from stavpr_ros.ros.navigation import tf_message
 from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings
-from stavpr_slam.pose_graph.solver import load_gtsam
+from stavpr_slam.pose_graph.network import load_gtsam
 from stavpr_slam.ros.correction import LEVER, LimitedCorrection
 from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
 from stavpr_slam.ros.graph_process import GraphProcess, RobotOdometry, Snapshot
@@ -299,6 +299,12 @@ class PoseGraphNode(ManagedNode):
             self.get_logger().error(f'no update: {snapshot.failure}', throttle_duration_sec=10.0)
         if snapshot.values['accepted_closures']:
             self._lost = ''
+        elif float(snapshot.values['evidence_against_correction']) > 0:
+            self.get_logger().warning(
+                'the odometry is published: the path by the loop closures is less probable '
+                f'(evidence -{snapshot.values["evidence_against_correction"]})',
+                throttle_duration_sec=10.0,
+            )
         if snapshot.paths is not None and self.state == 'active':
             trajectories, *edges = snapshot.paths
             for robot, (stamps, *both) in trajectories.items():
@@ -367,6 +373,8 @@ class PoseGraphNode(ManagedNode):
         }
         reason = max(useless, key=lambda text: useless[text])
         level, text = DiagnosticStatus.WARN, f'{graph["accepted_closures"]} closures accepted'
+        if float(self._values.get('evidence_against_correction', 0)) > 0:
+            text = 'the odometry is published: the path by the closures is less probable'
         if self.state != 'active':
             level, text = DiagnosticStatus.OK, f'the node is {self.state}'
         elif self._lost:

@@ -1,0 +1,220 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which loop closures are right, and how large the errors of the odometry are: by evidence.
+
+A robust solution at a tight odometry decides over all closures, so that the result does not
+depend on their order. Its evidence is the logarithm of how much more probable the closures are
+than by the odometry alone, where each wrong place may be anywhere on the map. Closures of
+successive images at successive places are one event, right or wrong, and count as one closure.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
+from stavpr_slam.pose_graph.network import Network
+
+TIGHT = 0.125  # factor on the errors of the odometry that it is trusted by at first
+SCALES = TIGHT * 2.0 ** np.arange(7)  # those that evidence can loosen it to
+PRECISE = TIGHT / 16  # the least one of a solution
+CERTAIN = math.log(20)  # evidence from which a correction is published
+LOOSENED = math.log(100)  # evidence from which the odometry is trusted less, and for each
+DOUBLED = math.log(20)  # doubling of its errors beyond the settings
+AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
+FAR = 1e-9  # all count
+STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
+GAP = 15.0  # meters that queries and places of an event are apart at most
+
+
+def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """
+    Return the number of the event of each closure, shape (n,).
+
+    :param query, place: nodes, (n,).
+    """
+    near = np.ones((len(query),) * 2, bool)
+    for nodes in (query, place):
+        at, session = chain.travelled[nodes], chain.session[nodes]
+        near &= (np.abs(at[:, None] - at) <= GAP) & (session[:, None] == session)
+    numbers: np.ndarray = connected_components(near)[1]
+    return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """
+    Which closures are right.
+
+    :param taken: shape (n,), bool.
+    :param scales: factors on the errors of the odometry of each robot.
+    :param evidence: of the closures that are taken; 0 = none are.
+    :param rejected: evidence against a correction that is not published; 0 = there is none.
+    :param values: the variables.
+    :param agreeing, corrected: the closures, and the variables, of the robust solution, whether
+        it is published or not.
+    :param strained: node behind the part of the odometry that it bends most; -1 = none.
+    :param chance: logarithm of the number of choices of as many events.
+    """
+
+    taken: np.ndarray
+    scales: np.ndarray
+    evidence: float
+    rejected: float
+    values: Any
+    agreeing: np.ndarray
+    corrected: Any
+    strained: int = -1
+    chance: float = 0.0
+
+
+class Decider:
+    """Decides on the closures of a network."""
+
+    def __init__(
+        self, chain: KeyframeChain, network: Network, initial: np.ndarray, measured: bool
+    ) -> None:
+        self._chain, self._network, self._measured = chain, network, measured
+        self._start = network.values(initial)
+        count = len(network.query)
+        self._events = (
+            np.arange(count) if measured else events(chain, network.query, network.place)
+        )
+        size = np.maximum(np.sort(np.ptp(initial[:, :3, 3], axis=0)), 1.0)
+        space = size[1:].prod() * 2 * math.pi
+        if network.freedom == 6:
+            space = size.prod() * 8 * math.pi**2
+        self._room = math.log(space) - network.freedom / 2 * math.log(2 * math.pi)
+        self._precise = np.linalg.slogdet(network.information)[1] / 2
+
+    def representatives(self, taken: np.ndarray) -> np.ndarray:
+        """Return the closure in the middle of each event, (m,)."""
+        numbers, found = np.flatnonzero(taken), []
+        at = self._chain.travelled[self._network.query]
+        for event in np.unique(self._events[taken]):
+            own = numbers[self._events[numbers] == event]
+            found.append(own[np.argsort(at[own], kind='stable')[len(own) // 2]])
+        return np.array(found, int)
+
+    def _evidence(self, odometry: Any, taken: np.ndarray, values: Any) -> float:
+        network, own = self._network, self.representatives(taken)
+        weights = np.zeros(len(taken))
+        weights[own] = 1.0
+        _, squared, determinant = network.solve(odometry, values, weights)
+        found = network.log_determinant - determinant - squared / 2
+        found += float(self._precise[own].sum()) + len(own) * self._room
+        # a session may begin anywhere in the same space
+        return found - network.joined(own) * (self._room + network.loose_determinant)
+
+    def _chance(self, taken: np.ndarray) -> float:
+        """
+        Return minus the logarithm of the probability of the events that are taken, by chance.
+
+        Events are drawn one by one, each by its number of closures, in any order: of n events of
+        one size, k have 1 / binomial(n, k).
+        """
+        sizes = np.sort(np.bincount(self._events[taken]))[::-1]
+        sizes = sizes[sizes > 0]
+        rest = len(taken) - np.cumsum(sizes) + sizes
+        return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
+
+    def at(self, scales: np.ndarray, near: Decision | None = None) -> Decision:
+        """
+        Decide with an odometry.
+
+        :param scales: factors on its errors, of each robot.
+        :param near: a decision with a tighter one, to begin at where the odometry is too far off.
+        """
+        network = self._network
+        odometry = network.odometry(scales[self._chain.robot])
+        none, start = np.zeros(len(network.query), bool), self._start
+        try:
+            try:
+                taken, values = network.robust(odometry, start)
+            except RuntimeError:  # of GTSAM: a path that is bent beyond its precision
+                if near is None:
+                    raise
+                taken, values = network.robust(odometry, near.corrected, AGAIN)
+            evidence = self._evidence(odometry, taken, values) if taken.any() else 0.0
+            # closures beside them may agree by now
+            for first in ((AGAIN, FAR) if self._measured else (AGAIN,)) * bool(taken.any()):
+                more, moved = network.robust(odometry, values, first)
+                found = self._evidence(odometry, more, moved) if more.any() else 0.0
+                if more.sum() > taken.sum() and found > evidence - CERTAIN:
+                    taken, values, evidence = more, moved, found
+        except RuntimeError:
+            return Decision(none, scales, 0.0, math.inf, start, none, start)
+        joins = network.joined(np.flatnonzero(taken))
+        node, squared = network.most_strained(odometry, values)
+        strained = node if squared > STRAINED else -1
+        if evidence < CERTAIN - joins * (CERTAIN + network.limit):
+            return Decision(none, scales, 0.0, -evidence, start, taken, values, strained)
+        chance = self._chance(taken)
+        return Decision(taken, scales, evidence, 0.0, values, taken, values, strained, chance)
+
+    def decide(self, robots: int) -> Decision:
+        """Decide with a tight odometry, or a looser one for which there is evidence."""
+        best = self.at(np.full(robots, TIGHT))
+        self.tried = [best]
+        for scale in SCALES[1 : 4 if self._measured else None]:
+            self.tried.append(self.at(np.full(robots, scale), self.tried[-1]))
+            best = self._better(best, self.tried[-1])
+            if all(each.evidence < best.evidence - LOOSENED for each in self.tried[-2:]):
+                break
+        for robot in range(robots) if robots > 1 else ():
+            for scale in SCALES:
+                changed = np.where(np.arange(robots) == robot, scale, best.scales)
+                best = self._better(best, self.at(changed))
+        return best
+
+    def _better(self, best: Decision, other: Decision) -> Decision:
+        """
+        Return another decision if there is evidence for its odometry, else the best one.
+
+        Of many events, some agree by chance where the odometry explains everything: the number of
+        choices counts against both, and so does each doubling of the errors in the settings.
+        """
+
+        def gain(decision: Decision) -> float:
+            doublings = np.log2(decision.scales.clip(1.0)).sum()
+            return decision.evidence - decision.chance - DOUBLED * float(doublings)
+
+        return other if gain(other) - max(gain(best), 0.0) > LOOSENED else best
+
+    def estimate(
+        self, decision: Decision, independent: np.ndarray
+    ) -> tuple[np.ndarray, Any, np.ndarray]:
+        """
+        Estimate the variables at the errors of the odometry that the closures show.
+
+        :param independent: closures whose errors do not correlate, shape (n,), bool; of other
+            events one closure counts.
+        :returns: the factors on the errors of each robot, the variables, and the closures that
+            count, shape (n,), bool.
+        """
+        if self._measured:
+            odometry = self._network.odometry(np.ones(len(self._chain)))
+            taken, values = self._network.robust(odometry, decision.values, AGAIN)
+            return np.ones_like(decision.scales), values, taken
+        counted = decision.taken & independent
+        for number in self.representatives(decision.taken):
+            if not (counted & (self._events == self._events[number])).any():
+                counted[number] = True
+
+        def solved(factor: float) -> tuple[float, float, Any]:
+            network = self._network
+            odometry = network.odometry(factor * decision.scales[self._chain.robot])
+            values, squared, determinant = network.solve(odometry, decision.values, counted * 1.0)
+            return network.log_determinant - determinant - squared / 2, factor, values
+
+        best, least = solved(1.0), PRECISE / decision.scales.min()
+        for change in (0.5, 2.0):
+            while best[1] * change >= least and best[1] * change < 64:
+                found = solved(best[1] * change)
+                if found[0] <= best[0]:
+                    break
+                best = found
+        return best[1] * decision.scales, best[2], counted

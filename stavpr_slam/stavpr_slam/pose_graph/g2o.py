@@ -1,0 +1,147 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pose graphs as g2o text, of the pose graph and of others.
+
+The information of an edge has the translation first, and in three dimensions the rotation as the
+vector of a quaternion, half of the rotation.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
+from stavpr_ros.units import SECOND
+from stavpr_slam.pose_graph.closures import Closure
+from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
+from stavpr_slam.pose_graph.keyframes import ChainSettings
+from stavpr_slam.pose_graph.path_errors import path_errors
+from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
+
+HALF = np.diag([1.0, 1, 1, 2, 2, 2])
+OUT_OF_PLANE = 1e4  # information of z, roll and pitch that a plane's edges are given
+Edge = tuple[int, int, np.ndarray, np.ndarray]  # start, end, motion (4, 4), information (6, 6)
+
+
+def g2o_text(graph: PoseGraph) -> str:
+    """Return the nodes as solved, the odometry and the accepted closures in the g2o format."""
+    count = len(graph.solved)
+    lines = ['# g2o: accepted closures only']
+    poses = to_poses(graph.solved)
+    lines += [f'VERTEX_SE3:QUAT {i} {_numbers(pose)}' for i, pose in enumerate(poses)]
+    chain = graph.chain
+    nodes = np.flatnonzero(chain.previous[:count] >= 0)
+    before, T = chain.previous[nodes], chain.transforms
+    scales = graph.scales[chain.robot[nodes]] if len(graph.scales) else np.ones(len(nodes))
+    covariances = scales[:, None, None] ** 2 * path_errors(chain, nodes, before)
+    motions = inverse(T[before]) @ T[nodes]
+    for row in zip(before.tolist(), nodes.tolist(), motions, covariances, strict=True):
+        lines.append(_edge_text(*row))
+    for edge in graph.used.values():
+        lines.append(_edge_text(edge.place, edge.query, edge.transform, edge.covariance))
+    return '\n'.join(lines) + '\n'
+
+
+def _edge_text(start: int, end: int, transform: np.ndarray, covariance: np.ndarray) -> str:
+    order = [3, 4, 5, 0, 1, 2]
+    information = np.linalg.inv(covariance)[np.ix_(order, order)]
+    upper = (HALF @ information @ HALF)[np.triu_indices(6)]
+    return f'EDGE_SE3:QUAT {start} {end} {_numbers(to_poses(transform))} {_numbers(upper)}'
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ' '.join(f'{value:.9g}' for value in values)
+
+
+def read_edges(path: str) -> list[Edge]:
+    """
+    Read the edges of a file; those in the plane (SE2) become rigid motions.
+
+    :returns: the information has the translation first, and whole rotations.
+    :raises InputError: it cannot be read, or a line is neither a vertex nor an edge of poses.
+    """
+    edges = []
+    try:
+        lines = Path(path).read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: {error}') from error
+    for number, line in enumerate(lines, 1):
+        tag, *fields = line.split() or ['#']
+        if tag.startswith(('VERTEX_SE', 'FIX', '#')):
+            continue
+        try:
+            edges.append(_edge(tag, fields))
+        except (ValueError, KeyError, np.linalg.LinAlgError):
+            raise InputError(
+                f'{path}, line {number}: expected VERTEX_SE2, VERTEX_SE3:QUAT, EDGE_SE2 or '
+                f'EDGE_SE3:QUAT with its numbers, found {line[:60]!r}'
+            ) from None
+    return edges
+
+
+def _edge(tag: str, fields: list[str]) -> Edge:
+    """
+    Return the edge of a line.
+
+    :raises ValueError, KeyError, LinAlgError: it is none.
+    """
+    pose, freedom = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}[tag]
+    start, end = int(fields[0]), int(fields[1])
+    values = np.array(fields[2:], np.float64)
+    upper = np.zeros((freedom, freedom))
+    upper[np.triu_indices(freedom)] = values[pose:]
+    own = upper + np.triu(upper, 1).T
+    np.linalg.cholesky(own)
+    if freedom == 3:
+        information, at = np.eye(6) * OUT_OF_PLANE, [0, 1, 5]
+        information[np.ix_(at, at)] = own
+        return start, end, matrices(planar_poses(values[None, :3])[0]), information
+    half = np.linalg.inv(HALF)
+    return start, end, matrices(values[:7]), half @ own @ half
+
+
+def graph_of(edges: list[Edge]) -> PoseGraph:
+    """
+    Return a pose graph of edges; it is not solved yet.
+
+    Edges from a vertex to the next one are its odometry, with their information as given; all
+    others, and second ones, are closures. A node is at a second of its own.
+
+    :raises InputError: two successive vertices have no edge, or a value is not finite.
+    """
+    odometry: dict[int, Edge] = {}
+    closures = []
+    for edge in edges:
+        is_next = edge[1] == edge[0] + 1 and edge[0] not in odometry
+        if is_next:
+            odometry[edge[0]] = edge
+        else:
+            closures.append(edge)
+    first, count = min(odometry, default=0), len(odometry)
+    missing = [i for i in range(first, first + count) if i not in odometry]
+    if missing or not count:
+        raise InputError(
+            f'no edge between the vertices {min(missing, default=0)} and the next one: expected '
+            'an odometry of successive vertices'
+        )
+    infinite = ChainSettings(distance=0.0, angle=0.0, max_gap=np.inf, max_speed=np.inf)
+    graph = PoseGraph(GraphSettings(infinite, measured=True))
+    pose, spread = np.eye(4), np.zeros((6, 6))
+    graph.add_odometry(SECOND, to_poses(pose), covariance=spread)
+    for i in range(first, first + count):
+        _, _, motion, information = odometry[i]
+        pose = pose @ motion
+        turn, order = adjoints(pose[None])[0], [3, 4, 5, 0, 1, 2]
+        spread = spread + turn @ np.linalg.inv(information)[np.ix_(order, order)] @ turn.T
+        back = np.zeros((6, 6))  # about the node, as in geometry_msgs/PoseWithCovariance
+        back[:3, 3:] = back[3:, :3] = np.eye(3)
+        back[:3, :3] = -cross(pose[None, :3, 3])[0]
+        covariance = back @ spread @ back.T
+        graph.add_odometry((i - first + 2) * SECOND, to_poses(pose), covariance=covariance)
+    for start, end, motion, information in closures:
+        turn = np.kron(np.eye(2), motion[:3, :3])  # to the axes of the start
+        covariance = turn @ np.linalg.inv(information) @ turn.T
+        stamps = [(node - first + 1) * SECOND for node in (end, start)]
+        graph.add_closure(Closure(stamps[0], stamps[1], to_poses(motion), covariance))
+    return graph

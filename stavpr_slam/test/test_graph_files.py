@@ -1,0 +1,118 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Graphs of other programs: g2o files in two and three dimensions, with false closures."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stavpr_ros.commands.stavpr import main
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges
+from stavpr_slam.pose_graph.transforms import exponentials
+from test_pose_graph import error
+
+SIDE, LAPS = 12, 3
+COUNT = 4 * SIDE * LAPS
+INFORMATION = {
+    3: [400, 0, 0, 400, 0, 3600],
+    6: np.diag([400] * 3 + [14400] * 3)[np.triu_indices(6)],
+}
+
+
+def truth(freedom: int) -> np.ndarray:
+    """Return laps of a square, one lap above the other in three dimensions, (COUNT, 4, 4)."""
+    pose, poses = np.eye(4), []
+    for i in range(COUNT):
+        poses.append(pose.copy())
+        turn = Rotation.from_euler('z', 90 * (i % SIDE == SIDE - 1), degrees=True)
+        pose[:3, 3] += pose[:3, 0] + [0, 0, 0.05 * (freedom == 6)]
+        pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+    return np.array(poses)
+
+
+def write(path, freedom, false=0.0):
+    """Write a graph of noisy odometry and closures of later laps, a share of them false."""
+    dice, T = np.random.default_rng(3), truth(freedom)
+    pairs = [(i, i + 1) for i in range(COUNT - 1)]
+    pairs += [(i - 4 * SIDE, i) for i in range(4 * SIDE, COUNT, 2)]
+    deviations = np.array([0.017] * 3 + [0.05] * 3)
+    if freedom == 3:
+        deviations[[0, 1, 5]] = 0
+    lines = ['FIX 0']
+    for start, end in pairs:
+        place = end
+        if end - start > 1 and dice.random() < false:
+            place = (end + int(dice.integers(10, 4 * SIDE - 10))) % COUNT
+        motion = (
+            inverse(T[start]) @ T[place] @ exponentials(deviations * dice.normal(size=(1, 6)))[0]
+        )
+        pose, tag = to_poses(motion), 'EDGE_SE3:QUAT'
+        if freedom == 3:
+            pose, tag = (
+                [*pose[:2], Rotation.from_matrix(motion[:3, :3]).as_rotvec()[2]],
+                'EDGE_SE2',
+            )
+        lines.append(f'{tag} {start} {end} ' + ' '.join(map(str, [*pose, *INFORMATION[freedom]])))
+    path.write_text('\n'.join(lines) + '\n')
+    return str(path)
+
+
+@pytest.mark.parametrize('freedom', [3, 6])
+@pytest.mark.parametrize('false', [0.0, 0.5])
+def test_closures_of_a_g2o_file_correct_its_odometry(tmp_path, freedom, false):
+    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', freedom, false)))
+    odometry = to_poses(graph.chain.transforms)
+    found = to_poses(graph.update(final=True))
+    expected = to_poses(truth(freedom))
+    assert error(found, expected) < 0.25 < 0.3 * error(odometry, expected)
+    assert graph.accepted == pytest.approx(48 * (1 - false), abs=12 * false)
+
+
+def test_written_graph_is_read_again(tmp_path):
+    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', 6, 0.3)))
+    graph.update(final=True)
+    (tmp_path / 'b.g2o').write_text(g2o_text(graph))
+    again = graph_of(read_edges(str(tmp_path / 'b.g2o')))
+    found = again.update(final=True)
+    assert (again.accepted, again.rejected) == (graph.accepted, 0)
+    np.testing.assert_allclose(found[:, :3, 3], graph.solved[:, :3, 3], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ('text', 'words'),
+    [
+        ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0\n', 'line 1: expected'),
+        ('EDGE_SE2 0 1 1 0 0 -1 0 0 1 0 1\n', 'line 1: expected'),
+        ('\nEDGE_XY 0 1 1 0\n', 'line 2: expected'),
+        ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 2 3 1 0 0 1 0 0 1 0 1\n', 'vertices 1 and'),
+        ('', 'no edge'),
+    ],
+)
+def test_graph_that_cannot_be_solved_is_named(tmp_path, text, words):
+    (tmp_path / 'a.g2o').write_text(text)
+    with pytest.raises(InputError, match=words):
+        graph_of(read_edges(str(tmp_path / 'a.g2o')))
+
+
+def test_command_writes_the_solution(tmp_path, capsys):
+    path = write(tmp_path / 'a.g2o', 3, 0.3)
+    assert main(['optimize_graph', path, '--output', str(tmp_path / 'b.tum')]) == 0
+    assert '144 poses, 48 closures' in capsys.readouterr().out
+    poses = np.loadtxt(tmp_path / 'b.tum')[:, 1:]
+    assert error(poses, to_poses(truth(3))) < 0.25
+    assert main(['optimize_graph', str(tmp_path / 'missing.g2o')]) == 1
+
+
+def test_false_closures_leave_the_odometry(tmp_path, capsys):
+    path = write(tmp_path / 'a.g2o', 3, 1.0)
+    assert main(['optimize_graph', path]) == 0
+    assert 'the odometry stays' in capsys.readouterr().out
+
+
+def test_edges_are_rigid_motions(tmp_path):
+    (start, end, motion, information), *_ = read_edges(write(tmp_path / 'a.g2o', 6))
+    assert (start, end) == (0, 1)
+    assert motion.shape == (4, 4)
+    np.testing.assert_allclose(np.diag(information), [400] * 3 + [3600] * 3)
+    np.testing.assert_allclose(matrices(to_poses(motion)), motion)
