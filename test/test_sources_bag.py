@@ -196,8 +196,44 @@ def bag_file(tmp_path, request):
 def test_bag_cut_off_fails(bag_file, keep):
     file, data = bag_file, bag_file.read_bytes()
     file.write_bytes(data[: int(len(data) * keep)])
+    if (file.suffix, keep) == ('.mcap', 0.99):  # without its index, which is not needed
+        assert len(list(open_source(file, '/raw'))) == 200
+        return
     with pytest.raises(SourceError, match=str(file)):
         list(open_source(file, '/raw'))
+
+
+def test_mcap_without_an_end_yields_its_whole_chunks(tmp_path, caplog):
+    """As after a power loss: zeros may follow, or a part of a chunk."""
+    image = np.zeros((64, 64, 3), np.uint8)
+    originals = (ImageRecord.of_image(image, t) for t in range(1, 201))
+    write_bag(tmp_path / 'bag', '/raw', originals, 'mcap')
+    data, file = next((tmp_path / 'bag').glob('*.mcap')).read_bytes(), tmp_path / 'lost.MCAP'
+    for kept, images in ((0.6, 85), (0.95, 170)):  # chunks are of one megabyte
+        part = data[: int(len(data) * kept)]
+        for content in (part, part + bytes(2_000_000)):
+            file.write_bytes(content)
+            assert [frame.stamp for frame in open_source(file)] == list(range(1, images + 1))
+    assert 'lost.MCAP has no end, as after a power loss' in caplog.text
+    file.write_bytes(data[:1000])
+    with pytest.raises(SourceError, match='has no images'):
+        open_source(file)
+
+
+def test_mcap_of_another_profile_names_it(tmp_path):
+    write_bag(tmp_path / 'bag', '/raw', records(), 'mcap')
+    file = next((tmp_path / 'bag').glob('*.mcap'))
+    file.write_bytes(file.read_bytes().replace(b'ros2', b'ros1', 1))
+    with pytest.raises(SourceError, match="is an MCAP of profile 'ros1': expected ros2"):
+        open_source(file)
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_bag_with_a_name_in_upper_case_is_read(tmp_path, ros1):
+    path = write_mixed(tmp_path / 'mixed.bag', ros1)
+    file = path if ros1 else next(path.glob('*.db3'))
+    upper = file.rename(tmp_path / f'DRIVE{file.suffix.upper()}')
+    assert len(list(open_source(upper, '/raw'))) == 5
 
 
 def test_bag_with_damaged_bytes_fails_or_reads(bag_file):

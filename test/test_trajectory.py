@@ -4,7 +4,7 @@
 
 import math
 
-from bags import SECOND, write_odometry
+from bags import SECOND, write_odometry, writing
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError, SourceError
 from stavpr_ros.mapping import distance, rotation, Trajectory
-from stavpr_ros.sources.bag import read_odometry
+from stavpr_ros.sources.bag import ODOMETRY, read_odometry
 
 
 def turned(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
@@ -185,7 +185,16 @@ def test_read_odometry_with_clock_jump_fails(tmp_path):
         read_odometry(path, '/odom')
 
 
-def test_from_arrays_with_invalid_pose_names_it():
-    poses = np.array([turned(0), np.zeros(7)])
-    with pytest.raises(InputError, match='pose number 1'):
-        Trajectory.from_arrays(np.array([1, 2]), poses)
+def test_from_arrays_counts_invalid_poses_unless_all_are():
+    poses = np.array([np.zeros(7), turned(0), np.full(7, np.nan), turned(90)])
+    trajectory = Trajectory.from_arrays(np.array([1, 2, 3, 4]), poses)
+    assert (len(trajectory), trajectory.rejected) == (2, 2)
+    with pytest.raises(InputError, match='pose number 0 and all before: pose'):
+        Trajectory.from_arrays(np.array([1]), poses[:1])
+
+
+def test_read_odometry_of_a_damaged_message_returns_no_pose_for_it(tmp_path):
+    with writing(tmp_path / 'bag') as bag:
+        for i in range(3):
+            bag.write_bytes('/odom', ODOMETRY, i + 1, b'\0\1\0\0damaged')
+    assert np.isnan(read_odometry(tmp_path / 'bag', '/odom')[1]).all()

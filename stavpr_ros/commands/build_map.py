@@ -193,7 +193,7 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
 def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     """Return the map, and the journal that it is in."""
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_ros.mapping import KeyframeSettings
+    from stavpr_ros.mapping import KeyframeSettings, Trajectory
     from stavpr_ros.mapping.builder import build_journal
     from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
@@ -216,12 +216,13 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     source = open_source(arguments.input, arguments.topic, bad_image, arguments.fps)
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
+    poses = _poses(arguments, len(source))
     journal = build_journal(
         images,
         extractor,
         arguments.output,
         _source_of(arguments),
-        _poses(arguments, len(source)),
+        poses,
         thumbnails=not arguments.no_thumbnails,
         keyframes=keyframes,
         thumbnail_width=width,
@@ -232,6 +233,8 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
             f'--odometry {arguments.odometry}: no image has a pose; are the stamps of both from '
             'one clock?'
         )
+    if isinstance(poses, Trajectory):
+        skipped['odometry'] += poses.rejected
     if unread := left_out(skipped, getattr(source, 'left_out', {})):
         say(unread, sys.stderr)
     say(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')

@@ -83,24 +83,27 @@ class Trajectory:
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
         self._lock = Lock()
+        self.rejected = 0  # poses of :meth:`from_arrays`
 
     @classmethod
     def from_arrays(
         cls, stamps: np.ndarray, poses: np.ndarray, timeout: float = 0.5
     ) -> 'Trajectory':
         """
-        Make a trajectory of recorded poses; all are kept.
+        Make a trajectory of recorded poses; invalid ones are counted in ``rejected``.
 
         :param stamps: nanoseconds, in order, shape (m,), int64.
         :param poses: shape (m, 7).
-        :raises InputError: an invalid pose.
+        :raises InputError: every pose is invalid.
         """
         trajectory = cls(timeout, capacity=max(1, len(stamps)))
         for i, (stamp, pose) in enumerate(zip(stamps.tolist(), poses, strict=True)):
             try:
                 trajectory.add(stamp, pose)
             except InputError as error:
-                raise InputError(f'pose number {i}: {error}') from error
+                trajectory.rejected += 1
+                if trajectory.rejected == len(stamps):
+                    raise InputError(f'pose number {i} and all before: {error}') from error
         return trajectory
 
     def __len__(self) -> int:

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag
-from stavpr_ros.sources.bag_path import reading
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.units import SECOND
@@ -186,15 +185,21 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
     :param topic: with or without the leading slash.
     :returns: stamps of the headers (times of recording where they are 0), ns, shape (m,), int64,
-        in order; x y z (meters) and quaternion x y z w, shape (m, 7), float64, as recorded.
+        in order; x y z (meters) and quaternion x y z w, shape (m, 7), float64, as recorded; a row
+        of NaN for a message that is damaged.
     :raises SourceError: the bag cannot be read, the topic is missing, or time jumps back in it.
     """
     path = Path(path)
-    stamps, poses = [], []
+    stamps: list[int] = []
+    poses = []
     with open_bag(path) as bag:
         for _, time_ns, raw in bag.messages(_connections(bag, path, topic)):
-            with reading(path):
+            try:
                 message = bag.deserialize(raw, ODOMETRY)
+            except Exception:  # garbage raises errors of any type
+                stamps.append(stamps[-1] if stamps else 0)
+                poses.append((math.nan,) * 7)
+                continue
             stamps.append(_stamp(message) or time_ns)
             p, q = message.pose.pose.position, message.pose.pose.orientation
             poses.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))

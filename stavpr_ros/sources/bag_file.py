@@ -19,6 +19,7 @@ from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import METADATA, reading, storage_files
+from stavpr_ros.sources.mcap import with_end
 from stavpr_ros.units import SECOND
 
 LOG_SUFFIXES = ('-wal', '-journal')
@@ -70,11 +71,13 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     with TemporaryDirectory(prefix='stavpr_bag_') as scratch:
         with reading(path):
             reader: Ros1Reader | Ros2Reader
-            if path.suffix == '.bag' and path.is_file():
+            if path.suffix.lower() == '.bag' and path.is_file():
                 reader = Ros1Reader(path)
                 deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
-                reader = Ros2Reader(_stage(path, Path(scratch)))
+                staged = _stage(path, Path(scratch))
+                staged = with_end(staged, path) if staged.suffix == '.mcap' else staged
+                reader = Ros2Reader(staged)
                 deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
             reader.open()
         try:
@@ -92,7 +95,7 @@ def _stage(path: Path, scratch: Path) -> Path:
     """
     if path.is_file() or not (path / METADATA).exists():
         file = path if path.is_file() else _only_storage_file(path)
-        return _stage_file(file, scratch / f'bag{file.suffix}')
+        return _stage_file(file, scratch / f'bag{file.suffix.lower()}')
     folder = scratch / 'bag'
     folder.mkdir()
     for file in path.iterdir():
@@ -120,7 +123,7 @@ def _stage_file(file: Path, target: Path) -> Path:
         for end in LOG_SUFFIXES
         if (log := Path(f'{file}{end}')).exists() and log.stat().st_size
     ]
-    if file.suffix != '.db3' or not logs:
+    if target.suffix != '.db3' or not logs:
         target.symlink_to(file.resolve())
         return target
     shutil.copyfile(file, target)

@@ -21,7 +21,7 @@ def is_bag(path: Path) -> bool:
     with reading(path):
         if path.is_dir():
             return (path / METADATA).exists() or bool(storage_files(path))
-        return path.suffix in STORAGE_SUFFIXES or path.suffix == '.bag'
+        return path.suffix.lower() in STORAGE_SUFFIXES | {'.bag'}
 
 
 @contextmanager
@@ -38,11 +38,11 @@ def reading(path: Path) -> Iterator[None]:
     except Exception as error:
         raise SourceError(
             f'{path} is damaged, cut off or no bag: expected a ROS 2 bag (folder, .db3, .mcap) or '
-            f'a ROS 1 .bag ({type(error).__name__}: {error}); try `ros2 bag reindex` or `rosbag '
-            'reindex`'
+            f'a ROS 1 .bag ({type(error).__name__}: {error}); try `ros2 bag reindex`, `rosbag '
+            'reindex` or `mcap recover`'
         ) from error
 
 
 def storage_files(folder: Path) -> list[Path]:
     """Return the files of a folder that bags store messages in."""
-    return sorted(file for file in folder.iterdir() if file.suffix in STORAGE_SUFFIXES)
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in STORAGE_SUFFIXES)
