@@ -194,7 +194,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     """Return the map, and the journal that it is in."""
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.mapping import KeyframeSettings, Trajectory
-    from stavpr_ros.mapping.builder import build_journal
+    from stavpr_ros.mapping.builder import build_journal, fit_value_range
     from stavpr_ros.mapping.journal_map import journal_map
     from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
     from stavpr_ros.sources import open_source
@@ -214,6 +214,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     keyframes = KeyframeSettings(*(getattr(arguments, f'keyframe_{rule}') for rule in RULES))
     extractor = make_extractor(arguments)
     source = open_source(arguments.input, arguments.topic, bad_image, arguments.fps)
+    fit_value_range(source, extractor)
     images = _Images(source, arguments.every)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
     poses = _poses(arguments, len(source))

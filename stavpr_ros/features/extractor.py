@@ -35,6 +35,8 @@ class FeatureSettings:
     :param strips: number of vertical strips W; 1 for features that are one vector.
     :param projection: identity of the random projection, None without one.
     :param feature_version: version of the computation: another one gives other features.
+    :param value_range: of images of 16 bits, the values that become 0 and 255; None = the upper
+        byte is taken.
     """
 
     kind: str
@@ -42,6 +44,7 @@ class FeatureSettings:
     strips: int = 7
     projection: str | None = None
     feature_version: int = 1
+    value_range: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.feature_version != 1:
@@ -53,7 +56,10 @@ class FeatureSettings:
 
     def to_json(self) -> str:
         """Return the settings as one line of JSON."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+        values = dataclasses.asdict(self)
+        if self.value_range is None:
+            del values['value_range']
+        return json.dumps(values, sort_keys=True)
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,11 @@ class FeatureExtractor:
     :param device: ``cpu``, ``cuda`` or ``auto``: ``cuda`` where it is available.
     :raises SettingsError: the network's output cannot be used.
     :raises UnavailableError: the device or the network's file is not there.
+
+    ``is_new`` until its first images have decided the range of values of 16 bits.
     """
+
+    is_new = True
 
     def __init__(
         self,
@@ -191,12 +201,18 @@ class FeatureExtractor:
                 model = str(find_model(backbone.sha256, model))
             backbone = dataclasses.replace(backbone, model=model)
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
+        extractor.set_value_range(settings.value_range)
         if extractor.settings != settings:
             raise FeatureMismatchError(
                 f'this extractor has the settings {extractor.settings.to_json()}, the map '
                 f'requires {settings.to_json()}'
             )
         return extractor
+
+    def set_value_range(self, value_range: tuple[int, int] | None) -> None:
+        """Set the values of 16 bits that become 0 and 255, once."""
+        self.settings = dataclasses.replace(self.settings, value_range=value_range)
+        self.is_new = False
 
     def extract(self, images: Sequence[np.ndarray]) -> LocalFeatures:
         """

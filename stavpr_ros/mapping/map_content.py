@@ -3,7 +3,7 @@
 """The parts of a map file, checked against each other and the manifest, as a map."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import cache
 import logging
 from pathlib import Path
@@ -24,6 +24,7 @@ from stavpr_ros.mapping.map_schema import (
     INTRINSICS,
     number,
     record,
+    VALUE_RANGE,
 )
 from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
 from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
@@ -69,6 +70,11 @@ def map_content(file: MapFile) -> PlaceMap:
     if 'vectors' in sections:
         _note_vectors(file.path)
     readable = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
+    if 'value_range' in readable:
+        VALUE_RANGE(data := sections['value_range']['data'], 'section value_range')
+        if data[0] >= data[1]:
+            raise ValueError(f'section value_range is {data}: expected a range')
+        settings = replace(settings, value_range=(data[0], data[1]))
     parts = {name: part for name, part in file.parts.items() if name in PARTS}
     if STATISTICS not in readable:
         parts = {n: part for n, part in parts.items() if not n.startswith(STATISTICS)}

@@ -17,7 +17,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
-from stavpr_ros.mapping.map_schema import identity_fields
+from stavpr_ros.mapping.map_schema import identity_fields, SETTINGS
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 from stavpr_ros.mapping.map_version2 import (
     copy_with,
@@ -70,6 +70,8 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
         data['same_places'] = None
     if place_map.threshold is not None:
         data['threshold'] = place_map.threshold
+    if place_map.settings.value_range is not None:
+        data['value_range'] = place_map.settings.value_range
     if place_map.error_risks is not None:
         data[ERROR_RISKS] = asdict(place_map.error_risks)
     if statistics is not None:  # the writer knows the hash of the features
@@ -77,16 +79,17 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
     settings, projection = place_map.settings, place_map.projection
     backbone = {name: getattr(settings.backbone, name) for name in identity_fields(settings.kind)}
     return {
-        'settings': vars(settings) | {'backbone': backbone},
+        'settings': {name: {**vars(settings), 'backbone': backbone}[name] for name in SETTINGS},
         'cells': place_map.features.cells,
         'projection': projection.name if projection else None,
         'sessions': [asdict(session) for session in place_map.sessions],
-        'sections': {name: _section(each) for name, each in data.items()},
+        'sections': {name: _section(each, name) for name, each in data.items()},
     }
 
 
-def _section(data: Any) -> dict[str, Any]:
-    return {'version': 1, 'required': False, 'data': data}
+def _section(data: Any, name: str = '') -> dict[str, Any]:
+    # programs that do not know the range of values would take their upper byte
+    return {'version': 1, 'required': name == 'value_range', 'data': data}
 
 
 def save_error_risks(risks: ErrorRisks, path: str | Path, force: Force) -> str:

@@ -157,6 +157,7 @@ INTRINSICS = record(
         'mount': list_of(number, 7, 7),
     }
 )
+VALUE_RANGE = list_of(integer(0, 65535 + 1), 2, 2)
 ERROR_RISKS = record(
     {
         'method': text(),

@@ -15,6 +15,7 @@ import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of, verify_map
+from stavpr_ros.mapping.builder import note_value_range
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
@@ -29,6 +30,7 @@ from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
+from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes
 
 NO_MAP = (
     "no map: call the service load_map, or set parameter 'map_path' before the node is configured"
@@ -90,6 +92,10 @@ class Operation(ABC):
         self.places: PlaceMap | GrowingMap | None = place_map
         self._recognizer: SequenceRecognizer | ViewBank | None = None
         self._start(place_map)
+        self._to_bytes: ToBytes | None = None
+        if self.extractor is not None:
+            is_new, known = self.extractor.is_new, scale(self.extractor.settings.value_range)
+            self._to_bytes = RangeFinder() if is_new else known
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._last: ImageResult | None = None
@@ -212,8 +218,10 @@ class Operation(ABC):
         assert self.extractor is not None
         width, bank = self._thumbnail_width(camera), self._recognizer
         with _timed(stages, 'decoding'):
-            image = decode_message(message, _needed_size(self.extractor, width))
+            image = decode_message(message, _needed_size(self.extractor, width), self._to_bytes)
             self.contrast = _contrast(image)
+            if self.extractor.is_new and (reason := self._find_range()):
+                return ImageResult(Status.NOT_READY, reason, image=image, cause='not ready')
             if reason := self._keyframes.too_alike(image):
                 return ImageResult(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
         if self.map_state == 'full':
@@ -235,6 +243,20 @@ class Operation(ABC):
                 result = self._checked(result)
             self._last = result
         return result
+
+    def _find_range(self) -> str:
+        """Find the range of 16 bits by the first images of a new map; return why it lacks one."""
+        finder, extractor = self._to_bytes, self.extractor
+        assert isinstance(finder, RangeFinder)
+        assert extractor is not None
+        images = finder.images
+        if not 0 < images < RANGE_IMAGES:
+            extractor.set_value_range(finder.value_range)
+            note_value_range(extractor)
+            self._to_bytes = scale(extractor.settings.value_range)
+            if images:
+                self._start(None)  # with these settings
+        return f'images of 16 bits, {images} of {RANGE_IMAGES} for their range' if images else ''
 
     def _checked(self, result: ImageResult) -> ImageResult:
         """Return a result, and its late ones that are matches, after the geometric check."""

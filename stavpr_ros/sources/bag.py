@@ -11,6 +11,7 @@ import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag
 from stavpr_ros.sources.encodings import decode_message
+from stavpr_ros.sources.files import ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.units import SECOND
 
@@ -28,7 +29,7 @@ class BagSource:
 
     Iterating yields :class:`Frame` with the header's stamp (the time of recording where that is 0)
     and ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens
-    the bag again.
+    the bag again. ``to_bytes`` converts images of 16 bits, None = by the upper byte.
 
     :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
     :param topic: the image topic; may be left out if there is only one.
@@ -45,6 +46,7 @@ class BagSource:
     ) -> None:
         self.path = Path(path)
         self.on_error = on_error
+        self.to_bytes: ToBytes | None = None
         with open_bag(self.path) as bag:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
@@ -75,12 +77,14 @@ class BagSource:
         return self._each(self._record, start, duration)
 
     def _frame(self, index: int, time_ns: int, message: Any) -> Frame:
-        return Frame(decode_message(message), _stamp(message) or time_ns, f'{self.topic}#{index}')
+        image = decode_message(message, to_bytes=self.to_bytes)
+        return Frame(image, _stamp(message) or time_ns, f'{self.topic}#{index}')
 
     def _record(self, _: int, time_ns: int, message: Any) -> ImageRecord:
         stamp_ns, frame_id = _stamp(message), message.header.frame_id
         if self.message_type == COMPRESSED:
-            return ImageRecord.of_image(decode_message(message), time_ns, stamp_ns, frame_id)
+            image = decode_message(message, to_bytes=np.asarray)  # the map decides the range
+            return ImageRecord.of_image(image, time_ns, stamp_ns, frame_id)
         return ImageRecord(
             time_ns,
             stamp_ns,

@@ -35,7 +35,7 @@ class Encoding:
     How the pixels of one ``sensor_msgs/Image`` encoding lie in memory.
 
     :param channels: values per pixel.
-    :param value_bytes: bytes per value, 1 or 2; of two only the more significant one is used.
+    :param value_bytes: bytes per value, 1 or 2.
     :param to_rgb: takes uint8 (rows, width, channels), a view of the message unless the values had
         two bytes; gives an RGB array (height, width, 3), new or the same.
     :param block: (rows, columns) of the pixels that share a color: the size is a multiple of it.
@@ -153,12 +153,13 @@ def decode_image(
     step: int,
     data: Any,
     least: tuple[int, int] | None = None,
+    to_bytes: files.ToBytes | None = None,
 ) -> np.ndarray:
     """
     Decode the fields of a raw ``sensor_msgs/Image``.
 
-    The bytes are viewed in place for any ``step``; the result has memory of its own. Of sixteen
-    bits the lower eight are dropped. YUV is BT.601 in the range of video, as in cv_bridge.
+    The bytes are viewed in place for any ``step``; the result has memory of its own. YUV is BT.601
+    in the range of video, as in cv_bridge.
 
     :param height: rows of the image; NV12, NV21 and NV24 have rows of color below them.
     :param width: pixels per row.
@@ -169,6 +170,7 @@ def decode_image(
         missing.
     :param least: rows and columns that are needed of a large image, which is reduced then, see
         :func:`stavpr_ros.sources.files.reduce`; None = all.
+    :param to_bytes: converts values of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
     :raises ImageError: header and data contradict each other, the encoding is unsupported, or the
         image has more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
@@ -193,14 +195,21 @@ def decode_image(
         pixels: np.ndarray = np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
         image = files.reduce(layout.to_rgb(pixels), least)
         return np.array(image, order='C') if image is pixels else image
-    # the more significant byte lies first if big-endian
-    pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
-    high = cv2.extractChannel(pairs, 0 if is_bigendian else 1)
-    pixels = np.asarray(high).reshape(rows, width, layout.channels)
-    return files.reduce(layout.to_rgb(pixels), least)
+    if to_bytes is None:  # the more significant byte lies first if big-endian
+        pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
+        high = np.asarray(cv2.extractChannel(pairs, 0 if is_bigendian else 1))
+    else:
+        order = '>u2' if is_bigendian else '<u2'
+        wide: np.ndarray = np.ndarray((rows, values), order, flat, 0, (step, 2))
+        high = to_bytes(wide.astype(np.uint16))
+    return files.reduce(layout.to_rgb(high.reshape(rows, width, layout.channels)), least)
 
 
-def decode_message(message: Any, least: tuple[int, int] | None = None) -> np.ndarray:
+def decode_message(
+    message: Any,
+    least: tuple[int, int] | None = None,
+    to_bytes: files.ToBytes | None = None,
+) -> np.ndarray:
     """
     Decode an image message, raw or compressed, of rclpy or rosbags, or any object with its fields.
 
@@ -208,11 +217,12 @@ def decode_message(message: Any, least: tuple[int, int] | None = None) -> np.nda
         ``sensor_msgs/Image``.
     :param least: rows and columns that are needed of a large image, which is reduced then; None =
         all.
+    :param to_bytes: converts values of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
     :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
     """
     if hasattr(message, 'format'):
-        return decode_compressed_message(message, least)
+        return decode_compressed_message(message, least, to_bytes)
     return decode_image(
         message.height,
         message.width,
@@ -221,10 +231,15 @@ def decode_message(message: Any, least: tuple[int, int] | None = None) -> np.nda
         message.step,
         message.data,
         least,
+        to_bytes,
     )
 
 
-def decode_compressed_message(message: Any, least: tuple[int, int] | None = None) -> np.ndarray:
+def decode_compressed_message(
+    message: Any,
+    least: tuple[int, int] | None = None,
+    to_bytes: files.ToBytes | None = None,
+) -> np.ndarray:
     """
     Decode a ``sensor_msgs/CompressedImage``.
 
@@ -232,7 +247,7 @@ def decode_compressed_message(message: Any, least: tuple[int, int] | None = None
     images, and to detect Bayer mosaics, which image_transport stores as gray files.
 
     :param message: anything with ``format`` and ``data``.
-    :param least: see :func:`decode_message`.
+    :param least, to_bytes: of :func:`decode_message`.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: a depth image, or see :func:`stavpr_ros.sources.files.decode_file`.
     """
@@ -244,7 +259,7 @@ def decode_compressed_message(message: Any, least: tuple[int, int] | None = None
             kind='depth',
         )
     try:
-        return files.decode_file(message.data, _demosaic_of(message.format), least)
+        return files.decode_file(message.data, _demosaic_of(message.format), least, to_bytes)
     except ImageError as error:
         raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
 

@@ -38,6 +38,8 @@ REDUCED_JPEG = {
 
 ToBytes = Callable[[np.ndarray], np.ndarray]
 """Converts values of 16 bits, uint16, to uint8, of the same shape."""
+RANGE_IMAGES, PERCENTILES = 20, (0.5, 99.5)
+"""The first images of a map, and the shares of their values, that decide the range in use."""
 ORIENTATION = 0x0112  # tag of EXIF
 HEIF = re.compile(rb'....ftyp(hei[cfmsx]|hev[cmsx]|mif1|msf1)', re.DOTALL)
 WIDE_TIFF = ('TIFF', 'F'), ('TIFF', 'I')  # Pillow's modes of 32 bits, which OpenCV does not read
@@ -85,6 +87,35 @@ def flat_bytes(data: Any) -> np.ndarray:
         return np.ascontiguousarray(data).reshape(-1).view(np.uint8)
     view = memoryview(data)
     return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
+
+
+class RangeFinder:
+    """Converts images of 16 bits by their upper byte, and counts their values."""
+
+    def __init__(self) -> None:
+        self.images, self._counts = 0, np.zeros(65536, np.int64)
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        self.images += 1
+        self._counts += np.bincount(values.reshape(-1), minlength=65536)
+        return (values >> 8).astype(np.uint8)
+
+    @property
+    def value_range(self) -> tuple[int, int] | None:
+        """Return the :data:`PERCENTILES` of all values; None = there were none."""
+        if not self.images:
+            return None
+        ends = self._counts.sum() * np.array(PERCENTILES) / 100
+        low, high = np.searchsorted(np.cumsum(self._counts), ends).tolist()
+        return low, max(high, low + 1)
+
+
+def scale(value_range: tuple[int, int] | None) -> ToBytes | None:
+    """Return the conversion that scales values of 16 bits to 0 .. 255; None for None."""
+    if value_range is None:
+        return None
+    scaled = np.interp(np.arange(65536), value_range, (0, 255))
+    return np.round(scaled).astype(np.uint8).__getitem__
 
 
 def decode_file(

@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
-from stavpr_ros.sources.files import decode_file
+from stavpr_ros.sources.files import decode_file, ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.units import SECOND
 
@@ -55,7 +55,8 @@ class FolderSource:
     Sub-folders, at any depth, are in natural order too, one after the other. Hidden files and
     folders are ignored; ``left_out`` counts other images and folders by their
     :data:`stavpr_ros.errors.CAUSES`. Iterating yields :class:`Frame` with an unknown stamp and,
-    as identifier, the file's name, in a sub-folder its path from the folder.
+    as identifier, the file's name, in a sub-folder its path from the folder. ``to_bytes`` converts
+    images of 16 bits, None = by the upper byte.
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
@@ -67,6 +68,7 @@ class FolderSource:
     ) -> None:
         self.path = Path(path)
         self.on_error = on_error
+        self.to_bytes: ToBytes | None = None
         try:
             files, self.left_out = _images_of(self.path)
         except OSError as error:
@@ -102,6 +104,7 @@ class FolderSource:
         """
         if not frames_per_second > 0:
             raise InputError(f'{frames_per_second} frames per second: expected more than 0')
+        self.to_bytes = np.asarray  # the map decides the range of 16 bits
         # the last instant before a file counts as its own: i / 10 is not exact
         first, last = (
             math.ceil(min(t * frames_per_second - 1e-6, len(self)))
@@ -116,7 +119,7 @@ class FolderSource:
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):
             try:
-                frame = Frame(_read(file), 0, text_of(file.relative_to(self.path)))
+                frame = Frame(_read(file, self.to_bytes), 0, text_of(file.relative_to(self.path)))
             except ImageError as error:
                 if self.on_error is None:
                     raise
@@ -153,9 +156,9 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
     return own if is_drive else below, +unread
 
 
-def _read(file: Path) -> np.ndarray:
+def _read(file: Path, to_bytes: ToBytes | None) -> np.ndarray:
     try:
-        return decode_file(file.read_bytes())
+        return decode_file(file.read_bytes(), to_bytes=to_bytes)
     except OSError as error:
         raise ImageError(
             f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',

@@ -53,14 +53,15 @@ class ImageRecord:
         """
         Make a record of an RGB image.
 
-        :param image: RGB, uint8, shape (height, width, 3).
+        :param image: RGB, uint8 or uint16, shape (height, width, 3).
         :param time_ns: when it was recorded, nanoseconds.
         :param stamp_ns: header stamp, nanoseconds; the time of recording if not given.
         """
         height, width = image.shape[:2]
         stamp = time_ns if stamp_ns is None else stamp_ns
-        data = np.ascontiguousarray(image).reshape(-1)
-        return cls(time_ns, stamp, frame_id, height, width, 'rgb8', False, width * 3, data)
+        data = np.ascontiguousarray(image, f'<u{image.itemsize}').reshape(-1).view(np.uint8)
+        layout = f'rgb{8 * image.itemsize}', False, width * 3 * image.itemsize
+        return cls(time_ns, stamp, frame_id, height, width, *layout, data)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.errors import left_out, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
+from stavpr_ros.mapping.builder import fit_value_range
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_path import is_bag
@@ -159,6 +160,7 @@ class _Loader:
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
         """Extract the features of a source, cropped as the options state."""
         args, extractor = self._arguments, self._chosen()
+        fit_value_range(source, extractor)
         # unknown places are cropped as the query is
         source = cropped(source, *((0, args.crop_map) if name == 'map' else (args.crop_query, 0)))
         began = time.perf_counter()
