@@ -123,6 +123,7 @@ setup(
         'ray': ['ray>=2.40'],
         'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,
+        'video': ['av>=18'],
     },
     zip_safe=False,
     entry_points=entry_points,

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
 PACKAGES = {'stavpr_ros': ROOT} | {name: ROOT / name for name in SIBLINGS}
 FOLDERS = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
-EXTRAS = ('onnx', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam')
+EXTRAS = ('onnx', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam', 'video')
 
 # Import name: distribution on PyPI, where they differ.
 DISTRIBUTIONS = {

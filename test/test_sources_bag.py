@@ -15,6 +15,7 @@ from stavpr_ros.errors import ImageError, OutputError, SettingsError, SourceErro
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, COMPRESSED, RAW
 from stavpr_ros.sources.bag_file import open_bag
+from stavpr_ros.sources.bag_messages import read_messages
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 
@@ -42,6 +43,27 @@ def write_mixed(path, ros1=False, bad=()):
             bag.write('/small', COMPRESSED, record.time_ns, header, 'png', png)
             bag.write('/text', TEXT, record.time_ns, 'hello')
     return path
+
+
+def test_parts_of_a_split_ros1_bag_are_one_drive(tmp_path):
+    whole = list(records(9))
+    times = [each.time_ns for each in whole]
+    for first in (6, 0, 3):
+        with writing(tmp_path / f'drive_{first}.bag', ros1=True) as bag:
+            for each in whole[first : first + 3]:
+                header = bag.header(each.stamp_ns)
+                bag.write('/raw', RAW, each.time_ns, header, 6, 8, 'rgb8', 0, 24, each.data)
+                bag.write('/text', TEXT, each.time_ns, 'hello')
+    source = open_source(tmp_path)
+    assert isinstance(source, BagSource)
+    assert len(source) == 9
+    assert [frame.stamp for frame in source] == [each.stamp_ns for each in whole]
+    assert [each.time_ns for each in source.records(0.4, 0.3)] == times[4:7]
+    assert [each.time_ns for each in read_messages(tmp_path, ['/text'])] == times
+    with writing(tmp_path / 'rear.bag', ros1=True) as bag:
+        bag.write('/rear', RAW, T0, bag.header(5), 6, 8, 'rgb8', 0, 24, whole[0].data)
+    with pytest.raises(SourceError, match=r'2 image topics, choose one .* /raw .*, /rear '):
+        open_source(tmp_path)
 
 
 def test_bag_is_written_by_one_writer_and_over_what_a_killed_one_left(tmp_path):

@@ -23,10 +23,12 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.records import evaluate_records
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure
 from stavpr_ros.commands import build_map, node, record, replay, stavpr
+from stavpr_ros.commands import map as map_command
 from stavpr_ros.commands.record import loop_closure_record
 from stavpr_ros.mapping import load_map
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
+from videos import write_video
 
 HANGS = 5 * TIMEOUT  # seconds after which an executable counts as stuck
 
@@ -237,16 +239,14 @@ def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatc
 
 def test_build_map_of_video_takes_images_at_the_rate(run, tmp_path):
     images = route_images(24)
-    codec, size = cv2.VideoWriter_fourcc(*'MJPG'), images[0].shape[1::-1]
-    writer = cv2.VideoWriter(str(tmp_path / 'phone.avi'), codec, 8, size)
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    writer.release()
+    write_video(tmp_path / 'phone.avi', images, rate=8)
     arguments = ['--input', tmp_path / 'phone.avi', '--fps', '4', '--keyframe-interval', '0.6']
     result = run(build_map, *arguments, '--output', tmp_path / 'map.stavpr')
     assert '4 of 12 images became places' in result.out
     stamps = load_map(tmp_path / 'map.stavpr').stamps
     np.testing.assert_allclose(stamps / SECOND, [1, 1.75, 2.5, 3.25], atol=0.002)
+    result = run(map_command, 'info', tmp_path / 'map.stavpr')
+    assert 'stamps     1.0 s to 3.2 s\n' in result.out
 
 
 @pytest.mark.parametrize(

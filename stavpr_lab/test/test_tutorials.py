@@ -6,29 +6,21 @@ from pathlib import Path
 import re
 import subprocess
 
-import cv2
 from fixtures import route_images
 from processes import environment
 import pytest
+from videos import write_video
 
 TUTORIALS = sorted((Path(__file__).resolve().parents[2] / 'docs/tutorials').glob('*.md'))
 SECONDS = 300
-
-
-def write_phone_video(path, images):
-    codec, size = cv2.VideoWriter_fourcc(*'mp4v'), images[0].shape[1::-1]
-    writer = cv2.VideoWriter(str(path), codec, 5, size)
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    writer.release()
 
 
 @pytest.fixture
 def folder(tmp_path):
     """Return a folder with the files that the tutorials begin with."""
     images = route_images(100)
-    write_phone_video(tmp_path / 'monday.mp4', images)
-    write_phone_video(tmp_path / 'tuesday.mp4', [image // 4 * 3 for image in images])
+    write_video(tmp_path / 'monday.mp4', images, rate=5)
+    write_video(tmp_path / 'tuesday.mp4', [image // 4 * 3 for image in images], rate=5)
     return tmp_path
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 # Tools of other packages, and the packages that provide them.
 TOOLS = {'align': 'stavpr_slam', 'colmap': 'stavpr_slam', 'plot': 'stavpr_lab'}
 
+DATED = 250_000_000 * SECOND  # stamps below count from the start of a video or a simulation
+
 EPILOG = """
 examples:
   map info route.stavpr --plot route.png
@@ -223,6 +225,8 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
 
 
 def _time(stamp: int) -> str:
+    if stamp < DATED:
+        return f'{stamp / SECOND:.1f} s'
     return datetime.fromtimestamp(stamp // SECOND, UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
 
 

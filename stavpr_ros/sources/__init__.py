@@ -25,7 +25,7 @@ def open_source(
     Open a folder of images, a video or a bag, whichever it is.
 
     :param path: a folder of images; a video (.mp4, .mov ...); a ROS 2 bag (its folder, or its .db3
-        or .mcap file); a ROS 1 .bag file.
+        or .mcap file); a ROS 1 .bag file; a folder of the videos or .bag files of one drive.
     :param topic: the bag's image topic; may be left out if there is only one. Of bags only.
     :param on_error: called with the error of an image that cannot be decoded, which is then
         skipped; without it the error is raised.

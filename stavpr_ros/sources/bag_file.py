@@ -12,6 +12,7 @@ import sqlite3
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
@@ -36,7 +37,7 @@ class OpenBag:
     """
 
     path: Path
-    reader: Ros1Reader | Ros2Reader
+    reader: Ros1Reader | Ros2Reader | AnyReader
     deserialize: Callable[[bytes, str], Any]
 
     def messages(
@@ -65,14 +66,17 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     """
     Open a bag for as long as the block runs.
 
-    :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
+    :param path: a ROS 1 .bag file, or a folder of the parts of a split one; a ROS 2 bag: its
+        folder, or its .db3 or .mcap file.
     :raises SourceError: it cannot be read.
     """
     with TemporaryDirectory(prefix='stavpr_bag_') as scratch:
         with reading(path):
-            reader: Ros1Reader | Ros2Reader
-            if path.suffix.lower() == '.bag' and path.is_file():
-                reader = Ros1Reader(path)
+            reader: Ros1Reader | Ros2Reader | AnyReader
+            files = storage_files(path) if path.is_dir() else [path]
+            if files and all(each.suffix.lower() == '.bag' and each.is_file() for each in files):
+                links = [_stage_file(each, Path(scratch, f'{each.stem}.bag')) for each in files]
+                reader = Ros1Reader(files[0]) if len(files) == 1 else AnyReader(links)
                 deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
             else:
                 staged = _stage(path, Path(scratch))

@@ -9,7 +9,7 @@ from typing import Any
 
 from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
-from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag
@@ -47,7 +47,7 @@ def read_messages(
     """
     with open_bag(path) as bag:
         connections = [each for each in bag.reader.connections if each.topic in topics]
-        convert = _Ros1() if isinstance(bag.reader, Ros1Reader) else None
+        convert = None if isinstance(bag.reader, Ros2Reader) else _Ros1()
         for connection, time_ns, raw in bag.messages(connections, start, duration):
             kind = message_type(connection)
             content = raw if convert is None else convert(kind, raw)

@@ -9,7 +9,7 @@ from pathlib import Path
 from stavpr_ros.errors import SourceError, StavprError
 
 METADATA = 'metadata.yaml'
-STORAGE_SUFFIXES = frozenset({'.db3', '.mcap'})
+STORAGE_SUFFIXES = frozenset({'.db3', '.mcap', '.bag'})
 
 
 def is_bag(path: Path) -> bool:
@@ -21,7 +21,7 @@ def is_bag(path: Path) -> bool:
     with reading(path):
         if path.is_dir():
             return (path / METADATA).exists() or bool(storage_files(path))
-        return path.suffix.lower() in STORAGE_SUFFIXES | {'.bag'}
+        return path.suffix.lower() in STORAGE_SUFFIXES
 
 
 @contextmanager

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 from stavpr_ros.errors import ImageError
+from stavpr_ros.sources import frame
 
-MAX_PIXELS = 64_000_000
-"""Largest decoded image: the header of a small file may claim one that exhausts the memory."""
+MAX_PIXELS = frame.MAX_PIXELS
 
 JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
 """Markers before a segment (length and bytes), and the end; never within compressed pixels."""

@@ -7,6 +7,9 @@ from typing import Any, Self
 
 import numpy as np
 
+MAX_PIXELS = 64_000_000
+"""Largest decoded image: the header of a small file may claim one that exhausts the memory."""
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:

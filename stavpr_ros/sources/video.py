@@ -1,52 +1,53 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A video file as a sequence of images."""
+"""A video, in one file or several, as a sequence of images."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing, suppress
+from itertools import islice
 import math
+from multiprocessing import Pipe
 import os
 from pathlib import Path
-import select
 import subprocess
 import sys
-from typing import Self
 
 import numpy as np
 from stavpr_ros.checks import require_above
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.regular_file import require_regular
-from stavpr_ros.sources.files import MAX_PIXELS
+from stavpr_ros.sources.bag_path import reading
+from stavpr_ros.sources.folder import natural_key
+from stavpr_ros.sources.folder import SUFFIXES as IMAGES
 from stavpr_ros.sources.frame import Frame, ImageRecord
-from stavpr_ros.sources.video_decoder import (
-    EARLY,
-    FACTS,
-    FRAME,
-    MEMORY,
-    NO_BACKEND,
-    NO_MEMORY,
-    NOT_OPENED,
-    TOO_LARGE,
-)
+from stavpr_ros.sources.video_decoder import CUT_OFF, EARLY, FACTS, FRAME, REASONS, REMEDY
 from stavpr_ros.units import SECOND
 
-SUFFIXES = frozenset({'.mp4', '.m4v', '.mov', '.avi', '.mkv', '.webm', '.3gp'})
+SUFFIXES = frozenset({
+    '.264', '.265', '.3g2', '.3gp', '.asf', '.avi', '.divx', '.dv', '.f4v', '.flv', '.h264',
+    '.h265', '.hevc', '.ivf', '.m2t', '.m2ts', '.m2v', '.m4v', '.mjpeg', '.mjpg', '.mkv', '.mod',
+    '.mov', '.mp4', '.mpe', '.mpeg', '.mpg', '.mts', '.mxf', '.nut', '.ogv', '.qt', '.rm', '.tod',
+    '.tp', '.ts', '.vob', '.webm', '.wmv', '.wtv', '.y4m',
+})  # fmt: skip
 FPS = 5.0
 """Images taken per second: 20 of them, the length of a window, show 4 s of the route."""
 TIMEOUT = 30.0  # seconds for the start of the decoder, and for each frame
-COMPLETE = 0.9  # share of the stated frames, whose number may be an estimate
+SAME_RATE = 0.05  # relative difference of the frame rates of one camera
 MODULE = 'stavpr_ros.sources.video_decoder'
-REMEDY = 'play it to the end to check it, or convert it: ffmpeg -i FILE converted.mp4'
-REASONS = {
-    NOT_OPENED: 'is damaged, cut off or no video that OpenCV decodes',
-    TOO_LARGE: f'has frames of more than {MAX_PIXELS} pixels',
-    NO_BACKEND: 'cannot be decoded: this OpenCV is built without FFmpeg',
-    NO_MEMORY: f'needs more than the {MEMORY >> 30} GiB of memory of the decoder',
-}
+
+
+def video_files(path: str | Path) -> list[Path]:
+    """Return a video's file, or the videos of a folder in natural order, by names only."""
+    path = Path(path)
+    with reading(path):
+        files = path.glob('[!.]*') if path.is_dir() else [path]
+        videos = [one for one in files if one.suffix.lower() in SUFFIXES and not one.is_dir()]
+    return sorted(videos, key=lambda file: natural_key(file.name))
 
 
 def is_video(path: str | Path) -> bool:
-    """Return whether a path is a video, by its name only."""
-    return Path(path).suffix.lower() in SUFFIXES and not Path(path).is_dir()
+    """Return whether a path is a video, or a folder with videos, by names only."""
+    return bool(video_files(path))
 
 
 def require_video(fps: float | None, paths: Iterable[str | None]) -> None:
@@ -64,17 +65,19 @@ class VideoSource:
     Images of a video, at a fixed rate, upright by the rotation that the file states.
 
     Iterating yields :class:`Frame` with ``name#i`` as identifier, i counting the images from 0. A
-    stamp is the time of the frame in the container, counted from 1 s, since 0 is unknown.
+    stamp is the time since the first frame, counted from the creation time that the file states,
+    else from 1 s, since 0 is unknown. Of an interlaced frame, one field is taken.
 
     Each iteration decodes in a process of its own, with limited memory and time: a damaged
     file cannot crash this one.
 
-    :param path: .mp4, .m4v, .mov, .avi, .mkv, .webm or .3gp, of a codec that OpenCV decodes.
-    :param on_error: called with an :class:`ImageError` if the video ends early; without it the
-        error is raised.
+    :param path: a file that FFmpeg decodes; or a folder with the files of one drive, of one size
+        and frame rate, in natural order of their names: stamps go on from file to file.
+    :param on_error: called with an :class:`ImageError` if a file ends early; without it the error
+        is raised.
     :param fps: images per second of video; all frames if it has fewer.
     :raises SettingsError: the rate is not above 0.
-    :raises SourceError: it cannot be decoded, or its stamps do not increase.
+    :raises SourceError: a file cannot be decoded, or they are not one drive.
     """
 
     def __init__(
@@ -85,61 +88,70 @@ class VideoSource:
     ) -> None:
         require_above('fps', fps, 0)
         self.path, self.on_error, self.fps = Path(path), on_error, fps
-        try:
-            require_regular(self.path)  # a pipe would never end
-        except OSError as error:
+        self._files = video_files(path) if self.path.is_dir() else [self.path]
+        if any(file.suffix.lower() in IMAGES for file in self.path.glob('[!.]*')):
+            raise SourceError(f'{path} has videos and images: expected one kind; name a video')
+        for file in self._files:
+            with reading(file):
+                require_regular(file)  # a pipe would never end
+        facts = []
+        with closing(_messages(self._files, fps)) as messages:
+            for file in self._files:
+                try:
+                    facts.append(FACTS.unpack(next(messages)))
+                except _DecoderError as error:
+                    raise SourceError(f'{file} {error}') from error
+        self._durations, rates, created, *sizes = np.array(facts).T
+        self._rate = rates[0]
+        disorder = created.all() and (np.diff(created) < 0).any()
+        if disorder or np.ptp(sizes, 1).any() or np.ptp(rates) > SAME_RATE * self._rate:
+            rows = zip(self._files, facts, strict=True)
+            listed = ', '.join(
+                f'{one.name} ({w}x{h}, {r:.4g} Hz)' for one, (_, r, _, h, w) in rows
+            )
             raise SourceError(
-                f'{path} cannot be read: {error.strerror}; check its name and permissions'
-            ) from error
-        with _Decoder(self.path, fps) as decoder:
-            frame_count, rate = decoder.facts()
-        most = self.path.stat().st_size  # no frame is smaller than a byte
-        self._stated = min(frame_count, most) if frame_count > 0 else 0
-        self._rate = rate if 0 < rate < math.inf else fps
+                f'{path} has videos of several sizes or rates, or not in the order of creation: '
+                f'expected the files of one drive; name one of {listed}'
+            )
+        self._start = round(created[0] * SECOND) or SECOND
 
     def __len__(self) -> int:
-        """Return the number of images by the container's number of frames: an estimate."""
-        if self._stated < 1:
+        """Return the number of images by the stated durations: an estimate."""
+        duration, frames = self._durations.sum(), self._durations.sum() * self._rate
+        # no frame is smaller than a byte
+        if not 0 < frames < sum(file.stat().st_size for file in self._files):
             return 0
-        last = (self._stated - 1) / self._rate
-        return int(min(self._stated, (last + EARLY) * self.fps // 1 + 1))
+        return int(min(frames, (duration - 1 / self._rate + EARLY) * self.fps // 1 + 1))
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode one image after the other."""
-        frames, last, i = 0, -math.inf, 0
-        with _Decoder(self.path, self.fps) as decoder:
-            decoder.facts()
+        i, file, seconds = 0, 0, 0.0
+        with closing(_messages(self._files, self.fps)) as messages:
             try:
-                while header := decoder.read(FRAME.size):
-                    seconds, height, width = FRAME.unpack(header)
-                    if not last < seconds < math.inf:
-                        raise SourceError(
-                            f'{self.path}: frame {frames} has the stamp {seconds:.3f} s after '
-                            f'{last:.3f} s: expected increasing stamps; {REMEDY}'
-                        )
-                    frames, last = frames + 1, seconds
-                    if height * width > MAX_PIXELS:
-                        raise SourceError(f'{self.path} {REASONS[TOO_LARGE]}; {REMEDY}')
-                    if height * width:
-                        pixels = decoder.read(height * width * 3)
-                        image = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
-                        stamp = SECOND + round(seconds * SECOND)
-                        yield Frame(image, stamp, f'{self.path.name}#{i}')
+                for header in islice(messages, len(self._files), None):
+                    seconds, file, height, width = FRAME.unpack(header)
+                    if height:
+                        image = np.frombuffer(next(messages), np.uint8)
+                        stamp = self._start + round(seconds * SECOND)
+                        name = f'{self._files[file].name}#{i}'
+                        yield Frame(image.reshape(height, width, 3), stamp, name)
                         i += 1
-                reason = decoder.reason()
+                    elif width == CUT_OFF:
+                        self._cut_off(file, seconds)
             except _DecoderError as error:
-                reason = str(error)
-        if not frames:
+                self._cut_off(file, seconds, f': {error}')
+        if not i:
             raise SourceError(f'{self.path} has no frame that can be decoded; {REMEDY}')
-        if reason or frames < COMPLETE * self._stated:
-            early = ImageError(
-                f'{self.path} ends early, after {frames} of about {self._stated:.0f} frames'
-                f'{reason and ": "}{reason}',
-                kind='cut off',
-            )
-            if self.on_error is None:
-                raise early
-            self.on_error(early)
+
+    def _cut_off(self, file: int, seconds: float, reason: str = '') -> None:
+        early = ImageError(
+            f'{self._files[file]} ends early, after {seconds:.1f} s of about '
+            f'{self._durations[file]:.1f} s{reason}',
+            kind='cut off',
+        )
+        if self.on_error is None:
+            raise early
+        self.on_error(early)
 
     def records(self, start: float = 0.0, duration: float = math.inf) -> Iterator[ImageRecord]:
         """
@@ -149,7 +161,7 @@ class VideoSource:
         :param duration: seconds from there on.
         """
         for frame in self:
-            seconds = (frame.stamp - SECOND) / SECOND
+            seconds = (frame.stamp - self._start) / SECOND
             if seconds >= start + duration:
                 return
             if seconds >= start:
@@ -160,66 +172,31 @@ class _DecoderError(Exception):
     """The decoder has ended or stalled; the text is the reason."""
 
 
-class _Decoder:
-    """A running decoder; killed at the end of the block."""
-
-    def __init__(self, path: Path, fps: float) -> None:
-        self._path = path
-        one = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), '1')
-        self._process = subprocess.Popen(
-            [sys.executable, '-m', MODULE, str(path.absolute()), str(fps)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            process_group=0,  # an interrupt from the terminal is for this process
-            env=os.environ | one,
-        )
-        assert self._process.stdout is not None
-        self._output = self._process.stdout
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
-        self._output.close()
-
-    def facts(self) -> tuple[float, float]:
-        """Return the stated number of frames and frames per second, both perhaps wrong."""
+def _messages(files: list[Path], fps: float) -> Generator[bytearray]:
+    """Yield what a decoder sends; end it at the end; raise _DecoderError if it is not in time."""
+    messages, end = Pipe(duplex=False)
+    one = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), '1')
+    with messages:
+        with end:
+            process = subprocess.Popen(
+                [sys.executable, '-m', MODULE, str(fps), *(file.absolute() for file in files)],
+                stdin=subprocess.DEVNULL,
+                stdout=end.fileno(),
+                stderr=subprocess.DEVNULL,
+                process_group=0,  # an interrupt from the terminal is for this process
+                env=os.environ | one,
+            )
         try:
-            content = self.read(FACTS.size)
-            reason = '' if content else self.reason()
-        except _DecoderError as error:
-            content, reason = bytearray(), str(error)
-        if not content:
-            raise SourceError(f'{self._path} {reason}; {REMEDY}')
-        frame_count, rate = FACTS.unpack(content)
-        return frame_count, rate
-
-    def read(self, size: int) -> bytearray:
-        """Return the next bytes, or none at the end; raise _DecoderError if it is not in time."""
-        content = bytearray(size)
-        rest = memoryview(content)
-        poll = select.poll()
-        poll.register(self._output, select.POLLIN)
-        while rest:
-            if not poll.poll(TIMEOUT * 1000):
+            with suppress(EOFError, OSError):  # ended, perhaps within a message
+                while messages.poll(TIMEOUT):
+                    yield bytearray(messages.recv_bytes())
                 raise _DecoderError(f'no frame was decoded in {TIMEOUT:g} s')
-            count = os.readv(self._output.fileno(), [rest])
-            if not count:
-                if len(rest) == size:
-                    return bytearray()
-                raise _DecoderError(self.reason() or 'the decoder ended within a frame')
-            rest = rest[count:]
-        return content
-
-    def reason(self) -> str:
-        """Return why the decoder ended, '' for the end of the video."""
-        try:
-            code = self._process.wait(TIMEOUT)
-        except subprocess.TimeoutExpired:
-            return f'the decoder did not end in {TIMEOUT:g} s'
-        if code < 0:
-            return f'crashed the decoder with signal {-code}'
-        return REASONS.get(code, f'ended the decoder with status {code}') if code else ''
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(TIMEOUT)
+        finally:
+            process.kill()
+            process.wait()
+    if (code := process.returncode) < 0:
+        raise _DecoderError(f'crashed the decoder with signal {-code}')
+    if code:
+        raise _DecoderError(REASONS.get(code, f'ended the decoder with status {code}'))

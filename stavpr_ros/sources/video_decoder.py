@@ -1,74 +1,166 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The program that decodes a video for :class:`stavpr_ros.sources.video.VideoSource`.
+The program that decodes videos for :class:`stavpr_ros.sources.video.VideoSource`, with PyAV.
 
-``python3 -m stavpr_ros.sources.video_decoder FILE FPS`` writes to its standard output the number
-of frames and their rate as the container states them (``FACTS``), then a header (``FRAME``) for
-every decoded frame, with height and width 0 for those between the images that are taken. The
-pixels of an image follow its header: RGB, uint8.
+``python3 -m stavpr_ros.sources.video_decoder FPS FILE...`` writes messages to its standard output,
+a connection: what each file states (``FACTS``); then a header (``FRAME``) for every decoded frame,
+which the pixels of an image follow: RGB, uint8. Frames between the images have height and width 0.
+A file that is shorter than it states ends with a header of the seconds that it has, ``CUT_OFF``.
 """
 
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import datetime, UTC
 import math
-import os
+from multiprocessing.connection import Connection
 import resource
 import struct
 import sys
-from typing import BinaryIO
+from typing import Any
 
-FACTS = struct.Struct('<dd')
-FRAME = struct.Struct('<dII')  # seconds after the start, height, width
+import numpy as np
+from stavpr_ros.sources.frame import MAX_PIXELS
+
+FACTS = struct.Struct('<dddII')  # duration, s; rate, Hz; creation, s since 1970; height, width
+FRAME = struct.Struct('<dIII')  # seconds after the start of the first file, file, height, width
+CUT_OFF = 1  # width of a header without height
 MEMORY = 4 << 30  # bytes of address space
-NOT_OPENED, TOO_LARGE, NO_BACKEND, NO_MEMORY = 3, 4, 5, 6  # exit codes; 0 = end of the video
+COMPLETE = 0.9  # share of the stated duration, which may be an estimate
 EARLY = 0.002  # seconds that an image may be early by: containers round to milliseconds
+RESTART = 1.0  # seconds back: another recording in the same file, no frames out of order
+TICK = 1e-4  # seconds: nearer times are equal
+RATE = 25  # Hz, of a file that states none
+NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: bare streams, whose duration and rate are guesses
+HDR = {16, 18}  # transfer functions PQ and HLG, shown as BT.709, 1
 
-CONTAINERS = 'mov,mp4,m4a,3gp,3g2,mj2,avi,matroska,webm'
-OPTIONS = f'protocol_whitelist;file|format_whitelist;{CONTAINERS}|threads;2'
-"""Of FFmpeg: without playlists, which name other files and addresses."""
+REFERENCES = 'concat dash hls image2 imf lavfi rtsp sap sdp vapoursynth avisynth vobsub'
+"""Containers of names of other files and addresses, or programs: not read."""
+
+REMEDY = 'play it to the end to check it, or convert it: ffmpeg -i FILE converted.mp4'
+NOT_OPENED, TOO_LARGE, NO_PYAV = 3, 4, 5  # exit codes; 0 = end of the last file
+REASONS = {
+    NOT_OPENED: f'is damaged, cut off, no video that FFmpeg decodes, or too large; {REMEDY}',
+    TOO_LARGE: f'has frames of more than {MAX_PIXELS} pixels; {REMEDY}',
+    NO_PYAV: 'needs PyAV, which is not installed: pip install av',
+}
 
 
-def main(path: str, fps: float, output: BinaryIO) -> int:
-    """Decode a video; return the exit code."""
+def main(fps: float, paths: list[str], output: Connection) -> int:
+    """Decode videos as one; return the exit code."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    os.environ['OPENCV_FFMPEG_CAPTURE_OPTIONS'] = OPTIONS
-    import cv2
-
-    if cv2.CAP_FFMPEG not in cv2.videoio_registry.getStreamBackends():
-        return NO_BACKEND
     try:
-        return _decode(path, fps, output)
-    except (MemoryError, cv2.error):
-        return NO_MEMORY
-
-
-def _decode(path: str, fps: float, output: BinaryIO) -> int:
-    import cv2
-    from stavpr_ros.sources.files import MAX_PIXELS
-
-    capture = cv2.VideoCapture(path, cv2.CAP_FFMPEG)
-    if not capture.isOpened():
+        import av
+    except ImportError:
+        return NO_PYAV
+    try:
+        for path in paths:
+            with _open(path) as container:
+                output.send_bytes(FACTS.pack(*_facts(container)))
+        decode(fps, paths, output)
+    except (av.FFmpegError, MemoryError):
         return NOT_OPENED
-    capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-    get = capture.get
-    if get(cv2.CAP_PROP_FRAME_WIDTH) * get(cv2.CAP_PROP_FRAME_HEIGHT) > MAX_PIXELS:
-        return TOO_LARGE
-    output.write(FACTS.pack(get(cv2.CAP_PROP_FRAME_COUNT), get(cv2.CAP_PROP_FPS)))
-    output.flush()
-    due = -math.inf  # number of the next image, by its time
-    while capture.grab():
-        seconds = get(cv2.CAP_PROP_POS_MSEC) / 1000
-        number = (seconds + EARLY) * fps
-        image = capture.retrieve()[1] if number >= due else None
-        if image is None:
-            output.write(FRAME.pack(seconds, 0, 0))
-        else:
-            output.write(FRAME.pack(seconds, *image.shape[:2]))
-            output.write(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).data)
-            due = math.floor(number) + 1
-        output.flush()
     return 0
 
 
+def _open(path: str) -> Any:
+    import av
+
+    formats = ','.join(av.formats_available.difference(REFERENCES.split()))
+    options = {'protocol_whitelist': 'file', 'format_whitelist': formats}
+    return av.open(path, options=options, metadata_errors='replace')
+
+
+def _video(container: Any) -> Any:
+    stream = container.streams.best('video')
+    if stream is None or stream.codec_context is None:
+        sys.exit(NOT_OPENED)
+    if stream.width * stream.height > MAX_PIXELS:
+        sys.exit(TOO_LARGE)
+    return stream
+
+
+def _facts(container: Any) -> tuple[float, float, float, int, int]:
+    stream, duration, created = _video(container), (container.duration or 0) / 1e6, 0.0
+    bare = container.format.flags & NO_TIMES
+    rate = (not bare and stream.average_rate) or stream.guessed_rate or RATE
+    with suppress(ValueError):
+        stated = datetime.fromisoformat(container.metadata.get('creation_time', ''))
+        created = stated.replace(tzinfo=stated.tzinfo or UTC).timestamp()
+        created *= 0 < created < 2**31  # the range of stamps in ROS
+    if container.format.name == 'avi':  # FFmpeg shortens the duration of a file that is cut off
+        duration = float(stream.frames / rate)
+    elif stream.duration:
+        duration = float(stream.duration * stream.time_base)
+    elif container.format.name.startswith('matroska'):  # it states the last time
+        duration -= max(container.start_time or 0, 0) / 1e6
+    return (0.0 if bare else duration), float(rate), created, stream.height, stream.width
+
+
+def decode(fps: float, paths: list[str], output: Connection) -> None:
+    """Send the frames of videos, and ``fps`` of them each second with pixels."""
+    from av.video.reformatter import VideoReformatter
+
+    reformatter, end, due = VideoReformatter(), 0.0, -math.inf  # due: number of the next image
+    for file, path in enumerate(paths):
+        with _open(path) as container:
+            start, (duration, rate, *_) = end, _facts(container)
+            for seconds, frame in _frames(container, start, 1 / rate):
+                number = (seconds + EARLY) * fps
+                if number < due:
+                    output.send_bytes(FRAME.pack(seconds, file, 0, 0))
+                else:
+                    image = _image(frame, reformatter)
+                    output.send_bytes(FRAME.pack(seconds, file, *image.shape[:2]))
+                    output.send_bytes(image.reshape(-1).data)
+                    due = math.floor(number) + 1
+                end = seconds + 1 / rate
+            if end - start < COMPLETE * duration:
+                output.send_bytes(FRAME.pack(end - start, file, 0, CUT_OFF))
+
+
+def _frames(container: Any, start: float, period: float) -> Iterator[tuple[float, Any]]:
+    """
+    Yield the frames with increasing times, the first one at ``start``.
+
+    A time that is missing or falls is continued by the frame rate. AVI has no times of
+    presentation: there the times of decoding count, which FFmpeg gives in the order of frames.
+    """
+    from av import FFmpegError, InvalidDataError
+
+    stream, seconds, origin = _video(container), start - period, math.nan
+    stream.thread_type, stream.codec_context.thread_count = 'AUTO', 2
+    stream.codec_context.options = {'max_pixels': str(MAX_PIXELS)}
+    bare, avi = container.format.flags & NO_TIMES, container.format.name == 'avi'
+    with suppress(FFmpegError):  # cut off
+        for packet in container.demux(stream):
+            with suppress(InvalidDataError):  # damaged: players skip it, too
+                for frame in packet.decode():
+                    ticks = frame.dts if avi or frame.pts is None else frame.pts
+                    stated = math.nan if bare or ticks is None else float(ticks * frame.time_base)
+                    following = seconds + period
+                    if math.isnan(origin) or stated - origin < seconds - RESTART:
+                        origin = stated - following
+                    seconds = stated - origin if stated - origin > seconds + TICK else following
+                    yield seconds, frame
+
+
+def _image(frame: Any, reformatter: Any) -> np.ndarray:
+    """Return a frame as RGB, uint8, upright; of an interlaced one, one field with double lines."""
+    to = {'dst_color_trc': 1, 'dst_color_primaries': 1} if frame.color_trc in HDR else {}
+    image = reformatter.reformat(frame, format='rgb24', **to).to_ndarray()
+    if frame.interlaced_frame:
+        image[1::2] = image[: len(image) // 2 * 2 : 2]
+    for data in frame.side_data:
+        if data.type.name == 'DISPLAYMATRIX':  # x and y become a x + c y and b x + d y
+            a, b, _, c, d = np.frombuffer(data, np.int32)[:5].tolist()
+            if abs(b) > abs(a):
+                image, a, d = image.swapaxes(0, 1), c, b
+            image = image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
+    return np.ascontiguousarray(image)
+
+
 if __name__ == '__main__':
-    sys.exit(main(sys.argv[1], float(sys.argv[2]), sys.stdout.buffer))
+    rate, *files = sys.argv[1:]
+    sys.exit(main(float(rate), files, Connection(sys.stdout.fileno(), readable=False)))

@@ -1,0 +1,61 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Small videos, by the encoders of PyAV."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+
+RATE, FRAMES, HEIGHT, WIDTH = 30, 60, 48, 64
+
+
+def colored_images(count=FRAMES):
+    """Return images whose left half is red and whose right half becomes brighter."""
+    images = np.empty((count, HEIGHT, WIDTH, 3), np.uint8)
+    images[:] = 4 * np.arange(count)[:, None, None, None]
+    images[:, :, : WIDTH // 2] = 255, 0, 0
+    return images
+
+
+def write_video(
+    path: Path,
+    images=None,
+    codec: str = 'mpeg4',
+    rate: int = RATE,
+    pixels: str = 'yuv420p',
+    options: dict[str, str] | None = None,
+    metadata: dict[str, str] | None = None,
+    times=None,
+) -> Path:
+    """
+    Write a video.
+
+    :param images: RGB, uint8; of ``colored_images`` if not given.
+    :param times: of the frames, in frames; 0, 1, 2, ... if not given.
+    """
+    images = colored_images() if images is None else images
+    with av.open(str(path), 'w') as container:
+        container.metadata.update(metadata or {})
+        stream = container.add_stream(codec, rate=rate, options=options or {})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate = pixels, 1_000_000
+        for i, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
+            frame.pts = int(i if times is None else times[i])
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def copy_video(path: Path, target: Path, later: float = 0.0, **options: str) -> Path:
+    """Copy the packets of a video, with times that are later by seconds, without encoding."""
+    with av.open(str(path)) as source, av.open(str(target), 'w', options=options) as container:
+        stream = container.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(source.streams.video[0]):
+            if packet.dts is not None:
+                packet.pts += round(later / packet.time_base)
+                packet.dts += round(later / packet.time_base)
+                packet.stream = stream
+                container.mux(packet)
+    return target
