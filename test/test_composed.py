@@ -72,6 +72,23 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
     assert node.runtime.pipeline.operation.window_fill == 0
 
 
+def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
+    make_node, map_file, route, monkeypatch
+):
+    logged = []
+    node = activated(make_node(map_path=map_file))
+    monkeypatch.setattr(node.get_logger(), 'warning', lambda text, **_: logged.append(text))
+    for tenths in (60, 61, 1, 2, 3):  # a clock is set
+        node.runtime.images.on_image(image_message(route[0], tenths * SECOND // 10))
+    assert not [text for text in logged if 'reset' in text]
+    for i in range(10):
+        for tenths in (2 * i + 5, 2 * i + 4):
+            node.runtime.images.on_image(image_message(route[i], tenths * SECOND // 10))
+    text = next(text for text in logged if 'reset' in text)
+    assert 'reset 3 times in a row' in text
+    assert 'jumped back by 0.100 s): publish the images in the order of their stamps' in text
+
+
 def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
     make_node, route, monkeypatch
 ):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import dataclasses
 from dataclasses import dataclass
 import json
+import logging
 from typing import Any
 
 import cv2
@@ -201,7 +202,10 @@ class FeatureExtractor:
                 model = str(find_model(backbone.sha256, model))
             backbone = dataclasses.replace(backbone, model=model)
         extractor = cls(settings.kind, backbone, settings.strips, projection, device=device)
-        extractor.set_value_range(settings.value_range)
+        extractor.settings = dataclasses.replace(
+            extractor.settings, value_range=settings.value_range
+        )
+        extractor.is_new = False
         if extractor.settings != settings:
             raise FeatureMismatchError(
                 f'this extractor has the settings {extractor.settings.to_json()}, the map '
@@ -210,7 +214,13 @@ class FeatureExtractor:
         return extractor
 
     def set_value_range(self, value_range: tuple[int, int] | None) -> None:
-        """Set the values of 16 bits that become 0 and 255, once."""
+        """Set the values of 16 bits that become 0 and 255, by the first images, and log them."""
+        if value_range is not None:
+            logging.getLogger(__name__).warning(
+                'images of 16 bits: their values %d to %d become 0 to 255, on this map and in its '
+                'queries',
+                *value_range,
+            )
         self.settings = dataclasses.replace(self.settings, value_range=value_range)
         self.is_new = False
 

@@ -2,17 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Building a map from a sequence of images."""
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Sized
+from collections.abc import Generator, Iterable, Iterator, Sized
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from itertools import islice
-import logging
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_shape, require_type
-from stavpr_ros.errors import ImageError, InputError, JournalError, SettingsError
+from stavpr_ros.errors import InputError, JournalError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping.journal import Base, JournalPlace, JournalReader, SUFFIX
 from stavpr_ros.mapping.journal_writer import JournalWriter
@@ -25,23 +24,11 @@ from stavpr_ros.mapping.place_map import (
     THUMBNAIL_WIDTH,
 )
 from stavpr_ros.mapping.trajectory import checked_pose, Trajectory
-from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes
+from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale
 from stavpr_ros.sources.frame import Frame
 from tqdm import tqdm
 
 BATCH = 16  # images extracted at a time
-_log = logging.getLogger(__name__)
-
-
-@runtime_checkable
-class SourceOf16Bits(Protocol):
-    """A sequence of frames that converts images of 16 bits."""
-
-    to_bytes: ToBytes | None
-    on_error: Callable[[ImageError], None] | None
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames."""
 
 
 class _Place(NamedTuple):
@@ -53,7 +40,7 @@ class _Place(NamedTuple):
     thumbnail: bytes
 
 
-def fit_value_range(source: object, extractor: FeatureExtractor) -> None:
+def fit_value_range(source: Any, extractor: FeatureExtractor) -> None:
     """
     Let a source convert images of 16 bits as the map of an extractor does.
 
@@ -61,7 +48,7 @@ def fit_value_range(source: object, extractor: FeatureExtractor) -> None:
 
     :param source: a folder or a bag; anything else is unchanged.
     """
-    if not isinstance(source, SourceOf16Bits):
+    if not hasattr(source, 'to_bytes'):
         return
     if extractor.is_new:
         finder, on_error = RangeFinder(), source.on_error
@@ -71,18 +58,7 @@ def fit_value_range(source: object, extractor: FeatureExtractor) -> None:
                 break
         source.on_error = on_error
         extractor.set_value_range(finder.value_range)
-        note_value_range(extractor)
     source.to_bytes = scale(extractor.settings.value_range)
-
-
-def note_value_range(extractor: FeatureExtractor) -> None:
-    """Log the range of values of 16 bits of a new map, if it has any."""
-    if extractor.settings.value_range is not None:
-        _log.warning(
-            'images of 16 bits: their values %d to %d become 0 to 255, on this map and in its '
-            'queries',
-            *extractor.settings.value_range,
-        )
 
 
 def extract_features(

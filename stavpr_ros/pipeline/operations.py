@@ -15,7 +15,6 @@ import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of, verify_map
-from stavpr_ros.mapping.builder import note_value_range
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
@@ -252,7 +251,6 @@ class Operation(ABC):
         images = finder.images
         if not 0 < images < RANGE_IMAGES:
             extractor.set_value_range(finder.value_range)
-            note_value_range(extractor)
             self._to_bytes = scale(extractor.settings.value_range)
             if images:
                 self._start(None)  # with these settings

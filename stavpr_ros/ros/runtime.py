@@ -43,6 +43,7 @@ from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
 
+MAX_SHORT_WINDOWS = 3  # one jump of a clock is no disorder
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
 SKIP_PERIOD = 60.0  # seconds between two warnings of skipped images in the log
 
@@ -80,6 +81,7 @@ class Runtime:
         self.odometry: OdometryInput | None = None
         self.camera: CameraInput | None = None
         self._epoch = self._pipeline_epoch = 0
+        self._since_restart = self._short_windows = 0  # images; restarts in a row before a window
         self._logged_reasons: set[str] = set()
         self._skips = SkipWatch()
         self._may_lack_map = False  # active since the end of a recording was last logged
@@ -284,8 +286,18 @@ class Runtime:
 
     def restart(self, reason: str) -> None:
         """Empty the window before the images that arrive from now on."""
-        self._node.get_logger().info(f'window reset: {reason}')
+        log, length = self._node.get_logger(), self.settings.pipeline.sequence.length
+        log.info(f'window reset: {reason}')
         self._epoch += 1
+        self._short_windows = self._short_windows + 1 if self._since_restart < length else 0
+        if self._short_windows >= MAX_SHORT_WINDOWS:
+            log.warning(
+                f'the window was reset {self._short_windows} times in a row before it was full, '
+                f'so that few images match ({reason}): publish the images in the order of their '
+                'stamps, and by one publisher',
+                throttle_duration_sec=REPORT_PERIOD,
+            )
+        self._since_restart = 0
         if (odometry := self.odometry) is not None:  # another thread may unsubscribe
             odometry.trajectory.clear()
 
@@ -330,6 +342,7 @@ class Runtime:
     # images
 
     def _enqueue(self, message: Any, arrival: float) -> None:
+        self._since_restart += 1
         dropped = self.worker.put(_Item(message, arrival, self._epoch))
         if dropped is not None:
             reason = 'newer images arrived before it was processed'
