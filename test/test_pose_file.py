@@ -69,7 +69,8 @@ def test_read_poses_with_rotations(tmp_path, text):
         ('0 0 0 0 0 0 0 1 0 1 0 0\n', 'line 1: its 12 numbers have no rotation matrix'),
         ('5,0,0,0,0,0,0,1\n4,0,0,0,0,0,0,1\n', 'the first one falls and is no stamp'),
         ('1700000000,0,0\n1700000001,1,0\n', 'number 1 of its positions is a stamp'),
-        ('Latitude,Longitude,alt\n47.3,8.5,400\n', 'latitudes and longitudes, project them'),
+        ('Latitude,Longitude,alt\n47.3,8.5,400\n', 'project latitudes and longitudes to meters'),
+        ('x,y,yaw [deg]\n1,2,90\n', 'its columns are x, y, yaw: .*convert angles to a quaternion'),
         (None, 'cannot be read'),
     ],
 )

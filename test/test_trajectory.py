@@ -193,6 +193,16 @@ def test_from_arrays_counts_invalid_poses_unless_all_are():
         Trajectory.from_arrays(np.array([1]), poses[:1])
 
 
+@pytest.mark.parametrize('wrong', [5 * SECOND, 9000 * SECOND])
+def test_read_odometry_of_one_stamp_of_another_time_returns_no_pose_for_it(tmp_path, wrong):
+    stamps = [50 * SECOND, 51 * SECOND, wrong, 52 * SECOND, 53 * SECOND]
+    when, poses = read_odometry(write_odometry(tmp_path / 'bag', stamps), '/odom')
+    assert np.isnan(poses).any(axis=1).tolist() == [False, False, True, False, False]
+    trajectory = Trajectory.from_arrays(when, poses)
+    assert trajectory.rejected == 1
+    assert trajectory.at(51 * SECOND + SECOND // 2)[0] == pytest.approx(2)
+
+
 def test_read_odometry_of_a_damaged_message_returns_no_pose_for_it(tmp_path):
     with writing(tmp_path / 'bag') as bag:
         for i in range(3):

@@ -190,7 +190,7 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     :param topic: with or without the leading slash.
     :returns: stamps of the headers (times of recording where they are 0), ns, shape (m,), int64,
         in order; x y z (meters) and quaternion x y z w, shape (m, 7), float64, as recorded; a row
-        of NaN for a message that is damaged.
+        of NaN for a message that is damaged or has a stamp of another time.
     :raises SourceError: the bag cannot be read, the topic is missing, or time jumps back in it.
     """
     path = Path(path)
@@ -210,6 +210,10 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     if not stamps:
         raise SourceError(f'odometry {topic!r} of {path} has no messages: expected at least one')
     when, where = np.array(stamps, np.int64), np.array(poses, np.float64)
+    before, after = when[:-2], when[2:]  # a single stamp of another time is invalid
+    is_alone = (when[1:-1] < before - LATE) | (when[1:-1] > after + LATE)
+    alone = 1 + np.flatnonzero(is_alone & (after >= before - LATE))
+    when[alone], where[alone] = when[alone - 1], np.nan
     _require_one_run(when, f'odometry {topic!r} of {path}')
     order = np.argsort(when, kind='stable')
     return when[order], where[order]

@@ -42,6 +42,7 @@ RANGE_IMAGES, PERCENTILES = 20, (0.5, 99.5)
 """The first images of a map, and the shares of their values, that decide the range in use."""
 ORIENTATION = 0x0112  # tag of EXIF
 HEIF = re.compile(rb'....ftyp(hei[cfmsx]|hev[cmsx]|mif1|msf1)', re.DOTALL)
+TIFF = b'II*\0', b'MM\0*', b'II+\0', b'MM\0+'  # the last two are of more than 4 GB
 WIDE_TIFF = ('TIFF', 'F'), ('TIFF', 'I')  # Pillow's modes of 32 bits, which OpenCV does not read
 
 COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
@@ -232,6 +233,7 @@ def checked_header(flat: np.ndarray, max_pixels: int) -> tuple[Image.Image, int]
         ) from error
     except Exception as error:  # a damaged header raises errors of any type
         reason = '' if isinstance(error, UnidentifiedImageError) else f': {error}'
+        kind = 'format' if flat[:4].tobytes() in TIFF else kind
         raise ImageError(
             f'{flat.size} bytes are no image, or damaged, or of a kind that is not read: expected '
             f'{", ".join(formats)} of 8 or 16 bits{reason}',

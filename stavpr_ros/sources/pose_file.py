@@ -15,7 +15,9 @@ EXPECTED = (
 NUMBERS = 3, 7, 12  # of a pose
 POSITION = re.compile(r'((.*[._])?(position|pos|translation|p|t)(_.*)?[._]?)?([xyz])')
 ROTATION = re.compile(r'(.*[._])?(orientation|quaternion|quat|rotation|rot|q)(_.*)?[._]?([xyzw])')
-DEGREES = re.compile(r'(.*[._])?(lat|lon|lng|long)(itude)?')
+DEGREES = re.compile(
+    r'(.*[._])?((lat|lon|lng|long)(itude)?|yaw|pitch|roll|theta|heading|bearing)(_.*)?'
+)
 NORMS = 0.9, 1.1  # of a quaternion in text, of a few digits
 MAX_STEP, MAX_EXTENT = 1e-3, 0.5  # median and extent of positions in degrees; in meters, too small
 
@@ -29,9 +31,12 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
     """
     table = Table(path, 'poses', EXPECTED)
     names = [re.sub(r'\s*[\[(].*', '', name).replace(' ', '_').casefold() for name in table.names]
-    if any(map(DEGREES.fullmatch, names)):
-        raise table.error('it has latitudes and longitudes, project them to meters (UTM)')
     columns = _columns(names)
+    if columns is None and any(map(DEGREES.fullmatch, names)):
+        raise table.error(
+            f'its columns are {", ".join(names)}: project latitudes and longitudes to meters '
+            '(UTM), and convert angles to a quaternion'
+        )
     rows = table.numbers(columns)
     if not np.isfinite(rows).all():
         raise table.error('a number is not finite', int(np.argmin(np.isfinite(rows).all(axis=1))))
