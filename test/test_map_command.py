@@ -44,16 +44,27 @@ def folder(drive, tmp_path, monkeypatch):
 
 
 def test_map_info_shows_what_a_map_holds(folder, capsys):
-    save_map(example_map(), 'both.stavpr')
+    both, date = example_map(), 1_700_000_000 * 10**9
+    sessions = replace(both.sessions[0], start=date), *both.sessions[1:]
+    stamps = np.where(both.stamps, both.stamps + date, 0)
+    save_map(replace(both, sessions=sessions, stamps=stamps), 'both.stavpr')
     assert main(['info', 'both.stavpr']) == 0
     shown = capsys.readouterr().out
     for text in (
         'format version 2', '24, 23 with a pose, 24 with an identifier',
         'gradient, version 1: 2 strips of 32 dimensions, float32',
-        open_map('both.stavpr').map_id, 'session    a, morning, robot 1: 12 places, 1970-01-01',
-        'a route of 23 m', '1970-01-01 00:00:24 UTC',
+        open_map('both.stavpr').map_id, 'session    a, morning, robot 1: 12 places, 2023-11-14',
+        'a route of 23 m', 'to 2023-11-14 22:13:44 UTC',
     ):  # fmt: skip
         assert text in shown
+
+
+def test_map_info_shows_stamps_that_are_no_dates_in_seconds(folder, capsys):
+    save_map(example_map(), 'both.stavpr')
+    assert main(['info', 'both.stavpr']) == 0
+    shown = capsys.readouterr().out
+    assert 's to 24.0 s\n' in shown
+    assert '1970' not in shown
 
 
 def test_map_info_escapes_control_characters(folder, capsys):

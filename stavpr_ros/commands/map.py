@@ -215,7 +215,7 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         assert place_map.session_index is not None
         places = np.count_nonzero(place_map.session_index == number)
         names = ''.join(f', {text}' for text in (session.name, session.robot) if text)
-        start = f', {_time(session.start)}' if session.start else ''
+        start = f', {_time(session.start)}' if session.start >= DATED else ''
         same = ''
         if place_map.same_as is not None:
             own = np.flatnonzero(place_map.session_index == number)
