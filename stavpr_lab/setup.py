@@ -38,13 +38,13 @@ setup(
         'scikit-learn>=1.4',
         'scipy>=1.11',
         'stavpr_ros',
-        'torch>=2.10',
         'tqdm>=4.66',
     ],
     extras_require={
         'hdf5': ['h5py>=3.10'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'slam': ['evo>=1.31', 'stavpr_slam'],
+        'torch': ['torch>=2.10'],
     },
     zip_safe=False,
 )

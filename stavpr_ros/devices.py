@@ -37,27 +37,27 @@ def choose_backend(requested: 'str | torch.device') -> 'str | torch.device':
     :raises UnavailableError: ``cuda`` was requested and is not available.
     """
     if requested == 'auto':
-        requested = 'cuda' if torch_has_cuda() else 'cpu'
+        requested = 'cpu' if why_no_cuda() else 'cuda'
     if isinstance(requested, str) and not requested.startswith('cuda:'):
         require_choice('backend', requested, BACKENDS)
         if requested == 'cpu':
             return 'cpu'
-    if str(requested).startswith('cuda') and not torch_has_cuda():
-        raise UnavailableError(
-            f"device '{requested}': torch finds no CUDA device here; take 'cpu' or 'auto'"
-        )
+    if str(requested).startswith('cuda') and (reason := why_no_cuda()):
+        raise UnavailableError(f"device '{requested}': {reason}; take 'cpu' or 'auto'")
     import torch
 
     return torch.device(requested)
 
 
 @cache
-def torch_has_cuda() -> bool:
-    """Return whether torch has a CUDA device; without a driver, torch is not imported."""
+def why_no_cuda() -> str:
+    """Return why no CUDA device is used, '' = torch has one; without a driver, it stays unread."""
     try:
         ctypes.CDLL('libcuda.so.1')
     except OSError:
-        return False
-    import torch
-
-    return bool(torch.cuda.is_available())
+        return 'no CUDA driver is installed'
+    try:
+        import torch
+    except (ImportError, OSError) as error:  # not installed, or without a library that it needs
+        return f'a CUDA driver is installed, but torch cannot be imported: {error}'
+    return '' if torch.cuda.is_available() else 'torch finds no CUDA device here'

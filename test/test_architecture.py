@@ -114,13 +114,27 @@ def test_package_and_parameters_import_lightly():
 
 
 def test_mapping_and_localization_with_gradient_load_no_torch(tmp_path):
-    """Nor what reads other inputs; a folder of images to a map, and the map to a match."""
+    """
+    Nor what reads other inputs; a folder of images to a map, and the map to a match.
+
+    Where torch is not installed and a driver of CUDA is, as on a Jetson; the memory stays small.
+    """
     rng = np.random.default_rng(0)
     for i, image in enumerate(rng.integers(0, 256, (40, 48, 64, 3), np.uint8)):
         cv2.imwrite(str(tmp_path / f'{i:02}.png'), image)
     code = f"""
-import sys
+import ctypes, sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] == 'torch':
+            raise ModuleNotFoundError(name=name)
+
+library = ctypes.CDLL
+ctypes.CDLL = lambda name, *rest: library(None if name == 'libcuda.so.1' else name, *rest)
+sys.meta_path.insert(0, NoTorch())
 from stavpr_ros.commands.build_map import main
+from stavpr_ros.devices import choose_backend, choose_device, why_no_cuda
 from stavpr_ros.mapping import open_map
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -131,7 +145,15 @@ extractor, recognizer = place_map.extractor(), PlaceRecognizer(place_map, Recogn
 images = [frame.image for frame in open_source({str(tmp_path)!r})]
 for image in images:
     match = recognizer.update(extractor.extract([image]))
-print('\\n', match.status.name, *sys.modules)
+assert choose_backend('auto') == choose_device('auto') == 'cpu'
+assert 'torch cannot be imported' in why_no_cuda()
+loaded = [*sys.modules]
+import stavpr_ros.ros.node, stavpr_ros.commands.replay, stavpr_ros.commands.record
+assert 'torch' not in sys.modules
+status = open('/proc/self/status').read()
+peak = int(status.partition('VmHWM:')[2].split()[0])
+assert peak < 450_000, f'{{peak}} kB'
+print('\\n', match.status.name, *loaded)
 """
     done = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, check=False

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+from unittest.mock import Mock
 from xml.etree import ElementTree
 import zipfile
 
@@ -25,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
 PACKAGES = {'stavpr_ros': ROOT} | {name: ROOT / name for name in SIBLINGS}
 FOLDERS = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
-EXTRAS = ('onnx', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam', 'video')
+EXTRAS = ('onnx', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam', 'torch', 'video')
 
 # Import name: distribution on PyPI, where they differ.
 DISTRIBUTIONS = {
@@ -294,6 +295,13 @@ def test_stavpr_without_a_package_names_it(monkeypatch, capsys):
     assert 'in the package stavpr_lab' in capsys.readouterr().err
     assert stavpr.main(['evaluat']) == 2
     assert 'choose from build_map' in capsys.readouterr().err
+
+
+def test_stavpr_without_torch_names_its_extra(monkeypatch, capsys):
+    error = ModuleNotFoundError("No module named 'torch'", name='torch')
+    monkeypatch.setattr(stavpr.importlib, 'import_module', Mock(side_effect=error))
+    assert stavpr.main(['map', 'info', 'x']) == 2
+    assert "this needs torch, an extra: pip install '.[torch]'" in capsys.readouterr().err
 
 
 def test_stavpr_passes_arguments_and_exit_code(monkeypatch):

@@ -165,7 +165,7 @@ def test_network_of_feature_settings_and_model_path_is_accepted():
         ('localization', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cuda'),
         ('loop_closure', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cpu'),
         ('localization', 'cpu', True, '', 'cpu', 'cpu'),
-        ('localization', 'auto', False, ' (torch finds no CUDA device here)', 'cpu', 'cpu'),
+        ('localization', 'auto', False, ' (no torch)', 'cpu', 'cpu'),
     ],
 )
 def test_backend_summary_names_device_of_each_stage(
@@ -173,7 +173,7 @@ def test_backend_summary_names_device_of_each_stage(
 ):
     module, available = 'stavpr_ros.pipeline.settings', 'cuda' if has_cuda else 'cpu'
     monkeypatch.setattr(f'{module}.choose_backend', {'auto': available, 'cpu': 'cpu'}.get)
-    monkeypatch.setattr(f'{module}.torch_has_cuda', lambda: has_cuda)
+    monkeypatch.setattr(f'{module}.why_no_cuda', lambda: '' if has_cuda else 'no torch')
     settings = PipelineSettings(backend=backend)
     assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
     extracting = f'backend {backend}{why}: networks on {extraction}'

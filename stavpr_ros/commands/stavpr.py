@@ -69,7 +69,13 @@ def main(args: list[str] | None = None) -> int:
     :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
     """
     forget_requirements()
-    return until_unread(lambda: _main(sys.argv[1:] if args is None else args))
+    try:
+        return until_unread(lambda: _main(sys.argv[1:] if args is None else args))
+    except ModuleNotFoundError as error:
+        if error.name != 'torch':
+            raise
+        print("stavpr: this needs torch, an extra: pip install '.[torch]'", file=sys.stderr)
+        return 2
 
 
 def _main(arguments: list[str]) -> int:

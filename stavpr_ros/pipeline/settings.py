@@ -11,7 +11,7 @@ from typing import Any
 
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import require_choice
-from stavpr_ros.devices import choose_backend, torch_has_cuda
+from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import kinds, settings_class, settings_from_json
@@ -132,8 +132,7 @@ class PipelineSettings:
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""
-        cuda = 'torch has a CUDA device' if torch_has_cuda() else 'torch finds no CUDA device here'
-        why = f' ({cuda})' if self.backend == 'auto' else ''
+        why = f' ({why_no_cuda() or "torch has a CUDA device"})' if self.backend == 'auto' else ''
         summary = f'backend {self.backend}{why}: networks on {choose_backend(self.backend)}'
         if operation == 'mapping':
             return summary

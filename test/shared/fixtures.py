@@ -10,7 +10,7 @@ from domain import DOMAIN
 from hypothesis import settings
 import numpy as np
 import pytest
-from stavpr_ros.devices import torch_has_cuda
+from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.threads import wait_passively
 
 wait_passively()  # torch and numba are not imported yet
@@ -80,7 +80,7 @@ def one_thread():
     limit_threads(0)
 
 
-@pytest.fixture(params=['cpu', 'cuda'][: 1 + torch_has_cuda()])
+@pytest.fixture(params=['cpu', 'cuda'][: 1 + (not why_no_cuda())])
 def device(request):
     """Return each device of torch here: the CPU, and CUDA where there is one."""
     import torch
