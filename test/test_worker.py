@@ -4,6 +4,8 @@
 
 from concurrent.futures import ThreadPoolExecutor
 import threading
+import time
+import weakref
 
 import pytest
 from stavpr_ros.errors import StavprError
@@ -56,6 +58,13 @@ def test_run_returns_and_raises_on_the_thread(make):
     assert worker.run(threading.current_thread).name == 'recognition'
     with pytest.raises(ZeroDivisionError):
         worker.run(lambda: 1 / 0)
+
+
+def test_worker_without_work_keeps_no_result_of_the_last_call(make):
+    result = weakref.ref(make().run(Busy))
+    end = time.monotonic() + TIMEOUT
+    while result() is not None:
+        assert time.monotonic() < end
 
 
 @pytest.mark.parametrize('busy', [False, True])

@@ -17,6 +17,7 @@ from stavpr_ros.threads import call_on_thread
 
 LOAD_TIMEOUT = 120.0  # seconds to read a map
 REST = 20.0  # pauses of the thread that compares hashes, as multiples of its computing time
+MAX_REST = 1.0  # seconds; a thread that waits for a processor seems to compute long
 
 
 class MapLoader:
@@ -113,7 +114,7 @@ class MapLoader:
         """Compare the file of the map in use with its hashes; log damage, and keep it."""
 
         def rest(seconds: float) -> None:
-            if self._ended.wait(REST * seconds) or self._in_use() is not places:
+            if self._ended.wait(min(REST * seconds, MAX_REST)) or self._in_use() is not places:
                 raise MapFileError(f'map {path} is not in use any more')
 
         try:

@@ -125,6 +125,7 @@ class Worker:
                 item = None if call else self._items.popleft()
             if call is not None:
                 self._call(*call)
+                call = None  # its result may be a map, and nothing may come for long
                 continue
             try:
                 self._process(item)
