@@ -271,5 +271,5 @@ def test_lost_images_are_logged_once_with_their_remedy(make_node, capfd):
             published.set()
 
     node._diagnostics._publisher.publish = count
-    assert published.wait(10)
+    assert published.wait(TIMEOUT)
     assert capfd.readouterr().err.count('3 images lost in transport in the last 10 s: ') == 1

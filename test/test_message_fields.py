@@ -438,7 +438,7 @@ def running(robot: Robot, drive: Drive, **parameters: Any) -> Iterator[Any]:
     robot.forget()
     closures = robot.listen(LoopClosure, '/stavpr/loop_closure', 1000)
     candidates = robot.listen(PlaceCandidates, '/stavpr/candidates', 1000)
-    thread = NodeThread([], {
+    thread = NodeThread(robot.context, [], {
         'robot_id': drive.robot_id,
         'mode': drive.mode,
         'operation': drive.operation,

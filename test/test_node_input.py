@@ -11,6 +11,7 @@ from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
+import rclpy
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from robot import image_message, RELIABLE, SECOND
 from sensor_msgs.msg import CompressedImage, Image
@@ -35,6 +36,14 @@ def publish(robot):
     yield publish
     for publisher in made:
         robot.node.destroy_publisher(publisher)
+
+
+@pytest.fixture
+def stranger(context):
+    """Return a node of another participant: in each, a topic has one type."""
+    node = rclpy.create_node('stranger', context=context)
+    yield node
+    node.destroy_node()
 
 
 def test_invalid_images_are_counted_and_explained_once_a_cause(robot, start, route):
@@ -96,29 +105,33 @@ def test_a_rule_that_skips_every_image_is_a_warning_and_so_is_the_missing_map(ro
     robot.until_logged('no map written, because none of')
 
 
-def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(robot, start, publish, route):
+def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(
+    robot, start, publish, stranger, route
+):
     """The topic with odometry is named, not that of a pose graph; a topic of another type too."""
     publish(Odometry, '/pose_graph/odometry')
     publish(TransformStamped, '/pose_graph/map_to_odom')
     start('-r', 'odom:=/wheel', keyframe_distance=1.0)
     found = 'nothing is published on /wheel, odometry is on /odom: remap odom'
     robot.until_diagnosed('input', WARN, found)
-    publish(Image, '/wheel')
+    stranger.create_publisher(Image, '/wheel', 1)
     robot.until_diagnosed('input', WARN, 'sensor_msgs/msg/Image is published on /wheel, odometry')
     robot.set(keyframe_distance=0.0)
     robot.show(np.full_like(route[0], 200))
     robot.until_diagnosed('input', WARN, 'the images show nothing (standard deviation 0.0 of 255)')
 
 
-def test_compressed_images_on_a_remapped_topic_are_recognized(robot, start, publish, route):
+def test_compressed_images_on_a_remapped_topic_are_recognized(
+    robot, start, publish, stranger, route
+):
     """The topic is below the one that `image` is remapped to; the diagnostics name it."""
     start('-r', 'image:=/front/image', wait=False, image_transport='compressed')
     topic = '/front/image/compressed'
     assert topic in robot.until_diagnosed('input', WARN, 'no publisher').message
-    raw = publish(Image, topic)
+    raw = stranger.create_publisher(Image, topic, 1)
     mistyped = 'sensor_msgs/msg/Image is published there: compare image_transport'
     robot.until_diagnosed('input', ERROR, mistyped)
-    robot.node.destroy_publisher(raw)
+    stranger.destroy_publisher(raw)
     camera = publish(CompressedImage, topic)
     robot.wait_for_node(camera, CompressedImage)
 

@@ -23,7 +23,7 @@ from stavpr_ros.ros import process, rclpy_workarounds
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, PromptExecutor, repeat_responses
 from std_srvs.srv import Trigger
 
-SPINS = 200  # of at most 50 ms each: until an event counts as missing
+SPINS = 2000  # of at most 50 ms each: until an event counts as missing
 LOST = 'failed to send response (timeout): client will not receive response'
 
 

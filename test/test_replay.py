@@ -15,7 +15,9 @@ import cv2
 import numpy as np
 from processes import DOMAIN, environment, TIMEOUT
 import pytest
-from rclpy.qos import qos_profile_sensor_data
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceMatch
 from stavpr_ros.commands.replay import main
@@ -26,6 +28,9 @@ from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
 from test_playback import spinning
 
+# as many as there are: this thread may get no processor for long
+BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
 
 class Subscriber:
     """Subscribes to images with best effort and publishes a match of each."""
@@ -35,7 +40,7 @@ class Subscriber:
         self.images = []
         self.changed = threading.Condition()
         self.publisher = node.create_publisher(PlaceMatch, '~/match', 10)
-        node.create_subscription(Image, 'image', self.receive, qos_profile_sensor_data)
+        node.create_subscription(Image, 'image', self.receive, BEST_EFFORT)
 
     def receive(self, image):
         with self.changed:
@@ -56,9 +61,22 @@ class Subscriber:
 
 
 @pytest.fixture
-def subscribe():
-    with spinning('stavpr', DOMAIN) as node:
-        yield partial(Subscriber, node)
+def node(monkeypatch):
+    """Return a node that shares its context, and so its participant, with the command."""
+    rclpy.init(domain_id=DOMAIN, signal_handler_options=SignalHandlerOptions.NO)
+    with (
+        monkeypatch.context() as command,
+        spinning(rclpy.get_default_context(), 'stavpr') as node,
+    ):
+        command.setattr(rclpy, 'init', lambda **options: None)
+        command.setattr(rclpy, 'try_shutdown', lambda: None)
+        yield node
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def subscribe(node):
+    return partial(Subscriber, node)
 
 
 @pytest.fixture
@@ -133,7 +151,7 @@ def test_replay_lossless_ignores_the_recorded_pace(tmp_path, subscribe, stamped,
     assert subscriber.data() == data
 
 
-def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path, replay):
+def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path, node, replay):
     bag, _ = make_bag(tmp_path / 'bag', count=40)
     waiting, backlog = deque(), []
 
@@ -146,14 +164,13 @@ def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path, repla
         if waiting:
             closure.publish(waiting.popleft())
 
-    with spinning('stavpr', DOMAIN) as node:
-        match = node.create_publisher(PlaceMatch, '~/match', 10)
-        closure = node.create_publisher(LoopClosure, '~/loop_closure', 10)
-        info = node.create_publisher(MapInfo, '~/map_info', LATCHED)
-        info.publish(MapInfo(operation='loop_closure'))
-        node.create_subscription(Image, 'image', answer, 10)
-        node.create_timer(0.05, close)
-        assert replay(bag, '--lossless')[0] == 0
+    match = node.create_publisher(PlaceMatch, '~/match', 10)
+    closure = node.create_publisher(LoopClosure, '~/loop_closure', 10)
+    info = node.create_publisher(MapInfo, '~/map_info', LATCHED)
+    info.publish(MapInfo(operation='loop_closure'))
+    node.create_subscription(Image, 'image', answer, 10)
+    node.create_timer(0.05, close)
+    assert replay(bag, '--lossless')[0] == 0
     assert len(backlog) == 40
     assert max(backlog) <= MAX_BEHIND + 2
 
@@ -161,9 +178,9 @@ def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path, repla
 def test_replay_lossless_without_a_match_sends_the_image_again(tmp_path, subscribe, replay):
     bag, data = make_bag(tmp_path / 'bag', count=5)
     subscriber = subscribe(answers=lambda images: len(images) != 3)
-    code, output, errors = replay(bag, '--lossless', '--timeout', '2')
+    code, output, errors = replay(bag, '--lossless', '--timeout', '4')
     assert code == 0
-    assert 'image 3 (stamp 1000000000.040000000): no result for 2 s, sent again' in errors
+    assert 'image 3 (stamp 1000000000.040000000): no result for 4 s, sent again' in errors
     assert '1 sent again' in output
     assert subscriber.data() == [*data[:3], *data[2:]]
 
@@ -176,6 +193,13 @@ def test_replay_lossless_without_a_match_after_all_tries_fails(tmp_path, subscri
     name = 'image 2 (stamp 1000000000.020000000)'
     assert f'replay: {name} got no result on /stavpr/match in 3 tries' in errors
     assert subscriber.milliseconds()[-3:] == [20] * 3
+
+
+def test_replay_of_a_part_without_images_fails(tmp_path, subscribe, replay):
+    bag, _ = make_bag(tmp_path / 'bag')
+    subscribe()
+    code, _, errors = replay(bag, '--start-offset', '1000')
+    assert (code, 'has no image from second 1000 on' in errors) == (1, True)
 
 
 def test_replay_without_a_subscriber_fails(tmp_path, replay):

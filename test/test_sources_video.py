@@ -279,8 +279,8 @@ def test_other_content_is_an_error(tmp_path, content):
 @pytest.mark.parametrize(
     ('program', 'timeout', 'reason'),
     [
-        ('import time; time.sleep(60)', 1, r'no frame was decoded in 1 s'),
-        ('import os; os.kill(os.getpid(), 11)', 60, r'crashed the decoder with signal 11'),
+        ('import time; time.sleep(600)', 1, r'no frame was decoded in 1 s'),
+        ('import os; os.kill(os.getpid(), 11)', 600, r'crashed the decoder with signal 11'),
     ],
 )
 def test_decoder_that_fails_is_an_error(tmp_path, monkeypatch, program, timeout, reason):
@@ -291,7 +291,7 @@ def test_decoder_that_fails_is_an_error(tmp_path, monkeypatch, program, timeout,
     began = time.monotonic()
     with pytest.raises(SourceError, match=reason):
         open_source(write_video(tmp_path / 'phone.mp4', colored_images(1)))
-    assert time.monotonic() - began < 30
+    assert time.monotonic() - began < 300
 
 
 def test_without_pyav_the_remedy_is_named(tmp_path, monkeypatch):

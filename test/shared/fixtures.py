@@ -155,7 +155,7 @@ def start(robot, map_file, tmp_path_factory):
     def start(*arguments, wait=True, **parameters):
         robot.forget()
         files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
-        started.append(NodeThread(arguments, files | parameters))
+        started.append(NodeThread(robot.context, arguments, files | parameters))
         if wait:
             robot.wait_for_node()
         return started[-1].node

@@ -12,7 +12,7 @@ from ament_index_python.packages import get_package_prefix
 from domain import DOMAIN
 from stavpr_ros.commands.stavpr import PACKAGES
 
-TIMEOUT = 60.0  # seconds until an expected event counts as missing
+TIMEOUT = 180.0  # seconds until an expected event counts as missing
 SECOND = 10**9
 
 
