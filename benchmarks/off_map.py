@@ -23,7 +23,7 @@ from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.metrics import accepted_counts, image_matches, sweep
+from stavpr_lab.evaluation.metrics import accepted_counts, published_matches, sweep
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, PlaceMap, select_places
@@ -47,6 +47,7 @@ TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
 SETS = (*WARPED, 'corridor', 'nordland')
 STANDING = 200  # places of a standstill in a map
+SPARSE = 3  # places of the route a place of a sparse map
 LONG_STOP = 'stop 1000'  # not pooled: so many images of one probability
 CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3', LONG_STOP)
 
@@ -69,13 +70,14 @@ class Pair:
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """
-    The matches of a drive of N images; every array has the shape (N,).
+    The matches of a drive of N images, and M - N early ones; every array has the shape (M,).
 
     :param accepted: matched.
     :param probabilities: declared for the matches, NaN = none.
     :param correct: the match is right.
     :param has_match: the place is in the map.
     :param unseen: the place was removed from the map.
+    :param early: by the newest images alone.
     """
 
     accepted: np.ndarray
@@ -83,10 +85,11 @@ class Outcome:
     correct: np.ndarray
     has_match: np.ndarray
     unseen: np.ndarray
+    early: np.ndarray
 
     @property
     def sure(self) -> np.ndarray:
-        """Return the wrong matches whose probability is 0.95 or more, shape (N,), bool."""
+        """Return the wrong matches whose probability is 0.95 or more, shape (M,), bool."""
         return self.accepted & ~self.correct & (self.probabilities >= LEVEL)
 
     @classmethod
@@ -96,23 +99,28 @@ class Outcome:
         return cls(*(np.concatenate([getattr(each, name) for each in outcomes]) for name in names))
 
     def numbers(self) -> dict[str, Any]:
-        """Return counts, precision and recall at the default threshold, best F1."""
-        counts = accepted_counts(self.accepted, self.correct, self.has_match)
+        """Return counts, precision and recall at the default threshold, best F1; F1 of images."""
+        is_image = ~self.early
+        columns = self.accepted, self.correct, self.has_match
+        counts = accepted_counts(*columns)
+        of_images = accepted_counts(*(column[is_image] for column in columns))
         curve = sweep(
-            np.where(np.isfinite(self.probabilities), 1 - self.probabilities, np.inf),
-            self.correct,
-            self.has_match,
+            np.where(np.isfinite(self.probabilities), 1 - self.probabilities, np.inf)[is_image],
+            self.correct[is_image],
+            self.has_match[is_image],
         )
         return {
-            'images': len(self.accepted),
+            'images': int(np.count_nonzero(is_image)),
+            'early': int(np.count_nonzero(self.early)),
+            'early_wrong': int(np.count_nonzero(self.early & ~self.correct)),
             'matched': counts.accepted,
             'wrong': counts.false_positives,
             'sure': int(np.count_nonzero(self.sure)),
             'precision': counts.precision,
-            'recall': counts.recall,
+            'recall': of_images.recall,
             'f1': max(each.f1 for each in curve),
             'recall_at_100_precision': max(each.recall for each in curve if each.precision == 1),
-            'unseen': int(np.count_nonzero(self.unseen)),
+            'unseen': int(np.count_nonzero(self.unseen & is_image)),
             'unseen_matched': int(np.count_nonzero(self.unseen & self.accepted)),
             'unseen_sure': int(np.count_nonzero(self.unseen & self.sure)),
         }
@@ -148,13 +156,16 @@ def outcome(
     :param unseen: images whose place was removed; None = none was.
     :param stamps: of the images, ns; None = unknown.
     """
-    matches = image_matches(matches_of(place_map, features, stamps), SETTINGS.sequence.length)
+    length = SETTINGS.sequence.length
+    matches, images = published_matches(matches_of(place_map, features, stamps), length)
+    truth = truth.select(images)
     return Outcome(
         matches.accepted,
         matches.probabilities,
         truth.accepts(matches.places),
         truth.has_match,
-        np.zeros(len(features), bool) if unseen is None else unseen,
+        np.zeros(len(images), bool) if unseen is None else unseen[images],
+        np.arange(len(images)) >= len(features),
     )
 
 
@@ -174,6 +185,13 @@ def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> O
         unseen[indices],
         drive.stamps[indices],
     )
+
+
+def sparse(pair: Pair) -> Outcome:
+    """Drive a query on the map of every third place."""
+    places = np.arange(0, len(pair.places), SPARSE)
+    truth = pair.truth.on_places(places)
+    return outcome(select_places(pair.places, places), pair.query.features, truth)
 
 
 def stretches(pair: Pair, coarser: int = 1) -> list[tuple[int, int]]:
@@ -287,7 +305,9 @@ class Measurement:
         pooled = [each for name, each in by_name.items() if not name.endswith(LONG_STOP)]
         if len(by_name) > 1:
             self.add('drives', f'{pair.name}/all', Outcome.pooled(pooled).numbers())
-        self.driven += pooled
+        each_third = sparse(pair)
+        self.add('sparse', pair.name, each_third.numbers())
+        self.driven += [*pooled, each_third]
         if not pair.long:
             self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
         outcomes = list(detours(pair, self.coarser))
@@ -314,12 +334,13 @@ class Measurement:
             place_map, query = maps[map_name], floors[query_name]
             nothing = GroundTruth(len(query), len(place_map), np.zeros(0, np.int64))
             one = outcome(place_map, query.features, nothing)
-            shares[f'{query_name} on {map_name}'] = float(one.accepted.mean())
+            shares[f'{query_name} on {map_name}'] = one.accepted.sum() / len(query)
             outcomes.append(one)
         pooled = Outcome.pooled(outcomes)
         worst = max(shares, key=shares.__getitem__)
         matched = int(np.count_nonzero(pooled.accepted))
-        values = {'images': len(pooled.accepted), 'matched': matched, 'pairs': len(pairs)}
+        values = {'images': int(np.count_nonzero(~pooled.early)), 'matched': matched}
+        values |= {'pairs': len(pairs), 'early': int(np.count_nonzero(pooled.early))}
         values['sure'] = int(np.count_nonzero(pooled.sure))
         self.add('floors', name, values | {'worst_pair': worst, 'worst': shares[worst]})
         return outcomes

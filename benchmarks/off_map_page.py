@@ -24,6 +24,9 @@ bins of the calibration are in [off_map.json](off_map.json).
   each map has 200 more places, equal, in its middle.
 * **Speeds:** half speed repeats every image; "all speeds" also pools stops of 30 and 100 images
   and dropped images. Best F1 is over all thresholds, precision is that of the default.
+* **Every third place:** of the map, all images of the query.
+* **Early matches:** of the newest images alone, before a window is full or since the camera has
+  come to the map. They count beside the image's later match, in all but recall and F1.
 * **Reverse order:** the last image of the query comes first; its direction is wrong.
 * **Start in the middle:** images until the first match is right; a window has 20.
 * **Calibration:** declared probability beside the share of right matches; the expected error is
@@ -86,6 +89,7 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
         worst = min(single, key=lambda name: single[name]['precision'])
         text = f'{single[worst]["precision"]:.3f} ({worst})'
         cells['lowest precision at the default'] = text, '>= 0.95'
+    cells |= _sparse_and_early(of('sparse'), [*single.values(), *detours.values()])
     if reverse:
         text = percent(total(reverse, 'wrong'), total(reverse, 'images')) + sure(reverse.values())
         cells['reverse order: images matched wrongly'] = text, '<= 3 %'
@@ -104,6 +108,21 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
                 if level['probability'] == LEVEL and level['matched']:
                     label = f'precision where {LEVEL} or more is declared, {name}'
                     cells[label] = f'{level["precision"]:.3f}', '>= 0.93'
+    return cells
+
+
+def _sparse_and_early(
+    sparse: dict[str, dict[str, Any]], driven: Iterable[dict[str, Any]]
+) -> dict[str, tuple[str, str]]:
+    """Return the rows of maps of every third place, and the row of early matches."""
+    cells = {}
+    for name, row in sparse.items():
+        text = f'{row["precision"]:.3f}, {row["recall"]:.3f}'
+        cells[f'every third place, {name}: precision, recall'] = text, '>= 0.95, >= 0.9'
+    early = [row for row in driven if 'early' in row]
+    if early:
+        text = percent(*(sum(row[name] for row in early) for name in ('early_wrong', 'early')))
+        cells['early matches of drives and detours: wrong'] = text, ''
     return cells
 
 

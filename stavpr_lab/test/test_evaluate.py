@@ -295,7 +295,10 @@ def test_evaluate_combines_drive_options(folders, report):
 def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, report, tmp_path):
     found, rows, text = report(*pair(folders))
     calibration = found['calibration']
-    assert calibration['images'] == sum(row['probability'] != 'nan' for row in rows) > 0
+    declared = sum(row['probability'] != 'nan' for row in rows)
+    early = found['decision']['early_matched']
+    assert calibration['images'] == declared + early > declared
+    assert f'{early} early matches, 0 of them wrongly' in text
     error = calibration['expected_calibration_error']
     assert f'expected calibration error {error:.4f}' in text
     page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from stavpr_lab.evaluation.evaluate import evaluate_traverse, ReducedDistances, TraverseResults
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.metrics import Ranking
+from stavpr_lab.evaluation.metrics import ImageMatches, Ranking
 from stavpr_lab.evaluation.report import worst_mistakes
 from stavpr_ros.errors import InputError
 
@@ -15,7 +15,9 @@ def results_of(places, scores):
     matches = Ranking(np.asarray(places)[:, None], np.asarray(scores))
     reduced = ReducedDistances(np.zeros((1, 1)), (60, 60))
     accepted, unknown = matches.scores < 1, np.full(len(places), np.nan)
-    return TraverseResults(matches, matches, np.zeros(len(places)), (), reduced, accepted, unknown)
+    published = ImageMatches.none(len(places)), np.arange(len(places))
+    columns = accepted, unknown, published
+    return TraverseResults(matches, matches, np.zeros(len(places)), (), reduced, *columns)
 
 
 def test_worst_mistakes_are_ordered_and_apart():

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics: by hand, against scikit-learn and against the oracle's plain loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import oracle
 import pytest
@@ -9,6 +11,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import (
     evaluate_ranking,
     image_matches,
+    published_matches,
     Ranking,
     smallest_indices,
 )
@@ -71,6 +74,18 @@ def test_image_matches_of_windows_of_four_by_hand():
     assert matches.distances.tolist() == [0.3, 0.3, 0.2, 0.4, 0.4, 0.4]
     within = matches.within(np.array([11, 14, -1, 14, 12, 19]), 2)
     assert within.tolist() == [True, False, False, True, False, False]
+
+
+def test_published_matches_are_of_images_and_early_by_hand():
+    """Of windows of 4: two images that end at image 2, and two accepted that end at image 5."""
+    early = replace(window(12, [(0, 12), (1, 13)], 0.05), status=Status.MATCH, probability=0.95)
+    full = window(11, [(0, 11), (1, 11), (2, 12), (3, 13)], 0.3)
+    waiting = replace(early, status=Status.WARMING_UP)
+    matches, images = published_matches([NONE, waiting, early, full, full, early], 4)
+    assert images.tolist() == [0, 1, 2, 3, 4, 5, 1, 4]
+    assert matches.places.tolist() == [11, 11, 11, 12, 13, -1, 12, 12]
+    assert np.flatnonzero(matches.accepted).tolist() == [6, 7]
+    assert matches.probabilities[6:].tolist() == [0.95, 0.95]
 
 
 def test_evaluate_ranking_of_five_queries_by_hand():

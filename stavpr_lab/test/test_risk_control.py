@@ -27,9 +27,11 @@ PLACES, NAN = 60, float('nan')
 
 
 def driven(truth, places, probabilities, **changes):
-    """Return a drive and its matches."""
+    """Return a drive, its matches, and their images; matches beyond are early ones, of image 0."""
     drive, none = DriveChanges(**changes).apply(truth), ImageMatches.none(len(places))
-    return drive, replace(none, places=np.array(places), probabilities=np.array(probabilities))
+    matches = replace(none, places=np.array(places), probabilities=np.array(probabilities))
+    images = np.arange(len(places))
+    return drive, matches, np.where(images < len(drive.images), images, 0)
 
 
 def risk_at(risks, probability):
@@ -46,6 +48,8 @@ def test_risks_of_two_blocks_by_hand():
     double = driven(truth, [3, 2, 4], [0.99, 0.95, 0.99], speed=2)
     risks = measured_risks([recorded, double], 2, 'x')
     assert [risk_at(risks, p) for p in (0.15, 0.95, 0.995)] == [1, 1, 0]
+    early = driven(truth, [0, 4, 2, 3, -1, 2], [0.9, 0.5, 0.3, NAN, NAN, 0.96])
+    assert risk_at(measured_risks([early], 2, 'x'), 0.95) == 1
 
 
 def test_risk_of_a_block_off_the_map_is_the_share_of_matched_images():

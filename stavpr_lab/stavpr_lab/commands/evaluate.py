@@ -321,6 +321,9 @@ def _print_report(report: 'Report') -> None:
     print(
         f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images{wrong}'
     )
+    if decision['early_matched']:
+        wrong = f', {decision["early_wrong"]} of them wrongly' if report.has_truth else ''
+        print(f'and {decision["early_matched"]} early matches{wrong}')
     if report.has_truth:
         from stavpr_lab.evaluation.protocol import text
 

@@ -14,7 +14,7 @@ from stavpr_lab.commands.evaluate_sequences import (
     recognizer_settings,
 )
 from stavpr_lab.evaluation.evaluate import recognize_all
-from stavpr_lab.evaluation.metrics import image_matches
+from stavpr_lab.evaluation.metrics import published_matches
 from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks
 from stavpr_ros.commands.program import say
 from stavpr_ros.errors import SettingsError
@@ -71,7 +71,7 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         places = select_places(reference, drive.places) if drive.removed else reference
         recognizer = PlaceRecognizer(places, settings, arguments.backend, arguments.precision)
         matches = recognize_all(recognizer, features[drive.images])
-        driven.append((drive, image_matches(matches, settings.sequence.length)))
+        driven.append((drive, *published_matches(matches, settings.sequence.length)))
     risks = measured_risks(driven, block, settings.method)
     risks = replace(risks, recordings=(recording,))
     say(

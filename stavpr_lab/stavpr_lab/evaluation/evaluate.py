@@ -19,8 +19,10 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import (
     evaluate_ranking,
     image_matches,
+    ImageMatches,
     is_full,
     Metrics,
+    published_matches,
     Ranking,
     RANKS,
     smallest_indices,
@@ -82,6 +84,7 @@ class TraverseResults:
     :param distances: of all images.
     :param accepted: whether the recognizer accepts the window's match, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
+    :param published: M >= N matches: the early ones behind these, and the image of each, (M,).
     """
 
     sequence: Ranking
@@ -91,6 +94,7 @@ class TraverseResults:
     distances: ReducedDistances = field(repr=False)
     accepted: np.ndarray = field(repr=False)
     probabilities: np.ndarray = field(repr=False)
+    published: tuple[ImageMatches, np.ndarray] = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -156,7 +160,9 @@ class Evaluation:
         """Return the calibration of the declared probabilities; None without any or the truth."""
         if not self.ground_truth.kind:
             return None
-        return calibrate(self.results.probabilities, self.correct, self.ground_truth.has_match)
+        matches, images = self.results.published
+        truth = self.ground_truth.select(images)
+        return calibrate(matches.probabilities, truth.accepts(matches.places), truth.has_match)
 
 
 def centered_images(count: int, length: int) -> slice:
@@ -242,11 +248,11 @@ def recognize_traverse(
             candidates[image, : len(places_of_window)] = places_of_window
             if i % interval == 0 or image in shown:
                 windows.append(_window_distances(image, i, length, rows, match.path))
-    matched = image_matches(matches, length, late)
+    matched, published = image_matches(matches, length, late), published_matches(matches, length)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
     sequence, distances = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
-        sequence, single, seconds, *distances, matched.accepted, matched.probabilities
+        sequence, single, seconds, *distances, matched.accepted, matched.probabilities, published
     )
 
 

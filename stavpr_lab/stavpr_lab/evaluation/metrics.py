@@ -269,6 +269,33 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     return result
 
 
+def published_matches(matches: Sequence[Match], length: int) -> tuple[ImageMatches, np.ndarray]:
+    """
+    Return all matches of a traverse: one an image, and the early ones behind them.
+
+    An early match is of the middle of the newest images alone, before a window is full or since
+    the camera has come to the map. A robot gets it, whatever the full window shows later.
+
+    :param matches, length: see :func:`image_matches`.
+    :returns: M >= N matches, and the image of each, (M,), int64.
+    """
+    of_images = image_matches(matches, length)
+    early = [
+        (end, match)
+        for end, match in enumerate(matches)
+        if match.accepted and not is_full(match, length)
+    ]
+    newest = [int(match.path[-1, 0]) for _, match in early]
+    images = [end - last + last // 2 for (end, _), last in zip(early, newest, strict=True)]
+    rows = [(each.place_index, each.score, True, each.probability) for _, each in early]
+    columns = np.array(rows).reshape(-1, 4).T
+    published = [
+        np.append(getattr(of_images, name), column.astype(getattr(of_images, name).dtype))
+        for name, column in zip(ImageMatches.__dataclass_fields__, columns, strict=True)
+    ]
+    return ImageMatches(*published), np.append(np.arange(len(matches)), images).astype(np.int64)
+
+
 def evaluate_ranking(
     ranking: Ranking, ground_truth: GroundTruth, images: slice = slice(None)
 ) -> Metrics:

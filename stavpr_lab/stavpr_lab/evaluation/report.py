@@ -83,16 +83,21 @@ class Report:
         return error_rate_and_recall(self.accepted, self.evaluation.correct, has_match)
 
     def decision(self) -> dict[str, Any]:
-        """Return how many images are matched and, with ground truth, how many of them wrongly."""
+        """Return how many images are matched, and by early matches; with ground truth, wrongly."""
         counts = self.counts
         decision: dict[str, Any] = {
             'rule': 'best F1' if self.default_threshold is None else 'default',
             'images': len(self.accepted),
             'matched': counts.accepted,
         }
+        matches, images = self.evaluation.results.published
+        early = slice(len(self.accepted), None)
+        decision['early_matched'] = len(images[early])
         if not self.has_truth:
             return decision
+        right = self.evaluation.ground_truth.select(images).accepts(matches.places)
         return decision | {
+            'early_wrong': int(np.count_nonzero(~right[early])),
             'wrongly_matched': counts.false_positives,
             'precision': counts.precision,
             'recall': counts.recall,

@@ -40,14 +40,15 @@ def made_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
 
 
 def measured_risks(
-    driven: Iterable[tuple[Drive, ImageMatches]], block: int, method: str
+    driven: Iterable[tuple[Drive, ImageMatches, np.ndarray]], block: int, method: str
 ) -> ErrorRisks:
     """
     Return the risks of the blocks of a recorded query.
 
     Images beside a removed stretch, which may be matched with its edge, do not count.
 
-    :param driven: drives of it, the first one as recorded, and their matches.
+    :param driven: drives of it, the first one as recorded, their matches, and the images of
+        these: :func:`stavpr_lab.evaluation.metrics.published_matches`.
     :param block: images of a block; the last one also has the rest.
     :param method: of :class:`stavpr_ros.mapping.error_risks.ErrorRisks`.
     """
@@ -55,11 +56,13 @@ def measured_risks(
     units = max(1, len(driven[0][0].images) // block)
     wrong, matched, images = np.zeros((3, units, len(PROBABILITIES)))
     on_map = np.zeros((units, 1), bool)
-    for drive, matches in driven:
-        has_match, correct = drive.truth.has_match, drive.truth.accepts(matches.places)
-        counted = np.any([has_match | ~drive.recorded.has_match, *drive.unseen()], axis=0)
+    for drive, matches, at in driven:
+        truth, recorded = drive.truth.select(at), drive.recorded.has_match[at]
+        has_match, correct = truth.has_match, truth.accepts(matches.places)
+        unseen = [stretch[at] for stretch in drive.unseen()]
+        counted = np.any([has_match | ~recorded, *unseen], axis=0)
         above = (matches.probabilities[:, None] > PROBABILITIES) & counted[:, None]
-        unit = np.minimum(drive.images // block, units - 1)
+        unit = np.minimum(drive.images[at] // block, units - 1)
         np.add.at(matched, unit, above)
         np.add.at(wrong, unit, above & ~correct[:, None])
         np.add.at(images, unit, counted[:, None])
