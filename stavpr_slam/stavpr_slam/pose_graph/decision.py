@@ -25,7 +25,7 @@ CERTAIN = math.log(20)  # evidence from which a correction is published
 LOOSENED = math.log(100)  # evidence from which the odometry is trusted less, and for each
 DOUBLED = math.log(20)  # doubling of its errors beyond the settings
 AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
-FAR = 1e-9  # all count
+MAX_TRIED = 50  # closures that are tried one by one
 STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
 GAP = 15.0  # meters that queries and places of an event are apart at most
 
@@ -121,6 +121,33 @@ class Decider:
         rest = len(taken) - np.cumsum(sizes) + sizes
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
+    def _extended(self, odometry: Any, taken: np.ndarray, values: Any) -> tuple[np.ndarray, Any]:
+        """
+        Add closures, one by one in the order of the drive, that bend the odometry little enough.
+
+        A closure at the end of a long path agrees with it, but is far away before it is added.
+        """
+        network = self._network
+        rejected = np.flatnonzero(~taken)
+        if len(rejected) > MAX_TRIED:
+            return taken, values
+        values, before, _ = network.solve(odometry, values, taken * 1.0)
+        rejected = rejected[np.argsort(np.maximum(network.query, network.place)[rejected])]
+        while True:
+            count = taken.sum()
+            for number in rejected[~taken[rejected]]:
+                weights = taken * 1.0
+                weights[number] = 1.0
+                try:
+                    moved, squared, _ = network.solve(odometry, values, weights)
+                except RuntimeError:
+                    continue
+                if squared - before < network.limit:
+                    taken = weights > 0
+                    values, before = moved, squared
+            if taken.sum() == count:
+                return taken, values
+
     def at(self, scales: np.ndarray, near: Decision | None = None) -> Decision:
         """
         Decide with an odometry.
@@ -139,9 +166,12 @@ class Decider:
                     raise
                 taken, values = network.robust(odometry, near.corrected, AGAIN)
             evidence = self._evidence(odometry, taken, values) if taken.any() else 0.0
-            # closures beside them may agree by now
-            for first in ((AGAIN, FAR) if self._measured else (AGAIN,)) * bool(taken.any()):
-                more, moved = network.robust(odometry, values, first)
+            tried = []
+            if taken.any():  # closures beside them may agree by now
+                tried.append(network.robust(odometry, values, AGAIN))
+            if self._measured:
+                tried += [self._extended(odometry, *each) for each in (*tried, (none, start))]
+            for more, moved in tried:
                 found = self._evidence(odometry, more, moved) if more.any() else 0.0
                 if more.sum() > taken.sum() and found > evidence - CERTAIN:
                     taken, values, evidence = more, moved, found
