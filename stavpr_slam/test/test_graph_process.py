@@ -4,10 +4,11 @@
 
 import numpy as np
 from stavpr_ros.mapping.transforms import matrices
-from stavpr_slam.pose_graph import GraphSettings
+from stavpr_slam.pose_graph import GraphSettings, optimize
 from stavpr_slam.pose_graph.path_errors import path_errors
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_process import GraphServer, RobotOdometry
+from test_pose_graph import circle, closure, error, LAP, odometry_of
 
 SECOND = 10**9
 POSES = planar_poses(np.column_stack([np.arange(10.0), np.zeros((10, 2))]))
@@ -44,3 +45,22 @@ def test_server_of_robots_has_breaks_and_paths_of_each_in_no_trajectory_file(tmp
     saved = server.serve([], False, (f'{tmp_path}/drive.tum', False)).saved
     assert 'ends in .g2o, the file of several robots' in saved
     assert stamps == {'a': [SECOND, 2 * SECOND], 'b': [SECOND, 2 * SECOND, 10 * SECOND]}
+
+
+def test_live_graph_ends_as_the_recorded_drive():
+    """The messages of wheels have covariances of zero; closures come one by one."""
+    truth = circle(3)
+    poses, zero = odometry_of(truth), np.zeros(36).tolist()
+    closures = [closure(truth, q, q % LAP, independent=True) for q in range(LAP, 3 * LAP, 6)]
+    server, waiting = GraphServer(GraphSettings(), {}), list(closures)
+    for i, pose in enumerate(poses):
+        inputs = [RobotOdometry('', (i + 1) * SECOND, pose.tolist(), zero)]
+        while waiting and waiting[0].query_stamp <= (i - 9) * SECOND:
+            inputs.append(waiting.pop(0))
+        server.serve(inputs, False, None)
+    snapshot = server.serve(waiting, True, None)
+    _, _, live = snapshot.paths.trajectories['']
+    offline, _ = optimize((np.arange(len(truth)) + 1) * SECOND, poses, closures)
+    expected = error(offline, truth)
+    assert expected < 0.15 * error(poses, truth)
+    assert error(live, truth) < 1.05 * expected + 0.02
