@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.pose_file import read_poses
 
@@ -54,6 +55,17 @@ def test_read_poses_with_rotations(tmp_path, text):
     assert has_rotations
 
 
+def test_read_poses_of_kitti_on_a_straight_road(tmp_path):
+    """The entries of the rotation hardly change, as degrees do."""
+    path, angles = tmp_path / 'poses.txt', np.linspace(0, 0.01, 50)
+    turns = Rotation.from_rotvec(angles[:, None] * [0, 0, 1])
+    positions = angles[:, None] * [3000, 2, 0]
+    np.savetxt(path, np.dstack([turns.as_matrix(), positions]).reshape(50, 12))
+    poses, has_rotations = read_poses(path)
+    np.testing.assert_allclose(poses, np.hstack([positions, turns.as_quat()]), atol=1e-9)
+    assert has_rotations
+
+
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
@@ -68,7 +80,7 @@ def test_read_poses_with_rotations(tmp_path, text):
         ('0,0,0,10,20,30,0\n', 'line 1: a quaternion of norm 37.4 instead of 1'),
         ('0 0 0 0 0 0 0 1 0 1 0 0\n', 'line 1: its 12 numbers have no rotation matrix'),
         ('5,0,0,0,0,0,0,1\n4,0,0,0,0,0,0,1\n', 'the first one falls and is no stamp'),
-        ('1700000000,0,0\n1700000001,1,0\n', 'number 1 of its positions is a stamp'),
+        ('1700000000,0,0\n1700000001,1,0\n', 'one of its positions is a stamp'),
         ('Latitude,Longitude,alt\n47.3,8.5,400\n', 'project latitudes and longitudes to meters'),
         ('x,y,yaw [deg]\n1,2,90\n', 'its columns are x, y, yaw: .*convert angles to a quaternion'),
         (None, 'cannot be read'),
@@ -88,7 +100,7 @@ def test_read_poses_of_degrees_raises(tmp_path):
     np.savetxt(
         path, np.array([47.3, 8.5, 400]) + meters / [111e3, 75e3, 1], delimiter=',', fmt='%.7f'
     )
-    with pytest.raises(SourceError, match='less than a millimeter an image, as latitudes'):
+    with pytest.raises(SourceError, match='fractions of a millimeter an image, as latitudes'):
         read_poses(path)
     np.savetxt(path, np.array([47.3, 8.5, 400]) + meters)
     assert len(read_poses(path)[0]) == 40

@@ -19,7 +19,7 @@ DEGREES = re.compile(
     r'(.*[._])?((lat|lon|lng|long)(itude)?|yaw|pitch|roll|theta|heading|bearing)(_.*)?'
 )
 NORMS = 0.9, 1.1  # of a quaternion in text, of a few digits
-MAX_STEP, MAX_EXTENT = 1e-3, 0.5  # median and extent of positions in degrees; in meters, too small
+MAX_STEP, MAX_EXTENT = 3e-4, 0.5  # of positions in degrees, median and sum; too small in meters
 
 
 def read_poses(path: Path) -> tuple[np.ndarray, bool]:
@@ -50,12 +50,13 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
         elif width not in NUMBERS:
             angles = '; angles must be a quaternion' if width == 6 else ''
             raise table.error(f'it has {width} numbers in a line{angles}')
-    if stamps := [i for i in range(3) if is_stamps(rows[:, i])]:
-        raise table.error(f'number {stamps[0] + 1} of its positions is a stamp')
-    if _in_degrees(rows[:, :2]):
+    positions = rows[:, 3::4] if rows.shape[1] == 12 else rows[:, :3]
+    if any(map(is_stamps, positions.T)):
+        raise table.error('one of its positions is a stamp')
+    if _in_degrees(positions[:, :2]):
         raise table.error(
-            'its positions move by less than a millimeter an image, as latitudes and longitudes '
-            'do, project them to meters (UTM); if they are meters, subtract the first one'
+            'its positions move by fractions of a millimeter an image, as latitudes and '
+            'longitudes do, project them to meters (UTM); if they are meters, subtract the first'
         )
     if rows.shape[1] == 12:
         return _of_matrices(table, rows.reshape(-1, 3, 4)), True

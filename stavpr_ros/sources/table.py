@@ -5,7 +5,6 @@
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-import re
 
 import numpy as np
 from stavpr_ros.errors import SourceError
@@ -117,7 +116,7 @@ def is_stamps(column: np.ndarray) -> bool:
 
 def is_counted(column: np.ndarray) -> bool:
     """Return whether numbers count the lines, from any number on."""
-    return len(column) > 2 and bool((np.diff(column) == 1).all())
+    return len(column) > 2 and bool((np.diff(np.asarray(column, np.float64)) == 1).all())
 
 
 def _is_header(cells: list[str], width: int, counted: bool) -> bool:
@@ -129,7 +128,7 @@ def _is_header(cells: list[str], width: int, counted: bool) -> bool:
 def _is_name(cell: str) -> bool:
     """Return whether a cell is neither empty nor a number."""
     try:
-        float(re.sub(r'\s', '', cell) or 0)
+        float(cell.strip() or 0)
     except ValueError:
         return True
     return False
