@@ -55,7 +55,7 @@ def test_finalized_node_after_a_signal_ends(robot, run, map_file):
 
 def test_node_after_two_signals_during_an_image_ends(robot, run, map_file, route):
     """`ros2 launch` sends a second interrupt."""
-    process = run(map_path=map_file, queue_size=1000)
+    process = run(slow=True, map_path=map_file, queue_size=1000)
     robot.wait_for_node()
     before, images = len(robot.answers), 400
     for i in range(images):

@@ -4,6 +4,7 @@
 
 import base64
 from http.client import HTTPConnection
+from itertools import cycle
 import json
 import math
 import re
@@ -182,7 +183,7 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
         robot.until(lambda: shown().get('state') == 'active', 'the state')
         robot.until(lambda: 'route' in shown(), 'the route')
         robot.drive(route[: LENGTH + 3])
-        shown_images = iter(route)
+        shown_images = cycle(route)
 
         def complete():
             robot.show(next(shown_images))

@@ -212,7 +212,7 @@ def test_pose_graph_over_ros_corrects_saves_and_survives_bad_input(peer, running
 def test_pose_graph_in_a_long_solution_delays_no_odometry_and_ends_at_once(peer, running):
     """The solution does not end: its process is stopped."""
     poses = odometry_of(circle())
-    peer.delay(SECOND, poses[0])
+    peer.deliver(odometry_message(SECOND, poses[0]), peer.odometry, peer.corrected)
     solver = solver_of(running)
     loaded = Path(f'/proc/{solver}/maps').read_text()
     assert 'gtsam' in loaded

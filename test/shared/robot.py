@@ -117,6 +117,7 @@ class Robot:
         self.answers: list[PlaceMatch] = self.listen(PlaceMatch, '/stavpr/match', RELIABLE)
         self.infos: list[MapInfo] = self.listen(MapInfo, '/stavpr/map_info', LATCHED)
         self.arrays: list[DiagnosticArray] = []
+        self._array_times: list[int] = []  # when they were published, ns
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         self.log: list[str] = []
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
@@ -130,8 +131,9 @@ class Robot:
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+    def _on_diagnostics(self, message: DiagnosticArray, info: dict[str, int]) -> None:
         self.arrays.append(message)
+        self._array_times.append(info['source_timestamp'])
         for status in message.status:
             self.diagnostics[status.name.partition(': ')[2]] = status
 
@@ -202,9 +204,10 @@ class Robot:
 
     def counts(self, part: str) -> dict[str, str]:
         """Return the values of the diagnostics of a part, newer than this call."""
-        self.arrays.clear()
-        # the first may have been under way when this was called
-        self.until(lambda: len(self.arrays) >= 2, 'diagnostics')
+        called = time.time_ns()
+        self._array_times.clear()
+        # the first may have been made before this was called
+        self.until(lambda: sum(each > called for each in self._array_times) >= 2, 'diagnostics')
         status = next(s for s in self.arrays[-1].status if s.name.endswith(part))
         return {pair.key: pair.value for pair in status.values}
 
