@@ -284,6 +284,7 @@ def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
                 setattr(message.relative_pose, name, value)
             peer.closures.publish(message)
 
+    peer.deliver(odometry_message(SECOND, odometry_of(truth)[0]), peer.odometry, peer.corrected)
     publish(frame='camera')
     peer.until_diagnosed(DiagnosticStatus.WARN, '100 of 100 closures are invalid: ')
     assert 'set camera_transform' in peer.text
