@@ -25,4 +25,4 @@ def generate_launch_description() -> LaunchDescription:
         output='screen',
         parameters=[{'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 0.0}],
     )
-    return node_launch(manager, autostart=False)
+    return node_launch(manager, needs='nav2_lifecycle_manager', autostart=False)

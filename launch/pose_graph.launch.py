@@ -41,4 +41,4 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(name, default_value=str(default).lower(), description=description)
         for name, (default, description) in ARGUMENTS.items()
     ]
-    return node_launch(*own, graph, operation='loop_closure')
+    return node_launch(*own, graph, needs='stavpr_slam', operation='loop_closure')

@@ -22,6 +22,7 @@ OPTIONS = {
     'fps': 'images per second: of a folder, as recorded; taken of a video; empty: 10, 5',
     'start_offset': 'recorded seconds to leave out at the beginning; empty: 0',
     'duration': 'recorded seconds to replay; empty: all',
+    'record': 'new file for the matches; empty: none',
 }
 SWITCHES = {
     'lossless': 'publish each image after the match of the last one; leave rate empty',

@@ -4,12 +4,14 @@
 
 from collections.abc import Callable
 import ctypes
+from functools import partial
 import logging
 import multiprocessing
 import os
 from pathlib import Path
 import platform
 import shutil
+import sys
 import tempfile
 
 from llvmlite import binding
@@ -18,7 +20,7 @@ from numba.core import event
 from tqdm import tqdm
 
 AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hwcap.h
-COMPILING = 'compiling kernels, once, about 30 s'
+COMPILING = 'compiling kernels, once, one to two minutes'
 KERNELS = 104  # that `stavpr warm` compiles, for the progress bar
 
 # Of numba's threading layers, the default's fallback aborts the process when two threads meet in
@@ -106,7 +108,9 @@ class _Progress(event.Listener):
         self._depth = self._compiled = 0
 
     def on_start(self, event: event.Event) -> None:
-        """Show a progress bar, or announce the first kernel."""
+        """Show a progress bar, or announce the first kernel, on a terminal or not."""
+        if self.announce is None and not sys.stderr.isatty():
+            self.announce = partial(print, file=sys.stderr, flush=True)
         if self._depth == 0 and self.announce is None:
             self._bar = tqdm(
                 desc=COMPILING,

@@ -3,7 +3,10 @@
 """The cache folder of compiled kernels, and the announcement of their compilation."""
 
 from pathlib import Path
+import subprocess
+import sys
 
+from processes import environment, TIMEOUT
 import pytest
 from stavpr_ros import compilation
 from stavpr_ros.compilation import cache_folder, COMPILING
@@ -46,3 +49,38 @@ def test_compilation_is_announced_once():
         progress.on_start(None)
         progress.on_end(None)
     assert texts == [COMPILING]
+
+
+DRIVE = """
+import gc
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from stavpr_ros.mapping import build_map
+from stavpr_ros.pipeline import PipelineSettings
+from stavpr_ros.pipeline.operations import Localizer, RouteCloser
+from stavpr_ros.pipeline.save_state import SaveState
+from stavpr_ros.sources.frame import Frame
+
+def compiled():
+    return {(f.__qualname__, tuple(f.signatures)) for f in gc.get_objects()
+            if isinstance(f, Dispatcher) and f.signatures}
+
+settings = PipelineSettings(backend='cpu', max_places=110)
+extractor = settings.extractor()
+images = np.random.default_rng(0).integers(0, 256, (60, 96, 128, 3), np.uint8)
+route = build_map([Frame(image, i, str(i)) for i, image in enumerate(images)], extractor)
+for operation in (
+    Localizer(settings, route, extractor, SaveState()),
+    RouteCloser(settings, None, extractor, SaveState()),
+):
+    before = compiled()
+    for i, image in enumerate([*images, *images]):
+        operation.recognizer.update(extractor.extract([image]), (i + 1) * 10**8)
+    print(operation.name, sorted(compiled() - before))
+"""
+
+
+def test_no_kernel_is_compiled_after_the_start_of_an_operation():
+    run = [sys.executable, '-c', DRIVE]
+    text = subprocess.check_output(run, env=environment(), timeout=TIMEOUT, text=True)
+    assert text.splitlines() == ['localization []', 'loop_closure []']

@@ -30,10 +30,11 @@ FIXED = {
     'pose_graph': {'operation': 'loop_closure'},
 }
 GIVEN = {'cameras': 'front'}  # required arguments
+PACKAGES = {'nav2': 'nav2_lifecycle_manager', 'pose_graph': 'stavpr_slam'}  # that files need
 TEXTS = {bool: ('true', True), int: ('3', 3), float: ('1', 1.0), str: ('2', '2')}
 
 REPLAY = {'bag', 'topic', 'odometry', 'also', 'rate', 'fps', 'start_offset', 'duration'}
-REPLAY |= {'lossless', 'loop', 'start_paused', 'shutdown'}
+REPLAY |= {'record', 'lossless', 'loop', 'start_paused', 'shutdown'}
 
 
 class Recorded:
@@ -94,9 +95,12 @@ def load(monkeypatch):
         arguments = {argument.first: argument for argument in declared}
         assert len(arguments) == len(declared)
 
-        def start(**given):
+        def start(missing=(), **given):
             defaults = {n: getattr(a, 'default_value', None) for n, a in arguments.items()}
-            context = Context(defaults | GIVEN | given)
+            shares = dict.fromkeys(PACKAGES.values(), '/share')
+            context = Context(shares | defaults | GIVEN | given)
+            for package in missing:
+                del context[package]
             return [node for e in those('OpaqueFunction') for node in e.function(context) or ()]
 
         return SimpleNamespace(arguments=arguments, start=start, nodes=those('Node'))
@@ -125,6 +129,13 @@ def test_launching_imports_nothing_heavy():
     assert own == {'stavpr_ros.parameters'}  # see test_parameters
     foreign = {name.partition('.')[0] for name in modules - own}
     assert foreign - set(sys.stdlib_module_names) == {'launch', 'launch_ros'}
+
+
+@pytest.mark.parametrize(('name', 'package'), PACKAGES.items())
+def test_launch_file_without_a_package_that_it_needs_starts_nothing(load, name, package):
+    """The check comes before the node in the description, and an error ends the launch."""
+    with pytest.raises(RuntimeError, match=f'{package} is not installed, so that nothing'):
+        load(name).start(missing=[package])
 
 
 @pytest.mark.parametrize('name', NAMES)

@@ -6,6 +6,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rcl_interfaces.srv import SetParameters
+import rclpy
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from robot import image_message, LENGTH, SECOND
@@ -147,6 +148,15 @@ def test_node_draws_match_images_for_a_subscriber_only(robot, start, route, monk
     robot.until(lambda: drawn[-1].header == match.header, 'the last image')
     image = np.frombuffer(drawn[-1].data, np.uint8).reshape(drawn[-1].height, -1, 3)
     np.testing.assert_array_equal(image[14:96, :128], route[9][14:])  # below the label
+
+
+def test_node_with_the_name_of_another_logs_it(robot, start):
+    start()
+    other = rclpy.create_node('stavpr', context=robot.context)
+    try:
+        robot.until_logged('another node is named /stavpr, and its matches are on the same')
+    finally:
+        other.destroy_node()
 
 
 def test_node_with_an_incompatible_subscriber_logs_it(robot, start):

@@ -87,7 +87,7 @@ def test_loop_closures_of_either_triangle_are_the_same():
 
 
 def test_from_pairs_outside_the_range_raises():
-    for pair in [(3, 0), (-1, 0), (0, 5), (0, -1)]:
+    for pair in [(3, 0), (-1, 0), (0, 5), (0, -2)]:
         with pytest.raises(InputError, match=rf'query {pair[0]} with place {pair[1]}'):
             by_hand([*PAIRS, pair])
     with pytest.raises(InputError, match='at least one'):
@@ -114,6 +114,19 @@ def test_from_file_reads_text(tmp_path, text):
     np.testing.assert_array_equal(
         GroundTruth.from_file(path, 3, 5, 1).pairs, by_hand(tolerance=1).pairs
     )
+
+
+def test_from_file_with_a_list_of_pairs_is_unknown_for_other_queries(tmp_path):
+    """A place of -1, a matrix and an image are statements on all that they are about."""
+    path = tmp_path / 'truth.csv'
+    path.write_text('query,place\n0,1\n2,-1\n')
+    truth = GroundTruth.from_file(path, 4, 5, 1)
+    assert truth.is_stated.tolist() == [True, False, True, False]
+    assert truth.has_match.tolist() == [True, False, False, False]
+    assert truth.select(np.array([3, 2])).is_stated.tolist() == [False, True]
+    assert truth.on_places(np.array([4])).is_stated.tolist() == truth.is_stated.tolist()
+    np.save(tmp_path / 'matrix.npy', MATRIX)
+    assert GroundTruth.from_file(tmp_path / 'matrix.npy', 3, 5).is_stated.all()
 
 
 def test_from_file_reads_a_place_a_line(tmp_path):

@@ -17,6 +17,7 @@ import pytest
 import rclpy
 from robot import LENGTH
 from sensor_msgs.msg import Image
+from stavpr_lab.commands import monitor
 from stavpr_lab.monitor.node import encode_row, History, KEPT, Monitor, span_of
 from stavpr_lab.monitor.server import MonitorServer
 from stavpr_msgs.msg import PlaceMatch
@@ -66,6 +67,14 @@ def test_row_spans_the_places_of_its_columns(places, span):
     assert span_of(np.array(places, float)) == span
 
 
+def test_history_keeps_a_match_just_after_a_dropped_image():
+    history = History(sample_seconds=100)
+    for status in ('dropped', 'skipped', 'match', 'no match', 'dropped'):
+        history.add({'status': status})
+    samples = history.since(0, 0)[1]['samples']
+    assert [sample['status'] for sample in samples] == ['dropped', 'match']
+
+
 def test_encode_row_by_hand():
     row = np.array([1, 3, 2, np.inf, 9], np.float32)  # least 1, median 2.5
     assert list(base64.b64decode(encode_row(row))) == [0, 255, 170, 255, 255]
@@ -101,6 +110,13 @@ def served(history):
     request.commands, request.server = commands, server
     yield request
     server.stop()
+
+
+@pytest.mark.parametrize('port', ['80000', '-1', 'web'])
+def test_monitor_on_a_port_that_is_none_is_a_wrong_usage(port, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        monitor.main([f'--port={port}'])
+    assert 'expected a port, 0 to 65535' in capsys.readouterr().err
 
 
 def test_server_serves_the_page_the_events_and_the_image(served, history):

@@ -28,6 +28,7 @@ STATUSES = (
 )
 MATCHES, LOOP_CLOSURES = 'matches', 'loop closures'
 TOPICS = {MATCHES: 'stavpr/match', LOOP_CLOSURES: 'stavpr/loop_closure'}
+LAST_SECONDS = 0.3  # without a message after a signal: then none is to come
 
 EPILOG = """
 The keys are the fields of stavpr_msgs/PlaceMatch, the status by its name, or with --loop-closures
@@ -78,10 +79,9 @@ def _run(args: list[str]) -> None:
 
     arguments = _parser().parse_args(own_arguments(args))
     with atomic_output(arguments.output, RECORDING, arguments.force) as file:
-        count = _write_messages(arguments, file, args)
-        if not count and os.path.exists(arguments.output):
-            file.abandon()  # an earlier recording is replaced by the first message
-    say(f'{count} {arguments.kind} written to {arguments.output}')
+        recorder = Recorder(file, arguments.output, arguments.kind)
+        _record_messages(recorder, arguments.kind, args)
+        recorder.finish()
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -103,14 +103,49 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _write_messages(
-    arguments: argparse.Namespace, file: AtomicFile, ros_arguments: list[str]
-) -> int:
+class Recorder:
     """
-    Write messages until a signal; return their number.
+    Writes messages to a file, one JSON object per line; ``count`` of them.
 
-    :raises OutputError: a message cannot be written; earlier ones stay.
+    :param file: of :func:`atomic_output`, of this name.
+    :param kind: matches or loop closures.
     """
+
+    def __init__(self, file: AtomicFile, name: str, kind: str = MATCHES) -> None:
+        self._file, self._name, self._kind, self.count = file, name, kind, 0
+        self._record_of: Any = match_record if kind == MATCHES else loop_closure_record
+
+    def write(self, message: Any) -> None:
+        """
+        Write a message.
+
+        :raises OutputError: it cannot be written; earlier ones stay.
+        """
+        file = self._file
+        line = json.dumps(self._record_of(message) | {'received': time.time_ns()}) + '\n'
+        size = os.fstat(file.fileno()).st_size
+        try:
+            file.write(line.encode())
+            file.flush() if file.committed else file.commit()
+        except OSError as error:
+            os.ftruncate(file.fileno(), size)
+            content = f'it has {self.count} {self._kind}, all of them whole'
+            raise OutputError(
+                f'{self._name} cannot be written ({error.strerror}); '
+                f'{content if file.committed else "what was there is untouched"}: free space, and '
+                'record again'
+            ) from error
+        self.count += 1
+
+    def finish(self) -> None:
+        """Keep an earlier recording where there is no message to replace it by."""
+        if not self.count and os.path.exists(self._name):
+            self._file.abandon()
+        say(f'{self.count} {self._kind} written to {self._name}')
+
+
+def _record_messages(recorder: Recorder, kind: str, ros_arguments: list[str]) -> None:
+    """Write messages until a signal, and the ones that have arrived before it."""
     import rclpy
     from rclpy.qos import QoSProfile
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -118,44 +153,22 @@ def _write_messages(
     from stavpr_ros.ros.subscriber_progress import READY, RECORDER
     from std_msgs.msg import Empty
 
-    count = 0
-    kinds: dict[str, Any] = {
-        MATCHES: (PlaceMatch, match_record),
-        LOOP_CLOSURES: (LoopClosure, loop_closure_record),
-    }
-    message_type, record_of = kinds[arguments.kind]
-
-    def write(message: Any) -> None:
-        nonlocal count
-        line = json.dumps(record_of(message) | {'received': time.time_ns()}) + '\n'
-        size = os.fstat(file.fileno()).st_size
+    message_type = PlaceMatch if kind == MATCHES else LoopClosure
+    with ros_node(lambda: rclpy.create_node(RECORDER), ros_arguments) as node:
+        subscription = node.create_subscription(
+            message_type, TOPICS[kind], recorder.write, QoSProfile(depth=1000)
+        )
+        topic = subscription.topic_name
+        discovery = Discovery(node, lambda: node.get_publishers_info_by_topic(topic))
         try:
-            file.write(line.encode())
-            file.flush() if file.committed else file.commit()
-        except OSError as error:
-            os.ftruncate(file.fileno(), size)
-            content = f'it has {count} {arguments.kind}, all of them whole'
-            raise OutputError(
-                f'{arguments.output} cannot be written ({error.strerror}); '
-                f'{content if file.committed else "what was there is untouched"}: free space, and '
-                'record again'
-            ) from error
-        count += 1
-
-    try:
-        with ros_node(lambda: rclpy.create_node(RECORDER), ros_arguments) as node:
-            subscription = node.create_subscription(
-                message_type, TOPICS[arguments.kind], write, QoSProfile(depth=1000)
-            )
-            topic = subscription.topic_name
-            discovery = Discovery(node, lambda: node.get_publishers_info_by_topic(topic))
             print(f'waiting for a publisher of {topic}', flush=True)
             spin_until(node, lambda: subscription.get_publisher_count() > 0)
             spin_until(node, discovery.done)
-            ready = node.create_publisher(Empty, READY, 1)  # replay --lossless waits for it
+            node.create_publisher(Empty, f'~/{READY}', 1)  # replay --lossless waits for it
             print(f'recording {topic}', flush=True)  # no message is missed from now on
             spin_until(node)
-            node.destroy_publisher(ready)
-    except KeyboardInterrupt:
-        pass  # the usual end
-    return count
+        except KeyboardInterrupt:  # the usual end
+            count = -1
+            while count < recorder.count:
+                count = recorder.count
+                rclpy.spin_once(node, timeout_sec=LAST_SECONDS)

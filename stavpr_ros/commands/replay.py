@@ -5,6 +5,7 @@
 import argparse
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, ExitStack
 import heapq
 import math
 import sys
@@ -12,7 +13,9 @@ import time
 
 import rclpy
 from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run_program, say
+from stavpr_ros.commands.record import Recorder
 from stavpr_ros.errors import ImageError, left_out, SourceError, StavprError, UnavailableError
+from stavpr_ros.output_file import atomic_output, RECORDING
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import (
     message_class,
@@ -41,8 +44,9 @@ examples:
         a ROS 1 bag with one image topic, at its recorded pace, on the topic image
   ros2 run stavpr_ros replay traverse --topic /camera/image_raw --rate 2
         a ROS 2 bag, twice as fast
-  ros2 run stavpr_ros replay traverse.mcap --lossless
-        each image after the result of the last one on /stavpr/match; nothing is dropped
+  ros2 run stavpr_ros replay traverse.mcap --lossless --record matches.jsonl
+        each image after the result of the last one on /stavpr/match; nothing is dropped, and the
+        file has the matches of all
   ros2 run stavpr_ros replay traverse --odometry --also /tf /tf_static --clock
         the bag's odometry on the topic odom, two more topics, and /clock for use_sim_time
   ros2 run stavpr_ros replay photos --fps 5 --ros-args -r image:=/camera/image
@@ -109,10 +113,15 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
                 options.clock or 0.0,
             )
             replayer = Replayer(node, notify, how, others)
-            try:
+            with closing(replayer), ExitStack() as stack:
+                if options.record:
+                    file = stack.enter_context(
+                        atomic_output(options.record, RECORDING, options.force)
+                    )
+                    recorder = Recorder(file, options.record)
+                    replayer.progress.on_match = recorder.write
+                    stack.callback(recorder.finish)
                 report = _replay(replayer, options, source, bar.update)
-            finally:
-                replayer.close()
     if not (replayer.published or skipped):
         raise SourceError(
             f'{options.bag} has no image from second {options.start_offset:g} on, for '
@@ -242,6 +251,10 @@ def _parser() -> argparse.ArgumentParser:
         metavar='HZ',
         help=f'images per second: of a folder, as recorded ({FOLDER_FPS:g}); taken of a video (5)',
     )
+    parser.add_argument(
+        '--record', metavar='FILE', help='write the matches, as `record`; --lossless misses none'
+    )
+    parser.add_argument('--force', action='store_true', help='replace an earlier --record FILE')
     parser.add_argument('--loop', action='store_true', help='start again at the end')
     parser.add_argument(
         '--start-offset',

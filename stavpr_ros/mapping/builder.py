@@ -24,9 +24,9 @@ from stavpr_ros.mapping.place_map import (
     THUMBNAIL_WIDTH,
 )
 from stavpr_ros.mapping.trajectory import checked_pose, Trajectory
+from stavpr_ros.progress import Progress
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale
 from stavpr_ros.sources.frame import Frame
-from tqdm import tqdm
 
 BATCH = 16  # images extracted at a time
 
@@ -214,9 +214,7 @@ def _extracted(
     places = _places(_with_poses(frames, poses), selector, thumbnail_width, last)
     with (
         closing(_batches_ahead(places)) as batches,
-        tqdm(
-            total=total, unit='image', desc='extracting', disable=None if progress else True
-        ) as bar,
+        Progress(total=total, unit='image', desc='extracting', disable=not progress) as bar,
     ):
         for batch in batches:
             yield batch, extractor.extract([each.image for each in batch])

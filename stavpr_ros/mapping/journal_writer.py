@@ -83,8 +83,8 @@ class JournalWriter:
             path, file = _create(Path(target), begin(base))
         except (OSError, OutputError) as error:
             raise JournalError(
-                f'no journal can be written beside {target} ({error}): make room, or set another '
-                'save_path'
+                f'no journal can be written beside {target} ({error}): make room, or name a '
+                'file elsewhere'
             ) from error
         return cls(path, file, [len(begin(base))], base, begin, log)
 

@@ -30,6 +30,7 @@ from stavpr_ros.recognition.recognizer import SequenceRecognizer
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes
+from stavpr_ros.units import SECOND
 
 NO_MAP = (
     "no map: call the service load_map, or set parameter 'map_path' before the node is configured"
@@ -40,6 +41,7 @@ NO_THRESHOLD = (
 )
 NOT_A_KEYFRAME = 'not a keyframe'
 BLANK_IMAGE = np.zeros((480, 640, 3), np.uint8)
+WARM_IMAGES = 8  # besides a window, that are recognized before the first one of a drive
 
 
 @runtime_checkable
@@ -341,7 +343,11 @@ class Localizer(Operation):
             recognizer = PlaceRecognizer(
                 place_map, settings.recognition(), backend, settings.precision
             )
-        _warm_up(recognizer, self.extractor, settings.sequence.length)
+        count, of_map = settings.sequence.length + WARM_IMAGES, None
+        images = _noise(self.extractor.extract([BLANK_IMAGE]), count)
+        if isinstance(recognizer, PlaceRecognizer):  # images of the map match it
+            images, of_map = place_map.features[:count], place_map
+        _warm_up(recognizer, images, of_map)
         self._recognizer = recognizer
         if settings.other_views and isinstance(recognizer, PlaceRecognizer):
             self._recognizer = ViewBank(recognizer, place_map)
@@ -389,8 +395,11 @@ class RouteCloser(Operation):
         self._recognizer = self._closer = _loop_closer(
             settings, settings.exclude_places, extractor
         )
-        # a closer that excludes next to nothing needs few images to warm up
-        _warm_up(_loop_closer(settings, 1, extractor), extractor, settings.sequence.length + 8)
+        # a closer that excludes next to nothing needs few images to warm up, on a second lap
+        lap = _noise(extractor.extract([BLANK_IMAGE]), settings.sequence.length + WARM_IMAGES)
+        closer = _loop_closer(settings, 1, extractor)
+        for _ in range(2):
+            _warm_up(closer, lap)
         self.places = GrowingMap(
             extractor.settings,
             extractor.projection,
@@ -433,11 +442,25 @@ def _loop_closer(
     )
 
 
-def _warm_up(recognizer: SequenceRecognizer, extractor: FeatureExtractor, images: int) -> None:
-    """Compile and allocate everything, so that the first image is as fast as the others."""
-    features = extractor.extract([BLANK_IMAGE])
-    for _ in range(images):
-        recognizer.update(features)
+def _noise(features: LocalFeatures, count: int) -> LocalFeatures:
+    """Return features of images that all differ, shaped as of one image."""
+    shape = len(features.strips), count, features.strips.shape[2]
+    strips = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return replace(features, strips=strips, weights=np.repeat(features.weights, count, axis=-1))
+
+
+def _warm_up(
+    recognizer: SequenceRecognizer, images: LocalFeatures, place_map: PlaceMap | None = None
+) -> None:
+    """
+    Compile and allocate everything, so that the first image is as fast as the others.
+
+    :param images: of a drive; place_map: that they are the first places of, with their poses.
+    """
+    for i in range(len(images)):
+        pose = None if place_map is None else place_map.pose(i)
+        recognizer.update(images[i : i + 1], (i + 1) * SECOND // 10, pose)
     recognizer.ranked(2)
     recognizer.reset()
 

@@ -19,7 +19,6 @@ WAITING = 'waiting'  # stage before the worker takes an image: in the total, not
 REORDERING_SECONDS = 0.1  # images less than this out of order were reordered in transport
 INTERVALS = 40  # pauses between images for the period of a camera, which needs half of them
 REGULAR = 0.75  # share of them near a multiple of the period, from which on a camera has one
-SKIP_SECONDS = 5.0  # that all images are skipped, from which on it is reported
 LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
 
 
@@ -241,31 +240,6 @@ class StampWatch:
         if near < REGULAR * len(multiples) or interval > LONGEST_LOSS * period:
             return 0
         return max(round(interval / period) - 1, 0)
-
-
-class SkipWatch:
-    """Finds out that every image is left out; for one thread. ``reason``: of the last one."""
-
-    def __init__(self) -> None:
-        self.count, self.reason = 0, ''
-        self._last: tuple[float, ...] = ()
-        self._elapsed = [0.0, 0.0]
-        self._is_due = True
-
-    def update(self, stamp: int, now: float) -> bool:
-        """
-        Count an image that is left out; return whether this has become worth a warning.
-
-        :param stamp: nanoseconds, 0 = unknown; now: of the steady clock, seconds. The longer time
-            counts: a replay may be faster than the camera. A pause is a second at most.
-        """
-        times = stamp / SECOND, now
-        for i, (time_, last) in enumerate(zip(times, self._last, strict=False)):
-            self._elapsed[i] += min(max(time_ - last, 0.0), 1.0)
-        self.count, self._last = self.count + 1, times
-        is_due, is_long = self._is_due, max(self._elapsed) >= SKIP_SECONDS
-        self._is_due = is_due and not is_long
-        return is_due and is_long
 
 
 def _evict(events: deque[Any], now: float) -> None:

@@ -11,7 +11,7 @@ from stavpr_ros.filter.model import MODEL
 from stavpr_ros.mapping import PlaceMap, select_places
 from stavpr_ros.prepare.blocks import blocks, PlaceChanges
 from stavpr_ros.prepare.centering import MeanCentering
-from tqdm import tqdm
+from stavpr_ros.progress import Progress
 
 MIN_MOTION = 0.1  # share of the median step; a camera that moved farther was not at rest
 
@@ -50,7 +50,7 @@ def _centered(
     place_map: PlaceMap, centering: MeanCentering, text: str
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield the centered features of each block, (W, m, d); a terminal shows the progress."""
-    with tqdm(total=len(place_map), desc=text, unit='place', disable=None) as bar:
+    with Progress(total=len(place_map), desc=text, unit='place') as bar:
         for places, block in blocks(place_map.features):
             yield places, centering.places(block).strips
             bar.update(places.stop - places.start)

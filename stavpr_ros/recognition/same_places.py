@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.progress import Progress
 from stavpr_ros.recognition.recognizer import PlaceRecognizer
 from stavpr_ros.recognition.settings import RecognizerSettings
-from tqdm import tqdm
 
 SURE = 0.9  # probability above which two places are taken to be the same
 
@@ -26,7 +26,7 @@ def with_same_places(place_map: PlaceMap) -> PlaceMap:
         return place_map
     same_as = np.arange(n)
     numbers = range(1, len(place_map.sessions))
-    for session in tqdm(numbers, desc='same places', unit='session', disable=None):
+    for session in Progress(numbers, desc='same places', unit='session'):
         earlier, places = np.flatnonzero(index < session), np.flatnonzero(index == session)
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
         matched = _recognized(reference, place_map, places)

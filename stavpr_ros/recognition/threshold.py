@@ -7,8 +7,8 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.progress import Progress
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from tqdm import tqdm
 
 WINDOWS = 24  # that are tried
 
@@ -63,7 +63,7 @@ def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
     rng = np.random.default_rng(0)
     distances = []
     starts = np.unique(np.linspace(0, n - l, min(WINDOWS, n - l + 1)).astype(int))
-    for variant, start in enumerate(tqdm(starts, desc='threshold', unit='window', disable=None)):
+    for variant, start in enumerate(Progress(starts, desc='threshold', unit='window')):
         images = [place_map.thumbnail(place) for place in range(start, start + l)]
         altered = [alter_image(image, variant, rng) for image in images if image is not None]
         features = extractor.extract(altered)

@@ -38,6 +38,7 @@ def node_launch(
     cameras: LaunchConfiguration | None = None,
     image: str = 'image',
     odom: str = 'odom',
+    needs: str = '',
     **fixed: object,
 ) -> LaunchDescription:
     """
@@ -47,12 +48,13 @@ def node_launch(
     :param cameras: names of cameras, separated by commas: one node each, in a namespace of this
         name; None = one node.
     :param image, odom: default topics.
+    :param needs: package of the actions, '' = none; where it is missing, nothing is started.
     :param fixed: parameters that the launch file sets itself.
     """
     own = [other for other in others if isinstance(other, DeclareLaunchArgument)]
     arguments = [*own, *_arguments(image, odom, fixed)]
     actions = [other for other in others if other not in own]
-    check = _check([argument.name for argument in arguments])
+    check = _check([argument.name for argument in arguments], needs)
 
     def start(context: LaunchContext) -> list[Node]:
         names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
@@ -90,14 +92,22 @@ def value_of(name: str, text: str) -> bool | float | str:
         raise RuntimeError(f'{name} = {text!r}: expected {EXPECTED[kind]}') from None
 
 
-def _check(names: list[str]) -> OpaqueFunction:
-    """Reject unknown arguments, unless the command line is for another launch file."""
+def _check(names: list[str], needs: str) -> OpaqueFunction:
+    """Reject unknown arguments, unless they are for another launch file, and a missing package."""
 
     def check(context: LaunchContext) -> None:
         file = context.get_locals_as_dict().get('current_launch_file_path')
         own = PACKAGE in sys.argv or file in (str(Path(word).resolve()) for word in sys.argv)
         if own and (problems := unknown_arguments(sys.argv, names)):
             raise RuntimeError('; '.join(problems))
+        if needs:
+            try:
+                FindPackageShare(needs).perform(context)
+            except Exception as error:  # of any type; launch would leave a started node running
+                raise RuntimeError(
+                    f'the package {needs} is not installed, so that nothing is started: install '
+                    'it, as ros-jazzy-NAME or in this workspace, or start stavpr.launch.py'
+                ) from error
 
     return OpaqueFunction(function=check)
 

@@ -40,6 +40,8 @@ from stavpr_ros.ros.services import Services
 from stavpr_ros.ros.worker import STOP_TIMEOUT
 from stavpr_ros.units import SECOND
 
+NAMESAKE_PERIOD = 60.0  # seconds between two warnings of another node with this name
+
 
 class PlaceRecognitionNode(ManagedNode):
     """
@@ -308,6 +310,14 @@ class PlaceRecognitionNode(ManagedNode):
 
     def _health(self) -> Health:
         self._publish_map_info()
+        name, namespace = self.get_name(), self.get_namespace()
+        if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
+            self.get_logger().warning(
+                f'another node is named {self.get_fully_qualified_name()}, and its matches are on '
+                'the same topics: end it (a killed one is gone after some seconds), or start this '
+                'one in another namespace',
+                throttle_duration_sec=NAMESAKE_PERIOD,
+            )
         camera = self.resolve_topic_name('image')
         health = Health(
             state=self.state,

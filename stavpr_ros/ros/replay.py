@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishes the records of a bag at a pace, or each image after the result of the last one."""
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -237,17 +236,10 @@ class Replayer:
         return self._unready_recorder() if self.options.lossless else ''
 
     def _unready_recorder(self) -> str:
-        """Return the recorder that would still miss results; empty = none."""
-        recorders = [
-            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-            for topic in ('stavpr/match', 'stavpr/loop_closure')
-            for info in self.node.get_subscriptions_info_by_topic(
-                self.node.resolve_topic_name(topic)
-            )
-            if info.node_name == RECORDER
-        ]
-        for name, count in Counter(recorders).items():
-            if self.node.count_publishers(READY.replace('~', name)) < count:
+        """Return the recorder that would still miss matches; empty = none."""
+        for info in self.node.get_subscriptions_info_by_topic(self._match_topic):
+            name = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            if info.node_name == RECORDER and not self.node.count_publishers(f'{name}/{READY}'):
                 return f'{name} to be ready'
         return ''
 

@@ -24,7 +24,7 @@ from stavpr_ros.pipeline.saving import (
     recover_maps,
     save_recorded_map,
 )
-from stavpr_ros.pipeline.statistics import SkipWatch, Statistics, WAITING
+from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
@@ -42,10 +42,12 @@ from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
+from stavpr_ros.units import SECOND
 
 MAX_SHORT_WINDOWS = 3  # one jump of a clock is no disorder
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
-SKIP_PERIOD = 60.0  # seconds between two warnings of skipped images in the log
+STAMP_JUMP = 3600.0  # seconds to an image of another recording
+SKIP_SECONDS, SKIP_PERIOD = 5.0, 60.0  # of skipped images until a warning, and to the next one
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,9 @@ class Runtime:
         self._epoch = self._pipeline_epoch = 0
         self._since_restart = self._short_windows = 0  # images; restarts in a row before a window
         self._logged_reasons: set[str] = set()
-        self._skips = SkipWatch()
+        # stamp and time of the first image since the last keyframe [s]
+        self._skipped_since: tuple[float, float] | None = None
+        self._last_reason = ''  # why the last image is in no window
         self._may_lack_map = False  # active since the end of a recording was last logged
         self.last_match = PlaceMatch()  # published for the last image in the window
         self.last_frame = ''  # of the poses of its places
@@ -149,7 +153,7 @@ class Runtime:
     def activate(self) -> None:
         """Subscribe, with an empty window: the camera may have been moved since the last image."""
         self.reset()
-        self._skips, self._may_lack_map = SkipWatch(), True
+        self._skipped_since, self._last_reason, self._may_lack_map = None, '', True
         self._update_odometry()
         if self.settings.relative_pose in ('auto', 'pnp'):
             self.camera = CameraInput(self._node, self.settings.camera_transform)
@@ -207,7 +211,7 @@ class Runtime:
             return f'no image was received on {topic}: compare `ros2 topic list`, set image:=TOPIC'
         causes = ', '.join(f'{n} {cause}' for cause, n in counts.dropped.total.most_common())
         text = f'none of {counts.received.count} images became a place ({causes})'
-        return f'{text}; the last one: {self._skips.reason}' if self._skips.reason else text
+        return f'{text}; the last one: {self._last_reason}' if self._last_reason else text
 
     def _unsubscribe(self) -> None:
         for subscription in (self.images, self.odometry, self.camera):
@@ -384,9 +388,10 @@ class Runtime:
         if result.cause:
             self._statistics.add_drop(result.cause)
             self._log_cause(result)
-            self._log_skips(result, nanoseconds(header.stamp))
+            if result.status is Status.SKIPPED:
+                self._log_skips(result, nanoseconds(header.stamp))
             return
-        self._skips = SkipWatch()
+        self._skipped_since = None
         self.last_match, self.last_frame, status = message, frames.frame, result.status
         place = message.newest_index if status is Status.MAPPED else message.place_index
         self._statistics.add_match(status.name, result.reason, place, message.distance, stages)
@@ -429,21 +434,23 @@ class Runtime:
 
     def _log_skips(self, result: ImageResult, stamp: int) -> None:
         """Log that a rule of keyframes skips every image, and the remedy."""
-        self._skips.reason = result.reason
-        if result.status is not Status.SKIPPED or not self._skips.update(stamp, time.monotonic()):
+        self._last_reason, now = result.reason, (stamp / SECOND, time.monotonic())
+        began = self._skipped_since or now
+        began = self._skipped_since = began if 0 <= now[0] - began[0] < STAMP_JUMP else now
+        # the stamps count too: a replay may be faster than the camera
+        if not any(SKIP_SECONDS <= now[i] - began[i] < SKIP_PERIOD for i in range(2)):
             return
         if result.cause == 'no odometry':
-            topic, odometry = self._node.resolve_topic_name('odom'), self.odometry
-            start = f"publish nav_msgs/Odometry on {topic}, with stamps of the camera's clock"
-            fault = odometry.fault() if odometry is not None else ''
-            remedy = f'{fault or start}; or, without odometry, set keyframe_distance and '
-            remedy += 'keyframe_angle to 0 (keyframe_change needs none)'
+            fault = self.odometry.fault() if self.odometry is not None else ''
+            topic = self._node.resolve_topic_name('odom')
+            remedy = fault or f"publish it on {topic}, with stamps of the camera's clock"
+            remedy += '; or set keyframe_distance and keyframe_angle to 0'
         else:
             rules = asdict(self.settings.pipeline.keyframes).items()
             names = ' or '.join(f'keyframe_{name}' for name, value in rules if value)
-            remedy = f'right while the camera stands, otherwise lower {names}'
+            remedy = f'right for a camera at rest, otherwise lower {names}'
         self._node.get_logger().warning(
-            f'every image is skipped, {self._skips.count} so far: {result.reason}; {remedy}',
+            f'every image is skipped: {result.reason}; {remedy}',
             throttle_duration_sec=SKIP_PERIOD,
         )
 

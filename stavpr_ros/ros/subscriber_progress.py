@@ -3,6 +3,7 @@
 """Counts how many of the published images a node has received, by its results."""
 
 from collections import Counter
+from collections.abc import Callable
 import time
 
 from rclpy.node import Node
@@ -14,7 +15,7 @@ from std_msgs.msg import Header
 RESULTS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 MAX_BEHIND = 8  # loop closures that may follow their matches later; a node drops more than 16
 QUIET = 2.0  # seconds after the last result: then outstanding images count as lost
-RECORDER, READY = 'stavpr_record', '~/recording'  # node; its topic from when it misses nothing
+RECORDER, READY = 'stavpr_record', 'recording'  # node; its topic while it misses nothing
 
 
 class SubscriberProgress:
@@ -25,7 +26,8 @@ class SubscriberProgress:
 
     :param node: for the subscription; the caller spins it.
 
-    ``status`` is the last result's; ``expects_closures``: one loop closure for each match.
+    ``status`` is the last result's; ``expects_closures``: one loop closure for each match;
+    ``on_match`` is called with each match, of any image.
     """
 
     def __init__(self, node: Node) -> None:
@@ -36,6 +38,7 @@ class SubscriberProgress:
         self.status = PlaceMatch.NOT_READY
         self._matches = self._closures = 0
         self.expects_closures = False
+        self.on_match: Callable[[PlaceMatch], object] = lambda match: None
         node.create_subscription(PlaceMatch, 'stavpr/match', self._on_match, RESULTS)
         topic = 'stavpr/loop_closure'
         node.create_subscription(LoopClosure, topic, self._on_closure, RESULTS)
@@ -70,6 +73,7 @@ class SubscriberProgress:
         return text + (f', {losses} lost: see docs/troubleshooting.md' if losses else '')
 
     def _on_match(self, match: PlaceMatch) -> None:
+        self.on_match(match)
         key = _key(match.header)
         if self._outstanding[key] > 0:
             self._outstanding[key] -= 1

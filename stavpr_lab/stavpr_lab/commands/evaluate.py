@@ -39,7 +39,8 @@ computed, .npy .npz .csv .mat, or FILE:NAME for one of several: (n, D), one vect
 ground truth (--truth), none by default:
   identity     image i of the query shows place i of the map; --tolerance is 3 then
   poses        places within --meters and --degrees of the query's pose
-  FILE         .csv: accepted pairs, query,place, from 0; .npy, .npz: a matrix, queries by places,
+  FILE         .csv: accepted pairs, query,place, from 0, place -1: not in the map; images that a
+               list does not name are not counted; .npy, .npz: a matrix, queries by places,
                pairs, or a place a query; an image: white at row i, column j accepts place j for
                query i; --tolerance is 0 then
 
@@ -311,11 +312,20 @@ def _truth_text(kind: str, tolerance: int) -> str:
 
 
 def _print_report(report: 'Report') -> None:
+    from stavpr_lab.evaluation.verdict import verdict_of
+
     say(report.title)
     if report.has_truth:
         _print_metrics(report)
     decision = report.decision()
     wrong = f', {decision["wrongly_matched"]} of them wrongly' if report.has_truth else ''
+    stated, images = decision.get('images_with_truth', 0), decision['images']
+    if report.has_truth and stated < images:
+        print(
+            f'ground truth of {stated} of {images} images, which alone count; in a list, a place '
+            'of -1 states that an image is not in the map'
+        )
+        wrong = f'; of {stated} with ground truth, {decision["matched_with_truth"]}{wrong}'
     if report.default_threshold is not None:
         print(f'matched above the probability {1 - report.default_threshold:.4g}')
     print(
@@ -329,6 +339,10 @@ def _print_report(report: 'Report') -> None:
 
         rate, recall = map(text, report.estimates)
         print(f'error rate {rate}, recall {recall}, with 95 % intervals')
+    verdict = verdict_of(report)
+    say(verdict.text)
+    for sentence in verdict.advice:
+        say(f'  {sentence}')
     print(
         f'{report.times["recognition_median_ms"]:.2f} ms an image for recognition (median), '
         f'{report.times["total_s"]:.1f} s in all'

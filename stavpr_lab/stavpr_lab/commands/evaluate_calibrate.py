@@ -22,9 +22,9 @@ from stavpr_ros.mapping import open_map, select_places
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.map_file import save_error_risks
 from stavpr_ros.output_file import FileVersion, MAP, require_replaceable
+from stavpr_ros.progress import Progress
 from stavpr_ros.recognition import PlaceRecognizer
 from stavpr_ros.recognition.error_rate import ERRORS, least_probability
-from tqdm import tqdm
 
 WINDOWS = 2  # of a block: as many images as a block of the bootstrap has
 OTHERS = (
@@ -67,7 +67,7 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         return
     block, driven = WINDOWS * settings.sequence.length, []
     drives = list(made_drives(sequences.drive.truth, block))
-    for drive in tqdm(drives, desc='calibrating', unit='drive', disable=None):
+    for drive in Progress(drives, desc='calibrating', unit='drive'):
         places = select_places(reference, drive.places) if drive.removed else reference
         recognizer = PlaceRecognizer(places, settings, arguments.backend, arguments.precision)
         matches = recognize_all(recognizer, features[drive.images])

@@ -161,7 +161,6 @@ def _run_row(
     """Run all columns of a row; None where the data set is too short for one."""
     from stavpr_lab.evaluation.paper.experiments import BaselineInputs, DatasetExperiment
     from stavpr_ros.commands.feature_options import make_extractor
-    from tqdm import tqdm
 
     features = make_extractor(options).settings
     arrays = {column: _arrays(Path(folder, name)) for column, folder in folders.items()}
@@ -174,7 +173,9 @@ def _run_row(
     )
     metrics: dict[str, Metrics | None] = {}
     title = f'{name}, {features.kind}'
-    for column in tqdm(columns, desc=title, unit='column', disable=None):
+    from stavpr_ros.progress import Progress
+
+    for column in Progress(columns, desc=title, unit='column'):
         too_short = len(dataset.query) < column.sequence.length
         metrics[column.name] = None if too_short else experiment.evaluate(column)
     return metrics

@@ -12,6 +12,8 @@ from stavpr_lab.monitor.server import MonitorServer
 from stavpr_ros.commands.program import make_parser, run_program
 from stavpr_ros.ros.process import own_arguments, ros_node, spin_until
 
+MAX_PORT = 65535
+
 EPILOG = """\
 The page shows the camera beside the matched place, the probability over time, the position on the
 map, the distances of the last minutes and the diagnostics, and starts and stops the node. It needs
@@ -54,7 +56,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = make_parser('monitor', __doc__.partition(': ')[2], EPILOG)
-    parser.add_argument('--port', type=int, default=8080, help='0 = any free one (%(default)d)')
+    parser.add_argument('--port', type=_port, default=8080, help='0 = any free one (%(default)d)')
     parser.add_argument(
         '--host',
         default='127.0.0.1',
@@ -63,6 +65,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--node', default='stavpr', help='name of the node (%(default)s)')
     return parser
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > MAX_PORT:
+        raise argparse.ArgumentTypeError(f'{text!r}: expected a port, 0 to {MAX_PORT}')
+    return int(text)
 
 
 if __name__ == '__main__':

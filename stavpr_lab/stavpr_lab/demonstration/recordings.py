@@ -21,6 +21,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
+from stavpr_ros.progress import Progress
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_path import is_bag, METADATA
@@ -28,7 +29,6 @@ from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
 from stavpr_ros.sources.video import is_video, require_video, VideoSource
-from tqdm import tqdm
 
 TOPIC = '/camera/image_raw'
 OnError = Callable[[ImageError], None]
@@ -209,5 +209,5 @@ def _records(traverse: Traverse, name: str, epoch: int | None = None) -> Iterato
     :param epoch: stamp of its first image, ns; None = the traverse's own.
     """
     later = 0 if epoch is None else epoch - int(traverse.stamps[0])
-    for frame in tqdm(traverse, desc=name, unit='image', disable=None):
+    for frame in Progress(traverse, desc=name, unit='image'):
         yield ImageRecord.of_image(frame.image, frame.stamp + later, frame_id='camera')

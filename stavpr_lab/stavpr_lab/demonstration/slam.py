@@ -18,6 +18,7 @@ from stavpr_lab.demonstration.street.traverses import SIZE
 from stavpr_lab.evaluation.plots import titled_page
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.output_file import JSON, write_output
+from stavpr_ros.progress import Progress
 from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord
@@ -25,7 +26,6 @@ from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.files import TUM, tum_text
 from stavpr_slam.pose_graph.transforms import planar_poses
 from std_msgs.msg import Header
-from tqdm import tqdm
 
 ODOMETRY, CAMERA_INFO = '/odom', '/camera_info'  # beside the topic of the node's images, /image
 RPE_METERS = 50.0
@@ -51,7 +51,7 @@ def _records(drive: LapDrive) -> Iterator[ImageRecord | MessageRecord]:
         header=Header(frame_id='camera'), width=SIZE[0], height=SIZE[1],
         distortion_model='plumb_bob', d=np.zeros(5), k=K.ravel(), r=np.eye(3).ravel(), p=P.ravel(),
     )  # fmt: skip
-    for i in tqdm(range(len(drive)), desc='three laps', unit='image', disable=None):
+    for i in Progress(range(len(drive)), desc='three laps', unit='image'):
         stamp = int(drive.stamps[i])
         odometry.header.stamp = info.header.stamp = time_message(stamp)
         odometry.pose.pose = pose_message(poses[i])

@@ -30,9 +30,9 @@ from stavpr_lab.evaluation.metrics import (
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.progress import Progress
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from tqdm import tqdm
 
 MARGIN = 8  # places beside the path of a window whose distances are kept
 MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
@@ -148,7 +148,10 @@ class Evaluation:
     def distances(self) -> dict[str, np.ndarray]:
         """Return the distances of the windows' matches, by group."""
         scores = self.results.sequence.scores
-        groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct]}
+        stated = self.ground_truth.is_stated
+        groups = {'correct': scores[self.correct], 'wrong': scores[~self.correct & stated]}
+        if not stated.all():
+            groups['without truth'] = scores[~stated]
         if not self.ground_truth.kind:
             groups = {'match': scores}
         if self.unknown is not None:
@@ -162,7 +165,8 @@ class Evaluation:
             return None
         matches, images = self.results.published
         truth = self.ground_truth.select(images)
-        return calibrate(matches.probabilities, truth.accepts(matches.places), truth.has_match)
+        columns = matches.probabilities, truth.accepts(matches.places), truth.has_match
+        return calibrate(*(column[truth.is_stated] for column in columns))
 
 
 def centered_images(count: int, length: int) -> slice:
@@ -229,7 +233,7 @@ def recognize_traverse(
     reduced = _BlockMinimum(count, places)
     windows: list[WindowDistances] = []
     interval = -(-count // WINDOWS)
-    for i in tqdm(range(count), desc=progress, unit='image', disable=None if progress else True):
+    for i in Progress(range(count), desc=progress, unit='image', disable=not progress):
         began = time.perf_counter()
         pose = None if odometry is None or np.isnan(odometry[i]).any() else odometry[i]
         stamp = 0 if stamps is None else int(stamps[i])

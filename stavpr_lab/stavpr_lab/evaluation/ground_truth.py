@@ -28,12 +28,15 @@ class GroundTruth:
     :param n: number of places of the map.
     :param keys: query * n + place of each accepted pair, sorted, each once, shape (M,), int64.
     :param kind: where the pairs come from; '' = there is no ground truth.
+    :param stated: whether the truth of a query is known, shape (N,), bool; None = of all. Other
+        queries count neither as in the map nor as off it.
     """
 
     N: int
     n: int
     keys: np.ndarray
     kind: str = 'pairs'
+    stated: np.ndarray | None = None
 
     @classmethod
     def unknown(cls, N: int, n: int) -> Self:
@@ -48,7 +51,7 @@ class GroundTruth:
         Accept the given pairs.
 
         :param queries: shape (M,), integers 0 .. N - 1, in any order.
-        :param places: shape (M,), integers 0 .. n - 1.
+        :param places: shape (M,), integers 0 .. n - 1; -1 = the query is not in the map.
         :param tolerance: places before and after an accepted one that are accepted as well.
         :raises InputError: a pair outside N queries and n places.
         """
@@ -57,7 +60,7 @@ class GroundTruth:
             raise InputError(
                 f'ground truth of {N} queries in {n} places: expected at least one of each'
             )
-        outside = (queries < 0) | (queries >= N) | (places < 0) | (places >= n)
+        outside = (queries < 0) | (queries >= N) | (places < -1) | (places >= n)
         if outside.any():
             first = int(np.argmax(outside))
             raise InputError(
@@ -65,7 +68,8 @@ class GroundTruth:
                 f'queries 0 .. {N - 1} and places 0 .. {n - 1}; is it that of other images, or '
                 'counted from 1?'
             )
-        return cls(N, n, np.unique(queries * n + places)).widened(tolerance)
+        keys = (queries * n + places)[places >= 0]
+        return cls(N, n, np.unique(keys)).widened(tolerance)
 
     @classmethod
     def identity(cls, N: int, n: int, tolerance: int = 0) -> Self:
@@ -88,6 +92,8 @@ class GroundTruth:
         """
         Read accepted pairs; queries and places are counted from 0.
 
+        Only a list of pairs may lack queries, whose truth is unknown then.
+
         * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
           single column is the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
         * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
@@ -104,7 +110,9 @@ class GroundTruth:
             truth = cls.from_pairs(queries, places, N, n, tolerance)
         except InputError as error:
             raise InputError(f'{path}: {error}') from error
-        return replace(truth, kind=text_of(Path(path).name))
+        stated = np.isin(np.arange(N), queries)
+        kind = text_of(Path(path).name)
+        return replace(truth, kind=kind, stated=None if stated.all() else stated)
 
     @classmethod
     def from_poses(
@@ -149,6 +157,11 @@ class GroundTruth:
     def pairs(self) -> np.ndarray:
         """Return the sorted accepted pairs of query and place, shape (M, 2), int64."""
         return np.stack([self.keys // self.n, self.keys % self.n], axis=1)
+
+    @cached_property
+    def is_stated(self) -> np.ndarray:
+        """Whether the truth of a query is known, shape (N,), bool."""
+        return np.ones(self.N, bool) if self.stated is None else self.stated
 
     @cached_property
     def has_match(self) -> np.ndarray:
@@ -221,7 +234,9 @@ class GroundTruth:
         # position of a pair in keys: position of its query's first pair, plus its rank there
         at = np.repeat(firsts - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
         rows = np.repeat(np.arange(len(indices)), counts)
-        return replace(self, N=len(indices), keys=rows * self.n + self.keys[at] % self.n)
+        keys, stated = rows * self.n + self.keys[at] % self.n, self.stated
+        stated = None if stated is None else stated[indices]
+        return replace(self, N=len(indices), keys=keys, stated=stated)
 
     def on_places(self, places: np.ndarray) -> Self:
         """
@@ -239,8 +254,8 @@ class GroundTruth:
         """
         Return the ground truth of one traverse on its own past: the later image is the query.
 
-        Either triangle of a square matrix may contain the pairs, the lower one (row = query, as
-        RTAB-Map writes it), the upper one or both.
+        Images that no pair names close no loop. Either triangle of a square matrix may contain the
+        pairs, the lower one (row = query, as RTAB-Map writes it), the upper one or both.
 
         :param exclude: the latest images before the query that are not part of the map.
         :raises InputError: N and n differ.
@@ -253,7 +268,7 @@ class GroundTruth:
         pairs = self.pairs
         later, earlier = pairs.max(axis=1), pairs.min(axis=1)
         past = later - earlier > exclude
-        return replace(self, keys=np.unique(later[past] * self.n + earlier[past]))
+        return replace(self, keys=np.unique(later[past] * self.n + earlier[past]), stated=None)
 
 
 def _checked_poses(poses: np.ndarray, name: str) -> np.ndarray:

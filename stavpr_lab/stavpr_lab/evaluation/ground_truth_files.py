@@ -27,7 +27,8 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
     """
     Read accepted pairs; see :meth:`stavpr_lab.evaluation.ground_truth.GroundTruth.from_file`.
 
-    :returns: queries and places, shape (M,), int64; from text and pairs, they may exceed N and n.
+    :returns: queries and places, shape (M,), int64; -1 = the query is not in the map. From text
+        and pairs, they may exceed N and n, and queries may be missing.
     :raises SourceError: the file cannot be read.
     :raises InputError: its size does not fit N queries and n places, or it accepts nothing.
     """
@@ -43,7 +44,7 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
             f'ground truth {path}: expected text ({" ".join(TEXT)}), an array '
             f'({" ".join(ARRAYS)}) or a black and white image (.png .bmp ...)'
         )
-    if not queries.size:
+    if not (places != -1).any():
         raise InputError(f'ground truth {path} accepts no pair: is it the right file?')
     return queries, places
 
@@ -88,7 +89,7 @@ def _from_text(path: Path, N: int) -> Pairs:
                 f'ground truth {path} has a place for {len(rows)} queries, but there are {N}'
             )
         rows = np.column_stack([np.arange(N), rows])
-    pairs = rows[rows[:, 1] != -1].astype(np.int64)  # -1: not in the map
+    pairs = rows.astype(np.int64)
     return pairs[:, 0], pairs[:, 1]
 
 
@@ -131,18 +132,22 @@ def _from_array(array: np.ndarray, path: Path, N: int, n: int) -> Pairs:
                 f'ground truth {path} has other values than 0 and one more: expected 1 where a '
                 'place is correct; is it a matrix of distances?'
             )
-        queries, places = np.nonzero(array)
-        return queries, places
+        return _of_matrix(array)
     whole = array.astype(np.int64)
     if array.dtype.kind == 'b' or not (whole == array).all():
         raise InputError(_wrong_shape(array.shape, path, N, n))
     if array.ndim == 2 and array.shape[1] == 2:
-        pairs = whole[whole[:, 1] != -1]
-        return pairs[:, 0], pairs[:, 1]
+        return whole[:, 0], whole[:, 1]
     if array.shape == (N,):
-        queries = np.nonzero(whole != -1)[0]
-        return queries, whole[queries]
+        return np.arange(N), whole
     raise InputError(_wrong_shape(array.shape, path, N, n))
+
+
+def _of_matrix(accepted: np.ndarray) -> Pairs:
+    """Return the pairs of a matrix, which is on all queries: others are not in the map."""
+    queries, places = np.nonzero(accepted)
+    none = np.flatnonzero(~accepted.any(axis=1))
+    return np.append(queries, none), np.append(places, np.full(len(none), -1))
 
 
 def _wrong_shape(shape: tuple[int, ...], path: Path, N: int, n: int) -> str:
@@ -178,5 +183,4 @@ def _from_image(path: Path, N: int, n: int) -> Pairs:
             f'ground truth {path} has {gray} gray pixels: expected white where a place is '
             'correct, black elsewhere'
         )
-    queries, places = np.nonzero(image >= WHITE)
-    return queries, places
+    return _of_matrix(image >= WHITE)

@@ -302,12 +302,13 @@ def evaluate_ranking(
     """
     Compare ranked places with the ground truth.
 
-    :param images: the queries that count; all by default.
+    :param images: the queries that count, of those whose truth is known; all by default.
     :raises InputError: no queries are left.
     """
-    correct = ground_truth.accepts(ranking.places)[images]
-    has_match = ground_truth.has_match[images]
-    scores = ranking.scores[images]
+    counted = np.arange(len(ranking))[images]
+    counted = counted[ground_truth.is_stated[counted]]
+    correct = ground_truth.accepts(ranking.places)[counted]
+    has_match, scores = ground_truth.has_match[counted], ranking.scores[counted]
     if not len(scores):
         raise InputError(f'{images} of {len(ranking)} queries leaves no queries to evaluate')
     counts = sweep(scores, correct[:, 0], has_match)

@@ -108,18 +108,17 @@ def reduced_matrix(
     :param matches: (query, place) of accepted matches, shape (count, 2), by outcome.
     :returns: where the axes are.
     """
-    with page(path, 7.5, float(np.clip(7.5 * shape[0] / shape[1], 4, 9))) as figure:
+    with page(path, 5.2, float(np.clip(5.2 * shape[0] / shape[1], 3.5, 7))) as figure:
         axes = figure.add_subplot()
         draw_matrix(figure, axes, distances, shape, truth, 'true place', matches)
     return _box(axes)
 
 
-def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> Box:
+def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> None:
     """
     Draw precision over recall, and a ring where F1 is best.
 
     :param curves: color and metrics, by name.
-    :returns: where the axes are.
     """
     with page(path, 5.2, 4.8) as figure:
         axes = figure.add_subplot()
@@ -133,22 +132,25 @@ def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> B
         axes.grid(color=GRID, lw=0.7)
         if curves:
             axes.legend(loc='lower left')
-    return _box(axes)
 
 
-def distance_histogram(
-    path: Path, groups: Mapping[str, tuple[str, np.ndarray]], threshold: float | None
+def match_histogram(
+    path: Path,
+    groups: Mapping[str, tuple[str, np.ndarray]],
+    limit: float | None,
+    quantity: str,
 ) -> None:
     """
-    Draw the distribution of the distances of correct, wrong and unknown matches.
+    Draw the distribution of the distances, or probabilities, of correct, wrong and other matches.
 
-    :param groups: color and distances of each group, by name; infinite distances are left out.
-    :param threshold: drawn as a line; None = none.
+    :param groups: color and values of each group, by name; infinite ones are left out.
+    :param limit: beyond which a window is matched, drawn as a line; None = none.
+    :param quantity: name of the values; the axis of a probability is 0 to 1.
     """
     finite = {name: values[np.isfinite(values)] for name, (_, values) in groups.items()}
-    everything = np.concatenate([*finite.values(), np.zeros(0)])
+    everything = np.concatenate([*finite.values(), np.array([] if limit is None else [limit])])
     low, high = (everything.min(), everything.max()) if everything.size else (0.0, 1.0)
-    high = max(high, low + 1e-6)
+    low, high = (0.0, 1.0) if quantity == 'probability' else (low, max(high, low + 1e-6))
     with page(path, 5.2, 4.8) as figure:
         axes = figure.add_subplot()
         axes.hist(
@@ -159,16 +161,14 @@ def distance_histogram(
             stacked=True,
             rwidth=0.9,
         )
-        if threshold is not None and low <= threshold <= high + 1e-3 * (high - low):
-            axes.axvline(
-                threshold, color=INK, lw=1.3, ls=(0, (5, 3)), label=f'threshold {threshold:.3g}'
-            )
+        if limit is not None:
+            axes.axvline(limit, color=INK, lw=1.3, ls=(0, (5, 3)), label=f'limit {limit:.3g}')
         margin = 0.02 * (high - low)
         axes.set(
-            xlabel='distance of the match', ylabel='images', xlim=(low - margin, high + margin)
+            xlabel=f'{quantity} of the match', ylabel='images', xlim=(low - margin, high + margin)
         )
         axes.locator_params(axis='y', integer=True)
-        legend_above(axes, 4)
+        legend_above(axes, 3)
 
 
 def warping_path(path: Path, distances: np.ndarray, pairs: np.ndarray, first: int = 0) -> None:
@@ -209,7 +209,7 @@ def drive(
     :param unseen: whether the map lacks its place and those around, shape (N,), bool.
     """
     index = np.arange(len(matched))
-    with page(path, 10, 4.2) as figure:
+    with page(path, 5.2, 5.2) as figure:
         axes = figure.add_subplot()
         if len(truth):
             axes.plot(*truth.T, '.', color=TRUTH, ms=3, mew=0, label='true place')
@@ -224,7 +224,7 @@ def drive(
                 axes.plot(at, height, marker, **style)
         axes.set(xlabel='query image', ylabel='place in the map', xlim=(-1, len(index)))
         axes.grid(color=GRID, lw=0.7)
-        legend_above(axes, 6)
+        legend_above(axes, 3)
 
 
 def reliability(path: Path, calibration: Calibration) -> None:
@@ -250,16 +250,16 @@ def reliability(path: Path, calibration: Calibration) -> None:
 def page(path: Path, width: float, height: float) -> Iterator[Figure]:
     """Yield an empty figure (width and height in inches) in the common style, then write it."""
     look: dict[Any, Any] = {
-        'font.size': 10.5,
+        'font.size': 11.5,
         'font.family': 'DejaVu Sans',
         'text.color': INK,
         'figure.facecolor': PAPER,
         'legend.frameon': False,
-        'legend.fontsize': 9.5,
+        'legend.fontsize': 10.5,
     }
     look |= {f'axes.{name}': value for name, value in AXES.items()}
     for side in ('xtick', 'ytick'):
-        look |= {f'{side}.color': QUIET, f'{side}.labelsize': 9.5}
+        look |= {f'{side}.color': QUIET, f'{side}.labelsize': 10.5}
     with rc_context(look):
         figure = Figure(figsize=(width, height), dpi=DPI, layout='constrained')
         yield figure
@@ -380,7 +380,7 @@ def legend_above(axes: Axes, columns: int) -> Legend:
     )  # fmt: skip
     legend.set_in_layout(False)
     lines = -(-len(legend.get_texts()) // columns)
-    axes.set_title('\n'.join(' ' * lines), fontsize=10.5)  # keeps room for it
+    axes.set_title('\n'.join(' ' * lines), fontsize=13)  # keeps room for it
     return legend
 
 
@@ -398,4 +398,4 @@ def show_distances(
     image = axes.imshow(distances, cmap=SCALE, vmin=low, vmax=max(high, low + 1e-6), **options)
     bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.015, aspect=32)
     bar.outline.set_visible(False)
-    bar.set_label('distance')
+    bar.set_ticks([low, max(high, low + 1e-6)], labels=['near', 'far'])  # may be negative

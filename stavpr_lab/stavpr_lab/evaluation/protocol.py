@@ -119,10 +119,11 @@ def evaluate_matches(
     :param truths: of the same queries, by tolerance.
     """
     for length, ranking in rankings:
-        images = block_samples(len(ranking))
         for tolerance, truth in truths.items():
+            images = block_samples(int(truth.is_stated.sum()))
             f1 = evaluate_ranking(ranking, truth).best.f1
-            columns = truth.accepts(ranking.best), ranking.scores, truth.has_match
+            numbers = truth.accepts(ranking.best), ranking.scores, truth.has_match
+            columns = [column[truth.is_stated] for column in numbers]
             sampled = recalls(*(column[images] for column in columns))
             first, full = (
                 _with_interval(np.append(value, values))

@@ -54,6 +54,15 @@ class Report:
         return jsonable(numbers)
 
     @property
+    def quantity(self) -> str:
+        """Return what decides on a match: the probability, or in mode paper the distance."""
+        return 'distance' if self.default_threshold is None else 'probability'
+
+    def amount(self, distances: Any) -> Any:
+        """Return distances of matches as amounts of :attr:`quantity`."""
+        return distances if self.default_threshold is None else 1 - distances
+
+    @property
     def has_truth(self) -> bool:
         """Whether there is a ground truth, and the metrics are meaningful."""
         return bool(self.evaluation.ground_truth.kind)
@@ -72,15 +81,20 @@ class Report:
 
     @cached_property
     def counts(self) -> ConfusionCounts:
-        """Return the counts of :attr:`accepted`."""
-        has_match = self.evaluation.ground_truth.has_match
-        return accepted_counts(self.accepted, self.evaluation.correct, has_match)
+        """Return the counts of :attr:`accepted`, of the images whose truth is known."""
+        return accepted_counts(*self._compared)
 
     @cached_property
     def estimates(self) -> tuple[Estimate, Estimate]:
         """Return error rate and recall of :attr:`accepted`, with 95 % intervals."""
-        has_match = self.evaluation.ground_truth.has_match
-        return error_rate_and_recall(self.accepted, self.evaluation.correct, has_match)
+        return error_rate_and_recall(*self._compared)
+
+    @cached_property
+    def _compared(self) -> list[np.ndarray]:
+        """Return accepted, correct and in the map, of the images whose truth is known."""
+        truth = self.evaluation.ground_truth
+        columns = self.accepted, self.evaluation.correct, truth.has_match
+        return [column[truth.is_stated] for column in columns] if truth.kind else list(columns)
 
     def decision(self) -> dict[str, Any]:
         """Return how many images are matched, and by early matches; with ground truth, wrongly."""
@@ -88,16 +102,19 @@ class Report:
         decision: dict[str, Any] = {
             'rule': 'best F1' if self.default_threshold is None else 'default',
             'images': len(self.accepted),
-            'matched': counts.accepted,
+            'matched': int(np.count_nonzero(self.accepted)),
         }
         matches, images = self.evaluation.results.published
         early = slice(len(self.accepted), None)
         decision['early_matched'] = len(images[early])
         if not self.has_truth:
             return decision
-        right = self.evaluation.ground_truth.select(images).accepts(matches.places)
+        truth = self.evaluation.ground_truth.select(images)
+        wrong = truth.is_stated & ~truth.accepts(matches.places)
         return decision | {
-            'early_wrong': int(np.count_nonzero(~right[early])),
+            'images_with_truth': len(self._compared[0]),
+            'matched_with_truth': counts.accepted,
+            'early_wrong': int(np.count_nonzero(wrong[early])),
             'wrongly_matched': counts.false_positives,
             'precision': counts.precision,
             'recall': counts.recall,
@@ -163,7 +180,7 @@ def worst_mistakes(evaluation: Evaluation, count: int) -> list[int]:
     if not evaluation.ground_truth.kind:
         return []
     matches, true = evaluation.results.sequence, evaluation.ground_truth.middles
-    wrong = ~evaluation.correct & np.isfinite(matches.scores)
+    wrong = ~evaluation.correct & evaluation.ground_truth.is_stated & np.isfinite(matches.scores)
     near = (true >= 0) & (np.abs(matches.best - true) < evaluation.sequence_length)
     apart = evaluation.sequence_length // 2
     images: list[int] = []

@@ -48,7 +48,7 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
         raise SourceError(f'the report cannot be written into {folder}: {error}') from error
     require_replaceable(page, HTML, force)
     _write_matches(report, folder / 'answers.csv')
-    boxes = _draw(report, folder)
+    box = _draw(report, folder)
     embedded = ['distances', 'similarity_matrix', 'drive']
     if report.has_truth:
         _write_curves(report.evaluation, folder / 'curves.csv')
@@ -57,7 +57,7 @@ def write_folder(report: Report, folder: Path, force: bool = False) -> Path:
         embedded.append('calibration')
     contents = {name: (folder / f'{name}.png').read_bytes() for name in embedded}
     mistakes = worst_mistakes(report.evaluation, MISTAKES)
-    write_output(page, html_page(report, mistakes, contents, boxes), HTML, force)
+    write_output(page, html_page(report, mistakes, contents, box), HTML, force)
     write_json(report, folder / 'results.json', force=True)
     return page
 
@@ -80,9 +80,10 @@ def _write_matches(report: Report, path: Path) -> None:
         'probability': results.probabilities.tolist(),
         'recorded_image': report.drive.images.tolist(),
     }
-    if not report.has_truth:
-        unknown = ('in_map', 'true_place', 'sequence_right', 'single_right')
-        columns |= dict.fromkeys(unknown, [''] * len(report.query))
+    for name in ('in_map', 'true_place', 'sequence_right', 'single_right'):
+        values = zip(columns[name], truth.is_stated, strict=True)
+        is_known = report.has_truth
+        columns[name] = [value if is_known and stated else '' for value, stated in values]
     _write_csv(path, list(columns), zip(*columns.values(), strict=True))
 
 
@@ -101,16 +102,16 @@ def _write_csv(path: Path, columns: list[str], rows: Iterable[Iterable[object]])
     write_output(path, text.getvalue(), csv_kind(columns), force=True)
 
 
-def _draw(report: Report, folder: Path) -> dict[str, Box]:
+def _draw(report: Report, folder: Path) -> Box:
     """
     Draw the curves, the distances, the drive, the calibration and one window.
 
-    :returns: where the axes of ``curves`` and ``matrix`` are in their plots.
+    :returns: where the axes of the matrix are in its plot.
     """
     evaluation = report.evaluation
-    boxes = {'matrix': _draw_matrix(report, folder / 'similarity_matrix.png')}
+    box = _draw_matrix(report, folder / 'similarity_matrix.png')
     if report.has_truth:
-        boxes['curves'] = _draw_curves(evaluation, folder / 'precision_recall.png')
+        _draw_curves(evaluation, folder / 'precision_recall.png')
     _draw_distances(report, folder / 'distances.png')
     _draw_drive(report, folder / 'drive.png')
     if evaluation.calibration is not None:
@@ -120,26 +121,27 @@ def _draw(report: Report, folder: Path) -> dict[str, Box]:
         local = window.path - [0, window.first]
         path = folder / f'window_{window.image}.png'
         plots.warping_path(path, window.distances, local, window.first)
-    return boxes
+    return box
 
 
-def _draw_curves(evaluation: Evaluation, path: Path) -> Box:
+def _draw_curves(evaluation: Evaluation, path: Path) -> None:
     kinds = {
         'sequences': (plots.SEQUENCE, evaluation.sequence),
         'sequences, without the ends': (plots.SEQUENCE_INNER, evaluation.sequence_without_ends),
         'single images': (plots.SINGLE, evaluation.single),
     }
-    return plots.precision_recall(path, kinds)
+    plots.precision_recall(path, kinds)
 
 
 def _draw_distances(report: Report, path: Path) -> None:
     colors = {'correct': 'right', 'wrong': 'wrong', 'match': 'match'}
     groups = {
-        name: (plots.COLORS[colors[name]] if name in colors else plots.UNKNOWN, distances)
-        for name, distances in report.evaluation.distances.items()
+        name: (plots.COLORS[colors[name]] if name in colors else plots.UNKNOWN, report.amount(row))
+        for name, row in report.evaluation.distances.items()
     }
     best, default = report.evaluation.sequence.best.threshold, report.default_threshold
-    plots.distance_histogram(path, groups, best if report.has_truth else default)
+    limit = report.amount(best if default is None else default)
+    plots.match_histogram(path, groups, limit, report.quantity)
 
 
 def _draw_drive(report: Report, path: Path) -> None:
@@ -147,6 +149,8 @@ def _draw_drive(report: Report, path: Path) -> None:
     unseen = np.any([np.zeros(truth.N, bool), *report.drive.unseen()], axis=0)
     correct = report.evaluation.correct if report.has_truth else None
     outcomes = plots.outcomes(report.accepted, correct, truth.has_match)
+    if report.has_truth and truth.stated is not None:
+        outcomes[~truth.stated] = plots.outcomes(report.accepted[~truth.stated], None, None)
     plots.drive(path, truth.pairs, truth.n, places, outcomes, unseen)
 
 
@@ -157,8 +161,11 @@ def _draw_matrix(report: Report, path: Path) -> Box:
     rows, columns = (truth.pairs // reduced.block).T
     true_blocks[rows, columns] = True
     pairs = np.stack([np.arange(truth.N), evaluation.results.sequence.best], axis=1)
-    accepted, correct = evaluation.best_accepted, evaluation.correct
-    matches = {'right': pairs[accepted & correct], 'wrong': pairs[accepted & ~correct]}
+    accepted, correct = report.accepted, evaluation.correct
+    wrong = accepted & ~correct & truth.is_stated
+    matches = {'right': pairs[accepted & correct], 'wrong': pairs[wrong]}
+    if truth.stated is not None:
+        matches['match'] = pairs[accepted & ~truth.stated]
     if not report.has_truth:
         matches = {'match': pairs[report.accepted]}
     truth_blocks = true_blocks if report.has_truth else None

@@ -18,13 +18,15 @@ from stavpr_lab.evaluation.metrics import RANKS
 from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
 from stavpr_lab.evaluation.protocol import text
 from stavpr_lab.evaluation.report import jsonable, METRICS, Report
+from stavpr_lab.evaluation.verdict import verdict_of
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.prepare.centering import evenly
 
 TEMPLATE = 'report.html.jinja'
 VIEWS = 240  # windows that can be looked at: more would make a large file
-POINTS = 400  # of a curve
 WIDTH, LARGE = 160, 4000  # of an image, pixels; bytes from which one is made smaller
+
+PAIRS = 24  # on the sheet
 
 # rows of the table: keys of Metrics.to_json
 NUMBERS = {
@@ -36,19 +38,16 @@ NUMBERS = {
     **{f'recall@{k}': f'recall_at_{k}' for k in RANKS},
     'recall at 100 % precision': 'recall_at_100_precision',
 }
-CARDS = ('recall@1', 'average precision', 'recall at 100 % precision')
 
 
-def html_page(
-    report: Report, mistakes: list[int], plots: Mapping[str, bytes], boxes: Mapping[str, Box]
-) -> str:
+def html_page(report: Report, mistakes: list[int], plots: Mapping[str, bytes], box: Box) -> str:
     """
     Return the page.
 
-    :param mistakes: images whose wrong matches are shown, the worst first.
+    :param mistakes: images whose wrong matches are on the sheet of pairs, the worst first.
     :param plots: PNG files ``distances``, ``similarity_matrix``, ``drive`` and, with ground truth,
         ``precision_recall`` and, where probabilities are declared, ``calibration``.
-    :param boxes: where the axes of ``curves`` and ``matrix`` are.
+    :param box: where the axes of the matrix are.
     """
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     environment.policies['json.dumps_kwargs'] = {'separators': (',', ':')}
@@ -56,13 +55,11 @@ def html_page(
     evaluation = report.evaluation
     return environment.from_string(template).render(
         title=report.title,
+        verdict=verdict_of(report),
         has_truth=report.has_truth,
-        images=len(report.query),
-        best=evaluation.sequence.best,
-        single=evaluation.single.best,
+        quantity=report.quantity,
         false_alarms=evaluation.false_alarm_rates,
         colors={'right': COLORS['right'], 'wrong': COLORS['wrong'], 'sequence': SEQUENCE},
-        cards=_cards(evaluation) if report.has_truth else [],
         decision=report.decision(),
         error_rate=text(report.estimates[0]),
         recall=text(report.estimates[1]),
@@ -74,11 +71,10 @@ def html_page(
             name: np.count_nonzero(~np.isfinite(distances))
             for name, distances in evaluation.distances.items()
         },
-        mistakes=[_mistake(report, image) for image in mistakes],
         rows=_rows(evaluation),
         settings={name: _text(value) for name, value in report.settings.items()},
         times={name: f'{value:.3g}' for name, value in report.times.items()},
-        data=jsonable({**_data(report, mistakes), 'boxes': boxes}),
+        data=jsonable({**_data(report, mistakes), 'box': box, 'quantity': report.quantity}),
     )
 
 
@@ -88,16 +84,6 @@ def _data_url(content: bytes, kind: str) -> str:
 
 def _text(value: Any) -> str:
     return '–' if value is None else value if isinstance(value, str) else json.dumps(value)
-
-
-def _cards(evaluation: Evaluation) -> list[tuple[str, float, float, str]]:
-    """Return each card: name, value for sequences, value for single images, color."""
-    sequence, single = evaluation.sequence.to_json(), evaluation.single.to_json()
-    keys = {'F1 of sequences': 'f1'} | {name: NUMBERS[name] for name in CARDS}
-    cards = [(name, sequence[key], single[key], SEQUENCE) for name, key in keys.items()]
-    if rates := evaluation.false_alarm_rates:
-        cards.append(('false alarms', rates['sequence'], rates['single'], COLORS['wrong']))
-    return cards
 
 
 def _rows(evaluation: Evaluation) -> dict[str, list[str]]:
@@ -112,17 +98,33 @@ def _rows(evaluation: Evaluation) -> dict[str, list[str]]:
     return rows
 
 
-def _mistake(report: Report, image: int) -> dict[str, Any]:
-    matches = report.evaluation.results.sequence
-    place, true = int(matches.best[image]), int(report.evaluation.ground_truth.middles[image])
-    images = [
-        (f'image {image}', _image(report.query, image)),
-        (f'place {place}', _image(report.reference, place)),
-        (f'place {true}' if true >= 0 else 'not in the map', _image(report.reference, true)),
-    ]
-    status = 'accepted' if report.evaluation.best_accepted[image] else 'rejected, correctly'
-    off = f', {abs(place - true)} places off' if true >= 0 else ''
-    return {'images': images, 'caption': f'distance {matches.scores[image]:.4f}, {status}{off}'}
+def _pairs(report: Report, mistakes: list[int]) -> list[dict[str, Any]]:
+    """Return the pairs of the sheet: the worst mistakes first, and matches of the whole drive."""
+    places, drive = report.evaluation.results.sequence.best, report.drive
+    matched = np.flatnonzero(report.accepted)
+    others = matched if len(matched) else np.flatnonzero(places >= 0)
+    chosen = others[evenly(len(others), PAIRS)].tolist()
+    return [
+        {
+            'image': image,
+            'place': int(places[image]),
+            'recorded': [int(drive.images[image]), int(drive.places[places[image]])],
+            **_decision(report, image),
+        }
+        for image in dict.fromkeys([*(i for i in mistakes if report.accepted[i]), *chosen])
+    ][:PAIRS]
+
+
+def _decision(report: Report, image: int) -> dict[str, Any]:
+    """Return the match of an image: its amount, whether it is matched, and right, if known."""
+    truth = report.evaluation.ground_truth
+    is_known = report.has_truth and truth.is_stated[image]
+    return {
+        'amount': float(report.amount(report.evaluation.results.sequence.scores[image])),
+        'matched': bool(report.accepted[image]),
+        'right': bool(report.evaluation.correct[image]) if is_known else None,
+        'true': int(truth.middles[image]),
+    }
 
 
 def _image(place_map: PlaceMap, place: int) -> str:
@@ -147,28 +149,23 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
         window for i, window in enumerate(windows) if i in indices or window.image in mistakes
     ]
     views = [_view(report, window) for window in sample]
-    places = {view[name] for view in views for name in ('place', 'true')}
-    curves = {'sequences': evaluation.sequence.curve, 'single images': evaluation.single.curve}
+    pairs = _pairs(report, mistakes)
+    places = {each[name] for each in [*views, *pairs] for name in ('place', 'true')}
+    images = {each['image'] for each in [*views, *pairs]}
     return {
         'images': len(report.query),
         'views': views,
+        'pairs': pairs,
         'start': mistakes[0] if mistakes else len(report.query) // 2,
-        'queries': {window.image: _image(report.query, window.image) for window in sample},
+        'queries': {image: _image(report.query, image) for image in sorted(images)},
         'places': {place: _image(report.reference, place) for place in sorted(places)},
-        'curves': {name: _points(curve) for name, curve in curves.items()},
     }
-
-
-def _points(curve: np.ndarray) -> list[list[float]]:
-    """Return at most :data:`POINTS` points of a curve, the first and the last among them."""
-    return np.round(curve[evenly(len(curve), POINTS)], 6).tolist()
 
 
 def _view(report: Report, window: WindowDistances) -> dict[str, Any]:
     """Return a window for the script; its distances as bytes: 0 near, 254 far, 255 none."""
     evaluation = report.evaluation
-    accepted = evaluation.best_accepted if report.has_truth else report.accepted
-    matches, truth = evaluation.results.sequence, evaluation.ground_truth
+    truth = evaluation.ground_truth
     rows, columns = window.distances.shape
     low, high = np.nanmin(window.distances), np.nanmax(window.distances)
     share = (window.distances - low) / max(float(high - low), 1e-9)
@@ -182,13 +179,9 @@ def _view(report: Report, window: WindowDistances) -> dict[str, Any]:
         'cells': base64.b64encode(cells.tobytes()).decode(),
         'path': window.path.tolist(),
         'truth': _true_stretches(truth, window),
-        'place': int(matches.best[window.image]),
+        'place': int(evaluation.results.sequence.best[window.image]),
         'single': int(evaluation.results.single.best[window.image]),
-        'true': int(truth.middles[window.image]),
-        'right': bool(evaluation.correct[window.image]) if report.has_truth else None,
-        'accepted': bool(accepted[window.image]),
-        'probability': float(evaluation.results.probabilities[window.image]),
-        'score': float(matches.scores[window.image]),
+        **_decision(report, window.image),
     }
 
 

@@ -61,6 +61,7 @@ def measured_risks(
         has_match, correct = truth.has_match, truth.accepts(matches.places)
         unseen = [stretch[at] for stretch in drive.unseen()]
         counted = np.any([has_match | ~recorded, *unseen], axis=0)
+        counted &= truth.is_stated
         above = (matches.probabilities[:, None] > PROBABILITIES) & counted[:, None]
         unit = np.minimum(drive.images[at] // block, units - 1)
         np.add.at(matched, unit, above)

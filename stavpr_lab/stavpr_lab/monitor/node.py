@@ -41,6 +41,7 @@ STATUSES = (
     *('not ready', 'dropped', 'skipped', 'mapped'),
 )
 """By the constants of PlaceMatch; recognition.Status has them too, but imports numba."""
+LEFT_OUT = ('dropped', 'skipped')  # statuses that say nothing on the place
 WITH_ROW = {PlaceMatch.WARMING_UP, PlaceMatch.NO_MATCH, PlaceMatch.MATCH}
 LEVELS = ('ok', 'warn', 'error', 'stale')
 
@@ -83,10 +84,11 @@ class History:
                 self._changed.notify_all()
 
     def add(self, sample: dict[str, Any]) -> None:
-        """Add a sample, unless the last one was just before."""
+        """Add a sample, unless the last one was just before, of an image that was matched too."""
         with self._changed:
-            now = time.monotonic()
-            if now - self._last >= self._sample_seconds:
+            now, last = time.monotonic(), self._samples[-1][1] if self._samples else {}
+            is_hidden = last.get('status') in LEFT_OUT and sample.get('status') not in LEFT_OUT
+            if is_hidden or now - self._last >= self._sample_seconds:
                 self._last = now
                 self._version += 1
                 self._samples.append((self._version, for_json(sample)))
@@ -224,10 +226,9 @@ class Monitor:
             self.history.set('state', response.current_state.label)
 
     def _on_match(self, message: PlaceMatch) -> None:
-        stamp = message.header.stamp
         self.history.add(
             {
-                'stamp': stamp.sec + stamp.nanosec / 1e9,
+                'time': time.time(),
                 'status': dict(enumerate(STATUSES)).get(message.status, 'unknown'),
                 'reason': message.reason,
                 'place': message.newest_index,
