@@ -48,6 +48,7 @@ class PathCandidate:
     :param probability: of the path by the filter.
     :param factor: of its odds, by the checks.
     :param least: its probability, at least, if the camera is at rest.
+    :param score: mean of -z along the path.
     """
 
     path: np.ndarray
@@ -55,6 +56,7 @@ class PathCandidate:
     probability: float
     factor: float
     least: float
+    score: float
 
     @property
     def weight(self) -> float:

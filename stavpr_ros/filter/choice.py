@@ -8,10 +8,9 @@ path as a whole (:mod:`stavpr_ros.filter.checks`) multiply its odds by a factor 
 refute it, a path through the next most probable place is checked, too. With the rest r of the
 probability on the map, and M = sum_c p_c + r,
 
-    P(c) = f_c p_c / (sum_c f_c p_c + r + (1 - M) / 2),
+    P(c) = f_c p_c / (sum_c f_c p_c + r + 1 - M).
 
-since the filter declares the odds of being on the map too low, by about 2 (``CALIBRATION``). Loop
-closure needs no calibration.
+In localization, :mod:`stavpr_ros.filter.evidence` makes the probability of the match from it.
 """
 
 from collections.abc import Callable
@@ -32,7 +31,6 @@ from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
 from stavpr_ros.filter.protocol import Filter
 from stavpr_ros.filter.refine import ascending, BAND, image_times, OFFSETS, refine
 
-CALIBRATION = 2.0  # factor of the odds of being on the map
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
 MIN_CANDIDATE = REFUTED  # probability of its place, at least: above refuted ones
@@ -74,6 +72,7 @@ class ChosenPath:
     :param shares: probability of these places and close ones, given the path, (l,).
     :param probability: of the place of the image at the position.
     :param min_probability: below which it is no match: of a camera at rest.
+    :param score: mean of -z along the path.
     :param places: columns that the image may show, ascending, (m,), and probabilities: theirs,
         after the checks.
     """
@@ -82,6 +81,7 @@ class ChosenPath:
     shares: np.ndarray
     probability: float
     min_probability: float
+    score: float
     places: np.ndarray
     probabilities: np.ndarray
 
@@ -94,7 +94,6 @@ class PathChoice:
     :param change: of the images, and of the map.
     :param layout: of the places.
     :param width: number of columns.
-    :param calibration: factor of the odds of being on the map.
     """
 
     def __init__(
@@ -103,10 +102,8 @@ class PathChoice:
         change: ImageChange,
         layout: ColumnLayout,
         width: int,
-        calibration: float,
     ) -> None:
         self._filter, self._change, self._layout = filter, change, layout
-        self._calibration = calibration
         self.grow(width)
 
     def grow(self, width: int) -> None:
@@ -143,11 +140,10 @@ class PathChoice:
         on_map = min(float(belief.weights.sum()), 1.0)
         unchecked = max(on_map - sum(candidate.probability for candidate in candidates), 0.0)
         total = unchecked + sum(candidate.weight for candidate in candidates)
-        odds_sum = total + (1 - on_map) / self._calibration
-        of_path = chosen.weight / max(odds_sum, sys.float_info.min)
+        of_path = chosen.weight / max(total + 1 - on_map, sys.float_info.min)
         share = float(chosen.shares[images.position])
         return ChosenPath(
-            chosen.path, chosen.shares, of_path * share, chosen.least * share,
+            chosen.path, chosen.shares, of_path * share, chosen.least * share, chosen.score,
             places, probabilities,
         )  # fmt: skip
 
@@ -186,7 +182,9 @@ class PathChoice:
         if images.lag_at_rest is not None:
             at_rest = z[numbers == numbers[-1]]
             least = least_at_rest(at_rest, mean, self._filter.settings.weight)
-        return PathCandidate(placed, shares, of_path, factor, least)
+        compared = z[np.isfinite(z)]
+        score = -float(compared.mean()) if len(compared) else 0.0
+        return PathCandidate(placed, shares, of_path, factor, least, score)
 
     def _path(self, state: np.ndarray, images: WindowImages) -> np.ndarray:
         """Return the column of each image, (l,); before the image at the position at one speed."""

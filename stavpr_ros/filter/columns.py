@@ -96,6 +96,16 @@ class ColumnLayout:
         """Return positions: those at most nms_radius apart are neighbors in one session."""
         return np.asarray(places) if self.columns is None else self.columns[self._same_as[places]]
 
+    def around(self, column: int, radius: int) -> np.ndarray:
+        """Return the columns of positions near a column's, as first ones and ends, (m, 2)."""
+        if self.columns is None:
+            return np.array([[column - radius, column + radius + 1]])
+        positions = self.columns[self._same_as]
+        place = int(self.place_before(np.array(column)))
+        near = self.columns[np.abs(positions - positions[place]) <= radius]
+        runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
+        return np.array([[run[0], run[-1] + 1] for run in runs])
+
     def merge_sessions(self, belief: Belief, n: int) -> tuple[np.ndarray, np.ndarray, int]:
         """
         Let places of one position share their probability.

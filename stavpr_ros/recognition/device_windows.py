@@ -13,12 +13,14 @@ from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.device_filter import DevicePlaceFilter
+from stavpr_ros.filter.evidence import FAR
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.sessions import in_places
 from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
 import torch
+from torch.nn.functional import pad
 
 
 def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
@@ -54,6 +56,20 @@ class DeviceBuffer(SequenceBuffer):
         flat = torch.from_numpy(self._ring(images) * self.memory.shape[1] + columns)
         entries: np.ndarray = self.memory.take(flat.to(self._device)).cpu().numpy()
         return entries
+
+    def best_elsewhere(self, steps: np.ndarray, excluded: np.ndarray) -> float:
+        """See :meth:`SequenceBuffer.best_elsewhere`; waits for the device."""
+        reach, images = int(np.abs(steps).max()), steps.shape[1]
+        rows = torch.from_numpy(self._ring(images)[:, 0]).to(self._device)
+        z = self.memory.index_select(0, rows)[:, : self.known]
+        z = pad(torch.where(z.isfinite(), z, float(FAR)), (reach, reach), value=float(FAR))
+        columns = torch.arange(self.known, device=self._device) + reach
+        smallest = torch.full_like(z[0, : self.known], torch.inf)
+        for shifts in torch.from_numpy(steps).to(self._device)[:, :, None]:
+            torch.minimum(smallest, z.gather(1, columns + shifts).sum(dim=0), out=smallest)
+        for first, end in np.maximum(excluded, 0).tolist():
+            smallest[first:end] = torch.inf
+        return -float(smallest.min()) / images
 
 
 class RowColumns:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.filter.choice import CALIBRATION, ChosenPath, PathChoice, WindowImages
+from stavpr_ros.filter.choice import ChosenPath, PathChoice, WindowImages
 from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.filter.evidence import APART, path_probability, RecentMean, straight_steps
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import NEGLIGIBLE, NO_PLACES
@@ -64,8 +65,9 @@ class FilterWindow(QueryWindow):
         lag = length - 1 - (0 if to_oldest else self._middle)
         self.filter: Filter = self.filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(places, settings, length)
-        calibration = 1.0 if to_oldest else CALIBRATION
-        self.choice = PathChoice(self.filter, self.change, layout, width, calibration)
+        self.choice = PathChoice(self.filter, self.change, layout, width)
+        self._recent = RecentMean()
+        self._posterior = self._of_window = 0.0  # of the latest match, and of the full window
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._entered = 0  # number of the image with which the latest path came to the map
@@ -85,7 +87,7 @@ class FilterWindow(QueryWindow):
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._at_rest, self._entered = None, 0
+        self._at_rest, self._entered, self._recent = None, 0, RecentMean()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -154,7 +156,11 @@ class FilterWindow(QueryWindow):
         A window of equal images would show neither how even the path to them was nor how fast.
         """
         middle = (len(self.images) - 1) // 2
-        match = self._at_rest or self._match_image(len(self.images), middle, nms_radius)
+        match = self._at_rest
+        if match is None:
+            match = self._match_image(len(self.images), middle, nms_radius)
+            self._of_window = self._posterior
+        self._recent.add(self._of_window)
         self._at_rest = match if self._rests(middle) else None
         return in_places(match, self.layout, nms_radius)
 
@@ -212,6 +218,7 @@ class FilterWindow(QueryWindow):
         n, first = self.buffer.known, self.buffer.first
         if not n:
             return WindowMatch()
+        self._posterior = 0.0
         rows = list(self.images)[len(self.images) - count :]
         belief = self.filter.belief(n, rows[-1].number - rows[position].number)
         if not len(belief.places):
@@ -229,13 +236,14 @@ class FilterWindow(QueryWindow):
         )
         chosen = self.choice.choose(belief, images)
         place = int(chosen.path[position])
+        certain, least = self._probabilities(chosen, images.numbers, position)
         second, probability = self.choice.second_best(chosen, n, place, nms_radius)
         path = _numbered(chosen.path + first)
         match = SequenceMatch(
             first=int(path[0, 1]),
             last=int(path[-1, 1]),
             middle=place + first,
-            distance=1 - chosen.probability,
+            distance=1 - certain,
             second_best_index=second + first if probability > 0 else -1,
             second_best_distance=1 - probability if probability > 0 else float('nan'),
         )
@@ -243,10 +251,23 @@ class FilterWindow(QueryWindow):
             match,
             path,
             partial(self._sequences, n, first, chosen),
-            chosen.probability,
+            certain,
             chosen.shares,
-            chosen.min_probability,
+            least,
         )
+
+    def _probabilities(
+        self, chosen: ChosenPath, numbers: np.ndarray, position: int
+    ) -> tuple[float, float]:
+        """Return the probability of a path, and the one below which it is no match."""
+        self._posterior, least = chosen.probability, chosen.min_probability
+        if self._to_oldest:
+            return self._posterior, least
+        steps = straight_steps(numbers, position)
+        near = self.layout.around(int(chosen.path[position]), APART)
+        elsewhere = self.buffer.best_elsewhere(steps, near)
+        others = chosen.score, elsewhere, self._recent.value, len(numbers)
+        return path_probability(self._posterior, *others), path_probability(least, *others)
 
     def _sequences(self, n: int, first: int, chosen: ChosenPath | None = None) -> WindowSequences:
         """Return all places; improbable ones have a share of their probability now."""

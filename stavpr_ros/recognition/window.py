@@ -18,6 +18,7 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
 from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.filter.evidence import best_elsewhere
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition.match import WindowMatch
@@ -135,6 +136,15 @@ class SequenceBuffer:
         """
         entries: np.ndarray = self.memory[self._ring(images), columns]
         return entries
+
+    def best_elsewhere(self, steps: np.ndarray, excluded: np.ndarray) -> float:
+        """
+        Return the largest mean of -z of straight paths of the newest images.
+
+        :param steps, excluded: of :func:`stavpr_ros.filter.evidence.best_elsewhere`; l images.
+        """
+        rows = self._ring(steps.shape[1])[:, 0]
+        return float(best_elsewhere(self.memory, rows, self.known, steps, excluded))
 
     def _ring(self, images: int | None = None) -> np.ndarray:
         """Return the rows of one copy of the newest images, oldest first, (images, 1)."""

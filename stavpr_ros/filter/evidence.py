@@ -1,0 +1,124 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The probability of the path of a window, by quantities without a unit.
+
+z at right places has another mean for each kind of features, each map and each light. These do not
+depend on it:
+
+- p, the probability of the path by the filter, after the checks;
+- the **gap** g = (m - m') / m: m is the mean of -z along the path, m' the largest along straight
+  paths of the same images elsewhere, more than ``APART`` places from its position
+  (:func:`best_elsewhere`): how near look-alikes come in this window, in this light;
+- r, the **recent** mean of p over the windows of the drive, from .5 on: whether this drive is on
+  the map at all;
+- the number l of images that are matched: a window, or the newest images alone.
+
+The probability is 1 / (1 + exp(-x)) with::
+
+    x = -0.282 + 0.29 ln(p / (1 - p)) + 3.243 g + 1.924 min(0, ln(r / (1 - r))) + 1.359 ln(l / 20)
+
+by logistic regression on features ``gradient`` and ``efficientnet_lite1`` together. Each of six
+routes has the same weight; floors that look alike, and unrelated routes, have four times as much:
+a little more than half of the drives is off the map. benchmarks/results/evidence.md names them,
+and has the results on data sets left out, other quantities, and what half and double of each
+factor does.
+"""
+
+import math
+
+import numpy as np
+from stavpr_ros.compilation import kernel
+
+CONSTANT, POSTERIOR, GAP, RECENT, IMAGES = -0.282, 0.29, 3.243, 1.924, 1.359
+WINDOW = 20  # images for which the constant holds
+APART = 20  # places: paths nearer than that to the path are not elsewhere
+SPEEDS = np.array([1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0])  # of straight paths
+MIN_SCORE = 0.05  # of a path, for the gap
+CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do not grow
+MIN_RECENT = 0.04  # a drive that comes to the map late is recognized there
+FIRST, LAST = 8, 108  # windows that count as the mean .5 at first, and that the mean goes back
+FAR = np.float32(1)  # z beside the map, and of places that are not compared
+CHUNK = 1024  # places whose sums stay in the cache
+
+
+class RecentMean:
+    """The mean probability p of a drive's windows, ``value``: .5 at first."""
+
+    def __init__(self) -> None:
+        self.value, self._count = 0.5, FIRST
+
+    def add(self, probability: float) -> None:
+        """Count another window."""
+        self._count = min(self._count + 1, LAST)
+        self.value += (probability - self.value) / self._count
+
+
+def path_probability(
+    posterior: float, score: float, elsewhere: float, recent: float, images: int
+) -> float:
+    """
+    Return the probability of a path.
+
+    :param posterior: p, by the filter and the checks.
+    :param score: m, mean of -z along the path.
+    :param elsewhere: m', of :func:`best_elsewhere`.
+    :param recent: r, of the windows before.
+    :param images: l.
+    """
+    gap = (score - elsewhere) / max(score, MIN_SCORE) if score > 0 else -1.0
+    x = CONSTANT + POSTERIOR * _log_odds(posterior, CERTAIN) + GAP * min(max(gap, -1.0), 1.0)
+    x += RECENT * min(_log_odds(recent, MIN_RECENT), 0.0) + IMAGES * math.log(images / WINDOW)
+    return 1 / (1 + math.exp(-x)) if posterior > 0 else 0.0
+
+
+def straight_steps(numbers: np.ndarray, position: int) -> np.ndarray:
+    """
+    Return the steps of straight paths from the place of an image, (V, l), int64.
+
+    :param numbers: of the images, (l,); equal ones are of a camera at rest.
+    """
+    steps: np.ndarray = np.rint(SPEEDS[:, None] * (numbers - numbers[position])).astype(np.int64)
+    return steps
+
+
+@kernel
+def best_elsewhere(
+    memory: np.ndarray, rows: np.ndarray, n: int, steps: np.ndarray, excluded: np.ndarray
+) -> float:
+    """
+    Return the largest mean of -z of straight paths, -inf where there is none.
+
+    :param memory: distances z, (L, n or more), float32.
+    :param rows: of the images in memory, (l,).
+    :param steps: of :func:`straight_steps`.
+    :param excluded: first ones and ends of the places whose paths do not count, (m, 2).
+    """
+    best, sums, images = np.float32(np.inf), np.empty(CHUNK, np.float32), len(rows)
+    for start in range(0, n, CHUNK):
+        count = min(CHUNK, n - start)
+        for v in range(len(steps)):
+            sums[:] = 0
+            for i in range(images):
+                row, shift = memory[rows[i]], start + steps[v, i]
+                low = min(max(-shift, 0), count)
+                high = max(min(n - shift, count), low)
+                for x in range(low):
+                    sums[x] += FAR
+                for x in range(low, high):
+                    z = row[shift + x]
+                    sums[x] += z if z < np.inf else FAR
+                for x in range(high, count):
+                    sums[x] += FAR
+            for first, end in excluded:
+                for x in range(max(first - start, 0), min(end - start, count)):
+                    sums[x] = np.inf
+            for x in range(count):
+                best = min(best, sums[x])
+    return -best / images
+
+
+def _log_odds(probability: float, least: float) -> float:
+    """Return the logarithm of the odds of a probability, from ``least`` to 1 less it."""
+    probability = min(max(probability, least), 1 - least)
+    return math.log(probability / (1 - probability))
