@@ -238,6 +238,7 @@ class FilterWindow(QueryWindow):
         place = int(chosen.path[position])
         certain, least = self._probabilities(chosen, images.numbers, position)
         second, probability = self.choice.second_best(chosen, n, place, nms_radius)
+        probability = min(probability, certain)
         path = _numbered(chosen.path + first)
         match = SequenceMatch(
             first=int(path[0, 1]),
@@ -250,7 +251,7 @@ class FilterWindow(QueryWindow):
         return WindowMatch(
             match,
             path,
-            partial(self._sequences, n, first, chosen),
+            partial(self._sequences, n, first, chosen, certain),
             certain,
             chosen.shares,
             least,
@@ -269,11 +270,13 @@ class FilterWindow(QueryWindow):
         others = chosen.score, elsewhere, self._recent.value, len(numbers)
         return path_probability(self._posterior, *others), path_probability(least, *others)
 
-    def _sequences(self, n: int, first: int, chosen: ChosenPath | None = None) -> WindowSequences:
+    def _sequences(
+        self, n: int, first: int, chosen: ChosenPath | None = None, most: float = 1.0
+    ) -> WindowSequences:
         """Return all places; improbable ones have a share of their probability now."""
         probabilities = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
         if chosen is not None:
-            probabilities[chosen.places] = chosen.probabilities
+            probabilities[chosen.places] = np.minimum(chosen.probabilities, most)
         costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
         return WindowSequences(costs, np.arange(first, first + n), probabilities)
 

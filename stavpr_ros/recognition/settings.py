@@ -110,7 +110,7 @@ class RecognizerSettings:
         spatial, sequence = self.spatial, self.sequence
         mode = self.mode if self.robust_options is None else 'own options'
         return (
-            f'{mode}, length {sequence.length}, beta {sequence.beta:g}, {spatial.strategy}, '
+            f'{mode} by evidence, length {sequence.length}, beta {sequence.beta:g}, {spatial.strategy}, '
             f'sigma {spatial.sigma:g}, xi {spatial.xi}, vertical {spatial.vertical}'
         )
 
