@@ -54,7 +54,7 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     assert match.candidates == ()
     pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
     match = process(pipeline, route[13:14], first=13)[0]
-    assert match.threshold == pytest.approx(0.03)
+    assert match.threshold == pytest.approx(0.05)
 
 
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
@@ -216,7 +216,7 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     waiting = statuses(matches).count(Status.WARMING_UP)
     found = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
     assert statuses(matches) == [Status.WARMING_UP] * waiting + [found] * (5 - waiting)
-    assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 3
+    assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 4
     assert matches[-1].match.window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
         assert matches[-1].match.first_image_index == places

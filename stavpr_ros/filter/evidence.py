@@ -28,6 +28,7 @@ factor does.
 import math
 
 import numpy as np
+from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
 
 CONSTANT, POSTERIOR, GAP, RECENT, IMAGES = -0.282, 0.29, 3.243, 1.924, 1.359
@@ -95,19 +96,25 @@ def best_elsewhere(
     :param excluded: first ones and ends of the places whose paths do not count, (m, 2).
     """
     best, sums, images = np.float32(np.inf), np.empty(CHUNK, np.float32), len(rows)
+    flat, infinite, far = memory.reshape(-1), splat(np.float32(np.inf)), splat(FAR)
     for start in range(0, n, CHUNK):
         count = min(CHUNK, n - start)
         for v in range(len(steps)):
             sums[:] = 0
             for i in range(images):
-                row, shift = memory[rows[i]], start + steps[v, i]
+                shift = start + steps[v, i]
+                row = rows[i] * memory.shape[1] + shift
                 low = min(max(-shift, 0), count)
                 high = max(min(n - shift, count), low)
                 for x in range(low):
                     sums[x] += FAR
-                for x in range(low, high):
-                    z = row[shift + x]
-                    sums[x] += z if z < np.inf else FAR
+                whole = low + (high - low) // LANES * LANES
+                for x in range(low, whole, LANES):
+                    z = load(flat, row + x)
+                    near = select(z < infinite, z, far)
+                    store(sums, x, load(sums, x) + near)
+                for x in range(whole, high):
+                    sums[x] += flat[row + x] if flat[row + x] < np.inf else FAR
                 for x in range(high, count):
                     sums[x] += FAR
             for first, end in excluded:
@@ -115,7 +122,7 @@ def best_elsewhere(
                     sums[x] = np.inf
             for x in range(count):
                 best = min(best, sums[x])
-    return -best / images
+    return -float(best) / images
 
 
 def _log_odds(probability: float, least: float) -> float:

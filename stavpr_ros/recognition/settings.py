@@ -110,8 +110,9 @@ class RecognizerSettings:
         spatial, sequence = self.spatial, self.sequence
         mode = self.mode if self.robust_options is None else 'own options'
         return (
-            f'{mode} by evidence, length {sequence.length}, beta {sequence.beta:g}, {spatial.strategy}, '
-            f'sigma {spatial.sigma:g}, xi {spatial.xi}, vertical {spatial.vertical}'
+            f'{mode} by evidence, length {sequence.length}, beta {sequence.beta:g}, '
+            f'{spatial.strategy}, sigma {spatial.sigma:g}, xi {spatial.xi}, '
+            f'vertical {spatial.vertical}'
         )
 
     @property
