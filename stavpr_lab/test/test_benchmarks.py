@@ -70,6 +70,7 @@ def test_changes_of_value_are_listed_and_classified(group, name, before, after, 
 def test_outcome_counts_right_wrong_and_unseen_matches():
     columns = ([1, 1, 1, 0, 0], [1, 1, 0, 1, 0], [1, 1, 0, 1, 1], [0, 0, 1, 0, 0])
     accepted, *others = (np.array(values, bool) for values in columns)
+    others.append(np.zeros(5, bool))  # no early ones
     outcome = off_map.Outcome(accepted, np.array([0.9, 0.8, 0.6, 0.2, np.nan]), *others)
     found = off_map.Outcome.pooled([outcome, outcome]).numbers()
     assert (found['images'], found['matched'], found['wrong']) == (10, 6, 2)
