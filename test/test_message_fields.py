@@ -444,7 +444,7 @@ def running(robot: Robot, drive: Drive, **parameters: Any) -> Iterator[Any]:
         'operation': drive.operation,
         'map_path': drive.path,
         'min_probability': PROBABILITY,
-            'keyframe_distance': 0.001,  # an image without odometry is not taken
+        'keyframe_distance': 0.001,  # an image without odometry is not taken
     } | parameters)  # fmt: skip
     try:
         robot.wait_for_node()

@@ -200,7 +200,7 @@ def test_decode_compressed_of_png_ignores_what_follows_its_end():
 
 @pytest.mark.parametrize('tags', [{278: 2**23}, {322: 16, 323: 2**23}])
 def test_decode_compressed_of_tiff_with_large_parts_allocates_nothing(monkeypatch, tags):
-    """OpenCV allocates a strip, or a tile, of up to a gigabyte before it reads the pixels."""
+    """Strips and tiles of up to a gigabyte are allocated by OpenCV before it reads the pixels."""
     file = BytesIO()
     Image.fromarray(NOISE).save(file, 'TIFF', tiffinfo={278: 3})
     data = bytearray(file.getvalue())

@@ -67,7 +67,8 @@ def accumulate(
         torch.minimum(diagonal, straight, out=corner)
         steps = steps if t % 2 else steps - 1
         torch.where(diagonal < straight, F[own, here], steps, out=F[own, here])
-    return tuple(each.transpose(0, 1).flatten(0, 1) for each in (S, F))  # type: ignore[return-value]
+    S, F = (each.transpose(0, 1).flatten(0, 1) for each in (S, F))
+    return S, F
 
 
 def spatial_alignment(

@@ -111,7 +111,7 @@ class Decider:
 
     def _chance(self, taken: np.ndarray) -> float:
         """
-        Return minus the logarithm of the probability of the events that are taken, by chance.
+        Return minus the logarithm of the probability to draw the events that are taken.
 
         Events are drawn one by one, each by its number of closures, in any order: of n events of
         one size, k have 1 / binomial(n, k).
@@ -204,7 +204,7 @@ class Decider:
         """
         Return another decision if there is evidence for its odometry, else the best one.
 
-        Of many events, some agree by chance where the odometry explains everything: the number of
+        Of many events, some agree at random where the odometry explains everything: the number of
         choices counts against both, and so does each doubling of the errors in the settings.
         """
 
