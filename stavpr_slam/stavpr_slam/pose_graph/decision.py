@@ -153,7 +153,8 @@ class Decider:
         Decide with an odometry.
 
         :param scales: factors on its errors, of each robot.
-        :param near: a decision with a tighter one, to begin at where the odometry is too far off.
+        :param near: a decision with a tighter one, to begin at where the odometry is too far off,
+            and to search thoroughly.
         """
         network = self._network
         odometry = network.odometry(scales[self._chain.robot])
@@ -169,7 +170,7 @@ class Decider:
             tried = []
             if taken.any():  # closures beside them may agree by now
                 tried.append(network.robust(odometry, values, AGAIN))
-            if self._measured:
+            if self._measured and near is not None:
                 tried += [self._extended(odometry, *each) for each in (*tried, (none, start))]
             for more, moved in tried:
                 found = self._evidence(odometry, more, moved) if more.any() else 0.0
