@@ -17,6 +17,7 @@ CAUSES = {
     'features': 'images whose features are not finite',
     'image': 'images that cannot be decoded',
     'format': 'images of a format that is not read (convert them to JPEG)',
+    'video': 'videos among images',
     'beside': 'images beside the sub-folders of the drive',
     'below': 'images in sub-folders of the drive',
     'foreign': 'folders of a NAS, an archive program or a viewer',

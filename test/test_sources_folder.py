@@ -150,3 +150,12 @@ def test_folder_counts_images_of_other_formats_once(tmp_path):
         (tmp_path / image).unlink()
     with pytest.raises(SourceError, match='left out: 3 images of a format that is'):
         FolderSource(tmp_path)
+
+
+def test_photos_of_a_telephone_with_a_video_each_are_the_drive(tmp_path):
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f'{number}.jpg'), np.full((8, 8), number, np.uint8))
+        (tmp_path / f'{number}.MOV').write_bytes(b'of the same moment')
+    source = open_source(tmp_path)
+    assert len(source) == 3
+    assert left_out(source.left_out) == 'left out: 3 videos among images'

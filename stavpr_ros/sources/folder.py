@@ -24,6 +24,12 @@ OTHER_IMAGES = frozenset({
     '.arw', '.avif', '.cr2', '.cr3', '.dng', '.exr', '.gif', '.hdr', '.jp2', '.jxl', '.nef',
     '.orf', '.raf', '.raw', '.rw2',
 })  # fmt: skip
+VIDEOS = frozenset({
+    '.264', '.265', '.3g2', '.3gp', '.asf', '.avi', '.divx', '.dv', '.f4v', '.flv', '.h264',
+    '.h265', '.hevc', '.ivf', '.m2t', '.m2ts', '.m2v', '.m4v', '.mjpeg', '.mjpg', '.mkv', '.mod',
+    '.mov', '.mp4', '.mpe', '.mpeg', '.mpg', '.mts', '.mxf', '.nut', '.ogv', '.qt', '.rm', '.tod',
+    '.tp', '.ts', '.vob', '.webm', '.wmv', '.wtv', '.y4m',
+})  # fmt: skip
 FOREIGN = re.compile(
     r'@.*|#recycle|#snapshot|\$recycle\.bin|lost\+found|__macosx|system volume information|'
     r'_*thumb(nail)?s?',
@@ -150,6 +156,7 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         names |= {path.stem for path in images}
         others = (path for path in paths if path.suffix.lower() in OTHER_IMAGES)
         unread['format'] += sum(path.stem not in names for path in others)
+        unread['video'] += sum(path.suffix.lower() in VIDEOS for path in paths)
         (own if Path(name) == top else below).extend(images)
     is_drive = len(own) * FEW > len(below)
     unread['below' if is_drive else 'beside'] = len(below if is_drive else own)

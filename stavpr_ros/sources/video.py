@@ -17,18 +17,12 @@ from stavpr_ros.checks import require_above
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import reading
-from stavpr_ros.sources.folder import natural_key
+from stavpr_ros.sources.folder import natural_key, VIDEOS
 from stavpr_ros.sources.folder import SUFFIXES as IMAGES
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.sources.video_decoder import CUT_OFF, EARLY, FACTS, FRAME, REASONS, REMEDY
 from stavpr_ros.units import SECOND
 
-SUFFIXES = frozenset({
-    '.264', '.265', '.3g2', '.3gp', '.asf', '.avi', '.divx', '.dv', '.f4v', '.flv', '.h264',
-    '.h265', '.hevc', '.ivf', '.m2t', '.m2ts', '.m2v', '.m4v', '.mjpeg', '.mjpg', '.mkv', '.mod',
-    '.mov', '.mp4', '.mpe', '.mpeg', '.mpg', '.mts', '.mxf', '.nut', '.ogv', '.qt', '.rm', '.tod',
-    '.tp', '.ts', '.vob', '.webm', '.wmv', '.wtv', '.y4m',
-})  # fmt: skip
 FPS = 5.0
 """Images taken per second: 20 of them, the length of a window, show 4 s of the route."""
 TIMEOUT = 30.0  # seconds for the start of the decoder, and for each frame
@@ -37,11 +31,17 @@ MODULE = 'stavpr_ros.sources.video_decoder'
 
 
 def video_files(path: str | Path) -> list[Path]:
-    """Return a video's file, or the videos of a folder in natural order, by names only."""
+    """
+    Return a video's file, or the videos of a folder in natural order, by names only.
+
+    Among more images than videos, videos are not the drive: a telephone adds one to each photo.
+    """
     path = Path(path)
     with reading(path):
-        files = path.glob('[!.]*') if path.is_dir() else [path]
-        videos = [one for one in files if one.suffix.lower() in SUFFIXES and not one.is_dir()]
+        files = list(path.glob('[!.]*')) if path.is_dir() else [path]
+        videos = [one for one in files if one.suffix.lower() in VIDEOS and not one.is_dir()]
+    if sum(one.suffix.lower() in IMAGES for one in files) >= max(len(videos), 2):
+        return []
     return sorted(videos, key=lambda file: natural_key(file.name))
 
 
