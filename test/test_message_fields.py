@@ -91,7 +91,9 @@ class Drive:
         return '' if self.places is None else self.places.ids[place]
 
     def session(self, place: int) -> str:
-        return '' if self.places is None else ('day', 'night')[place >= LAP]
+        if self.places is None or not self.places.sessions:
+            return ''
+        return ('day', 'night')[place >= LAP]
 
     def window(self, match: PlaceMatch) -> list[Time]:
         """Return the stamps of the images in the window."""
@@ -378,7 +380,8 @@ MAP_INFO: Checks = {
         'in no file (recorded maps)',
         lambda m, d: m.map_id == (d.map_id if m.state == 'loaded' else '')),
     'sessions': ('of the map; empty = unknown',
-        lambda m, d: list(m.sessions) == (['day', 'night'] if m.state == 'loaded' else [])),
+        lambda m, d: list(m.sessions) == ([each.id for each in d.places.sessions] if m.state
+        == 'loaded' else [])),
     'operation': ('localization, mapping or loop_closure',
         lambda m, d: m.operation == d.operation),
     'state': ('none, loading (old map in use), loaded, growing, full',
@@ -491,12 +494,12 @@ def drives(robot, small_map, tmp_path_factory):
     robust = Drive('r2', **on_map)
     with running(robot, robust, candidates=3) as node:
         robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'odometry')
-        show(robot, robust, np.arange(10, 20) + AHEAD)
-        rest(robot, robust, 19 + AHEAD)
+        show(robot, robust, np.arange(40, 50) + AHEAD)
+        rest(robot, robust, 49 + AHEAD)
         reset(robot, robust)
         show(robot, robust, [ELSEWHERE])
         rest(robot, robust, ELSEWHERE)
-        show(robot, robust, np.arange(40, 50) + AHEAD)
+        show(robot, robust, np.arange(10, 20) + AHEAD)
 
     paper = Drive('r2', 'paper', **on_map)
     checked = {'threshold': 0.2, 'geometric_check': 'orb'}
@@ -543,7 +546,13 @@ def drives(robot, small_map, tmp_path_factory):
     without_map = Drive()
     with running(robot, without_map):
         show(robot, without_map, range(2))
-    return [robust, paper, mapping, loop, others, without_map]
+
+    path = str(tmp_path_factory.mktemp('map') / 'route.stavpr')
+    save_map(small_map, path)
+    early = Drive(path=path, places=load_map(path))
+    with running(robot, early):
+        show(robot, early, range(40, 46))
+    return [robust, paper, mapping, loop, others, without_map, early]
 
 
 def reset(robot: Robot, drive: Drive) -> None:
@@ -606,15 +615,16 @@ def test_every_field_has_a_check_beside_its_sentence(file):
 
 def test_drives_show_what_the_fields_distinguish(drives):
     """Or a check would hold for want of messages."""
-    robust, paper, mapping, loop, _, _ = drives
+    robust, paper, mapping, loop, _, _, early = drives
     assert {match.status for drive in drives for match in drive.matches} == set(range(8))
-    assert {0.1, 0.2} <= {round(match.threshold, 6) for match in robust.matches}
+    assert {0.2, 0.1} == {round(match.threshold, 6) for match in early.matches}
     assert 0.0 in {match.threshold for match in loop.matches}
     for drive in (robust, paper):
         assert {matched(match) for match in drive.matches} == {True, False}
         assert drive.candidates
         assert drive.closures
-    assert {match.session for match in robust.matches} == {'', 'day', 'night'}
+    sessions = {match.session for match in robust.matches + paper.matches}
+    assert sessions == {'', 'day', 'night'}
     assert any(each.is_late for each in loop.closures)
     assert len([each for each in loop.closures if each.relative_pose.is_independent]) > 1
     assert {info.state for info in mapping.infos} >= {'growing', 'full'}

@@ -238,7 +238,9 @@ class FilterWindow(QueryWindow):
         place = int(chosen.path[position])
         certain, least = self._probabilities(chosen, images.numbers, position)
         second, probability = self.choice.second_best(chosen, n, place, nms_radius)
-        probability = min(probability, certain)
+        peak = float(chosen.probabilities.max(initial=0.0))
+        share = certain / peak if peak > certain else 1.0  # none is above the match
+        probability *= share
         path = _numbered(chosen.path + first)
         match = SequenceMatch(
             first=int(path[0, 1]),
@@ -251,7 +253,7 @@ class FilterWindow(QueryWindow):
         return WindowMatch(
             match,
             path,
-            partial(self._sequences, n, first, chosen, certain),
+            partial(self._sequences, n, first, chosen, share),
             certain,
             chosen.shares,
             least,
@@ -271,12 +273,13 @@ class FilterWindow(QueryWindow):
         return path_probability(self._posterior, *others), path_probability(least, *others)
 
     def _sequences(
-        self, n: int, first: int, chosen: ChosenPath | None = None, most: float = 1.0
+        self, n: int, first: int, chosen: ChosenPath | None = None, share: float = 1.0
     ) -> WindowSequences:
         """Return all places; improbable ones have a share of their probability now."""
         probabilities = self.filter.places_of_states()[:n] * np.float64(NEGLIGIBLE)
         if chosen is not None:
-            probabilities[chosen.places] = np.minimum(chosen.probabilities, most)
+            probabilities[chosen.places] = chosen.probabilities
+        probabilities *= share
         costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
         return WindowSequences(costs, np.arange(first, first + n), probabilities)
 
