@@ -107,6 +107,7 @@ docs: development ## build the documentation into docs/_build; warnings are erro
 
 bench bench-quick: override EXTRAS += bench
 bench: build ## measure speed and memory beside lower bounds and peers (ARGS=)
+	@$(RUN) python benchmarks/cost.py
 	@$(RUN) python benchmarks/matching.py $(ARGS)
 
 bench-quick: build ## the same for up to 20,000 places, in two to three minutes (ARGS=)

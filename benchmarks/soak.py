@@ -105,11 +105,14 @@ def publish(
     images: list[Any],
     arguments: argparse.Namespace,
     each_minute: Callable[[], None] = lambda: None,
+    after: tuple[float, Callable[[], None]] | None = None,
+    others: int = 0,
 ) -> tuple[list[dict[str, Any]], float]:
     """
     Publish images at ``arguments.rate`` for ``arguments.seconds``.
 
-    :param names: of the nodes that subscribe.
+    :param names: of the nodes that subscribe, and others: subscribers that publish nothing.
+    :param after: called once, so many seconds after the first image.
     :returns: figures of each node; images per second.
     """
     import rclpy
@@ -125,12 +128,20 @@ def publish(
                 PlaceMatch, f'/{name}/match', one.on_match, QoSProfile(depth=1000)
             )
         publisher = node.create_publisher(type(images[0]), topic, qos)
-        spin_until(node, lambda: publisher.get_subscription_count() == len(names))
+        spin_until(node, lambda: publisher.get_subscription_count() == len(names) + others)
         discovery = Discovery(node, lambda: node.get_subscriptions_info_by_topic(f'/{topic}'))
         spin_until(node, discovery.done)
         began = time.monotonic()
         each_minute()
         node.create_timer(60.0, each_minute)
+        if after is not None:
+            seconds, call = after
+
+            def once() -> None:
+                node.destroy_timer(waiting)
+                call()
+
+            waiting = node.create_timer(seconds, once)
 
         def publish_next() -> None:
             message, now = next(messages), time.time_ns()

@@ -1,0 +1,233 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Processor time of an image: stages of the library, and a node beside an empty subscriber.
+
+The node and a subscriber of rclpy without a callback's work receive the same images at the same
+time. Run it where the package is built and sourced: ``make shell``, then
+``python benchmarks/cost.py``.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+import json
+import os
+from pathlib import Path
+import statistics
+import subprocess
+import sys
+import tempfile
+from textwrap import dedent
+import time
+from typing import Any
+
+from results import table
+from soak import about, HEIGHT, image_message, make_map, memory, publish, texture_route, WIDTH
+
+WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
+SETTLED = 5.0  # seconds after the first image, before times count
+SUBSCRIBER = dedent("""
+    import rclpy
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import Image
+    rclpy.init()
+    node = rclpy.create_node('empty')
+    node.create_subscription(Image, 'image', lambda message: None, qos_profile_sensor_data)
+    rclpy.spin(node)
+""")
+# owner and name of the function of each stage
+STAGES = {
+    'decoding': ('operations', 'decode_message'),
+    'keyframes': ('operation._keyframes', 'accept'),
+    'extraction': ('operation.extractor', 'extract'),
+    'centering': ('recognizer._centering', 'next_query'),
+    'image distances': ('recognizer._matcher', 'distances'),
+    'window and filter': ('recognizer._window', 'push'),
+    'match': ('recognizer', '_match'),
+}
+
+
+def seconds_of(pid: int) -> float:
+    """Return the processor time of a process, with the times of the system."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def proportional_memory(pid: int) -> float:
+    """Return the proportional set of a process, MB: pages that processes share count in parts."""
+    lines = Path(f'/proc/{pid}/smaps_rollup').read_text().splitlines()
+    return int(next(line for line in lines if line.startswith('Pss:')).split()[1]) / 1024
+
+
+# ------------------------------------------------ stages
+
+
+def measure_stages(path: str, precision: str, threads: int) -> dict[str, float]:
+    """Return the median processor time of each stage of an image, and of all, microseconds."""
+    import numpy as np
+    from peaks import reader
+    from stavpr_ros.pipeline import operations, Pipeline, PipelineSettings, read_map
+    from stavpr_ros.threads import limit_threads
+
+    limit_threads(threads)
+    settings = PipelineSettings(backend='cpu', precision=precision)
+    pipeline = Pipeline(settings)
+    pipeline.change(loaded=read_map(path, settings))
+    operation = pipeline.operation
+    recognizer = operation.recognizer
+    owners = {'operations': operations, 'operation': operation, 'recognizer': recognizer}
+    times: dict[str, list[float]] = {}
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            began = time.process_time()
+            result = function(*arguments, **options)
+            times.setdefault(name, []).append(time.process_time() - began)
+            return result
+
+        return call
+
+    messages = [image_message(image) for image in texture_route(VIEWS)]
+    process = timed('all', operation.process)
+    for number in range(WARM + 2 * IMAGES):
+        if number == WARM + IMAGES:  # the whole is measured without the timers of the stages
+            for stage, (owner, name) in STAGES.items():
+                first, *rest = owner.split('.')
+                target = owners[first]
+                for each in rest:
+                    target = getattr(target, each)
+                setattr(target, name, timed(stage, getattr(target, name)))
+        if number in (WARM, WARM + IMAGES):
+            total = times.get('all', [])[-IMAGES:]
+        process(messages[number % VIEWS], (number + 1) * 10**8, list_candidates=False)
+    assert recognizer is not None
+    size = recognizer.places * 7 * 224 * (1 if precision == 'int8' else 4) // 4
+    content, read = np.ones(size, np.float32), reader(threads)
+    call = timed('reading the map', lambda: read(content))
+    for _ in range(50):
+        call()
+    medians = {name: statistics.median(values[-IMAGES:]) for name, values in times.items()}
+    medians['all'] = statistics.median(total)
+    medians['rest'] = medians['all'] - sum(medians[name] for name in STAGES)
+    return {name: round(1e6 * value) for name, value in medians.items()}
+
+
+def stages(path: str, precision: str, threads: int) -> dict[str, float]:
+    """Measure the stages in a process of its own, with so many threads."""
+    environment = {
+        **os.environ,
+        'NUMBA_NUM_THREADS': str(threads),
+        'OMP_NUM_THREADS': str(threads),
+    }
+    command = [sys.executable, __file__, '--map', path, '--stages', precision, str(threads)]
+    output = subprocess.check_output(command, env=environment, text=True)
+    result: dict[str, float] = json.loads(output.splitlines()[-1])
+    return result
+
+
+# ------------------------------------------------ node and subscriber
+
+
+@contextmanager
+def process(command: list[str]) -> Iterator[int]:
+    """Run a process while the block runs; yield its number."""
+    one = subprocess.Popen(command)
+    try:
+        yield one.pid
+    finally:
+        one.terminate()
+        one.wait()
+
+
+def node_cost(path: str, rate: float, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the percent of a core that the node and the empty subscriber take."""
+    from rclpy.qos import qos_profile_sensor_data
+    from stavpr_lab.demonstration.live import executable
+
+    options = ['--ros-args', '-p', f'map_path:={path}', '--log-level', 'error']
+    arguments.rate, marks = rate, {}
+    images = [image_message(image) for image in texture_route(VIEWS)]
+    with (
+        process([executable('node'), *options]) as node,
+        process([sys.executable, '-c', SUBSCRIBER]) as subscriber,
+    ):
+
+        def mark(name: str) -> None:
+            marks[name] = time.monotonic(), seconds_of(node), seconds_of(subscriber)
+
+        (figures,), _ = publish(
+            ['stavpr'], 'image', qos_profile_sensor_data, images, arguments,
+            after=(SETTLED, lambda: mark('first')), others=1,
+        )  # fmt: skip
+        mark('last')
+        figures['pss_mb'], figures['rss_mb'] = proportional_memory(node), memory(node)
+    wall, own, empty = (last - first for first, last in zip(*marks.values(), strict=True))
+    figures |= {'rate': rate, 'node': 100 * own / wall, 'subscriber': 100 * empty / wall}
+    return figures | {'ratio': own / empty}
+
+
+def lines_of(report: dict[str, Any]) -> list[str]:
+    """Return the tables of a report."""
+    names = [*STAGES, 'rest', 'all', 'reading the map']
+    head = ['stage, us', *(f'{p}, {t} threads' for p, t in report['cases'])]
+    rows = [[n, *(f'{one.get(n, 0):.0f}' for one in report['stages'])] for n in names]
+    lines = table(head, rows)
+    head = ['images/s', 'node, %', 'subscriber, %', 'ratio', 'p50 / p99, ms', 'PSS, MB']
+    rows = [
+        [
+            f'{one["rate"]:g}', f'{one["node"]:.1f}', f'{one["subscriber"]:.1f}',
+            f'{one["ratio"]:.2f}', f'{one["latency_ms_p50"]:.1f} / {one["latency_ms_p99"]:.1f}',
+            f'{one["pss_mb"]:.0f}',
+        ]
+        for one in report['nodes']
+    ]  # fmt: skip
+    return [*lines, *(table(head, rows) if rows else [])]
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--rates', type=float, nargs='*', default=[10, 30], help='images/s')
+    parser.add_argument('--seconds', type=float, default=25, help='of each rate (%(default)s)')
+    parser.add_argument('--map', help='instead of one of 2000 synthetic places')
+    parser.add_argument('--threads', type=int, nargs='*', default=[1, 2], help='of the stages')
+    parser.add_argument('--stages', nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument('--output', help='write the figures to this JSON file as well')
+    arguments = parser.parse_args()
+    from stavpr_ros.threads import wait_passively
+
+    wait_passively()
+    if arguments.stages:
+        precision, threads = arguments.stages
+        print(json.dumps(measure_stages(arguments.map, precision, int(threads))))
+        return
+    from stavpr_lab.demonstration.live import private_domain
+    from stavpr_ros.ros.process import prepare_transport
+
+    os.environ.update(private_domain())
+    prepare_transport()
+    load = os.getloadavg()[0]
+    cases = [(p, t) for t in arguments.threads for p in ('float32', 'int8')]
+    folder: Any = nullcontext('') if arguments.map else tempfile.TemporaryDirectory()
+    with folder as name:
+        path = str(Path(arguments.map or Path(name) / 'map.stavpr').resolve())
+        if not arguments.map:
+            make_map(Path(path))
+        report = {
+            'size': f'{WIDTH}x{HEIGHT}',
+            'cases': cases,
+            'stages': [stages(path, *case) for case in cases],
+            'nodes': [node_cost(path, rate, arguments) for rate in arguments.rates],
+            **about(load),
+        }
+    print('\n'.join(lines_of(report)))
+    print({name: report[name] for name in ('cpu', 'cores', 'commit', 'load_before')})
+    if arguments.output:
+        Path(arguments.output).write_text(json.dumps(report, indent=2) + '\n')
+
+
+if __name__ == '__main__':
+    main()
