@@ -98,9 +98,9 @@ class KeyframeSelector:
         """Discard the last keyframe: the next image is one."""
         self._stamp = 0
         self._pose: np.ndarray | None = None
-        self._gray: np.ndarray | None = None
-        # last compared image, its gray
-        self._compared: tuple[np.ndarray, np.ndarray] | None = None
+        # of the last keyframe, and of the last compared image; gray where it has been compared
+        self._last: tuple[np.ndarray, np.ndarray | None] | None = None
+        self._compared: tuple[np.ndarray, np.ndarray | None] | None = None
 
     def too_soon(self, stamp: int, pose: np.ndarray | None) -> str:
         """
@@ -136,10 +136,13 @@ class KeyframeSelector:
         :returns: the reason in words; empty if there is none.
         """
         least = self.settings.change
-        if not least or self._gray is None:
+        if not least or self._last is None:
             return ''
-        self._compared = image, small_gray(image)
-        change = image_change(self._compared[1], self._gray)
+        last, gray = self._last
+        last_gray = small_gray(last) if gray is None else gray
+        compared = small_gray(image)
+        self._last, self._compared = (last, last_gray), (image, compared)
+        change = image_change(compared, last_gray)
         if change < least:
             return f'differs by {change:.4f} from the last keyframe: less than {least:g}'
         return ''
@@ -150,14 +153,14 @@ class KeyframeSelector:
 
         :param stamp: nanoseconds; 0 = unknown.
         :param pose: where it was taken, shape (7,); None = unknown.
-        :param image: RGB, uint8, shape (h, w, 3).
+        :param image: RGB, uint8, shape (h, w, 3), kept.
         :raises InputError: an invalid pose; nothing is changed.
         """
         pose = None if pose is None else checked_pose(pose)
-        # computed even if the rule is off: it may be on for the next image
-        last, self._compared = self._compared, None
-        gray = last[1] if last is not None and last[0] is image else small_gray(image)
-        self._stamp, self._pose, self._gray = stamp, pose, gray
+        compared, self._compared = self._compared, None
+        is_compared = compared is not None and compared[0] is image
+        self._last = compared if is_compared else (image, None)
+        self._stamp, self._pose = stamp, pose
 
     def _not_moved(self, pose: np.ndarray, last: np.ndarray) -> str:
         rules = self.settings

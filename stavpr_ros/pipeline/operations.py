@@ -76,8 +76,7 @@ class Operation(ABC):
     :param save_state: of the places.
     :raises StavprError: invalid settings, a map that cannot be used, or a missing model.
 
-    ``places`` is a map, a growing one, or None while localization waits for one; ``contrast`` the
-    standard deviation of the last image.
+    ``places`` is a map, a growing one, or None while localization waits for one.
     """
 
     name = ''
@@ -101,7 +100,7 @@ class Operation(ABC):
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._last: ImageResult | None = None
         self._window: deque[WindowRow] = deque(maxlen=settings.sequence.length)
-        self.contrast = math.nan
+        self._image: np.ndarray | None = None  # the last one
 
     @abstractmethod
     def _start(self, place_map: PlaceMap | None) -> None:
@@ -121,6 +120,15 @@ class Operation(ABC):
     def view(self) -> str:
         """Return how images are compared, one of ``VIEWS``; empty without other views."""
         return self._recognizer.view if isinstance(self._recognizer, ViewBank) else ''
+
+    @property
+    def contrast(self) -> float:
+        """Deviation of the last image's green channel, of 255; from 32 rows or columns."""
+        image = self._image  # once, as above
+        if image is None:
+            return math.nan
+        step = max(1, min(image.shape[:2]) // 32)
+        return float(image[::step, ::step, 1].std())
 
     @property
     def map_state(self) -> str:
@@ -220,7 +228,7 @@ class Operation(ABC):
         width, bank = self._thumbnail_width(camera), self._recognizer
         with _timed(stages, 'decoding'):
             image = decode_message(message, _needed_size(self.extractor, width), self._to_bytes)
-            self.contrast = _contrast(image)
+            self._image = image
             if self.extractor.is_new and (reason := self._find_range()):
                 return ImageResult(Status.NOT_READY, reason, image=image, cause='not ready')
             if reason := self._keyframes.too_alike(image):
@@ -471,12 +479,6 @@ def _needed_size(extractor: FeatureExtractor, thumbnail_width: int) -> tuple[int
     if backbone.resize != 'area':  # bilinear features are of single pixels
         return None
     return backbone.size, max(backbone.size, thumbnail_width)
-
-
-def _contrast(image: np.ndarray) -> float:
-    """Return the standard deviation of the green channel, of 255; from 32 rows or columns."""
-    step = max(1, min(image.shape[:2]) // 32)
-    return float(image[::step, ::step, 1].std())
 
 
 @contextmanager
