@@ -115,3 +115,19 @@ def test_gradient_error_in_thread_is_raised(route):
     images[3] = np.empty((0, 5, 3), np.uint8)
     with pytest.raises(cv2.error):
         Gradient(GradientSettings()).feature_maps(images)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    height=st.integers(64, 500),
+    width=st.integers(64, 500),
+    seed=st.integers(0, 2),
+    blur=st.booleans(),
+)
+def test_area_averages_equal_opencv(height, width, seed, blur):
+    gray = np.random.default_rng(seed).integers(0, 256, (height, width), np.uint8)
+    gray = cv2.GaussianBlur(gray, (0, 0), 2) if blur else gray
+    made = Gradient(GradientSettings(size=64, logarithm=False))
+    expected = cv2.resize(gray, (64, 64), interpolation=cv2.INTER_AREA)
+    padded = made._prepare(cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB))
+    np.testing.assert_array_equal(padded, np.pad(expected, 1, mode='edge'))

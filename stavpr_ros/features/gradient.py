@@ -24,6 +24,7 @@ import numpy as np
 from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import kernel
 from stavpr_ros.devices import DEVICES
+from stavpr_ros.features.area import cells, shrink
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import GradientSettings
 from stavpr_ros.threads import thread_count
@@ -44,6 +45,7 @@ FULL_SCALE = F(255)
 DARK = 32  # the logarithm is linear far below 1 / DARK of the full intensity
 _I = np.arange(256) / 255
 LOGARITHM = np.rint(255 * np.log1p(DARK * _I) / np.log1p(DARK)).astype(np.uint8)
+LINEAR = np.arange(256, dtype=np.uint8)
 PER_THREAD = 8  # images at least: starting a thread costs as much as one or two images
 
 
@@ -66,17 +68,25 @@ class Gradient:
         maps: np.ndarray = np.empty((len(images), *self._shape), np.float32)
 
         def extract(i: int) -> None:
-            gray = self._prepare(images[i])
-            padded = cv2.copyMakeBorder(gray, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-            _feature_maps(padded, s.cell, F(1.0 if s.signed else 0.5), F(FLOOR), maps[i])
+            _feature_maps(
+                self._prepare(images[i]), s.cell, F(1.0 if s.signed else 0.5), F(FLOOR), maps[i]
+            )
 
         _on_threads(extract, len(images))
         return maps
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
-        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        small = resize_square(gray, self.settings.size, self.settings.resize)
-        return cv2.LUT(small, LOGARITHM) if self.settings.logarithm else small
+        """Return an image in gray, with a border, (size + 2, size + 2), uint8."""
+        size, table = self.settings.size, LOGARITHM if self.settings.logarithm else LINEAR
+        height, width = image.shape[:2]
+        is_whole = not (height % size or width % size)  # OpenCV adds up integers then
+        if self.settings.resize != 'area' or min(height, width) < size or is_whole:
+            gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+            small = cv2.LUT(resize_square(gray, size, self.settings.resize), table)
+            return np.asarray(cv2.copyMakeBorder(small, 1, 1, 1, 1, cv2.BORDER_REPLICATE))
+        padded = np.empty((size + 2, size + 2), np.uint8)
+        shrink(image, *cells(width, size), *cells(height, size), table, padded)
+        return padded
 
 
 def _on_threads(work: Callable[[int], None], count: int) -> None:
