@@ -8,6 +8,7 @@ nodes inside a run follow from its ends. Drives in a plane have poses in the pla
 """
 
 from collections.abc import Mapping, Sequence
+import math
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.closures import ResolvedClosure
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.runs import Runs
-from stavpr_slam.pose_graph.transforms import logarithms
 
 ANCHOR = 1e-4  # deviation of the pose of the first node, rad and m
 LOOSE_ANGLE, LOOSE_POSITION = 3.0, 1e3  # of a session that nothing joins to the others
@@ -77,11 +77,12 @@ class Network:
         self._loose = np.diag((loose[PLANAR] if self._is_planar else loose) ** -2.0)
         self.loose_determinant = float(np.linalg.slogdet(self._loose)[1] / 2)
         self.limit = float(chi2.ppf(INLIER, self.freedom))
-        Z = np.array([each.transform for each in closures]).reshape(-1, 4, 4)
         covariance = np.array([each.covariance for each in closures]).reshape(-1, 6, 6)
-        self._back = inverse(Z)
-        self._measured = [self._pose(each) for each in Z]
+        self._measured = [self._pose(each.transform) for each in closures]
         self.information = np.linalg.inv(self._own(covariance))
+        self._factors = [self._closure(i, 1.0) for i in range(len(closures))]
+        inside = np.flatnonzero(self._runs.variable & (self._runs.before >= 0)).tolist()
+        self._motions = {i: self._pose(self._runs.motion[i]) for i in inside}
 
     def joined(self, numbers: np.ndarray) -> int:
         """Return how many sessions some of the closures join to others."""
@@ -140,41 +141,41 @@ class Network:
         """
         gtsam, runs, initial = self._gtsam, self._runs, self._initial
         graph, d = gtsam.NonlinearFactorGraph(), self.freedom
-        covariances = self._own(scales[:, None, None] ** 2 * runs.covariance)
+        own = np.array(list(self._motions), int)
+        covariances = self._own(scales[own, None, None] ** 2 * runs.covariance[own])
+        informations = dict(zip(self._motions, np.linalg.inv(covariances), strict=True))
         tight = gtsam.noiseModel.Isotropic.Sigma(d, ANCHOR)
         prior = gtsam.PriorFactorPose2 if self._is_planar else gtsam.PriorFactorPose3
-        self.log_determinant = 0.0
+        self.log_determinant = -float(np.linalg.slogdet(covariances)[1].sum()) / 2
         for node in self._variables:
             before, link = int(runs.before[node]), self._links.get(node, -1)
             if before >= 0:
-                information = np.linalg.inv(covariances[node])
-                motion = self._pose(runs.motion[node])
-                graph.add(self._between(before, node, motion, information))
+                graph.add(self._between(before, node, self._motions[node], informations[node]))
             elif link < 0:
-                information = np.eye(d) / ANCHOR**2
+                self.log_determinant -= d * math.log(ANCHOR)
                 graph.add(prior(node, self._pose(initial[node]), tight))
             else:
-                information = self._loose
+                self.log_determinant += self.loose_determinant
                 step = self._pose(inverse(initial[link]) @ initial[node])
-                graph.add(self._between(link, node, step, information))
-            self.log_determinant += np.linalg.slogdet(information)[1] / 2
+                graph.add(self._between(link, node, step, self._loose))
         return graph
+
+    def _closure(self, i: int, weight: float) -> Any:
+        return self._between(
+            int(self.place[i]), int(self.query[i]), self._measured[i],
+            weight * self.information[i],
+        )  # fmt: skip
 
     def _with(self, odometry: Any, weights: np.ndarray) -> Any:
         graph = self._gtsam.NonlinearFactorGraph(odometry)
         for i in np.flatnonzero(weights > 1e-4).tolist():
-            graph.add(self._between(
-                int(self.place[i]), int(self.query[i]), self._measured[i],
-                weights[i] * self.information[i],
-            ))  # fmt: skip
+            whole = weights[i] == 1
+            graph.add(self._factors[i] if whole else self._closure(i, float(weights[i])))
         return graph
 
     def residuals(self, values: Any) -> np.ndarray:
         """Return the squared deviations of the closures, shape (n,)."""
-        X = self._ends(values)
-        off = logarithms(self._back @ inverse(X[self.place]) @ X[self.query])
-        off = off[:, PLANAR] if self._is_planar else off
-        return np.einsum('ni,nij,nj->n', off, self.information, off)
+        return np.array([2 * each.error(values) for each in self._factors])
 
     def most_strained(self, odometry: Any, values: Any) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""
