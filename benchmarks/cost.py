@@ -34,7 +34,10 @@ SUBSCRIBER = dedent("""
     rclpy.init()
     node = rclpy.create_node('empty')
     node.create_subscription(Image, 'image', lambda message: None, qos_profile_sensor_data)
-    rclpy.spin(node)
+    try:
+        rclpy.spin(node)
+    except rclpy.executors.ExternalShutdownException:
+        pass
 """)
 # owner and name of the function of each stage
 STAGES = {

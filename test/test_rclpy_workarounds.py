@@ -20,7 +20,13 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from stavpr_ros.errors import OutputError
 from stavpr_ros.ros import process, rclpy_workarounds
-from stavpr_ros.ros.rclpy_workarounds import ManagedNode, PromptExecutor, repeat_responses
+from stavpr_ros.ros.rclpy_workarounds import (
+    HandOverGroup,
+    ManagedNode,
+    PromptExecutor,
+    repeat_responses,
+)
+from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
 SPINS = 2000  # of at most 50 ms each: until an event counts as missing
@@ -112,6 +118,25 @@ def test_prompt_executor_after_a_failing_callback_goes_on(node, prompt, capfd):
     for _ in range(3):
         prompt.spin_once(timeout_sec=0.05)
     prompt.finish(10.0)
+    assert 'ValueError: defect' in capfd.readouterr().err
+
+
+def test_prompt_executor_runs_callbacks_that_hand_over_itself_and_logs_their_errors(
+    node, prompt, capfd
+):
+    qos = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    threads = []
+
+    def callback(message):
+        threads.append(threading.current_thread())
+        raise ValueError('defect')
+
+    node.create_subscription(Int32, 'handed', callback, qos, callback_group=HandOverGroup())
+    publisher = node.create_publisher(Int32, 'handed', qos)
+    for number in range(2):
+        publisher.publish(Int32(data=number))
+    spin_until(prompt, lambda: len(threads) == 2)
+    assert set(threads) == {threading.current_thread()}
     assert 'ValueError: defect' in capfd.readouterr().err
 
 

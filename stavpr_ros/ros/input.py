@@ -9,7 +9,7 @@ import threading
 import time
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -29,7 +29,7 @@ from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import StampWatch, Statistics
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.ros.parameters import transport_remedy
-from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.ros.rclpy_workarounds import HandOverGroup, ManagedNode
 from stavpr_ros.units import SECOND
 
 QUEUE = 10  # images in the middleware while the executor is busy
@@ -188,11 +188,12 @@ def subscribe(
     """
     Subscribe, in a callback group of its own unless one is given; qos_overrides change the QoS.
 
+    :param callback: hands over: the executor waits for it.
     :param qos: of the caller; rclpy writes the overrides into it.
     :param events: callbacks of the middleware; those that it does not support are left out.
     :raises SettingsError: invalid qos_overrides.
     """
-    group = group or MutuallyExclusiveCallbackGroup()
+    group = group or HandOverGroup()
     while True:
         try:
             return node.create_subscription(
@@ -244,7 +245,7 @@ class AdaptiveSubscription:
         self.topic = node.resolve_topic_name(topic)
         self._override = f'qos_overrides.{self.topic}.subscription.reliability'
         self.overridden = self._override in node.parameter_overrides
-        self._group = MutuallyExclusiveCallbackGroup()
+        self._group = HandOverGroup()
         self._seen: deque[tuple[int, int | None]] = deque(maxlen=MEMORY)
         self._sequence: int | None = None  # number of the last image of the only publisher
         self._publishers = 0  # that are matched

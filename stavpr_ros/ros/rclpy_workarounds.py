@@ -10,6 +10,7 @@ when upstream is fixed, and the workaround can go.
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import partial
 import os
 import threading
 import time
@@ -19,7 +20,7 @@ import warnings
 
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.executors import Executor, ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
@@ -27,6 +28,8 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.task import Task
 from stavpr_ros.errors import SettingsError, UnavailableError
 
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
@@ -75,6 +78,10 @@ def ros_arguments_checked() -> Iterator[None]:
 _warning_filters = threading.Lock()  # they belong to the process
 
 
+class HandOverGroup(MutuallyExclusiveCallbackGroup):
+    """Of subscriptions with callbacks that only hand over: the executor calls them itself."""
+
+
 class PromptExecutor(Executor):
     """
     Multi-threaded executor that takes the next callback when a thread has begun the last one.
@@ -90,6 +97,11 @@ class PromptExecutor(Executor):
 
     Callbacks that raise are logged; upstream ends the process.
 
+    Each wake-up collects all entities again, upstream three times a callback: before it, when it
+    has begun and when it has ended. A callback of a :class:`HandOverGroup` runs on the thread of
+    the executor, which needs no waking. No upstream change is known: a later executor waits for
+    events without collecting.
+
     :param threads: callbacks that may run at once.
     """
 
@@ -104,14 +116,38 @@ class PromptExecutor(Executor):
             task, _, _ = self.wait_for_ready_callbacks(timeout_sec)
         except (ShutdownException, TimeoutException, rclpy_implementation.InvalidHandle):
             return
+        if not isinstance(task, Task):
+            task()
+            return
         future = self._pool.submit(_run, task)
         self._running = {other for other in self._running if not other.done()} | {future}
         while not (task.executing() or future.done()):
             time.sleep(START_POLL)
 
+    def _make_handler(self, entity: Any, node: Any, take_from_wait_list: Any) -> Any:
+        hands_over = isinstance(entity.callback_group, HandOverGroup)
+        if hands_over and isinstance(entity, Subscription):
+            return partial(_hand_over, entity, take_from_wait_list)
+        return super()._make_handler(entity, node, take_from_wait_list)
+
     def finish(self, timeout: float) -> None:
         """Wait for the callbacks that have begun, at most so many seconds."""
         wait(self._running, timeout)
+
+
+def _hand_over(entity: Subscription, take: Callable[[Subscription], Any]) -> None:
+    """Take the message of a subscription and call its callback, a plain function."""
+    if not entity.callback_group.beginning_execution(entity):
+        return
+    try:
+        if (call := take(entity)) is not None:
+            call().send(None)
+    except StopIteration:
+        pass
+    except Exception:
+        log_failure(traceback.format_exc())
+    finally:
+        entity.callback_group.ending_execution(entity)
 
 
 def _run(task: Any) -> None:
