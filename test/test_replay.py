@@ -164,10 +164,10 @@ def test_replay_lossless_waits_for_loop_closures_that_are_behind(tmp_path, node,
         if waiting:
             closure.publish(waiting.popleft())
 
+    info = node.create_publisher(MapInfo, '~/map_info', LATCHED)  # the first, as the node's
+    info.publish(MapInfo(operation='loop_closure'))
     match = node.create_publisher(PlaceMatch, '~/match', 10)
     closure = node.create_publisher(LoopClosure, '~/loop_closure', 10)
-    info = node.create_publisher(MapInfo, '~/map_info', LATCHED)
-    info.publish(MapInfo(operation='loop_closure'))
     node.create_subscription(Image, 'image', answer, 10)
     node.create_timer(0.05, close)
     assert replay(bag, '--lossless')[0] == 0

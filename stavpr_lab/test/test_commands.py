@@ -398,7 +398,7 @@ def test_demo_terminated_ends_its_processes(traverse, tmp_path):
         assert process.popen.poll() is None, process.output()
         time.sleep(0.01)
     assert process.stop(signal.SIGTERM) == 130
-    listed = subprocess.run(['ps', '-eo', 'args'], capture_output=True, text=True, check=True)
+    listed = subprocess.run(['ps', '-ewwo', 'args'], capture_output=True, text=True, check=True)
     assert str(output) not in listed.stdout
 
 

@@ -153,6 +153,8 @@ class Replayer:
                 'start it, compare the topics (`ros2 topic list`) and ROS_DOMAIN_ID, or wait '
                 'longer (--wait)'
             )
+        if self.options.lossless:
+            self._spin_until(self.progress.knows_operation, self.options.timeout)
 
     def play(self, records: Iterable[ImageRecord | MessageRecord]) -> None:
         """

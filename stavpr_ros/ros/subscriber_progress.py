@@ -32,6 +32,7 @@ class SubscriberProgress:
 
     def __init__(self, node: Node) -> None:
         self._node, self._topic = node, node.resolve_topic_name('stavpr/match')
+        self._info_topic, self._has_info = node.resolve_topic_name('stavpr/map_info'), False
         self._outstanding: Counter[tuple[int, int, str]] = Counter()
         self._sent = self._received = 0
         self._last = time.monotonic()  # event
@@ -43,6 +44,10 @@ class SubscriberProgress:
         topic = 'stavpr/loop_closure'
         node.create_subscription(LoopClosure, topic, self._on_closure, RESULTS)
         node.create_subscription(MapInfo, 'stavpr/map_info', self._on_map_info, LATCHED)
+
+    def knows_operation(self) -> bool:
+        """Return whether ``expects_closures`` is the node's, or no node publishes it."""
+        return self._has_info or not self._node.count_publishers(self._info_topic)
 
     def sent(self, header: Header) -> None:
         """Count an image; to be called before it is published."""
@@ -83,6 +88,7 @@ class SubscriberProgress:
         self._matches += match.status == PlaceMatch.MATCH
 
     def _on_map_info(self, info: MapInfo) -> None:
+        self._has_info = True
         self.expects_closures = info.operation == 'loop_closure'
 
     def _on_closure(self, _: LoopClosure) -> None:

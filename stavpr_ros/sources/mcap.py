@@ -54,8 +54,8 @@ def with_end(staged: Path, path: Path) -> Path:
 @cache  # once for each file
 def _note_cut(path: Path, count: int) -> None:
     logging.getLogger(__name__).warning(
-        '%s has no end, as after a power loss: its whole records are read, the last %d bytes are '
-        'not; `mcap recover` makes a file with an index',
+        '%s has no end, as after a power loss: its whole records are read, all but the last %d '
+        'bytes; `mcap recover` makes a file with an index',
         *(path, count),
     )
 

@@ -53,7 +53,7 @@ class NodeThread:
     """
     The node, spun by the executor of its executable on a thread of the test's process.
 
-    :param context: that of the robot. With one of its own, the node would be another participant
+    :param context: the robot's. With one of its own, the node would be another participant
         of the same process: on a busy machine, Fast DDS 2.14 sent one in 50 of those nothing of
         the endpoints that were there before it, however long it waited.
     :param arguments: of the command line, after ``--ros-args``.

@@ -18,6 +18,7 @@ from typing import Any
 from ament_index_python.packages import get_package_prefix, PackageNotFoundError
 from stavpr_lab.demonstration.recordings import Recording
 from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.signals import signals_deferred
 
 START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile
 END_TIMEOUT = 20.0  # seconds for a process to end, or for the next record
@@ -102,7 +103,8 @@ def run_live(
         processes: dict[str, Process] = {}
         for name, command in {'node': node, **(others or {}), **recorders}.items():
             running = _running(command, folder / f'{name}.log', environment)
-            processes[name] = stack.enter_context(running)
+            with signals_deferred():  # a process that is being started would outlive this one
+                processes[name] = stack.enter_context(running)
 
         def wait_until(condition: Callable[[], bool], seconds: float, event: str) -> None:
             _wait_until(condition, processes, folder, seconds, event)
@@ -110,7 +112,9 @@ def run_live(
         for name in recorders:
             log = folder / f'{name}.log'
             wait_until(partial(_is_recording, log), START_TIMEOUT, 'the node')
-        with _running(replay, None, environment) as player:
+        with ExitStack() as replaying:
+            with signals_deferred():
+                player = replaying.enter_context(_running(replay, None, environment))
             wait_until(lambda: player.poll() is not None, math.inf, 'the end of the replay')
         if player.returncode != 0:
             raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')

@@ -92,7 +92,7 @@ def strained(
     """
     Return the break between the closures beside a node that the solution bends the odometry at.
 
-    The parameters are those of :func:`find`.
+    Parameters as of :func:`find`.
     """
     query = np.array([each.query for each in closures], int)
     own = taken & (chain.session[query] == chain.session[node])

@@ -18,12 +18,13 @@ from scipy.sparse.csgraph import connected_components
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 
+# Chosen on KITTI 00 and 08 and a world of the demonstration; docs/slam.md has half and double.
 TIGHT = 0.125  # factor on the errors of the odometry that it is trusted by at first
-SCALES = TIGHT * 2.0 ** np.arange(7)  # those that evidence can loosen it to
-PRECISE = TIGHT / 16  # the least one of a solution
+SCALES = TIGHT * 2.0 ** np.arange(6)  # those that evidence can loosen it to: up to 4
+PRECISE = TIGHT / 16  # the smallest one of a solution
 CERTAIN = math.log(20)  # evidence from which a correction is published
-LOOSENED = math.log(100)  # evidence from which the odometry is trusted less, and for each
-DOUBLED = math.log(20)  # doubling of its errors beyond the settings
+LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
+DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
 AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
 MAX_TRIED = 50  # closures that are tried one by one
 STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
@@ -57,7 +58,7 @@ class Decision:
     :param agreeing, corrected: the closures, and the variables, of the robust solution, whether
         it is published or not.
     :param strained: node behind the part of the odometry that it bends most; -1 = none.
-    :param chance: logarithm of the number of choices of as many events.
+    :param chance: minus the logarithm of the probability to draw these events.
     """
 
     taken: np.ndarray
@@ -131,7 +132,10 @@ class Decider:
         rejected = np.flatnonzero(~taken)
         if len(rejected) > MAX_TRIED:
             return taken, values
-        values, before, _ = network.solve(odometry, values, taken * 1.0)
+        try:
+            values, before, _ = network.solve(odometry, values, taken * 1.0)
+        except RuntimeError:
+            return taken, values
         rejected = rejected[np.argsort(np.maximum(network.query, network.place)[rejected])]
         while True:
             count = taken.sum()
