@@ -324,13 +324,44 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'publish_tf',
             False,
             'localization: publish the transform from map_frame to the frame of the odometry on '
-            '/tf, for maps with poses; requires tf2_msgs, and odometry on the topic odom.',
+            '/tf, from the first match on, every 0.05 s; for maps with poses; requires tf2_msgs, '
+            'and odometry on the topic odom. No other node may publish it.',
+        ),
+        NodeParameter(
+            'transform_tolerance',
+            0.2,
+            'Time by which the transform of publish_tf is post-dated, so that it is known at the '
+            'present time. A correction has its effect so much later.',
+            's',
+            bounds=(0.0, 60.0),
         ),
         NodeParameter(
             'publish_initialpose',
             False,
             'localization: publish initialpose (x, y, yaw), for Nav2, at the first match after '
             'the start, a reset or sequence_length images without a match; for maps with poses.',
+        ),
+        NodeParameter(
+            'localized_probability',
+            0.9,
+            'localization: ~/localized becomes true after a match of at least this probability '
+            'that 3 of the next 5 images confirm.',
+            bounds=(0.0, 1.0),
+        ),
+        NodeParameter(
+            'lost_images',
+            20,
+            '~/localized becomes false after this many images without a match.',
+            'images',
+            bounds=(1, 1000000),
+        ),
+        NodeParameter(
+            'lost_distance',
+            5.0,
+            '~/localized becomes false this far, by the odometry where there is one, from the '
+            'last match; 0 = by images only.',
+            'm',
+            bounds=(0.0, 1e6),
         ),
         NodeParameter(
             'diagnostics_period', 1.0, 'Period of the diagnostics.', 's', 'start', (0.1, 60.0)

@@ -157,6 +157,8 @@ CASES = {
         (OK, '1 of 2 images matched', {'recent_statuses': {'match': 1, 'no match': 1, 'x': 9}}),
         (OK, '0 of 0 images matched in the last 10 s', NEW),
         (OK, 'warming up: 19 of 20 images', {'window': 19}),
+        (OK, 'matched', {'sends_transform': True, 'localized': True}),
+        (WARN, 'not localized: the transform on /tf is of the last', {'sends_transform': True}),
         (WARN, 'no match is possible: no threshold', {'missing': 'no threshold'}),
         (OK, 'waiting for the map', LOADING | {'missing': 'a map is being loaded'}),
         (WARN, 'no match is possible', {'map_state': 'loading', 'missing': 'no threshold'}),

@@ -15,8 +15,11 @@ from pipelines import at, LENGTH, localizing, message, SECOND
 from processes import environment, TIMEOUT
 import pytest
 from rclpy.qos import qos_profile_services_default
+from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import matrices
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.recognition import Status
 from stavpr_ros.ros.messages import pose_message
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
 from test_visualization import header, Publishers
@@ -54,46 +57,88 @@ def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():
 
 @pytest.fixture
 def publishing(map_file, monkeypatch):
-    """Return a function that shows images to a localizing pipeline and publishes."""
+    """
+    Return a function that shows images to a localizing pipeline and publishes.
+
+    Image i is stamped i + 1 s and processed at ``clock.time``, 0.5 s later; ``beats`` has the
+    function that the thread calls.
+    """
+    clock, beats = SimpleNamespace(time=0.0), []
 
     class TFMessage:
         def __init__(self, transforms):
-            self.transforms = [(t.header.stamp.sec, t.transform) for t in transforms]
+            stamps = [t.header.stamp for t in transforms]
+            self.transforms = [
+                (stamp.sec + stamp.nanosec / SECOND, t.transform)
+                for stamp, t in zip(stamps, transforms, strict=True)
+            ]
             self.frames = [(t.header.frame_id, t.child_frame_id) for t in transforms]
 
     module = ModuleType('tf2_msgs.msg')
     module.TFMessage = TFMessage
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', module)
+    monkeypatch.setattr(
+        'stavpr_ros.ros.navigation.Beat',
+        lambda period, act, name: beats.append(act) or SimpleNamespace(stop=lambda: None),
+    )
     pipeline = localizing(map_file)
     settings = SimpleNamespace(
-        publish_tf=True, publish_initialpose=True, map_frame='map', pipeline=pipeline.settings
-    )
+        publish_tf=True, publish_initialpose=True, map_frame='map', pipeline=pipeline.settings,
+        transform_tolerance=0.25,
+    )  # fmt: skip
     publishers = Publishers(())
+    publishers.get_clock = lambda: SimpleNamespace(now=lambda: Time(seconds=clock.time))
     navigation = Navigation(publishers, settings)
 
     def show(images, first=0):
         statuses = []
         for i, image in enumerate(images, first):
+            clock.time = i + 1.5
             match = pipeline.operation.process(message(image), (i + 1) * SECOND)
             navigation.publish(header(i), match, pipeline.places, at(i - 10), 'odom')
             statuses.append(match.accepted)
         return statuses
 
     return SimpleNamespace(
-        show=show, pipeline=pipeline, tf=publishers.by_topic['/tf'].messages,
+        show=show, pipeline=pipeline, navigation=navigation, clock=clock, beats=beats,
+        tf=publishers.by_topic['/tf'].messages,
         initial=publishers.by_topic['initialpose'].messages,
     )  # fmt: skip
 
 
-def test_transform_is_that_of_the_last_match_with_the_stamp_of_the_image(publishing, route):
+def test_transform_is_sent_from_the_first_match_on_and_post_dated(publishing, route):
+    (beat,) = publishing.beats
     accepted = publishing.show(route[:10])
+    beat()
     first = accepted.index(True)
-    assert len(publishing.tf) == 10 - first
-    for i, sent in enumerate(publishing.tf, first):
-        ((stamp, transform),) = sent.transforms
-        assert (stamp, sent.frames) == (i + 1, [('map', 'odom')])
+    stamps = [sent.transforms[0][0] for sent in publishing.tf]
+    # the first also at the stamp of its image, which is before the tolerance
+    assert stamps == [first + 1, *(i + 1.75 for i in range(first, 10) if accepted[i])]
+    for sent in publishing.tf:
+        ((_, transform),) = sent.transforms
+        assert sent.frames == [('map', 'odom')]
         assert transform.translation.x == pytest.approx(10, abs=1)  # odometry is at x - 10
         assert transform.rotation.w == pytest.approx(1)
+
+
+def test_transform_is_repeated_until_the_map_or_the_state_changes(publishing, route):
+    (beat,), clock = publishing.beats, publishing.clock
+    beat()
+    assert not publishing.tf  # nothing before the first match
+    publishing.show(route[:10])
+    _, last = publishing.tf[-1].transforms[0]
+    count, lost = len(publishing.tf), ImageResult(Status.NO_MATCH, 'lost')
+    publishing.navigation.publish(header(30), lost, publishing.pipeline.places, at(0), 'odom')
+    for clock.time in (40.0, 40.0, 40.05):  # a paused clock sends no stamp twice
+        beat()
+    repeated = [sent.transforms[0] for sent in publishing.tf[count:]]
+    assert repeated == [(40.25, last), (pytest.approx(40.3), last)]
+    assert publishing.navigation.sends_transform
+    publishing.navigation.forget()
+    clock.time += 1
+    beat()
+    assert len(publishing.tf) == count + 2
+    assert not publishing.navigation.sends_transform
 
 
 def test_initial_pose_is_published_once_for_each_relocalization(publishing, route):

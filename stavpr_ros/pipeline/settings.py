@@ -185,7 +185,11 @@ class NodeSettings:
     verbosity: str
     threads: int
     publish_tf: bool
+    transform_tolerance: float
     publish_initialpose: bool
+    localized_probability: float
+    lost_images: int
+    lost_distance: float
     relative_pose: str
     verifier: str
     camera_transform: str

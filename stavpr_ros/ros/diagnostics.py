@@ -134,6 +134,8 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             'last_place': counts.place if counts.place >= 0 else None,
             'last_distance': counts.distance,
             'last_answer_age_s': counts.answered.age,
+            'localized': health.localized,
+            'sends_transform': health.sends_transform,
             'camera': health.camera,
             'view': health.view or None,
             **{_key('edges', source): count for source, count in counts.edges.total.items()},

@@ -50,6 +50,9 @@ class Health:
     contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown
     applied_threshold: float | None = None  # the recognizer's; None = the settings'
 
+    localized: bool = False
+    sends_transform: bool = False  # map -> odom, of the last match
+
     @property
     def limit(self) -> float | None:
         """Return the distance below which a window is matched, None = not set."""
@@ -83,7 +86,7 @@ def findings(health: Health, node: str) -> dict[str, list[Finding]]:
     return {
         'input': [*_silence(health), *_image_faults(health)] or [(OK, normal)],
         'map': of_map,
-        'recognition': [_recognition_finding(health)],
+        'recognition': [_recognition_finding(health), *_transform_finding(health)],
         'processing': [_processing_finding(health), *_edge_faults(health)],
     }
 
@@ -196,6 +199,12 @@ def _recognition_finding(health: Health) -> Finding:
         reason = f' ({counts.reason})' if counts.reason else ''
         text += f'; last result: {counts.status}{place}{distance}{reason}'
     return OK, text
+
+
+def _transform_finding(health: Health) -> Iterator[Finding]:
+    """Yield that the transform for navigation cannot be trusted."""
+    if health.sends_transform and not health.localized:
+        yield WARN, 'not localized: the transform on /tf is of the last match'
 
 
 def _why_no_match_is_possible(health: Health) -> str:

@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """For navigation, off by default: the transform from map to odometry, and the initial pose."""
 
+import threading
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
+from rclpy.duration import Duration
 from rclpy.node import Node
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
@@ -13,6 +16,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
+from stavpr_ros.ros.beat import Beat
 from stavpr_ros.ros.messages import matched_pose_message, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
@@ -21,11 +25,16 @@ from std_msgs.msg import Header
 # offset from the mapped route
 MIN_VARIANCE_XY, MIN_VARIANCE_YAW = 0.25, 0.0685
 TF_DEPTH = 100  # as tf2_ros has it
+TF_PERIOD = 0.05  # seconds, as RTAB-Map repeats it
 
 
 class Navigation:
     """
     Publishes ``map -> odom`` on ``/tf``, and ``initialpose`` once per relocalization.
+
+    The transform is that of the last match. It is repeated on a thread of its own and stamped
+    ``transform_tolerance`` later than now, so that a transform at the present time is known: tf2
+    does not extrapolate. Nothing is sent before the first match.
 
     :raises UnavailableError: ``publish_tf`` is set and tf2_msgs is not installed.
     """
@@ -33,14 +42,25 @@ class Navigation:
     def __init__(self, node: Node, settings: NodeSettings) -> None:
         self._node, self._settings = node, settings
         self._tf: Any = None
+        self._beat: Beat | None = None
         self._initial_pose: Any = None
+        self._tolerance = Duration(seconds=settings.transform_tolerance)
+        self._lock = threading.Lock()  # of the transform and its publisher
+        self._transform: TransformStamped | None = None
+        self._stamp: Time | None = None  # of the last transform
         if settings.publish_tf:
-            self._tf = node.create_publisher(tf_message(), '/tf', TF_DEPTH)
+            self._tf_message = tf_message()
+            self._tf = node.create_publisher(self._tf_message, '/tf', TF_DEPTH)
+            self._beat = Beat(TF_PERIOD, self.repeat, 'tf')
         if settings.publish_initialpose:
             self._initial_pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
         self._unmatched = settings.pipeline.sequence.length  # images since the last match
-        self._places: PlaceMap | GrowingMap | None = None
-        self._transform: TransformStamped | None = None
+        self._places: PlaceMap | None = None
+
+    @property
+    def sends_transform(self) -> bool:
+        """Whether the transform is being sent: there was a match since :meth:`forget`."""
+        return self._transform is not None and self._tf is not None
 
     def publish(
         self,
@@ -55,16 +75,13 @@ class Navigation:
 
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
+        if places is not self._places:
+            self.forget()
+            self._places = places if isinstance(places, PlaceMap) else None
         if result.cause or not isinstance(places, PlaceMap):
             return
-        if places is not self._places:
-            self._places, self._transform = places, None
-            self._unmatched = self._settings.pipeline.sequence.length
         map_frame = self._settings.map_frame
         pose = places.place(result.newest_index).pose if result.accepted else None
-        if pose is not None and odometry is not None:
-            correction = map_to_odometry(pose, odometry)
-            self._transform = transform_message(correction, map_frame, odometry_frame)
         # a whole window without a match, or a new window
         length = self._settings.pipeline.sequence.length
         is_lost = self._unmatched >= length - 1
@@ -72,16 +89,44 @@ class Navigation:
             self._unmatched = length
         else:
             self._unmatched = 0 if result.accepted else self._unmatched + 1
-        with until_shutdown(self._node):
-            if self._tf is not None and self._transform is not None:
-                self._transform.header.stamp = header.stamp  # without a match, the last transform
-                self._tf.publish(tf_message()(transforms=[self._transform]))
-            message = matched_pose_message(header, result, places, map_frame) if is_lost else None
-            if self._initial_pose is not None and message is not None:
+        if pose is not None and odometry is not None:
+            transform = transform_message(
+                map_to_odometry(pose, odometry), map_frame, odometry_frame
+            )
+            with self._lock:
+                if self._transform is None:  # from the image on, not from the tolerance on
+                    self._send(transform, header.stamp)
+                self._transform = transform
+            self.repeat()
+        message = matched_pose_message(header, result, places, map_frame) if is_lost else None
+        if self._initial_pose is not None and message is not None:
+            with until_shutdown(self._node):
                 self._initial_pose.publish(planar(message))
 
+    def repeat(self) -> None:
+        """Send the last transform, if any, for the time until the next one."""
+        with self._lock:
+            if self._transform is not None:
+                now = self._node.get_clock().now()
+                self._send(self._transform, (now + self._tolerance).to_msg())
+
+    def _send(self, transform: TransformStamped, stamp: Time) -> None:
+        if self._tf is None or stamp == self._stamp:  # tf2 refuses a stamp twice: a paused clock
+            return
+        self._stamp = transform.header.stamp = stamp
+        with until_shutdown(self._node):
+            self._tf.publish(self._tf_message(transforms=[transform]))
+
+    def forget(self) -> None:
+        """Send no transform until the next match: another map, or the node is deactivated."""
+        with self._lock:
+            self._transform = None
+        self._places, self._unmatched = None, self._settings.pipeline.sequence.length
+
     def close(self) -> None:
-        """Destroy the publishers, and release the map."""
+        """End the thread, destroy the publishers, and release the map."""
+        if self._beat is not None:
+            self._beat.stop()
         self._places = None
         for publisher in filter(None, (self._tf, self._initial_pose)):
             self._node.destroy_publisher(publisher)

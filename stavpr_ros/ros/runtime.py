@@ -32,6 +32,7 @@ from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus
+from stavpr_ros.ros.localized import LocalizedPublisher
 from stavpr_ros.ros.map_loading import MapLoader
 from stavpr_ros.ros.messages import map_info_message, nanoseconds, PoseFrames
 from stavpr_ros.ros.navigation import Navigation
@@ -102,6 +103,7 @@ class Runtime:
         self._navigation: Navigation | None = None
         if settings.publish_tf or settings.publish_initialpose:
             self._navigation = Navigation(node, settings)
+        self._localized = LocalizedPublisher(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
         verifier = load_verifier(settings.verifier) if settings.verifier else None
@@ -170,6 +172,7 @@ class Runtime:
         """Unsubscribe; publish waiting images as dropped, and waiting closures; save a map."""
         self._unsubscribe()
         self.worker.run(self._edges.flush)  # after the image in process
+        self.worker.run(self._forget)
         self._save(self.worker.run)
 
     def close(self) -> None:
@@ -186,6 +189,7 @@ class Runtime:
                 close_journals(self._pipeline, delete_route, self._node.get_logger())
             self._output.close()
             self._views.close()
+            self._localized.close()
             if self._navigation is not None:
                 self._navigation.close()
 
@@ -308,7 +312,16 @@ class Runtime:
     def reset(self) -> None:
         """Empty the window now, and drop waiting images."""
         self._drop_waiting('the window was reset', 'window reset')
-        self.worker.run(self.pipeline.operation.reset)
+        self.worker.run(self._reset_window)
+
+    def _reset_window(self) -> None:
+        self.pipeline.operation.reset()
+        self._localized.reset()
+
+    def _forget(self) -> None:
+        self._localized.reset()
+        if self._navigation is not None:
+            self._navigation.forget()
 
     def map_info(self) -> MapInfo:
         """Return the description of the map in use."""
@@ -341,6 +354,8 @@ class Runtime:
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.operation.contrast,
             applied_threshold=pipeline.operation.threshold,
+            localized=self._localized.is_localized,
+            sends_transform=self._navigation is not None and self._navigation.sends_transform,
         )
 
     # images
@@ -367,7 +382,7 @@ class Runtime:
         """Process one image, on the worker."""
         if item.epoch != self._pipeline_epoch:
             self._pipeline_epoch = item.epoch
-            self.pipeline.operation.reset()
+            self._reset_window()
         operation, waiting = self.pipeline.operation, time.monotonic() - item.arrival
         header, places, view = item.message.header, operation.places, operation.view
         pose, frames = self._pose_at(nanoseconds(header.stamp))
@@ -379,6 +394,7 @@ class Runtime:
         began = time.monotonic()
         if self._navigation is not None:
             self._navigation.publish(header, result, places, pose, frames.odometry)
+        self._localized.publish(result, places, pose)
         self._views.publish(header, result, operation, frames.frame, pose)
         edge, closures = self._edges.prepare(header, result, operation, frames, camera)
         message = self._output.publish(header, result, places, frames, edge)

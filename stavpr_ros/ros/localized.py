@@ -1,0 +1,130 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the robot is localized, with hysteresis, and the place where it is: latched topics."""
+
+import math
+
+import numpy as np
+from rclpy.node import Node
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.pipeline import NodeSettings
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.ros.qos import LATCHED
+from stavpr_ros.ros.rclpy_workarounds import until_shutdown
+from std_msgs.msg import Bool, String
+
+TRIAL, CONFIRMATIONS = 5, 3  # images after a match, and how many of them must match near it
+NOWHERE = 'none'  # ~/current_node of a robot that is not localized
+
+
+class Localization:
+    """
+    The state of being localized, image by image.
+
+    True after a match of ``localized_probability`` that 3 of the next 5 images confirm by a match
+    within ``nms_radius`` of it; false after ``lost_images`` images or ``lost_distance`` meters
+    without a match.
+    """
+
+    def __init__(self, settings: NodeSettings) -> None:
+        self._settings, self._radius = settings, settings.pipeline.nms_radius
+        self.reset()
+
+    def reset(self) -> None:
+        """Be not localized, as at the start."""
+        self.is_localized = False
+        self._first = -1  # place of the match that is on trial, -1 = none
+        self._tried = self._confirmed = 0  # images since then, and those that match near it
+        self._unmatched = 0  # images since the last match
+        self._position: np.ndarray | None = None  # at the last match, or the first one after it
+
+    def update(self, place: int, probability: float, position: np.ndarray | None) -> None:
+        """
+        Take the result of an image in the window.
+
+        :param place: of the match, -1 = none.
+        :param probability: of it, NaN in mode paper: any match begins a trial.
+        :param position: x y z of the odometry, None = unknown.
+        """
+        matched = place >= 0
+        self._unmatched = 0 if matched else self._unmatched + 1
+        if matched or self._position is None:
+            self._position = position
+        if self.is_localized:
+            moved = 0.0 if position is None else float(np.linalg.norm(position - self._position))
+            limits = self._settings.lost_images, self._settings.lost_distance
+            if self._unmatched >= limits[0] or 0 < limits[1] <= moved:
+                self.reset()
+            return
+        if self._first >= 0:
+            self._tried += 1
+            self._confirmed += matched and abs(place - self._first) <= self._radius
+            if self._confirmed >= CONFIRMATIONS:
+                self.is_localized, self._first = True, -1
+                return
+            if self._tried >= TRIAL:
+                self._first = -1
+        certain = math.isnan(probability) or probability >= self._settings.localized_probability
+        if self._first < 0 and matched and certain:
+            self._first, self._tried, self._confirmed = place, 0, 0
+
+
+class LocalizedPublisher:
+    """Publishes ``~/localized`` and ``~/current_node`` when they change; on the worker."""
+
+    def __init__(self, node: Node, settings: NodeSettings) -> None:
+        self._node, self._state = node, Localization(settings)
+        self._localized = node.create_publisher(Bool, '~/localized', LATCHED)
+        self._current_node = node.create_publisher(String, '~/current_node', LATCHED)
+        self._places: PlaceMap | GrowingMap | None = None
+        self._published: tuple[bool | None, str] = (None, '')
+        self._publish(NOWHERE)
+
+    @property
+    def is_localized(self) -> bool:
+        """Whether the robot is localized."""
+        return self._state.is_localized
+
+    def publish(
+        self,
+        result: ImageResult,
+        places: PlaceMap | GrowingMap | None,
+        odometry: np.ndarray | None,
+    ) -> None:
+        """
+        Publish what an image has changed; a robot is localized on a map only, not on a route.
+
+        :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
+        """
+        if places is not self._places:
+            self.reset()
+            self._places = places
+        if result.cause or not isinstance(places, PlaceMap):
+            return
+        position = None if odometry is None else odometry[:3]
+        self._state.update(result.newest_index, result.probability, position)
+        if not self.is_localized:
+            self._publish(NOWHERE)
+        elif result.accepted:
+            place = places.place(result.newest_index)
+            self._publish(place.identifier or str(result.newest_index))
+
+    def reset(self) -> None:
+        """Be not localized: another map, or the window was emptied."""
+        self._state.reset()
+        self._places = None
+        self._publish(NOWHERE)
+
+    def close(self) -> None:
+        """Destroy the publishers, and release the map."""
+        self._places = None
+        for publisher in (self._localized, self._current_node):
+            self._node.destroy_publisher(publisher)
+
+    def _publish(self, current_node: str) -> None:
+        last, self._published = self._published, (self.is_localized, current_node)
+        with until_shutdown(self._node):
+            if last[0] is not self.is_localized:
+                self._localized.publish(Bool(data=self.is_localized))
+            if last[1] != current_node:
+                self._current_node.publish(String(data=current_node))

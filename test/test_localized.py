@@ -1,0 +1,113 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the robot is localized: the hysteresis by hand, and the topics of a node."""
+
+from itertools import pairwise
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from robot import LATCHED, LENGTH
+from stavpr_ros.ros.localized import Localization, NOWHERE
+from std_msgs.msg import Bool, String
+from std_srvs.srv import Trigger
+
+SETTINGS = SimpleNamespace(
+    localized_probability=0.9,
+    lost_images=3,
+    lost_distance=5.0,
+    pipeline=SimpleNamespace(nms_radius=10),
+)
+TREE = Path(__file__).parents[1] / 'config' / 'nav2_localized.xml'
+# nodes of BehaviorTree.CPP 4, and of nav2_behavior_tree/nav2_tree_nodes.xml of Jazzy, their ports
+TREE_NODES = {
+    'ReactiveSequence': set(),
+    'ReactiveFallback': set(),
+    'Sequence': set(),
+    'KeepRunningUntilFailure': set(),
+    'ScriptCondition': {'code'},
+    'ControllerSelector': {'topic_name', 'default_controller', 'selected_controller'},
+    'Spin': {'spin_dist', 'time_allowance', 'is_recovery', 'error_code_id'},
+    'PipelineSequence': set(),
+    'RateController': {'hz'},
+    'ComputePathToPose': {'goal', 'start', 'path', 'planner_id', 'error_code_id'},
+    'FollowPath': {'path', 'controller_id', 'goal_checker_id', 'error_code_id'},
+}
+SURE, UNSURE, NONE = (7, 0.95), (8, 0.5), (-1, 0.2)  # place and probability
+
+
+def states(*results, positions=()):
+    """Return the state after each result."""
+    localization = Localization(SETTINGS)
+    positions = [np.array([x, 0, 0]) for x in positions] or [None] * len(results)
+    return [
+        localization.update(*result, position) or localization.is_localized
+        for result, position in zip(results, positions, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ('results', 'count'),
+    [
+        ([SURE, UNSURE, UNSURE, UNSURE], 3),
+        ([SURE, NONE, UNSURE, NONE, UNSURE, UNSURE], 5),  # the last of five
+        ([UNSURE] * 9, None),
+        ([SURE, (18, 0.95), (-1, 0.2), (17, 0.6), (17, 0.6), (17, 0.6)], 5),  # too far is no proof
+        ([SURE, NONE, NONE, NONE, UNSURE, UNSURE, UNSURE, UNSURE], None),
+        ([SURE, NONE, NONE, NONE, UNSURE, SURE, UNSURE, UNSURE, UNSURE], 8),  # a second trial
+        ([(7, math.nan)] * 4, 3),  # mode paper
+    ],
+)
+def test_robot_is_localized_after_a_sure_match_that_three_of_five_confirm(results, count):
+    expected = [False] * len(results)
+    if count is not None:
+        expected[count:] = [True] * (len(results) - count)
+    assert states(*results) == expected
+
+
+def test_robot_is_lost_after_images_or_meters_without_a_match():
+    found = [SURE, *[UNSURE] * 3]
+    assert states(*found, NONE, NONE, UNSURE, NONE, NONE, NONE)[3:] == [*[True] * 6, False]
+    far = states(*found, NONE, UNSURE, NONE, NONE, positions=[0, 1, 2, 3, 7.9, 8, 12, 13])
+    assert far[3:] == [True, True, True, True, False]
+
+
+def test_node_publishes_latched_whether_and_where_the_robot_is_localized(robot, start, route):
+    node = start(localized_probability=0.05)
+    localized = robot.listen(Bool, '/stavpr/localized', LATCHED)
+    places = robot.listen(String, '/stavpr/current_node', LATCHED)
+    robot.until(lambda: bool(localized and places), 'the latched messages')
+    assert (localized[0].data, places[0].data) == (False, 'none')
+    matches = robot.drive(route[:20])
+    robot.until(lambda: localized[-1].data, 'being localized')
+    last = matches[-1].newest_id
+    robot.until(lambda: places[-1].data == last, 'the place of the last image')
+    names = [each.data for each in places]
+    assert all(a != b for a, b in pairwise(names))  # only changes
+    assert set(names[1:]) <= {match.newest_id for match in matches[LENGTH - 1 :]}
+    late = robot.listen(String, '/stavpr/current_node', LATCHED)
+    robot.until(lambda: bool(late), 'the place, for a later subscriber')
+    assert late[-1].data == last
+    robot.until(lambda: robot.counts('recognition')['localized'] == 'True', 'the diagnostics')
+    robot.does(Trigger, 'reset')
+    robot.until(lambda: not localized[-1].data, 'being lost')
+    robot.until(lambda: places[-1].data == 'none', 'no place')
+    assert [each.data for each in localized] == [False, True, False]
+    assert node.state == 'active'
+
+
+def test_behavior_tree_has_nodes_of_nav2_and_reads_the_place():
+    root = ElementTree.parse(TREE).getroot()
+    (tree,) = root.iter('BehaviorTree')
+    assert root.attrib == {'BTCPP_format': '4', 'main_tree_to_execute': tree.get('ID')}
+    nodes = [node for node in tree.iter() if node is not tree]
+    assert all(set(node.attrib) - {'name'} <= TREE_NODES[node.tag] for node in nodes)
+    by_tag = {node.tag: node.attrib for node in nodes}
+    selector = by_tag['ControllerSelector']
+    assert selector['topic_name'] == '/stavpr/current_node'
+    assert selector['default_controller'] == NOWHERE
+    assert selector['selected_controller'] == '{place}'
+    assert by_tag['ScriptCondition']['code'] == f"place != '{NOWHERE}'"
