@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the numerics use the processor beside everything else that runs on a robot."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from functools import cache
 import os
 import sys
@@ -63,6 +64,24 @@ def thread_count() -> int:
 def _of_torch() -> int:
     """Return how many threads torch takes before the first limit."""
     return int(sys.modules['torch'].get_num_threads())
+
+
+@contextmanager
+def one_thread(is_enough: bool = True) -> Iterator[None]:
+    """
+    Run numba's kernels on the calling thread while the block runs.
+
+    :param is_enough: else nothing changes.
+    """
+    import numba
+
+    before = numba.get_num_threads()
+    if is_enough:
+        numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def call_on_thread(function: Callable[[], Result], name: str) -> Future[Result]:

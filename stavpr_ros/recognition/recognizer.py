@@ -43,11 +43,13 @@ from stavpr_ros.recognition.relative_motion import (
 from stavpr_ros.recognition.sessions import layout_of
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
+from stavpr_ros.threads import one_thread
 
 if TYPE_CHECKING:
     import torch
 
 EARLY = 0.9  # minimum probability of a match by the newest images alone
+SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
 TIMED = 3  # images, to compare the time of one with the time budget
 
 
@@ -339,6 +341,8 @@ class PlaceRecognizer(SequenceRecognizer):
         )
         self._centering = prepared.centering
         self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
+        numbers = place_map.settings.strips * len(features) * self._dimension
+        self._is_small = numbers * (1 if precision == 'int8' else 4) < SMALL_MAP
         if isinstance(self._window, FilterWindow):
             self._window.change.learn(prepared.changes, self._window.layout.firsts)
         # of the start, for the log: statistics that were learned again, an error rate that is not
@@ -459,8 +463,9 @@ class PlaceRecognizer(SequenceRecognizer):
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
-        row = self._matcher.distances(strips, features.weights[:, 0])
-        self._window.push(row, strips, stamp)
+        with one_thread(self._is_small):
+            row = self._matcher.distances(strips, features.weights[:, 0])
+            self._window.push(row, strips, stamp)
         if self._centering is not None:
             self._centering.note_standstill(self._window.is_standstill)
         return self._match(odometry_xy)
