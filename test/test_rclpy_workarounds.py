@@ -14,6 +14,7 @@ from unittest.mock import call, Mock
 import pytest
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
@@ -138,6 +139,17 @@ def test_prompt_executor_runs_callbacks_that_hand_over_itself_and_logs_their_err
     spin_until(prompt, lambda: len(threads) == 2)
     assert set(threads) == {threading.current_thread()}
     assert 'ValueError: defect' in capfd.readouterr().err
+
+
+def test_prompt_executor_calls_back_with_events_of_publishers(node, prompt):
+    changes = []
+    events = PublisherEventCallbacks(matched=lambda event: changes.append(event.current_count))
+    node.create_publisher(Int32, 'watched', 1, event_callbacks=events)
+    for _ in range(3):
+        prompt.spin_once(timeout_sec=0.01)
+    node.create_subscription(Int32, 'watched', lambda message: None, 1)
+    spin_until(prompt, lambda: changes)
+    assert changes == [1]
 
 
 def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt, monkeypatch):

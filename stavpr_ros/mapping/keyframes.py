@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_between
+from stavpr_ros.compilation import kernel
 from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
 from stavpr_ros.units import SECOND
 
@@ -59,9 +60,38 @@ def small_gray(image: np.ndarray) -> np.ndarray:
     :param image: RGB, uint8, shape (h, w, 3).
     :returns: float32, shape (24, 32).
     """
-    small = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
+    width, height = SIZE
+    if image.shape[0] % height or image.shape[1] % width or not image.flags.c_contiguous:
+        small = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
+    else:
+        small = np.empty((height, width, 3), np.uint8)
+        _block_means(image.reshape(height, -1, image.shape[1] * 3), small)
     gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return np.asarray(cv2.GaussianBlur(gray, (0, 0), BLUR))
+
+
+@kernel
+def _block_means(rows: np.ndarray, small: np.ndarray) -> None:
+    """
+    Write the means of blocks of pixels, rounded as OpenCV's: its sums are of whole numbers, too.
+
+    :param rows: of each row of blocks, shape (h, rows, 3 columns), uint8.
+    :param small: shape (h, w, 3), uint8, written.
+    """
+    height, count, length = rows.shape
+    side = length // (3 * small.shape[1])  # pixels
+    scale, sums = np.float32(1) / np.float32(count * side), np.empty(length, np.uint32)
+    for i in range(height):
+        sums[:] = 0
+        for row in range(count):
+            for x in range(length):
+                sums[x] += rows[i, row, x]
+        for j in range(small.shape[1]):
+            for channel in range(3):
+                total = np.uint32(0)
+                for x in range(3 * j * side + channel, 3 * (j + 1) * side, 3):
+                    total += sums[x]
+                small[i, j, channel] = np.uint8(np.rint(np.float32(total) * scale))
 
 
 def image_change(a: np.ndarray, b: np.ndarray) -> float:

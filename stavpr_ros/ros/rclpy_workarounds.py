@@ -21,6 +21,7 @@ import warnings
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.event_handler import QoSPublisherEventType
 from rclpy.executors import Executor, ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
@@ -32,6 +33,7 @@ from rclpy.subscription import Subscription
 from rclpy.task import Task
 from stavpr_ros.errors import SettingsError, UnavailableError
 
+EVENT_PERIOD = 0.15  # seconds between collections of the events of publishers
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
 RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when the process ends
@@ -99,7 +101,8 @@ class PromptExecutor(Executor):
 
     Each wake-up collects all entities again, upstream three times a callback: before it, when it
     has begun and when it has ended. A callback of a :class:`HandOverGroup` runs on the thread of
-    the executor, which needs no waking. No upstream change is known: a later executor waits for
+    the executor, which needs no waking, and events of publishers, half of all entities, are
+    collected every ``EVENT_PERIOD``. No upstream change is known: a later executor waits for
     events without collecting.
 
     :param threads: callbacks that may run at once.
@@ -109,6 +112,21 @@ class PromptExecutor(Executor):
         super().__init__(**options)
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix='callback')
         self._running: set[Future[None]] = set()
+        self._collects_events, self._next_events = True, 0.0
+
+    def get_nodes(self) -> list[Node]:
+        """Return all nodes, whose entities are collected next."""
+        now = time.monotonic()
+        self._collects_events = now >= self._next_events
+        if self._collects_events:
+            self._next_events = now + EVENT_PERIOD
+        return list(super().get_nodes())
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return whether to collect an entity."""
+        event_type = None if self._collects_events else getattr(entity, 'event_type', None)
+        is_later = isinstance(event_type, QoSPublisherEventType)
+        return not is_later and bool(super().can_execute(entity))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Begin the next callback, if one is ready in time."""
