@@ -6,7 +6,7 @@ Start the node under the lifecycle manager of Nav2, which configures and activat
 ros2 launch stavpr_ros nav2.launch.py map_path:=FILE image:=TOPIC
 
 To use the manager of your own Nav2 launch files, start the node with autostart:=false, and add
-its name to node_names there. The node makes no bond: bond_timeout must be 0.
+its name to node_names there. The bond requires the package bond, which Nav2 has, too.
 """
 
 from launch import LaunchDescription
@@ -23,6 +23,6 @@ def generate_launch_description() -> LaunchDescription:
         name='lifecycle_manager_stavpr',
         namespace=LaunchConfiguration('namespace'),
         output='screen',
-        parameters=[{'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 0.0}],
+        parameters=[{'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 4.0}],
     )
     return node_launch(manager, needs='nav2_lifecycle_manager', autostart=False)

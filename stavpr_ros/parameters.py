@@ -401,6 +401,14 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'The node configures and activates itself; false: a lifecycle manager does.',
             when='start',
         ),
+        NodeParameter(
+            'bond_heartbeat_period',
+            0.25,
+            'Period of the heartbeats of the bond to a lifecycle manager of Nav2, where the '
+            'package bond is installed; 0 = no bond.',
+            's',
+            bounds=(0.0, 4.0),
+        ),
     ),
 }
 

@@ -182,11 +182,11 @@ def test_launch_of_cameras_starts_a_node_for_each_with_its_name_in_paths(load):
     assert paths == ['maps/front.stavpr', 'maps/rear.stavpr']
 
 
-def test_launch_for_nav2_has_a_manager_without_bond(load):
+def test_launch_for_nav2_has_a_manager_with_a_bond(load):
     (manager,) = load('nav2').nodes
     assert manager.package == 'nav2_lifecycle_manager'
     assert manager.parameters == [
-        {'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 0.0}
+        {'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 4.0}
     ]
     assert words(manager.namespace) == '${namespace}'
 

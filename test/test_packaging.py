@@ -52,7 +52,9 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-ROS = re.compile(r'\w+_(msgs|srvs|interfaces)|rclpy|launch|launch_ros|ament_index_python|tf2_ros')
+ROS = re.compile(
+    r'\w+_(msgs|srvs|interfaces)|bond|rclpy|launch|launch_ros|ament_index_python|tf2_ros'
+)
 ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 
 each_package = pytest.mark.parametrize('package', PACKAGES)

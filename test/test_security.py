@@ -45,7 +45,8 @@ def test_policy_of_the_node_is_what_it_uses(policy, context, transport):
     if names['subscribe'] & BOTH_CAMERAS:  # one of them at a time
         names['subscribe'] |= BOTH_CAMERAS
     names['subscribe'].add('/clock')  # with use_sim_time
-    names['publish'] |= {'/tf', '/initialpose'}  # with publish_tf, and for Nav2
+    names['publish'] |= {'/tf', '/initialpose', '/bond'}  # with publish_tf, and for Nav2
+    names['subscribe'].add('/bond')
     assert names == {'request': set(), **policy['node']}
 
 
@@ -55,7 +56,7 @@ def test_policy_of_the_others_fits_the_node(policy):
         assert policy[other]['subscribe'] <= node['publish'] | {'/clock'}
     assert policy['operator']['request'] <= node['reply']
     assert 'request' not in policy['reader']
-    assert node['subscribe'] <= policy['sensors']['publish']
+    assert node['subscribe'] - {'/bond'} <= policy['sensors']['publish']
 
 
 def test_policy_has_no_comment_that_sros2_takes_for_an_enclave():

@@ -173,6 +173,7 @@ class NodeSettings:
     map_path: str
     maps_folder: str
     autostart: bool
+    bond_heartbeat_period: float
     image_transport: str
     queue_size: int
     max_rate: float

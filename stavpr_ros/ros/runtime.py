@@ -29,6 +29,7 @@ from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.verification import load_verifier
 from stavpr_ros.ros import REPORT_PERIOD
+from stavpr_ros.ros.bond import Bond, make_bond
 from stavpr_ros.ros.edges import EdgePublisher
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import ImageInput, InputStatus
@@ -100,6 +101,7 @@ class Runtime:
             lambda: self.pipeline.places,
             on_map_change,
         )
+        self._bond: Bond | None = None
         self._navigation: Navigation | None = None
         if settings.publish_tf or settings.publish_initialpose:
             self._navigation = Navigation(node, settings)
@@ -167,6 +169,8 @@ class Runtime:
             lambda message, reason: self._drop(message, Status.SKIPPED, reason, 'max_rate'),
             self.restart,
         )
+        settings = self.settings
+        self._bond = make_bond(self._node, settings.bond_heartbeat_period, not settings.autostart)
 
     def deactivate(self) -> None:
         """Unsubscribe; publish waiting images as dropped, and waiting closures; save a map."""
@@ -174,6 +178,12 @@ class Runtime:
         self.worker.run(self._edges.flush)  # after the image in process
         self.worker.run(self._forget)
         self._save(self.worker.run)
+        self._end_bond()
+
+    def _end_bond(self) -> None:
+        if self._bond is not None:
+            self._bond.close()
+        self._bond = None
 
     def close(self) -> None:
         """Unsubscribe, save a recorded map, and end the worker and the publishers."""
@@ -188,6 +198,7 @@ class Runtime:
                 delete_route = not self.settings.save_path
                 close_journals(self._pipeline, delete_route, self._node.get_logger())
             self._output.close()
+            self._end_bond()
             self._views.close()
             self._localized.close()
             if self._navigation is not None:
