@@ -75,13 +75,14 @@ def one_thread(is_enough: bool = True) -> Iterator[None]:
     """
     import numba
 
-    before = numba.get_num_threads()
-    if is_enough:
+    before = numba.get_num_threads() if is_enough else 1
+    if before > 1:
         numba.set_num_threads(1)
     try:
         yield
     finally:
-        numba.set_num_threads(before)
+        if before > 1:
+            numba.set_num_threads(before)
 
 
 def call_on_thread(function: Callable[[], Result], name: str) -> Future[Result]:

@@ -12,7 +12,9 @@ import pytest
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, open_map, save_map, verify_map
 from stavpr_ros.memory import is_aligned
+from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.sources.frame import ImageRecord
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 
@@ -22,6 +24,7 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 # Resident bytes beside the features: the heap, the window, the filter and the whitening; a copy of
 # the features takes more.
 ALLOWANCE = 46e6
+IMAGES = 20_000  # of the long run
 
 
 @pytest.fixture
@@ -89,3 +92,20 @@ def test_resident_memory_is_that_of_the_features(operation, mode, n, d):
     found = memory.measure_memory(operation, mode, 'float32', n, d)
     assert found.feature_bytes == 4 * 7 * n * d
     assert 0.9 < found.ratio < 1 + ALLOWANCE / found.feature_bytes
+
+
+@pytest.mark.long
+def test_memory_does_not_grow_with_the_images(path, route):
+    """Settings change, the window is emptied, and candidates are listed now and then."""
+    settings = PipelineSettings(mode='robust')
+    pipeline = Pipeline(settings)
+    pipeline.change(loaded=read_map(str(path), settings))
+    messages, resident = [ImageRecord.of_image(image, 0) for image in route], []
+    for number in range(IMAGES):
+        if number % 1000 == 0:
+            pipeline.operation.reset()
+            pipeline.change(replace(settings, min_probability=0.5 + number % 7 / 100))
+        pipeline.operation.process(messages[number % len(messages)], (number + 1) * 10**8)
+        if number in (IMAGES // 4, IMAGES - 1):
+            resident.append(memory.resident_bytes())
+    assert resident[1] - resident[0] < 1000 * (IMAGES * 3 // 4)
