@@ -16,7 +16,7 @@ from stavpr_ros.ros.launching import node_launch, PACKAGE, remappings
 OPTIONS = {
     'topic': 'image topic in the bag; empty: the only one',
     'odometry': 'odometry topic in the bag, published on odom; empty: the only one if '
-    'keyframe_distance or keyframe_angle is given, else none',
+    'keyframe_distance or keyframe_angle_deg is given, else none',
     'also': 'further topics of the bag, separated by spaces, published under their names',
     'rate': 'factor on the recorded pace; empty: 1',
     'fps': 'images per second: of a folder, as recorded; taken of a video; empty: 10, 5',
@@ -43,7 +43,8 @@ def _replay(context: LaunchContext) -> list[Node]:
     for name in OPTIONS:
         if texts[name]:
             words += [f'--{name.replace("_", "-")}', *texts[name].split()]
-    if not texts['odometry'] and (is_set('keyframe_distance') or is_set('keyframe_angle')):
+    moving = ('keyframe_distance', 'keyframe_angle_deg', 'keyframe_angle')
+    if not texts['odometry'] and any(map(is_set, moving)):
         words.append('--odometry')
     for name in ('lossless', 'loop', 'start_paused'):
         if is_set(name):

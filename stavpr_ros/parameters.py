@@ -128,14 +128,14 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'keyframe_distance',
             0.0,
-            'Minimum distance between keyframes (or minimum rotation, keyframe_angle), from '
+            'Minimum distance between keyframes (or minimum rotation, keyframe_angle_deg), from '
             'nav_msgs/Odometry on the topic odom; 0 = off.',
             'm',
             'live',
             (0.0, 1e4),
         ),
         NodeParameter(
-            'keyframe_angle',
+            'keyframe_angle_deg',
             0.0,
             'Minimum rotation between keyframes, see keyframe_distance; 0 = off.',
             'degrees',
@@ -414,6 +414,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
 
 PARAMETERS = tuple(row for rows in GROUPS.values() for row in rows)
 BY_NAME = {row.name: row for row in PARAMETERS}
+# earlier names, accepted with a warning until version 1.1
+RENAMED = {'keyframe_angle': 'keyframe_angle_deg'}
 
 
 def default(name: str) -> Any:

@@ -4,6 +4,7 @@
 
 from collections import Counter
 import math
+from pathlib import Path
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -16,6 +17,7 @@ from stavpr_ros.pipeline.statistics import ImageCounts, Tally
 from stavpr_ros.ros.diagnostics import diagnostic_array
 from stavpr_ros.ros.health import Health
 from stavpr_ros.ros.input import InputStatus
+import yaml
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -278,3 +280,16 @@ VALUES = [
 @pytest.mark.parametrize(('part', 'changes', 'value'), VALUES)
 def test_part_has_value(part, changes, value):
     assert value in values(part, **changes)
+
+
+def test_statuses_are_in_the_group_of_the_aggregator():
+    """Its GenericAnalyzer takes the names that contain one of these texts."""
+    path = Path(__file__).parents[1] / 'config' / 'diagnostic_aggregator.yaml'
+    (group,) = (
+        each
+        for each in yaml.safe_load(path.read_text())['analyzers']['ros__parameters'].values()
+        if isinstance(each, dict)
+    )
+    assert group['type'] == 'diagnostic_aggregator/GenericAnalyzer'
+    names = [status.name for status in statuses({}).values()]
+    assert all(any(text in name for text in group['contains']) for name in names)

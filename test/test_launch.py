@@ -15,7 +15,7 @@ from types import ModuleType, SimpleNamespace
 
 from processes import executable
 import pytest
-from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME, RENAMED
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
@@ -145,7 +145,7 @@ def test_launch_file_has_an_argument_for_every_parameter(load, name):
     common = {'image', 'odom', 'namespace', 'params_file', 'use_sim_time'}
     own = {'replay': REPLAY, 'multi_camera': {'cameras'}}
     own['pose_graph'] = {'max_correction_speed', 'correct_tf'}
-    expected = (set(BY_NAME) - set(fixed)) | common | own.get(name, set())
+    expected = (set(BY_NAME) | set(RENAMED)) - set(fixed) | common | own.get(name, set())
     assert set(launch.arguments) == expected
     for argument in launch.arguments.values():
         assert len(argument.description) > 10
@@ -253,7 +253,8 @@ def test_launch_of_replay_shuts_down_with_it_on_request_only(load):
         ({'rate': '2', 'start_offset': '5'}, ['--rate', '2', '--start-offset', '5']),
         ({'also': '/tf /tf_static'}, ['--also', '/tf', '/tf_static']),
         ({'keyframe_distance': '0.5'}, ['--odometry']),
-        ({'keyframe_angle': '10'}, ['--odometry']),
+        ({'keyframe_angle_deg': '10'}, ['--odometry']),
+        ({'keyframe_angle': '10'}, ['--odometry']),  # its earlier name
         ({'keyframe_distance': '0.5', 'odometry': '/wheels'}, ['--odometry', '/wheels']),
         ({'keyframe_distance': '0.0'}, []),
         ({'use_sim_time': 'true', 'loop': 'true'}, ['--loop', '--clock']),

@@ -81,7 +81,8 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     assert robot.show_at(5.4, route[2]).status == SKIPPED
     assert robot.show_at(6.1, route[3]).status in (WARMING_UP, MATCH)
     assert robot.show_at(6.1, route[4], degrees=170).status == SKIPPED
-    robot.set(keyframe_angle=30.0)
+    robot.set(keyframe_angle=30.0)  # its earlier name
+    robot.until_logged("parameter 'keyframe_angle' is keyframe_angle_deg now")
     assert robot.show_at(6.1, route[5], degrees=40).status in (WARMING_UP, MATCH)
     assert 'no odometry' in robot.show(route[7], 3600 * SECOND).reason  # another clock
 
@@ -91,7 +92,7 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
 
     robot.until(compared, 'a remark on the stamps')
     robot.until_diagnosed('input', WARN, 'has stopped')
-    robot.set(keyframe_distance=0.0, keyframe_angle=0.0)
+    robot.set(keyframe_distance=0.0, keyframe_angle_deg=0.0)
     robot.until(lambda: not robot.odometry.get_subscription_count(), 'the end of odometry')
 
 

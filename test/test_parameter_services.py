@@ -10,6 +10,7 @@ import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 import rclpy
+from robot import parameters_of
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
 
 NESTED = '[' * 2000
@@ -91,3 +92,13 @@ def test_any_parameter_is_set_or_rejected_with_a_reason(make_node):
         assert node.settings.pipeline.recognition()
 
     check()
+
+
+def test_parameter_by_its_earlier_name_is_set_with_a_warning(make_node, capfd):
+    node = make_node(keyframe_angle=5.0)
+    assert node.get_parameter('keyframe_angle_deg').value == 5
+    assert "parameter 'keyframe_angle' is keyframe_angle_deg now" in capfd.readouterr().err
+    assert node.set_parameters(parameters_of({'keyframe_angle': 7}))[0].successful
+    assert node.settings.pipeline.keyframes.angle == 7
+    assert "parameter 'keyframe_angle' is keyframe_angle_deg now" in capfd.readouterr().err
+    assert not node.has_parameter('keyframe_angle')

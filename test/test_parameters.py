@@ -78,7 +78,7 @@ def test_default_values_give_default_settings():
         (PAPER | {'threshold': -1.0}, 'applied_threshold', None),
         ({'keyframe_interval': 1.5}, 'keyframes.interval', 1.5),
         ({'keyframe_distance': 2.5}, 'keyframes.distance', 2.5),
-        ({'keyframe_angle': 3.5}, 'keyframes.angle', 3.5),
+        ({'keyframe_angle_deg': 3.5}, 'keyframes.angle', 3.5),
         ({'geometric_check': 'sift'}, 'geometric.method', 'sift'),
     ],
 )

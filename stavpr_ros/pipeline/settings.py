@@ -234,7 +234,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
         keyframes=KeyframeSettings(
             values['keyframe_interval'],
             values['keyframe_distance'],
-            values['keyframe_angle'],
+            values['keyframe_angle_deg'],
             values['keyframe_change'],
         ),
         geometric=None if method == 'none' else GeometricSettings(method, values['min_inliers']),

@@ -14,12 +14,13 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-from stavpr_ros.parameters import EXPECTED, PARAMETERS
+from stavpr_ros.parameters import EXPECTED, PARAMETERS, RENAMED
 
 PACKAGE = 'stavpr_ros'
 TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
 }
+TYPES |= {old: TYPES[new] for old, new in RENAMED.items()}
 CAMERA = '{camera}'  # in a text, the name of each of several cameras
 
 
@@ -114,6 +115,7 @@ def _check(names: list[str], needs: str) -> OpaqueFunction:
 
 def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareLaunchArgument]:
     sentences = {row.name: row.sentence for row in PARAMETERS}
+    sentences |= {old: f'Earlier name of {new}.' for old, new in RENAMED.items()}
     sentences['use_sim_time'] = 'Take the time from the topic /clock.'
     return [
         DeclareLaunchArgument('image', default_value=image, description='topic of the images'),

@@ -20,7 +20,7 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.compilation import progress
 from stavpr_ros.errors import left_out, SettingsError, StavprError
-from stavpr_ros.parameters import BY_NAME
+from stavpr_ros.parameters import BY_NAME, RENAMED
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
@@ -29,6 +29,7 @@ from stavpr_ros.ros.output import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,
+    renamed,
     require_changeable,
     require_writable,
     typed,
@@ -217,6 +218,11 @@ class PlaceRecognitionNode(ManagedNode):
 
     def set_parameters_atomically(self, parameters: list[Parameter]) -> SetParametersResult:
         """Set parameters, all or none, one thread at a time."""
+        for i, row in enumerate(parameters):
+            if row.name in RENAMED:
+                self.get_logger().warning(renamed(row.name))
+                parameters = [*parameters]
+                parameters[i] = Parameter(RENAMED[row.name], value=row.value)
         try:
             if unknown := unknown_parameters(row.name for row in parameters):
                 raise SettingsError('; '.join(unknown))

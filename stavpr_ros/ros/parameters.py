@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from stavpr_ros.checks import require_plain
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS
+from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS, RENAMED
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
@@ -63,9 +63,12 @@ def declare_parameters(node: ManagedNode) -> dict[str, Any]:
     """
     Declare the parameters on a node and return their values, name to value.
 
+    Earlier names are accepted; of both, the new one counts.
+
     :raises SettingsError: a parameter was given with the wrong type.
     """
-    overrides = node.parameter_overrides
+    given = node.parameter_overrides
+    overrides = {RENAMED[name]: row for name, row in given.items() if name in RENAMED} | given
     values = {}
     for row in PARAMETERS:
         value = typed(overrides[row.name]).value if row.name in overrides else row.default
@@ -75,15 +78,23 @@ def declare_parameters(node: ManagedNode) -> dict[str, Any]:
 
 
 def unknown_parameters(names: Iterable[str]) -> list[str]:
-    """Return a warning for each unknown parameter, with the most similar name."""
+    """Return a warning for each unknown parameter, with the most similar or the new name."""
     warnings = []
     for name in names:
         if name in BY_NAME or name.startswith(_RCLPY_PARAMETERS):
+            continue
+        if name in RENAMED:
+            warnings.append(renamed(name))
             continue
         near = difflib.get_close_matches(name, BY_NAME, 1)
         hint = f': did you mean {near[0]}?' if near else ': see `ros2 param list`'
         warnings.append(f'parameter {name!r} is unknown{hint}')
     return warnings
+
+
+def renamed(name: str) -> str:
+    """Return the warning of an earlier name."""
+    return f'parameter {name!r} is {RENAMED[name]} now: the earlier name is accepted until 1.1'
 
 
 def require_changeable(changes: Mapping[str, Any], state: str) -> None:

@@ -471,7 +471,7 @@ class Runtime:
             fault = self.odometry.fault() if self.odometry is not None else ''
             topic = self._node.resolve_topic_name('odom')
             remedy = fault or f"publish it on {topic}, with stamps of the camera's clock"
-            remedy += '; or set keyframe_distance and keyframe_angle to 0'
+            remedy += '; or set keyframe_distance and keyframe_angle_deg to 0'
         else:
             rules = asdict(self.settings.pipeline.keyframes).items()
             names = ' or '.join(f'keyframe_{name}' for name, value in rules if value)
