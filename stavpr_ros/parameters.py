@@ -364,6 +364,21 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             bounds=(0.0, 1e6),
         ),
         NodeParameter(
+            'subgoal_distance',
+            2.0,
+            'localization: how far ahead of the matched place, along the route of the map, the '
+            'place of ~/subgoal is; number of places on a map without poses.',
+            'm',
+            bounds=(0.0, 1e4),
+        ),
+        NodeParameter(
+            'subgoal_width',
+            0,
+            'Width of the image on ~/subgoal; 0 = of the thumbnails of the map.',
+            'pixels',
+            bounds=(0, 4096),
+        ),
+        NodeParameter(
             'diagnostics_period', 1.0, 'Period of the diagnostics.', 's', 'start', (0.1, 60.0)
         ),
         NodeParameter(

@@ -191,6 +191,8 @@ class NodeSettings:
     localized_probability: float
     lost_images: int
     lost_distance: float
+    subgoal_distance: float
+    subgoal_width: int
     relative_pose: str
     verifier: str
     camera_transform: str

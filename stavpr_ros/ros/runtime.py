@@ -40,6 +40,7 @@ from stavpr_ros.ros.navigation import Navigation
 from stavpr_ros.ros.output import is_requested, Output
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.sensors import CameraInput, OdometryInput
+from stavpr_ros.ros.subgoal import SubgoalPublisher
 from stavpr_ros.ros.visualization import Visualization
 from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.signals import time_left
@@ -106,6 +107,7 @@ class Runtime:
         if settings.publish_tf or settings.publish_initialpose:
             self._navigation = Navigation(node, settings)
         self._localized = LocalizedPublisher(node, settings)
+        self._subgoal = SubgoalPublisher(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
         verifier = load_verifier(settings.verifier) if settings.verifier else None
@@ -201,6 +203,7 @@ class Runtime:
             self._end_bond()
             self._views.close()
             self._localized.close()
+            self._subgoal.close()
             if self._navigation is not None:
                 self._navigation.close()
 
@@ -406,6 +409,7 @@ class Runtime:
         if self._navigation is not None:
             self._navigation.publish(header, result, places, pose, frames.odometry)
         self._localized.publish(result, places, pose)
+        self._subgoal.publish(header, result, places)
         self._views.publish(header, result, operation, frames.frame, pose)
         edge, closures = self._edges.prepare(header, result, operation, frames, camera)
         message = self._output.publish(header, result, places, frames, edge)

@@ -1,0 +1,106 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The image of the map some way ahead, as the subgoal of a learned policy of navigation."""
+
+import cv2
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import CompressedImage
+from stavpr_msgs.msg import PlaceCandidate, PlaceCandidates
+from stavpr_ros.errors import MapFileError
+from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.pipeline import NodeSettings
+from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.ros.messages import origin, time_message
+from stavpr_ros.ros.output import is_requested
+from stavpr_ros.ros.rclpy_workarounds import until_shutdown
+from std_msgs.msg import Header
+
+QUALITY = 90  # of JPEG, of an image whose width is changed
+
+
+class SubgoalPublisher:
+    """
+    Publishes ``~/subgoal``, a thumbnail of the map, and its place on ``~/subgoal_place``.
+
+    Both have the header of the image that was matched; only with a subscriber.
+    """
+
+    def __init__(self, node: Node, settings: NodeSettings) -> None:
+        self._node, self._settings = node, settings
+        self._image = node.create_publisher(CompressedImage, '~/subgoal', 1)
+        self._place = node.create_publisher(PlaceCandidates, '~/subgoal_place', 1)
+
+    def publish(
+        self, header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None
+    ) -> None:
+        """Publish the subgoal of a match on a map; on the worker."""
+        if not (result.accepted and isinstance(places, PlaceMap)):
+            return
+        if not any(is_requested(self._node, each) for each in (self._image, self._place)):
+            return
+        index = place_ahead(places, result.newest_index, self._settings.subgoal_distance)
+        place = places.place(index)
+        candidate = PlaceCandidate(
+            place_index=index,
+            distance=result.distance,
+            probability=result.probability,
+            place_stamp=time_message(place.stamp),
+            place_id=place.identifier,
+            session=place.session,
+        )
+        message = PlaceCandidates(
+            header=header,
+            **origin(self._settings.robot_id, places),
+            threshold=result.threshold,
+            candidates=[candidate],
+        )
+        content = thumbnail_of_width(places, index, self._settings.subgoal_width)
+        with until_shutdown(self._node):
+            self._place.publish(message)
+            if content:
+                self._image.publish(CompressedImage(header=header, format='jpeg', data=content))
+
+    def close(self) -> None:
+        """Destroy the publishers."""
+        for publisher in (self._image, self._place):
+            self._node.destroy_publisher(publisher)
+
+
+def place_ahead(places: PlaceMap, index: int, distance: float) -> int:
+    """
+    Return the first place at least so far ahead on the route, or the last one of its session.
+
+    :param distance: along the route, meters; on a map without poses, number of places.
+    """
+    session, ahead, moved, here = places.session(index), index, 0.0, places.pose(index)
+    while moved < distance and ahead + 1 < len(places) and places.session(ahead + 1) == session:
+        ahead += 1
+        pose = places.pose(ahead)
+        if not places.has_poses:
+            moved += 1
+        elif pose is not None:
+            moved += 0.0 if here is None else float(np.linalg.norm(pose[:3] - here[:3]))
+            here = pose
+    return ahead
+
+
+def thumbnail_of_width(places: PlaceMap, index: int, width: int) -> bytes:
+    """
+    Return the thumbnail of a place as JPEG, empty = none.
+
+    :param width: pixels, 0 = as it is in the map.
+    """
+    try:
+        content = bytes(places.thumbnails[index]) if len(places.thumbnails) else b''
+    except MapFileError:  # the file has been overwritten since it was opened
+        return b''
+    image = places.thumbnail(index) if content and width else None
+    if image is None or image.shape[1] == width:
+        return content
+    size = width, max(1, round(width * image.shape[0] / image.shape[1]))
+    shrinks = width < image.shape[1]
+    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    _, jpeg = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return jpeg.tobytes()
