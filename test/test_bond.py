@@ -28,7 +28,7 @@ class Status:
 
 
 class Node:
-    """A node that keeps what is published on ``bond``, and hears a manager."""
+    """A node that keeps what is published on ``bond``, and receives a manager's."""
 
     def __init__(self):
         self.sent, self.destroyed, self.warnings = [], [], []
@@ -52,7 +52,7 @@ class Node:
 
     def create_subscription(self, kind, topic, callback, qos, **options):
         assert (kind, topic) == (Status, 'bond')
-        self.hear = callback
+        self.receive = callback
         return callback
 
     def destroy_publisher(self, publisher):
@@ -65,8 +65,8 @@ class Node:
         return [message.active for message in self.sent]
 
     def manager(self, active, name='stavpr', instance='manager'):
-        """Hear a manager of another period."""
-        self.hear(Status(id=name, instance_id=instance, active=active, heartbeat_period=1.0))
+        """Receive the state of a manager of another period."""
+        self.receive(Status(id=name, instance_id=instance, active=active, heartbeat_period=1.0))
 
 
 @pytest.fixture
