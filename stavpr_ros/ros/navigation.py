@@ -32,7 +32,7 @@ class Navigation:
     """
     Publishes ``map -> odom`` on ``/tf``, and ``initialpose`` once per relocalization.
 
-    The transform is that of the last match. It is repeated on a thread of its own and stamped
+    The transform is of the last match. It is repeated on a thread of its own and stamped
     ``transform_tolerance`` later than now, so that a transform at the present time is known: tf2
     does not extrapolate. Nothing is sent before the first match.
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The image of the map some way ahead, as the subgoal of a learned policy of navigation."""
+"""The image of the map further ahead, as the subgoal of a learned policy of navigation."""
 
 import cv2
 import numpy as np
