@@ -27,6 +27,7 @@ LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
 DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
 AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
 MAX_TRIED = 50  # closures that are tried one by one
+DROPPED = 20  # that deviate most and are left out one by one
 STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
 GAP = 15.0  # meters that queries and places of an event are apart at most
 
@@ -122,34 +123,43 @@ class Decider:
         rest = len(taken) - np.cumsum(sizes) + sizes
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
-    def _extended(self, odometry: Any, taken: np.ndarray, values: Any) -> tuple[np.ndarray, Any]:
+    def _improved(
+        self, odometry: Any, taken: np.ndarray, values: Any, adds: bool
+    ) -> tuple[np.ndarray, Any]:
         """
-        Add closures, one by one in the order of the drive, that bend the odometry little enough.
+        Add and leave out closures, one by one, where that is evidence.
 
-        A closure at the end of a long path agrees with it, but is far away before it is added.
+        A false closure with a large deviation agrees with many paths, and bends the odometry: it
+        is less probable than a place anywhere on the map. A right one at the end of a long path is
+        far away before others are added.
+
+        :param adds: closures in the order of the drive, unless there are many.
         """
-        network = self._network
-        rejected = np.flatnonzero(~taken)
-        if len(rejected) > MAX_TRIED:
-            return taken, values
-        try:
-            values, before, _ = network.solve(odometry, values, taken * 1.0)
-        except RuntimeError:
-            return taken, values
-        rejected = rejected[np.argsort(np.maximum(network.query, network.place)[rejected])]
+        network, taken = self._network, taken.copy()
+
+        def solved(values: Any) -> tuple[Any, float]:
+            values, squared, determinant = network.solve(odometry, values, taken * 1.0)
+            found = float(self._precise[taken].sum()) + taken.sum() * self._room
+            return values, found - determinant - squared / 2
+
         while True:
-            count = taken.sum()
-            for number in rejected[~taken[rejected]]:
-                weights = taken * 1.0
-                weights[number] = 1.0
+            values, before = solved(values)
+            rejected, deviating = np.flatnonzero(~taken), np.flatnonzero(taken)
+            rejected = rejected[: len(rejected) * (adds and len(rejected) <= MAX_TRIED)]
+            rejected = rejected[np.argsort(np.maximum(network.query, network.place)[rejected])]
+            deviating = deviating[np.argsort(-network.residuals(values)[deviating])][:DROPPED]
+            changed = False
+            for number in [*rejected, *deviating]:
+                taken[number] = not taken[number]
                 try:
-                    moved, squared, _ = network.solve(odometry, values, weights)
+                    moved, found = solved(values)
                 except RuntimeError:
-                    continue
-                if squared - before < network.limit:
-                    taken = weights > 0
-                    values, before = moved, squared
-            if taken.sum() == count:
+                    found = -math.inf
+                if found > before:
+                    values, before, changed = moved, found, True
+                else:
+                    taken[number] = not taken[number]
+            if not changed:
                 return taken, values
 
     def at(self, scales: np.ndarray, near: Decision | None = None) -> Decision:
@@ -174,11 +184,16 @@ class Decider:
             tried = []
             if taken.any():  # closures beside them may agree by now
                 tried.append(network.robust(odometry, values, AGAIN))
-            if self._measured and near is not None:
-                tried += [self._extended(odometry, *each) for each in (*tried, (none, start))]
+            if self._measured and near is not None and scales.min() >= 1:
+                tried += [
+                    self._improved(odometry, *each, True) for each in (*tried, (none, start))
+                ]
             for more, moved in tried:
                 found = self._evidence(odometry, more, moved) if more.any() else 0.0
-                if more.sum() > taken.sum() and found > evidence - CERTAIN:
+                is_better = found > evidence
+                if not self._measured:
+                    is_better = more.sum() > taken.sum() and found > evidence - CERTAIN
+                if is_better:
                     taken, values, evidence = more, moved, found
         except RuntimeError:
             return Decision(none, scales, 0.0, math.inf, start, none, start)
@@ -220,19 +235,22 @@ class Decider:
         return other if gain(other) - max(gain(best), 0.0) > LOOSENED else best
 
     def estimate(
-        self, decision: Decision, independent: np.ndarray
+        self, decision: Decision, independent: np.ndarray, searches: bool
     ) -> tuple[np.ndarray, Any, np.ndarray]:
         """
         Estimate the variables at the errors of the odometry that the closures show.
 
         :param independent: closures whose errors do not correlate, shape (n,), bool; of other
             events one closure counts.
+        :param searches: leave out closures that are less probable than a place anywhere.
         :returns: the factors on the errors of each robot, the variables, and the closures that
             count, shape (n,), bool.
         """
         if self._measured:
             odometry = self._network.odometry(np.ones(len(self._chain)))
             taken, values = self._network.robust(odometry, decision.values, AGAIN)
+            if searches:
+                taken, values = self._improved(odometry, taken, values, False)
             return np.ones_like(decision.scales), values, taken
         counted = decision.taken & independent
         for number in self.representatives(decision.taken):

@@ -290,7 +290,7 @@ class PoseGraph:
         self._edges = {}
         if decision.taken.any():
             independent = np.array([each.is_independent for each in used], bool)
-            self.scales, values, counted = decider.estimate(decision, independent)
+            self.scales, values, counted = decider.estimate(decision, independent, searches)
             numbers = np.flatnonzero(allowed)[counted]
             self._edges = {int(i): self._closures[i] for i in numbers}
         self.solved = network.nodes(values)
