@@ -34,7 +34,7 @@ EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
 .PHONY: help setup build demo animation evaluate test test-long test-arm coverage crash-test lint docs bench bench-quick accuracy \
-	protocol off-map shell clean distclean development
+	protocol off-map pose-graphs shell clean distclean development
 
 help: ## list the targets (the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
@@ -124,6 +124,11 @@ accuracy: build ## measure the accuracy on the data sets (ARGS=)
 off-map: override EXTRAS += evaluation
 off-map: build ## measure mode robust off the map, at night, at other speeds (ARGS=)
 	@OMP_WAIT_POLICY=PASSIVE $(RUN) python benchmarks/off_map.py $(ARGS)
+
+pose-graphs: override EXTRAS += slam
+pose-graphs: build ## measure the pose graph on KITTI in groups, and on public graphs (ARGS=)
+	@$(RUN) python benchmarks/graph_methods.py --drives
+	@$(RUN) python benchmarks/graph_files.py $(ARGS)
 
 shell: build ## open a bash in which the built packages are found
 	@echo 'The executables are in $(EXECUTABLES)/ and $(LAB)/. Leave with exit.'

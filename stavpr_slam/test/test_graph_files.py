@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from stavpr_ros.commands.stavpr import main
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_slam.pose_graph import decision
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges
 from stavpr_slam.pose_graph.transforms import exponentials
 from test_pose_graph import error
@@ -116,3 +117,24 @@ def test_edges_are_rigid_motions(tmp_path):
     assert motion.shape == (4, 4)
     np.testing.assert_allclose(np.diag(information), [400] * 3 + [3600] * 3)
     np.testing.assert_allclose(matrices(to_poses(motion)), motion)
+
+
+@pytest.mark.parametrize('dropped', [decision.DROPPED, 0])
+def test_closure_that_bends_the_odometry_is_less_probable_than_a_place_anywhere(
+    data_folder, monkeypatch, dropped
+):
+    """With 9 false closures at random, one agrees with a path that it bends."""
+    monkeypatch.setattr(decision, 'DROPPED', dropped)
+    edges = read_edges(str(data_folder / 'pose_graphs/MIT.g2o'))
+    right = [edge for edge in edges if edge[1] != edge[0] + 1]
+    nodes, dice = max(edge[1] for edge in edges) + 1, np.random.default_rng(2)
+    false, information = [], np.median([edge[3] for edge in right], axis=0)
+    while len(false) < 9:
+        i, j = dice.integers(0, nodes - 1, 2).tolist()
+        if abs(i - j) >= 3:
+            false.append((i, j, right[dice.integers(len(right))][2], information))
+    graph = graph_of([*edges, *false])
+    graph.update(final=True)
+    accepted = np.array([edge.accepted for edge in graph.edges])
+    assert accepted[: len(right)].mean() > 0.9
+    assert accepted[len(right) :].any() == (dropped == 0)

@@ -7,7 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_slam.pose_graph import breaks, decision, keyframes, optimize, PoseGraph, sessions
+from stavpr_slam.pose_graph import (
+    breaks,
+    Closure,
+    decision,
+    keyframes,
+    optimize,
+    PoseGraph,
+    sessions,
+)
 from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.false_places import FalsePlaces
 from stavpr_slam.pose_graph.transforms import adjoints, exponentials, planar_poses
@@ -243,3 +251,27 @@ def test_break_is_at_a_pause(monkeypatch):
     monkeypatch.setattr(breaks, 'PAUSE', np.inf)
     found, _ = optimize(stamps, odometry, closures)
     assert error(found, truth) > 3
+
+
+def test_recorded_drive_in_groups_of_ten_is_never_above_its_odometry(data_folder):
+    """Drive 06 of KITTI with an appearance detector's closures, two thirds of them false."""
+    folder = data_folder / 'kitti_graphs/06'
+    odometry, truth, pairs = (
+        np.loadtxt(folder / f'{name}.csv', delimiter=',', skiprows=1)
+        for name in ('odometry', 'truth', 'closures_alpha_0.30')
+    )
+    poses, graph, at = planar_poses(odometry), PoseGraph(), 0
+    covariance = np.diag([3.0] * 3 + [np.radians(20)] * 3) ** 2
+    pairs = pairs[np.argsort(pairs[:, 0], kind='stable')].astype(int)
+    for number, (query, place) in enumerate(pairs.tolist(), 1):
+        while at <= query:
+            graph.add_odometry((at + 1) * SECOND, poses[at])
+            at += 1
+        stamps = (query + 1) * SECOND, (place + 1) * SECOND
+        graph.add_closure(Closure(*stamps, np.array([0, 0, 0, 0, 0, 0, 1.0]), covariance))
+        if number % 10 == 0 or number == len(pairs):
+            graph.update(final=number == len(pairs))
+            found = np.array([graph.at((i + 1) * SECOND) for i in range(at)])
+            before = error(poses[:at], truth[:at])
+            assert error(found, truth[:at]) < max(1.02 * before, before + 0.2)
+    assert error(found, truth[:at]) < 0.75 * before
