@@ -154,8 +154,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'image_transport',
             'raw',
             'raw: sensor_msgs/Image on the topic image; compressed: sensor_msgs/CompressedImage '
-            'on the topic image/compressed (follows a remapping of image).',
-            choices=('raw', 'compressed'),
+            'on the topic image/compressed (follows a remapping of image); ffmpeg, foxglove: '
+            'video on image/ffmpeg, image/foxglove, of the extra video (docs/integration.md).',
+            choices=('raw', 'compressed', 'ffmpeg', 'foxglove'),
         ),
         NodeParameter(
             'backend',

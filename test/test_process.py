@@ -50,6 +50,7 @@ def test_log_directory_that_cannot_be_written_is_named(monkeypatch):
     [
         ('/image', '/image/compressed', 'set image_transport to compressed'),
         ('/image/compressed', '/image', 'set image_transport to raw'),
+        ('/image/ffmpeg', '/image/foxglove', 'set image_transport to foxglove'),
         ('/image', '/other', ''),
     ],
 )

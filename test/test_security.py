@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from stavpr_ros.ros.node import PlaceRecognitionNode
 
 POLICY = Path(__file__).parents[1] / 'config' / 'sros2_policy.xml'
-BOTH_CAMERAS = {'/image', '/image/compressed'}
+BOTH_CAMERAS = {'/image', *(f'/image/{name}' for name in ('compressed', 'ffmpeg', 'foxglove'))}
 
 
 @pytest.fixture(scope='module')

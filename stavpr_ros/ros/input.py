@@ -9,7 +9,7 @@ import threading
 import time
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
+from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -23,16 +23,18 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import StampWatch, Statistics
+from stavpr_ros.ros.message_types import message_class
 from stavpr_ros.ros.messages import nanoseconds
-from stavpr_ros.ros.parameters import transport_remedy
+from stavpr_ros.ros.parameters import transport_remedy, TRANSPORTS
 from stavpr_ros.ros.rclpy_workarounds import HandOverGroup, ManagedNode
+from stavpr_ros.sources.video_topic import VideoStream
 from stavpr_ros.units import SECOND
+from std_msgs.msg import Header
 
-QUEUE = 10  # images in the middleware while the executor is busy
+QUEUE, PACKETS = 10, 100  # images, packets of video, in the middleware while the executor is busy
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 _REMEDIES = {
     'RELIABILITY': 'remove qos_overrides.{topic}.subscription.reliability, or make the publisher '
@@ -87,20 +89,22 @@ class ImageInput:
         self._last: float | None = None  # seconds, of the last image within the rate
         self._lock = threading.Lock()  # close() waits for the image of another thread
         self._closed = False
-        # as in image_transport, the compressed topic is below the one that `image` is remapped to
-        compressed_topic = node.resolve_topic_name('image') + '/compressed'
-        kinds = {'raw': (Image, 'image'), 'compressed': (CompressedImage, compressed_topic)}
-        message_type, name = kinds[settings.image_transport]
-        self._type = f'sensor_msgs/msg/{message_type.__name__}'
+        self._type, ending = TRANSPORTS[settings.image_transport]
+        is_video = self._type not in (TRANSPORTS['raw'][0], TRANSPORTS['compressed'][0])
+        self._video = VideoStream() if is_video else None
+        self._lost = self._counted = 0  # images between publisher and subscription; in statistics
+        # as in image_transport, other topics are below the one that `image` is remapped to
+        name = node.resolve_topic_name('image') + ending if ending else 'image'
         self.topic = node.resolve_topic_name(name)  # before events, which come on another thread
         self._subscription = AdaptiveSubscription(
             node,
-            message_type,
+            message_class(self._type),
             name,
-            QUEUE,
+            PACKETS if is_video else QUEUE,
             self.on_image,
-            lambda count: statistics.add_drop('lost in transport', count),
+            self._on_lost,
             self._on_refused,
+            MutuallyExclusiveCallbackGroup() if is_video else None,  # decoding takes long
         )
 
     def status(self) -> InputStatus:
@@ -135,6 +139,19 @@ class ImageInput:
         self.remedy = qos_remedy(self.topic, policy)
         self._node.get_logger().error(f'images are not received: {self.remedy}')
 
+    def _on_lost(self, count: int) -> None:
+        self._lost += count
+        if self._video is not None:
+            self._video.interrupt()
+        self._count_lost()
+
+    def _count_lost(self) -> None:
+        """Count lost images: the middleware and the publisher's numbers may both miss some."""
+        lost = max(self._lost, self._video.lost if self._video else 0)
+        if lost > self._counted:
+            self._statistics.add_drop('lost in transport', lost - self._counted)
+            self._counted = lost
+
     def on_image(self, message: Any) -> None:
         """Enqueue an image, or reject it for its rate; the callback of the subscription."""
         with self._lock:
@@ -142,6 +159,9 @@ class ImageInput:
                 return
             arrival = time.monotonic()
             self._statistics.add_image()
+            if self._video is not None:
+                message = self._video.read(message, Header)  # others depend on it
+                self._count_lost()
             stamp = nanoseconds(message.header.stamp)
             ahead, missing = self.stamps.update(stamp)
             self._statistics.add_stamp_jump(ahead, missing)
@@ -227,6 +247,7 @@ class AdaptiveSubscription:
     :param callback: called with each image once, in the order of arrival.
     :param on_lost: called with the number of images lost between publisher and subscription.
     :param on_refused: called with the policy of an incompatible publisher.
+    :param group: of the callbacks; None = they only hand over.
     :raises SettingsError: invalid qos_overrides.
     """
 
@@ -239,13 +260,14 @@ class AdaptiveSubscription:
         callback: Callable[[Any], None],
         on_lost: Callable[[int], None],
         on_refused: Callable[[str], None],
+        group: CallbackGroup | None = None,
     ) -> None:
         self._node, self._type, self._depth = node, message_type, depth
         self._callback, self._on_lost, self._on_refused = callback, on_lost, on_refused
         self.topic = node.resolve_topic_name(topic)
         self._override = f'qos_overrides.{self.topic}.subscription.reliability'
         self.overridden = self._override in node.parameter_overrides
-        self._group = HandOverGroup()
+        self._group = group or HandOverGroup()
         self._seen: deque[tuple[int, int | None]] = deque(maxlen=MEMORY)
         self._sequence: int | None = None  # number of the last image of the only publisher
         self._publishers = 0  # that are matched

@@ -15,6 +15,7 @@ from stavpr_ros.output_file import require_room
 from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS, RENAMED
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE
 
 _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 _FILES = ('map_path', 'save_path', 'model_path')
@@ -118,16 +119,28 @@ def require_changeable(changes: Mapping[str, Any], state: str) -> None:
         )
 
 
+TRANSPORTS = {
+    'raw': ('sensor_msgs/msg/Image', ''),
+    'compressed': ('sensor_msgs/msg/CompressedImage', '/compressed'),
+    'ffmpeg': (FFMPEG, '/ffmpeg'),
+    'foxglove': (FOXGLOVE, '/foxglove'),
+}
+"""As in image_transport: the type of the messages, and what follows the topic ``image``."""
+
+
 def transport_remedy(node: ManagedNode, topic: str) -> str:
     """
-    Return the remedy for images that are published in the other transport only, '' = none.
+    Return the remedy for images that are published in another transport only, '' = none.
 
     :param topic: of the images, resolved.
     """
-    raw = topic.removesuffix('/compressed')
-    transport, other = ('compressed', f'{raw}/compressed') if topic == raw else ('raw', raw)
-    published = node.count_publishers(other)
-    return f'{other} is published: set image_transport to {transport}' if published else ''
+    raw = topic
+    for _, ending in TRANSPORTS.values():
+        raw = raw.removesuffix(ending)
+    for transport, (_, ending) in TRANSPORTS.items():
+        if (other := raw + ending) != topic and node.count_publishers(other):
+            return f'{other} is published: set image_transport to {transport}'
+    return ''
 
 
 def inside_maps_folder(parameter: Parameter, node: ManagedNode, folder: Path) -> Parameter:

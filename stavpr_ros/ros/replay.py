@@ -5,10 +5,7 @@
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-import importlib.util
 import math
-from pathlib import Path
-import re
 import time
 from typing import Any
 
@@ -21,7 +18,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.errors import StavprError, UnavailableError
+from stavpr_ros.errors import StavprError
+from stavpr_ros.ros.message_types import message_class
 from stavpr_ros.ros.messages import record_message, time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
@@ -42,28 +40,6 @@ class NoSubscriberError(StavprError):
 
 class NoResultError(StavprError):
     """A published image got neither a result nor an acknowledgment in time."""
-
-
-def message_class(name: str) -> type:
-    """
-    Return the class of a message type.
-
-    :param name: such as ``nav_msgs/msg/Odometry``; it may come from a foreign file, so only
-        packages with messages are imported.
-    :raises UnavailableError: its package is not installed.
-    """
-    if words := re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name):
-        package, kind = words.groups()
-        spec = importlib.util.find_spec(package)  # does not import it
-        folders = (spec.submodule_search_locations if spec else None) or []
-        if any(Path(folder, 'msg').is_dir() for folder in folders):
-            kind_class = getattr(importlib.import_module(f'{package}.msg'), kind, None)
-            if isinstance(kind_class, type):
-                return kind_class
-    raise UnavailableError(
-        f'the message type {name} is not installed: install its package and source its '
-        'environment, or leave the topic out'
-    )
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,12 @@ from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE, VideoStream
 from stavpr_ros.units import SECOND
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+VIDEO = {FFMPEG, FOXGLOVE}
 ODOMETRY = 'nav_msgs/msg/Odometry'
 LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
 MIN_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
@@ -25,7 +27,7 @@ Item = TypeVar('Item')
 
 class BagSource:
     """
-    The images of one topic, raw or compressed, in the order of recording.
+    The images of one topic, raw, compressed or video, in the order of recording.
 
     Iterating yields :class:`Frame` with the header's stamp (the time of recording where that is 0)
     and ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens
@@ -82,7 +84,7 @@ class BagSource:
 
     def _record(self, _: int, time_ns: int, message: Any) -> ImageRecord:
         stamp_ns, frame_id = _stamp(message), message.header.frame_id
-        if self.message_type == COMPRESSED:
+        if self.message_type != RAW:
             image = decode_message(message, to_bytes=np.asarray)  # the map decides the range
             return ImageRecord.of_image(image, time_ns, stamp_ns, frame_id)
         return ImageRecord(
@@ -103,13 +105,15 @@ class BagSource:
         start: float = 0.0,
         duration: float = math.inf,
     ) -> Iterator[Item]:
+        stream = VideoStream() if self.message_type in VIDEO else None
         with open_bag(self.path) as bag:
             index = -1
             connections = [each for each in bag.reader.connections if each.topic == self.topic]
             messages = bag.messages(connections, start, duration)
             for index, (_, time_ns, raw) in enumerate(messages):
                 try:
-                    item = finish(index, time_ns, self._message(bag, raw))
+                    message = self._message(bag, raw)
+                    item = finish(index, time_ns, stream.read(message) if stream else message)
                 except ImageError as error:
                     image_error = ImageError(
                         f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind
@@ -152,7 +156,7 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
 
 def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
     """Return the requested topic, or the only one; an error lists the topics."""
-    images = {name: info for name, info in topics.items() if info[0] in {RAW, COMPRESSED}}
+    images = {name: info for name, info in topics.items() if info[0] in {RAW, COMPRESSED, *VIDEO}}
     if topic is not None:
         name = next((name for name in topics if name.lstrip('/') == topic.lstrip('/')), None)
         if name in images:
@@ -172,9 +176,8 @@ def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -
         raise SourceError(
             f'{path} has {len(nonempty)} image topics, choose one (--topic): {_listed(nonempty)}'
         )
-    raise SourceError(
-        f'{path} has no images (expected {RAW} or {COMPRESSED}): there are {_listed(topics)}'
-    )
+    kinds = ', '.join([RAW, COMPRESSED, *sorted(VIDEO)])
+    raise SourceError(f'{path} has no images (expected {kinds}): there are {_listed(topics)}')
 
 
 def _listed(topics: dict[str, tuple[str, int]]) -> str:

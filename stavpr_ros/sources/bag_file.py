@@ -5,6 +5,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 import math
 from pathlib import Path
 import shutil
@@ -16,11 +17,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
-from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
 from stavpr_ros.errors import SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import METADATA, reading, storage_files
 from stavpr_ros.sources.mcap import with_end
+from stavpr_ros.sources.video_topic import DEFINITIONS, FFMPEG, FOXGLOVE, ROS1_FFMPEG
 from stavpr_ros.units import SECOND
 
 LOG_SUFFIXES = ('-wal', '-journal')
@@ -33,7 +36,8 @@ class OpenBag:
     A bag that is open for reading.
 
     :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` and
-        ``nav_msgs`` are read, equal in every distribution: no definition in the bag is needed.
+        ``nav_msgs`` are read, equal in every distribution, and those of video topics, of which
+        fields may follow: no definition in the bag is needed.
     """
 
     path: Path
@@ -73,21 +77,47 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     with TemporaryDirectory(prefix='stavpr_bag_') as scratch:
         with reading(path):
             reader: Ros1Reader | Ros2Reader | AnyReader
+            deserialize: Callable[[bytes, str], Any]
             files = storage_files(path) if path.is_dir() else [path]
             if files and all(each.suffix.lower() == '.bag' and each.is_file() for each in files):
                 links = [_stage_file(each, Path(scratch, f'{each.stem}.bag')) for each in files]
                 reader = Ros1Reader(files[0]) if len(files) == 1 else AnyReader(links)
-                deserialize = get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
+                deserialize = _ros1_store().deserialize_ros1
             else:
                 staged = _stage(path, Path(scratch))
                 staged = with_end(staged, path) if staged.suffix == '.mcap' else staged
                 reader = Ros2Reader(staged)
-                deserialize = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+                deserialize = _deserialize_cdr
             reader.open()
         try:
             yield OpenBag(path, reader, deserialize)
         finally:
             reader.close()
+
+
+@cache
+def _ros1_store() -> Typestore:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    for name, text in (DEFINITIONS | {FFMPEG: ROS1_FFMPEG}).items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+@cache
+def _ros2_store() -> Typestore:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+def _deserialize_cdr(raw: bytes, kind: str) -> Any:
+    store = _ros2_store()
+    if kind != FOXGLOVE:
+        return store.deserialize_cdr(raw, kind)
+    definition = store.get_msgdef(kind)  # without the check that no bytes are left
+    read = definition.deserialize_cdr_le if raw[1] else definition.deserialize_cdr_be
+    return read(raw[4:], 0, definition.cls, store)[0]
 
 
 def _stage(path: Path, scratch: Path) -> Path:

@@ -213,14 +213,16 @@ def decode_message(
     """
     Decode an image message, raw or compressed, of rclpy or rosbags, or any object with its fields.
 
-    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, else a
-        ``sensor_msgs/Image``.
+    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, the image of a video
+        topic if it decodes itself, else a ``sensor_msgs/Image``.
     :param least: rows and columns that are needed of a large image, which is reduced then; None =
         all.
     :param to_bytes: converts values of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
     :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
     """
+    if hasattr(message, 'decode'):
+        return files.reduce(message.decode(), least)
     if hasattr(message, 'format'):
         return decode_compressed_message(message, least, to_bytes)
     return decode_image(

@@ -111,7 +111,7 @@ def decode(fps: float, paths: list[str], output: Connection) -> None:
                 if number < due:
                     output.send_bytes(FRAME.pack(seconds, file, 0, 0))
                 else:
-                    image = _image(frame, reformatter)
+                    image = rgb_of(frame, reformatter)
                     output.send_bytes(FRAME.pack(seconds, file, *image.shape[:2]))
                     output.send_bytes(image.reshape(-1).data)
                     due = math.floor(number) + 1
@@ -146,7 +146,7 @@ def _frames(container: Any, start: float, period: float) -> Iterator[tuple[float
                     yield seconds, frame
 
 
-def _image(frame: Any, reformatter: Any) -> np.ndarray:
+def rgb_of(frame: Any, reformatter: Any) -> np.ndarray:
     """Return a frame as RGB, uint8, upright; of an interlaced one, one field with double lines."""
     to = {'dst_color_trc': 1, 'dst_color_primaries': 1} if frame.color_trc in HDR else {}
     image = reformatter.reformat(frame, format='rgb24', **to).to_ndarray()

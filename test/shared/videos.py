@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small videos, by the encoders of PyAV."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -59,3 +60,19 @@ def copy_video(path: Path, target: Path, later: float = 0.0, **options: str) -> 
                 packet.stream = stream
                 container.mux(packet)
     return target
+
+
+def packets(images, codec: str = 'libx264', gop: int = 5, b_frames: int = 0) -> list[av.Packet]:
+    """Encode RGB images as a camera's encoder does: parameters in each key frame, no file."""
+    encoder = av.CodecContext.create(codec, 'w')
+    encoder.height, encoder.width = images[0].shape[:2]
+    encoder.pix_fmt, encoder.time_base, encoder.bit_rate = 'yuv420p', Fraction(1, RATE), 1_000_000
+    encoder.gop_size, encoder.max_b_frames = gop, b_frames
+    options = f'keyint={gop}:min-keyint={gop}:scenecut=0:bframes={b_frames}'
+    encoder.options = {f'{codec[3:]}-params': options + ':log-level=none' * (codec == 'libx265')}
+    result = []
+    for i, image in enumerate(images):
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
+        frame.pts = i
+        result += encoder.encode(frame)
+    return result + encoder.encode(None)

@@ -1,0 +1,212 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Video topics: packets by encoders of PyAV, in substitutes for the messages of other projects.
+
+The substitutes are built from the published definitions, in a bag or in this process.
+"""
+
+from types import SimpleNamespace
+
+from bags import SECOND, writing
+from builtin_interfaces.msg import Time
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg
+from sensor_msgs.msg import CompressedImage
+from stavpr_ros.errors import ImageError
+from stavpr_ros.pipeline.statistics import Statistics
+from stavpr_ros.ros import input as ros_input
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+from stavpr_ros.sources import files
+from stavpr_ros.sources.bag import BagSource
+from stavpr_ros.sources.encodings import decode_message
+from stavpr_ros.sources.video_topic import (
+    DEFINITIONS,
+    FFMPEG,
+    FOXGLOVE,
+    NO_KEY_FRAME,
+    ROS1_FFMPEG,
+    VideoStream,
+)
+from std_msgs.msg import Header
+from videos import colored_images, HEIGHT, packets, WIDTH
+
+COUNT, GOP = 15, 5
+IMAGES = colored_images(COUNT)
+CODECS = {'libx264': ('h264;yuv420p;bgr8;rgb8', 'h264'), 'libx265': ('hevc_nvenc', 'h265')}
+NEWER = 'string uuid\nstring lineage\n'  # fields behind those that are read
+
+
+@pytest.fixture(scope='module', params=CODECS)
+def codec(request):
+    return request.param
+
+
+@pytest.fixture(scope='module')
+def encoded(codec):
+    return packets(IMAGES, codec, GOP)
+
+
+def message_of(packet, kind, codec, i, **changes):
+    """Return a packet as a message of a kind, its fields in the order of the definition."""
+    data, time = np.frombuffer(bytes(packet), np.uint8), Time(sec=i + 1)
+    fields = {'timestamp': time, 'frame_id': 'camera', 'data': data, 'format': CODECS[codec][1]}
+    if kind == FFMPEG:
+        fields = {
+            'header': Header(stamp=time, frame_id='camera'),
+            'width': WIDTH,
+            'height': HEIGHT,
+        }
+        fields |= {'encoding': CODECS[codec][0], 'pts': packet.pts}
+        fields |= {'flags': int(packet.is_keyframe), 'is_bigendian': False, 'data': data}
+    return SimpleNamespace(**fields | changes)
+
+
+def decoded(stream, messages):
+    """Return the image of each message, or the kind of its error."""
+    found = []
+    for message in messages:
+        image = stream.read(message)
+        assert image.header.stamp.sec
+        try:
+            found.append(decode_message(image))
+        except ImageError as error:
+            found.append(error.kind)
+    return found
+
+
+def check(found, missing=()):
+    """Compare images with those that were encoded; others have an error."""
+    for i, image in enumerate(found):
+        if i in missing:
+            assert image == missing[i], i
+        else:
+            assert np.median(np.abs(image.astype(int) - IMAGES[i])) < 4, i
+
+
+@pytest.mark.parametrize('kind', [FFMPEG, FOXGLOVE])
+def test_each_packet_is_an_image_from_the_first_key_frame_on(encoded, codec, kind):
+    messages = [message_of(each, kind, codec, i) for i, each in enumerate(encoded)]
+    check(decoded(VideoStream(), messages))
+    late = decoded(VideoStream(), messages[3:])
+    check([*IMAGES[:3], *late], dict.fromkeys(range(3, GOP), NO_KEY_FRAME))
+
+
+def test_lost_packets_are_counted_and_their_key_frame_is_awaited(encoded, codec):
+    messages = [message_of(each, FFMPEG, codec, i) for i, each in enumerate(encoded)]
+    stream = VideoStream()
+    found = decoded(stream, messages[:6] + messages[8:])
+    check([*found[:6], *IMAGES[6:8], *found[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
+    assert stream.lost == 2
+    decoded(stream, messages)  # the publisher has started again
+    assert stream.lost == 2
+    for i, message in enumerate(messages):
+        message.pts = 33_333 * i  # microseconds
+    check(decoded(other := VideoStream(), messages))
+    assert other.lost == 0
+
+
+def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch):
+    stream, random = VideoStream(), np.random.default_rng(0)
+    for kind in (FFMPEG, FOXGLOVE):
+        for i, packet in enumerate(encoded * 4):
+            message = message_of(packet, kind, codec, i)
+            message.data = message.data.copy()
+            where = random.integers(0, message.data.size, 1 + i % 7)
+            message.data[where] = random.integers(0, 256, where.size)
+            message.data = message.data[: random.integers(0, message.data.size + 1)]
+            decoded(stream, [message])
+    good = [message_of(each, FFMPEG, codec, i) for i, each in enumerate(encoded)]
+    check(decoded(stream, good))
+    bad = message_of(encoded[0], FFMPEG, codec, 0, width=100_000, height=100_000)
+    assert decoded(stream, [bad]) == ['too large']
+    bad = message_of(encoded[0], FFMPEG, codec, 0, encoding='av1')
+    assert decoded(stream, [bad]) == ['encoding']
+    monkeypatch.setattr(files, 'MAX_PIXELS', WIDTH * HEIGHT - 1)  # what the parameters claim
+    for message in good[:2]:
+        message.width = message.height = 1
+    assert decoded(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]
+
+
+def test_b_frames_are_refused_with_the_remedy():
+    found = packets(IMAGES, b_frames=2)
+    message = message_of(found[0], FOXGLOVE, 'libx264', 0)
+    with pytest.raises(ImageError, match='max_b_frames: 0'):
+        VideoStream().read(message).decode()
+
+
+@pytest.mark.parametrize('kind', [FFMPEG, FOXGLOVE, 'ros1', 'newer'])
+def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded, kind):
+    is_ros1, name = kind == 'ros1', FOXGLOVE if kind in (FOXGLOVE, 'newer') else FFMPEG
+    text = ROS1_FFMPEG if is_ros1 else DEFINITIONS[name] + (NEWER if kind == 'newer' else '')
+    path = tmp_path / ('drive.bag' if is_ros1 else 'drive')
+    with writing(path, is_ros1) as bag:
+        bag._store.register(get_types_from_msg(text, name))
+        for i, packet in enumerate(encoded):
+            if i == 7:
+                continue
+            data, header = np.frombuffer(bytes(packet), np.uint8), bag.header((i + 1) * SECOND)
+            fields = header.stamp, 'camera', data, CODECS[codec][1]
+            fields += ('id', 'text') if kind == 'newer' else ()
+            if name == FFMPEG:
+                start = (header, data, WIDTH, HEIGHT) if is_ros1 else (header, WIDTH, HEIGHT)
+                fields = *start, CODECS[codec][0], packet.pts, int(packet.is_keyframe)
+                fields += () if is_ros1 else (False, data)
+            bag.write('/camera/video', name, (i + 1) * SECOND, *fields)
+    errors = []
+    source = BagSource(path, on_error=errors.append)
+    assert (source.message_type, len(source)) == (name, COUNT - 1)
+    frames = list(source)
+    if name == FFMPEG:  # the other one does not tell that a packet is missing
+        assert [each.kind for each in errors] == 2 * [NO_KEY_FRAME]
+        left = [*range(7), *range(10, COUNT)]
+        assert [frame.stamp for frame in frames] == [(i + 1) * SECOND for i in left]
+        for i, frame in zip(left, frames, strict=True):
+            assert np.median(np.abs(frame.image.astype(int) - IMAGES[i])) < 4
+        record = next(source.records())
+        assert (record.encoding, record.stamp_ns) == ('rgb8', SECOND)
+
+
+def test_damaged_foxglove_message_of_a_bag_is_an_error_of_its_image(tmp_path):
+    with writing(tmp_path / 'drive') as bag:
+        bag._store.register(get_types_from_msg(DEFINITIONS[FOXGLOVE], FOXGLOVE))
+        for content in (b'', b'\0\1\0\0', b'\0\1\0\0' + 40 * b'\xff'):
+            bag.write_bytes('/video', FOXGLOVE, SECOND, content)
+    errors = []
+    assert list(BagSource(tmp_path / 'drive', on_error=errors.append)) == []
+    assert [each.kind for each in errors] == 3 * ['damaged']
+
+
+def test_node_subscribes_below_the_topic_of_images_and_counts_lost_packets(
+    context, monkeypatch, encoded, codec
+):
+    monkeypatch.setattr(ros_input, 'message_class', lambda name: CompressedImage)
+    node, statistics, queue, late = ManagedNode('n', context=context), Statistics(), [], []
+    settings = SimpleNamespace(image_transport='ffmpeg', max_rate=1.0, max_stamp_gap=2.0)
+    images = ros_input.ImageInput(
+        node,
+        settings,
+        statistics,
+        lambda message, arrival: queue.append(message),
+        lambda message, reason: late.append(message),
+        lambda reason: None,
+    )
+    try:
+        assert images.topic == '/image/ffmpeg'
+        for i in (0, 1, 2, 3, 5, 6):
+            message = message_of(encoded[i], FFMPEG, codec, i)
+            if i == 2:  # faster than max_rate: decoded, since the next ones depend on it
+                message.header.stamp = Time(sec=2, nanosec=1)
+            images.on_image(message)
+        assert [each.header.stamp.sec for each in queue] == [1, 2, 4, 6, 7]
+        check([*IMAGES[:3], decode_message(queue[2]), IMAGES[4], *map(decode_message, queue[3:])])
+        assert len(late) == 1
+        images._on_lost(3)  # by the middleware, the one above among them
+        assert statistics.counts().dropped.total['lost in transport'] == 3
+        images.on_image(message_of(encoded[7], FFMPEG, codec, 7))
+        with pytest.raises(ImageError, match='before a key frame'):
+            decode_message(queue[-1])
+    finally:
+        images.close()
+        node.destroy_node()
