@@ -129,6 +129,16 @@ def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch
     assert decoded(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]
 
 
+def test_image_that_ffmpeg_conceals_is_damaged(route):
+    messages = [
+        message_of(each, FOXGLOVE, 'libx264', i)
+        for i, each in enumerate(packets(route[:6], 'libx264', 5))
+    ]
+    messages[2].data = messages[2].data[: messages[2].data.size // 2]
+    found = [each if isinstance(each, str) else '' for each in decoded(VideoStream(), messages)]
+    assert found == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
+
+
 def test_b_frames_are_refused_with_the_remedy():
     found = packets(IMAGES, b_frames=2)
     message = message_of(found[0], FOXGLOVE, 'libx264', 0)

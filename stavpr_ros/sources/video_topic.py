@@ -135,7 +135,7 @@ class VideoStream:
             frames = self._context.decode(packet)
         except Exception as error:  # damage raises errors of several types
             frames, reason = [], f': {error}'
-        if len(frames) != 1 or frames[0].pts != self._number:
+        if len(frames) != 1 or frames[0].pts != self._number or frames[0].is_corrupt:
             raise ImageError(
                 f'packet of {len(data)} bytes of {named!r} gives no image of its own: damaged, '
                 f'too large, or with B frames (max_b_frames: 0 prevents them){reason}',
