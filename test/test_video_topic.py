@@ -168,7 +168,7 @@ def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded
     source = BagSource(path, on_error=errors.append)
     assert (source.message_type, len(source)) == (name, COUNT - 1)
     frames = list(source)
-    if name == FFMPEG:  # the other one does not tell that a packet is missing
+    if name == FFMPEG:  # the other one does not report that a packet is missing
         assert [each.kind for each in errors] == 2 * [NO_KEY_FRAME]
         left = [*range(7), *range(10, COUNT)]
         assert [frame.stamp for frame in frames] == [(i + 1) * SECOND for i in left]

@@ -146,7 +146,7 @@ class ImageInput:
         self._count_lost()
 
     def _count_lost(self) -> None:
-        """Count lost images: the middleware and the publisher's numbers may both miss some."""
+        """Count lost images: the middleware and the publisher's numbers may each miss one."""
         lost = max(self._lost, self._video.lost if self._video else 0)
         if lost > self._counted:
             self._statistics.add_drop('lost in transport', lost - self._counted)

@@ -36,7 +36,7 @@ class OpenBag:
     A bag that is open for reading.
 
     :param deserialize: (bytes, message type) to message. Only types of ``sensor_msgs`` and
-        ``nav_msgs`` are read, equal in every distribution, and those of video topics, of which
+        ``nav_msgs`` are read, equal in every distribution, and the ones of video topics, of which
         fields may follow: no definition in the bag is needed.
     """
 

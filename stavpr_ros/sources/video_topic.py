@@ -78,7 +78,7 @@ class VideoStream:
         self._codec = ''
         self._number = 0  # of the packet
         self._pts: int | None = None  # of the last packet
-        self._counts = False  # pts was seen to count packets; some publishers state a time
+        self._counts = False  # pts counts packets; other publishers state a time
 
     def interrupt(self) -> None:
         """Wait for a key frame: packets were lost."""
