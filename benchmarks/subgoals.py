@@ -7,7 +7,7 @@ The place of each image by the place of the nearest single image, by the topolog
 PlaceNav (github.com/lasuomela/PlaceNav, after Xu et al., "Probabilistic Visual Place Recognition
 for Hierarchical Localization"), written anew with its parameters, and by ``PlaceRecognizer`` in
 mode robust, which keeps the last place where an image has no match. All have the same features;
-those of the first two are one unit vector an image. ``python benchmarks/subgoals.py``, on Gardens
+they are one unit vector an image for the first two. ``python benchmarks/subgoals.py``, on Gardens
 Point in STAVPR_DATA, in half a minute.
 """
 

@@ -79,7 +79,7 @@ def publishing(map_file, monkeypatch):
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', module)
     monkeypatch.setattr(
         'stavpr_ros.ros.navigation.Beat',
-        lambda period, act, name: beats.append(act) or SimpleNamespace(stop=lambda: None),
+        lambda node, period, act, name: beats.append(act) or SimpleNamespace(stop=lambda: None),
     )
     pipeline = localizing(map_file)
     settings = SimpleNamespace(

@@ -4,21 +4,22 @@
 
 from collections.abc import Callable
 import threading
-import traceback
 
-from rclpy.logging import get_logger
+from rclpy.node import Node
+from stavpr_ros.ros import REPORT_PERIOD
 
 
 class Beat:
     """
-    Calls a function every period, on the steady clock, from now on.
+    Calls a function every period, on the steady clock, from now on: a paused bag does not stop it.
 
+    :param node: it logs errors; the next call may succeed.
     :param period: seconds.
-    :param name: of the thread.
+    :param name: of the thread, and of what an error prevents.
     """
 
-    def __init__(self, period: float, act: Callable[[], object], name: str) -> None:
-        self._period, self._act = period, act
+    def __init__(self, node: Node, period: float, act: Callable[[], object], name: str) -> None:
+        self._node, self._period, self._act = node, period, act
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -32,5 +33,8 @@ class Beat:
         while not self._stop.wait(self._period):
             try:
                 self._act()
-            except Exception:  # the next call may succeed
-                get_logger('stavpr_beat').error(traceback.format_exc())
+            except Exception as error:
+                self._node.get_logger().error(
+                    f'no {self._thread.name}: {type(error).__name__}: {error}',
+                    throttle_duration_sec=REPORT_PERIOD,
+                )

@@ -42,7 +42,7 @@ class Bond:
         self._publisher = node.create_publisher(status, TOPIC, PUBLISHED)
         qos = QoSProfile(depth=RECEIVED)
         self._subscription = subscribe(node, status, TOPIC, self._on_status, qos, overridable=())
-        self._beat = Beat(period, self.beat, 'bond')
+        self._beat = Beat(node, period, self.beat, 'bond')
         self.beat()
 
     def beat(self) -> None:

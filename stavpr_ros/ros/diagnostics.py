@@ -5,13 +5,12 @@
 from collections.abc import Callable, Mapping
 import math
 import re
-import threading
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
-from stavpr_ros.ros import REPORT_PERIOD
+from stavpr_ros.ros.beat import Beat
 from stavpr_ros.ros.health import findings, Health, loss
 from std_msgs.msg import Header
 
@@ -25,38 +24,27 @@ Value = str | int | float | None
 
 class DiagnosticsPublisher:
     """
-    Publishes on ``/diagnostics`` from a thread with a steady clock: a paused bag does not stop it.
+    Publishes on ``/diagnostics`` from a thread.
 
     :param period: seconds.
     :param health: returns the state of the node; called from the thread.
     """
 
     def __init__(self, node: Node, period: float, health: Callable[[], Health]) -> None:
-        self._node, self._period, self._health = node, period, health
+        self._node, self._health = node, health
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name='diagnostics', daemon=True)
-        self._thread.start()
+        self._beat = Beat(node, period, self._report, 'diagnostics')
 
     def stop(self) -> None:
         """End the thread."""
-        self._stop.set()
-        self._thread.join()
+        self._beat.stop()
 
-    def _run(self) -> None:
-        while not self._stop.wait(self._period):
-            try:
-                stamp = self._node.get_clock().now().to_msg()
-                name = self._node.get_fully_qualified_name()
-                health = self._health()
-                self._publisher.publish(diagnostic_array(health, name, stamp))
-                if text := loss(health):
-                    self._node.get_logger().warning(text, throttle_duration_sec=LOSS_PERIOD)
-            except Exception as error:  # the next report may succeed
-                self._node.get_logger().error(
-                    f'no diagnostics: {type(error).__name__}: {error}',
-                    throttle_duration_sec=REPORT_PERIOD,
-                )
+    def _report(self) -> None:
+        stamp = self._node.get_clock().now().to_msg()
+        name, health = self._node.get_fully_qualified_name(), self._health()
+        self._publisher.publish(diagnostic_array(health, name, stamp))
+        if text := loss(health):
+            self._node.get_logger().warning(text, throttle_duration_sec=LOSS_PERIOD)
 
 
 def diagnostic_array(health: Health, node: str, stamp: Time) -> DiagnosticArray:

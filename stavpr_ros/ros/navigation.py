@@ -51,7 +51,7 @@ class Navigation:
         if settings.publish_tf:
             self._tf_message = tf_message()
             self._tf = node.create_publisher(self._tf_message, '/tf', TF_DEPTH)
-            self._beat = Beat(TF_PERIOD, self.repeat, 'tf')
+            self._beat = Beat(node, TF_PERIOD, self.repeat, 'tf')
         if settings.publish_initialpose:
             self._initial_pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
         self._unmatched = settings.pipeline.sequence.length  # images since the last match
