@@ -128,7 +128,7 @@ class Services:
             # call
             result = runtime.pipeline.operation.relocalize(count)
             response.match = runtime.last_match
-            header, places = response.match.header, runtime.pipeline.places
+            header, places = response.match.header, runtime.pipeline.operation.matched_places
             candidates = candidates_message(header, result, places)
             response.candidates = candidates.candidates if candidates is not None else []
             pose = matched_pose_message(header, result, places, runtime.last_frame)
