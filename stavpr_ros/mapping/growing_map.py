@@ -116,7 +116,9 @@ class GrowingMap:
         :param replaces: also where the place is related already.
         """
         if replaces or place not in self._related:
-            self._related[place] = earlier if self._same_as is None else int(self._same_as[earlier])
+            self._related[place] = (
+                earlier if self._same_as is None else int(self._same_as[earlier])
+            )
 
     def __len__(self) -> int:
         return self._count

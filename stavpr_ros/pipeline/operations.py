@@ -226,9 +226,21 @@ class Operation(ABC):
             result = ImageResult(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
         if list_candidates and self.recognizer is not None and result.nearest_index >= 0:
             result = result.with_candidates(self.recognizer.ranked(self.settings.candidates))
+            result = replace(result, session_probabilities=self._session_probabilities())
         if math.isnan(result.threshold):  # none has applied
             result = replace(result, threshold=threshold)
         return replace(result, stages=stages)
+
+    def _session_probabilities(self) -> tuple[float, ...]:
+        """Return the probability of each session of the map, by the newest image."""
+        places, recognizer = self.reference, self.recognizer
+        if places is None or places.session_index is None or recognizer is None:
+            return ()
+        by_place = recognizer.place_probabilities()
+        if len(by_place) != len(places):
+            return ()
+        sums = np.bincount(places.session_index, by_place, len(places.sessions))
+        return tuple(sums.tolist())
 
     def _process(
         self, stages: dict[str, float], message: Any, row: WindowRow, camera: Camera | None
@@ -413,7 +425,7 @@ class Mapper(Operation):
         return replace(result, image_index=index)
 
     def _checked(self, result: ImageResult) -> ImageResult:
-        """Return a result after the geometric check; without a match, the image is a place only."""
+        """Return a result after the geometric check; without a match, it is of a place only."""
         result = super()._checked(result)
         if not result.accepted:
             return replace(result, status=Status.MAPPED, reason='')
