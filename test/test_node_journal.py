@@ -149,7 +149,8 @@ def recording(robot, tmp_path):
 
 def mapped(robot):
     """Return the stamps of the images that were published as places."""
-    places = [match for match in robot.answers if match.status == PlaceMatch.MAPPED]
+    recorded = PlaceMatch.MAPPED, PlaceMatch.MATCH
+    places = [match for match in robot.answers if match.status in recorded]
     return {match.header.stamp.sec * SECOND for match in places}
 
 
