@@ -277,7 +277,7 @@ def test_relocalize_returns_the_last_match_with_candidates_and_pose(robot, start
     assert (response.has_pose, response.pose) == (False, PoseWithCovarianceStamped())
 
 
-def test_node_records_a_session_on_a_map_and_says_where_the_robot_is(
+def test_node_records_a_session_on_a_map_and_publishes_where_the_robot_is(
     robot, start, route, map_file, tmp_path
 ):
     node = start(operation='mapping', localized_probability=0.05)
