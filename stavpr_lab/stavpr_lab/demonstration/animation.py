@@ -57,7 +57,7 @@ def write_animation(folder: Path, path: Path, ahead: float = 0.0) -> None:
     Write an animation of the query's images beside their places, as WebP.
 
     :param folder: output of the command ``demo`` without options.
-    :param ahead: see :func:`draw`.
+    :param ahead: as for :func:`draw`.
     :raises StavprError: a file of the demonstration cannot be read.
     """
     place_map = load_map(folder / 'map.stavpr')
