@@ -125,7 +125,7 @@ def recover(
     :param output: file of the map, which must not exist; None = the journal's name without its
         suffix. That may be the map that is continued, which is replaced then; beside another map,
         a numbered name is taken.
-    :param relate: relates the places of the last session to those of the map, see
+    :param relate: relates places of the last session to places of the map, see
         :func:`stavpr_ros.recognition.same_places.with_last_related`.
     :raises JournalError: no journal, one without places, or one that is being written.
     :raises OutputError: the map cannot be written; the journal stays.
