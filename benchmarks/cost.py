@@ -140,7 +140,10 @@ def process(command: list[str]) -> Iterator[int]:
         yield one.pid
     finally:
         one.terminate()
-        one.wait()
+        try:
+            one.wait(10)
+        except subprocess.TimeoutExpired:  # rclpy's signal handlers lose one at times
+            one.kill()
 
 
 def node_cost(path: str, rate: float, arguments: argparse.Namespace) -> dict[str, Any]:

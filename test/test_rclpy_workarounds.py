@@ -7,14 +7,16 @@ A test of upstream that fails means that its workaround can go.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor
+import queue
 import threading
+import time
 from types import SimpleNamespace
 from unittest.mock import call, Mock
 
 import pytest
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
@@ -22,9 +24,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from stavpr_ros.errors import OutputError
 from stavpr_ros.ros import process, rclpy_workarounds
 from stavpr_ros.ros.rclpy_workarounds import (
-    HandOverGroup,
     ManagedNode,
     PromptExecutor,
+    ReceivedGroup,
+    Receiver,
     repeat_responses,
 )
 from std_msgs.msg import Int32
@@ -122,25 +125,6 @@ def test_prompt_executor_after_a_failing_callback_goes_on(node, prompt, capfd):
     assert 'ValueError: defect' in capfd.readouterr().err
 
 
-def test_prompt_executor_runs_callbacks_that_hand_over_itself_and_logs_their_errors(
-    node, prompt, capfd
-):
-    qos = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    threads = []
-
-    def callback(message):
-        threads.append(threading.current_thread())
-        raise ValueError('defect')
-
-    node.create_subscription(Int32, 'handed', callback, qos, callback_group=HandOverGroup())
-    publisher = node.create_publisher(Int32, 'handed', qos)
-    for number in range(2):
-        publisher.publish(Int32(data=number))
-    spin_until(prompt, lambda: len(threads) == 2)
-    assert set(threads) == {threading.current_thread()}
-    assert 'ValueError: defect' in capfd.readouterr().err
-
-
 def test_prompt_executor_calls_back_with_events_of_publishers(node, prompt):
     changes = []
     events = PublisherEventCallbacks(matched=lambda event: changes.append(event.current_count))
@@ -156,6 +140,85 @@ def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt, monkeypatch)
     destroyed = Mock(side_effect=rclpy_implementation.InvalidHandle('destroyed'))
     monkeypatch.setattr(prompt, 'wait_for_ready_callbacks', destroyed)
     prompt.spin_once(0.1)
+
+
+# subscriptions with a thread of their own
+
+
+@pytest.fixture
+def received(node, context):
+    """Return what `callback` raises errors for, events of matches, and the subscription."""
+    messages, matches = queue.Queue(), queue.Queue()
+
+    def callback(message):
+        messages.put((message.data, threading.current_thread()))
+        raise ValueError('defect')
+
+    events = SubscriptionEventCallbacks(matched=lambda event: matches.put(event.current_count))
+    subscription = node.create_subscription(
+        Int32, 'received', callback, 10, callback_group=ReceivedGroup(), event_callbacks=events
+    )
+    Receiver(subscription, context)
+    return messages, matches, subscription
+
+
+def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, received, capfd):
+    messages, matches, _ = received
+    publisher = node.create_publisher(Int32, 'received', 10)
+    assert matches.get(timeout=60) == 1
+    for number in range(2):
+        publisher.publish(Int32(data=number))
+    (first, thread), (second, same) = (messages.get(timeout=60) for _ in range(2))
+    assert (first, second) == (0, 1)
+    assert thread is same is not threading.current_thread()
+    node.destroy_publisher(publisher)
+    assert matches.get(timeout=60) == 0  # on the thread that has logged the errors
+    assert capfd.readouterr().err.count('ValueError: defect') == 2
+
+
+@pytest.mark.parametrize('by', ['subscription', 'node', 'context'])
+def test_receiver_of_a_destroyed_subscription_node_or_context_ends(context, received, by, node):
+    messages, _, subscription = received
+    publisher = node.create_publisher(Int32, 'received', 10)
+    while messages.empty():  # until the thread waits, and is matched
+        publisher.publish(Int32(data=1))
+        time.sleep(0.01)
+    thread = messages.get()[1]
+    end = {
+        'subscription': lambda: node.destroy_subscription(subscription),
+        'node': node.destroy_node,
+        'context': context.try_shutdown,
+    }
+    end[by]()
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+def test_receiver_that_is_destroyed_by_its_callback_or_during_it_ends(node, context):
+    waits, released = threading.Event(), threading.Event()
+
+    def callback(message):
+        waits.set()
+        released.wait(60)
+        node.destroy_subscription(subscription)
+
+    subscription = node.create_subscription(
+        Int32, 'received', callback, 10, callback_group=ReceivedGroup()
+    )
+    receiver = Receiver(subscription, context)
+    publisher = node.create_publisher(Int32, 'received', 10)
+    while not waits.is_set():
+        publisher.publish(Int32(data=1))
+        time.sleep(0.01)
+    node.destroy_subscription(subscription)  # must not wait for the callback
+    released.set()
+    receiver.join(60)
+    assert not receiver.is_alive()
+
+
+def test_executor_does_not_wait_for_a_received_subscription(received, prompt):
+    *_, subscription = received
+    assert not any(map(prompt.can_execute, (subscription, *subscription.event_handlers)))
 
 
 # responses to clients that are not matched yet

@@ -11,11 +11,10 @@ import threading
 from typing import Any
 import uuid
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from stavpr_ros.ros.beat import Beat
-from stavpr_ros.ros.input import subscribe
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 
 TOPIC, TIMEOUT = 'bond', 4.0  # seconds, as nav2_util::LifecycleNode
@@ -40,8 +39,10 @@ class Bond:
         self._has_manager = self._is_closed = False
         self._manager_ended = threading.Event()
         self._publisher = node.create_publisher(status, TOPIC, PUBLISHED)
-        qos = QoSProfile(depth=RECEIVED)
-        self._subscription = subscribe(node, status, TOPIC, self._on_status, qos, overridable=())
+        group = MutuallyExclusiveCallbackGroup()
+        self._subscription = node.create_subscription(
+            status, TOPIC, self._on_status, RECEIVED, callback_group=group
+        )
         self._beat = Beat(node, period, self.beat, 'bond')
         self.beat()
 

@@ -9,7 +9,6 @@ import threading
 import time
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -29,7 +28,7 @@ from stavpr_ros.pipeline.statistics import StampWatch, Statistics
 from stavpr_ros.ros.message_types import message_class
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.ros.parameters import transport_remedy, TRANSPORTS
-from stavpr_ros.ros.rclpy_workarounds import HandOverGroup, ManagedNode
+from stavpr_ros.ros.rclpy_workarounds import ManagedNode, ReceivedGroup, Receiver
 from stavpr_ros.sources.video_topic import VideoStream
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Header
@@ -104,7 +103,6 @@ class ImageInput:
             self.on_image,
             self._on_lost,
             self._on_refused,
-            MutuallyExclusiveCallbackGroup() if is_video else None,  # decoding takes long
         )
 
     def status(self) -> InputStatus:
@@ -202,26 +200,23 @@ def subscribe(
     qos: QoSProfile,
     *,
     overridable: tuple[QoSPolicyKind, ...] = (*OVERRIDABLE, QoSPolicyKind.RELIABILITY),
-    group: CallbackGroup | None = None,
     **events: Callable[[Any], None],
 ) -> Subscription:
     """
-    Subscribe, in a callback group of its own unless one is given; qos_overrides change the QoS.
+    Subscribe, and call back on a thread of this subscription; qos_overrides change the QoS.
 
-    :param callback: hands over: the executor waits for it.
     :param qos: of the caller; rclpy writes the overrides into it.
     :param events: callbacks of the middleware; those that it does not support are left out.
     :raises SettingsError: invalid qos_overrides.
     """
-    group = group or HandOverGroup()
     while True:
         try:
-            return node.create_subscription(
+            subscription = node.create_subscription(
                 message_type,
                 topic,
                 callback,
                 qos,
-                callback_group=group,
+                callback_group=ReceivedGroup(),
                 event_callbacks=SubscriptionEventCallbacks(**events),
                 qos_overriding_options=QoSOverridingOptions(overridable),
             )
@@ -233,6 +228,9 @@ def subscribe(
                 f'cannot subscribe to {name}: {error}; correct qos_overrides.{name}.subscription '
                 'and start again'
             ) from error
+        else:
+            Receiver(subscription, node.context)
+            return subscription
 
 
 class AdaptiveSubscription:
@@ -247,7 +245,6 @@ class AdaptiveSubscription:
     :param callback: called with each image once, in the order of arrival.
     :param on_lost: called with the number of images lost between publisher and subscription.
     :param on_refused: called with the policy of an incompatible publisher.
-    :param group: of the callbacks; None = they only hand over.
     :raises SettingsError: invalid qos_overrides.
     """
 
@@ -260,14 +257,12 @@ class AdaptiveSubscription:
         callback: Callable[[Any], None],
         on_lost: Callable[[int], None],
         on_refused: Callable[[str], None],
-        group: CallbackGroup | None = None,
     ) -> None:
         self._node, self._type, self._depth = node, message_type, depth
         self._callback, self._on_lost, self._on_refused = callback, on_lost, on_refused
         self.topic = node.resolve_topic_name(topic)
         self._override = f'qos_overrides.{self.topic}.subscription.reliability'
         self.overridden = self._override in node.parameter_overrides
-        self._group = group or HandOverGroup()
         self._seen: deque[tuple[int, int | None]] = deque(maxlen=MEMORY)
         self._sequence: int | None = None  # number of the last image of the only publisher
         self._publishers = 0  # that are matched
@@ -345,7 +340,6 @@ class AdaptiveSubscription:
             lambda message, info: self._on_message(number, message, info),
             QoSProfile(depth=self._depth, reliability=reliability),
             overridable=(*OVERRIDABLE, *extra),
-            group=self._group,
             incompatible_qos=lambda event: self._on_incompatible(number, event),
             matched=lambda event: self._on_matched(number, event),
             message_lost=self._on_message_lost,

@@ -9,8 +9,7 @@ when upstream is fixed, and the workaround can go.
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
-from functools import partial
+from contextlib import contextmanager, ExitStack, suppress
 import os
 import threading
 import time
@@ -20,9 +19,10 @@ import warnings
 
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.event_handler import QoSPublisherEventType
+from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
+from rclpy.context import Context
 from rclpy.executors import Executor, ShutdownException, TimeoutException
+from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
 from rclpy.logging import get_logger
@@ -30,10 +30,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
 from rclpy.subscription import Subscription
-from rclpy.task import Task
 from stavpr_ros.errors import SettingsError, UnavailableError
 
-EVENT_PERIOD = 0.15  # seconds between collections of the events of publishers
+RECEIVER_POLL = 10**9  # nanoseconds until a receiver detects the end of the process
+END_POLL = 0.01  # seconds until a receiver is noticed to call back
 START_POLL = 0.0005  # seconds between two checks whether a thread has begun a callback
 RESPONSE_LOST = 'failed to send response'  # part of rclpy's warning
 RESPONSE_TIMEOUT = 3.5  # seconds of attempts; callbacks have a little more when the process ends
@@ -80,8 +80,75 @@ def ros_arguments_checked() -> Iterator[None]:
 _warning_filters = threading.Lock()  # they belong to the process
 
 
-class HandOverGroup(MutuallyExclusiveCallbackGroup):
-    """Of subscriptions with callbacks that only hand over: the executor calls them itself."""
+class ReceivedGroup(CallbackGroup):
+    """Of the subscription of a :class:`Receiver`: no executor waits for it or for its events."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return whether an executor may call the callback of an entity."""
+        return False
+
+
+class Receiver(threading.Thread):
+    """
+    Calls the callbacks of a subscription, until it is destroyed.
+
+    No upstream change is known: each wake-up of an executor collects all entities of its nodes
+    again, three times for a message, and each message wakes it up that waits for an event of the
+    subscription. The wait set of this thread has the subscription, its events, and the end.
+
+    :param subscription: in a :class:`ReceivedGroup`. Errors of its callbacks are logged.
+    """
+
+    def __init__(self, subscription: Subscription, context: Context) -> None:
+        super().__init__(name='receiver', daemon=True)
+        self._subscription, self._context = subscription, context
+        self._guard = GuardCondition(None, None, context=context)
+        self._ended = self._calls = False
+        self._destroy, subscription.destroy = subscription.destroy, self.end
+        context.on_shutdown(self._guard.trigger)
+        self.start()
+
+    def end(self) -> None:
+        """Destroy the subscription, after a callback in progress, which is not waited for."""
+        self._ended = True
+        self._destroy()  # deferred until the thread has ended
+        self._guard.trigger()
+        while self.is_alive() and not self._calls:
+            self.join(END_POLL)
+
+    def run(self) -> None:
+        """Wait for messages and events."""
+        context, handle = self._context, self._subscription.handle
+        kind, events = self._subscription.msg_type, self._subscription.event_handlers
+        callback = self._subscription.callback
+        if self._subscription._callback_type is Subscription.CallbackType.MessageOnly:
+            callback = lambda message, info: self._subscription.callback(message)  # noqa: E731
+        with suppress(rclpy_implementation.InvalidHandle), ExitStack() as stack:
+            for entity in (handle, self._guard.handle, *events, context.handle):
+                stack.enter_context(entity)  # it may be destroyed already
+            wait_set = rclpy_implementation.WaitSet(1, 1, 0, 0, 0, len(events), context.handle)
+            # an interpreter that ends must not meet this thread in a call of C++
+            while not self._ended and context.ok() and threading.main_thread().is_alive():
+                wait_set.clear_entities()
+                wait_set.add_subscription(handle)
+                wait_set.add_guard_condition(self._guard.handle)
+                for event in events:
+                    event.add_to_wait_set(wait_set)
+                wait_set.wait(RECEIVER_POLL)
+                for event in events:
+                    if event.is_ready(wait_set) and (data := event.take_data()):
+                        self._call(event.callback, data)
+                if not self._ended and (taken := handle.take_message(kind, False)):
+                    self._call(callback, *taken)
+                    del taken  # an image, until the next one
+
+    def _call(self, callback: Callable[..., None], *arguments: Any) -> None:
+        self._calls = True
+        try:
+            callback(*arguments)
+        except Exception:
+            log_failure(traceback.format_exc())
+        self._calls = False
 
 
 class PromptExecutor(Executor):
@@ -99,12 +166,6 @@ class PromptExecutor(Executor):
 
     Callbacks that raise are logged; upstream ends the process.
 
-    Each wake-up collects all entities again, upstream three times a callback: before it, when it
-    has begun and when it has ended. A callback of a :class:`HandOverGroup` runs on the thread of
-    the executor, which needs no waking, and events of publishers, half of all entities, are
-    collected every ``EVENT_PERIOD``. No upstream change is known: a later executor waits for
-    events without collecting.
-
     :param threads: callbacks that may run at once.
     """
 
@@ -112,21 +173,6 @@ class PromptExecutor(Executor):
         super().__init__(**options)
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix='callback')
         self._running: set[Future[None]] = set()
-        self._collects_events, self._next_events = True, 0.0
-
-    def get_nodes(self) -> list[Node]:
-        """Return all nodes, whose entities are collected next."""
-        now = time.monotonic()
-        self._collects_events = now >= self._next_events
-        if self._collects_events:
-            self._next_events = now + EVENT_PERIOD
-        return list(super().get_nodes())
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return whether to collect an entity."""
-        event_type = None if self._collects_events else getattr(entity, 'event_type', None)
-        is_later = isinstance(event_type, QoSPublisherEventType)
-        return not is_later and bool(super().can_execute(entity))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Begin the next callback, if one is ready in time."""
@@ -134,38 +180,14 @@ class PromptExecutor(Executor):
             task, _, _ = self.wait_for_ready_callbacks(timeout_sec)
         except (ShutdownException, TimeoutException, rclpy_implementation.InvalidHandle):
             return
-        if not isinstance(task, Task):
-            task()
-            return
         future = self._pool.submit(_run, task)
         self._running = {other for other in self._running if not other.done()} | {future}
         while not (task.executing() or future.done()):
             time.sleep(START_POLL)
 
-    def _make_handler(self, entity: Any, node: Any, take_from_wait_list: Any) -> Any:
-        hands_over = isinstance(entity.callback_group, HandOverGroup)
-        if hands_over and isinstance(entity, Subscription):
-            return partial(_hand_over, entity, take_from_wait_list)
-        return super()._make_handler(entity, node, take_from_wait_list)
-
     def finish(self, timeout: float) -> None:
         """Wait for the callbacks that have begun, at most so many seconds."""
         wait(self._running, timeout)
-
-
-def _hand_over(entity: Subscription, take: Callable[[Subscription], Any]) -> None:
-    """Take the message of a subscription and call its callback, a plain function."""
-    if not entity.callback_group.beginning_execution(entity):
-        return
-    try:
-        if (call := take(entity)) is not None:
-            call().send(None)
-    except StopIteration:
-        pass
-    except Exception:
-        log_failure(traceback.format_exc())
-    finally:
-        entity.callback_group.ending_execution(entity)
 
 
 def _run(task: Any) -> None:
