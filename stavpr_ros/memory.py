@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrays whose memory begins with a cache line: vectors across two are read at half the speed."""
 
+import math
+
 import numpy as np
 from numpy.typing import DTypeLike
 
@@ -24,7 +26,7 @@ def is_aligned(array: np.ndarray) -> bool:
 
 
 def _aligned(allocate, shape, dtype):  # type: ignore[no-untyped-def]
-    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     block = allocate(size + CACHE_LINE, np.uint8)
-    first = -block.ctypes.data % CACHE_LINE
+    first = -block.__array_interface__['data'][0] % CACHE_LINE  # faster than block.ctypes
     return block[first : first + size].view(dtype).reshape(shape)

@@ -3,6 +3,7 @@
 """Conversions between messages and the types of the library; no publishers."""
 
 import array
+from copy import copy
 from dataclasses import dataclass
 import math
 
@@ -51,6 +52,16 @@ class PoseFrames:
 
 
 NO_FRAMES = PoseFrames()
+# copied and shared, never changed: rosidl makes all messages of a message to construct it
+NO_EDGE = RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_error=math.nan)
+_NO_MATCH = PlaceMatch(
+    sequence_first=-1,
+    sequence_last=-1,
+    sequence_middle=-1,
+    second_best_index=-1,
+    second_best_distance=math.nan,
+    relative_pose=NO_EDGE,
+)
 
 
 def time_message(nanoseconds: int) -> Time:
@@ -93,27 +104,16 @@ def match_message(
     :param edge: of the middle pair, None = none; frame: of the base.
     """
     match, is_mapped = result.match, result.status is Status.MAPPED
-    message = PlaceMatch(
-        header=header,
-        **origin(robot_id, places),
-        status=result.status,
-        reason=result.reason,
-        place_index=result.place_index,
-        newest_index=result.image_index if is_mapped else result.newest_index,
-        distance=result.distance,
-        threshold=result.threshold,
-        probability=result.probability,
-        sequence_first=-1,
-        sequence_last=-1,
-        sequence_middle=-1,
-        window_first=header.stamp,
-        window_middle=header.stamp,
-        window_last=header.stamp,
-        second_best_index=-1,
-        second_best_distance=math.nan,
-        inliers=result.inliers,
-        relative_pose=no_edge(),
-    )
+    newest_index = result.newest_index
+    message = copy(_NO_MATCH)
+    message.header, message.robot_id = header, robot_id
+    message.map_id = '' if places is None else places.map_id
+    message.status, message.reason = result.status, result.reason
+    message.place_index = result.place_index
+    message.newest_index = result.image_index if is_mapped else newest_index
+    message.distance, message.threshold = result.distance, result.threshold
+    message.probability, message.inliers = result.probability, result.inliers
+    message.window_first = message.window_middle = message.window_last = header.stamp
     if match is not None and match.window_stamps:
         stamps = match.window_stamps
         message.window_first = time_message(stamps[0])
@@ -127,7 +127,7 @@ def match_message(
         message.second_best_index = sequence.second_best_index
         message.second_best_distance = sequence.second_best_distance
     if match is not None and result.accepted and places is not None:
-        place, newest = places.place(result.place_index), places.place(result.newest_index)
+        place, newest = places.place(message.place_index), places.place(newest_index)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
         message.session = place.session
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
@@ -220,7 +220,7 @@ def loop_closure_message(
         threshold=result.threshold,
         probability=result.probability,
         inliers=result.inliers,
-        relative_pose=no_edge(),
+        relative_pose=NO_EDGE,
         pairs=pairs,
     )
     if query_pose is not None and place.pose is not None:
@@ -250,11 +250,6 @@ def relative_pose_message(
     message.pose.pose = pose_message(edge.pose)
     message.pose.covariance = edge.covariance.ravel()
     return message
-
-
-def no_edge() -> RelativePose:
-    """Return the message where there is no pair."""
-    return RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_error=math.nan)
 
 
 def matched_pose_message(
