@@ -9,9 +9,13 @@ import numpy as np
 from pipelines import settings_of
 import pytest
 from stavpr_ros.errors import ImageError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import build_map
+from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.pipeline import Pipeline
+from stavpr_ros.sources import open_source
 from stavpr_ros.sources.encodings import decode_image, decode_message
-from stavpr_ros.sources.files import reduction
+from stavpr_ros.sources.files import decode_file, reduction
 
 MIN_SIZE = (224, 224)
 
@@ -128,3 +132,16 @@ def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes,
     settings = settings_of(feature_settings=f'{{"resize": "{resize}"}}', **changes)
     pipeline = Pipeline(settings, 'mapping')
     assert pipeline.operation.process(raw(image), 1).image.shape[0] == rows
+
+
+def test_map_of_large_files_has_the_features_that_a_node_computes(image, tmp_path):
+    cv2.imwrite(str(tmp_path / 'large.jpg'), image[..., ::-1])
+    extractor = FeatureExtractor()
+    place_map = build_map(open_source(tmp_path), extractor, progress=False)
+    reduced = decode_file(
+        (tmp_path / 'large.jpg').read_bytes(), None, extractor.needed_size(THUMBNAIL_WIDTH)
+    )
+    assert reduced.shape == (270, 480, 3)
+    np.testing.assert_array_equal(
+        place_map.features.strips, extractor.extract([reduced]).strips, strict=True
+    )

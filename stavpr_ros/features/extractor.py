@@ -224,6 +224,13 @@ class FeatureExtractor:
         self.settings = dataclasses.replace(self.settings, value_range=value_range)
         self.is_new = False
 
+    def needed_size(self, thumbnail_width: int) -> tuple[int, int] | None:
+        """Return the rows and columns of an image that have an effect; None = all."""
+        backbone = self.settings.backbone
+        if backbone.resize != 'area':  # bilinear features are of single pixels
+            return None
+        return backbone.size, max(backbone.size, thumbnail_width)
+
     def extract(self, images: Sequence[np.ndarray]) -> LocalFeatures:
         """
         Extract the local features of images.

@@ -227,7 +227,7 @@ class Operation(ABC):
         assert self.extractor is not None
         width, bank = self._thumbnail_width(camera), self._recognizer
         with _timed(stages, 'decoding'):
-            image = decode_message(message, _needed_size(self.extractor, width), self._to_bytes)
+            image = decode_message(message, self.extractor.needed_size(width), self._to_bytes)
             self._image = image
             if self.extractor.is_new and (reason := self._find_range()):
                 return ImageResult(Status.NOT_READY, reason, image=image, cause='not ready')
@@ -471,14 +471,6 @@ def _warm_up(
         recognizer.update(images[i : i + 1], (i + 1) * SECOND // 10, pose)
     recognizer.ranked(2)
     recognizer.reset()
-
-
-def _needed_size(extractor: FeatureExtractor, thumbnail_width: int) -> tuple[int, int] | None:
-    """Return the rows and columns of an image that have an effect; None = all."""
-    backbone = extractor.settings.backbone
-    if backbone.resize != 'area':  # bilinear features are of single pixels
-        return None
-    return backbone.size, max(backbone.size, thumbnail_width)
 
 
 @contextmanager

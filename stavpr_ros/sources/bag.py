@@ -31,7 +31,8 @@ class BagSource:
 
     Iterating yields :class:`Frame` with the header's stamp (the time of recording where that is 0)
     and ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens
-    the bag again. ``to_bytes`` converts images of 16 bits, None = by the upper byte.
+    the bag again. ``to_bytes`` and ``least`` are as of a
+    :class:`stavpr_ros.sources.folder.FolderSource`.
 
     :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
     :param topic: the image topic; may be left out if there is only one.
@@ -49,6 +50,7 @@ class BagSource:
         self.path = Path(path)
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
+        self.least: tuple[int, int] | None = None
         with open_bag(self.path) as bag:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
@@ -79,7 +81,7 @@ class BagSource:
         return self._each(self._record, start, duration)
 
     def _frame(self, index: int, time_ns: int, message: Any) -> Frame:
-        image = decode_message(message, to_bytes=self.to_bytes)
+        image = decode_message(message, self.least, self.to_bytes)
         return Frame(image, _stamp(message) or time_ns, f'{self.topic}#{index}')
 
     def _record(self, _: int, time_ns: int, message: Any) -> ImageRecord:

@@ -62,7 +62,8 @@ class FolderSource:
     folders are ignored; ``left_out`` counts other images and folders by their
     :data:`stavpr_ros.errors.CAUSES`. Iterating yields :class:`Frame` with an unknown stamp and,
     as identifier, the file's name, in a sub-folder its path from the folder. ``to_bytes`` converts
-    images of 16 bits, None = by the upper byte.
+    images of 16 bits, None = by the upper byte; ``least`` are the rows and columns needed of large
+    images, which are reduced, None = all.
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
@@ -75,6 +76,7 @@ class FolderSource:
         self.path = Path(path)
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
+        self.least: tuple[int, int] | None = None
         try:
             files, self.left_out = _images_of(self.path)
         except OSError as error:
@@ -125,7 +127,8 @@ class FolderSource:
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):
             try:
-                frame = Frame(_read(file, self.to_bytes), 0, text_of(file.relative_to(self.path)))
+                image = _read(file, self.least, self.to_bytes)
+                frame = Frame(image, 0, text_of(file.relative_to(self.path)))
             except ImageError as error:
                 if self.on_error is None:
                     raise
@@ -163,9 +166,9 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
     return own if is_drive else below, +unread
 
 
-def _read(file: Path, to_bytes: ToBytes | None) -> np.ndarray:
+def _read(file: Path, least: tuple[int, int] | None, to_bytes: ToBytes | None) -> np.ndarray:
     try:
-        return decode_file(file.read_bytes(), to_bytes=to_bytes)
+        return decode_file(file.read_bytes(), None, least, to_bytes)
     except OSError as error:
         raise ImageError(
             f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',

@@ -17,6 +17,7 @@ from stavpr_ros.checks import require_above
 from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import reading
+from stavpr_ros.sources.files import reduce
 from stavpr_ros.sources.folder import natural_key, VIDEOS
 from stavpr_ros.sources.folder import SUFFIXES as IMAGES
 from stavpr_ros.sources.frame import Frame, ImageRecord
@@ -67,6 +68,7 @@ class VideoSource:
     Iterating yields :class:`Frame` with ``name#i`` as identifier, i counting the images from 0. A
     stamp is the time since the first frame, counted from the creation time that the file states,
     else from 1 s, since 0 is unknown. Of an interlaced frame, one field is taken.
+    ``least`` is as of a :class:`stavpr_ros.sources.folder.FolderSource`.
 
     Each iteration decodes in a process of its own, with limited memory and time: a damaged
     file cannot crash this one.
@@ -88,6 +90,7 @@ class VideoSource:
     ) -> None:
         require_above('fps', fps, 0)
         self.path, self.on_error, self.fps = Path(path), on_error, fps
+        self.least: tuple[int, int] | None = None
         self._files = video_files(path) if self.path.is_dir() else [self.path]
         if any(file.suffix.lower() in IMAGES for file in self.path.glob('[!.]*')):
             raise SourceError(f'{path} has videos and images: expected one kind; name a video')
@@ -134,7 +137,8 @@ class VideoSource:
                         image = np.frombuffer(next(messages), np.uint8)
                         stamp = self._start + round(seconds * SECOND)
                         name = f'{self._files[file].name}#{i}'
-                        yield Frame(image.reshape(height, width, 3), stamp, name)
+                        image = reduce(image.reshape(height, width, 3), self.least)
+                        yield Frame(image, stamp, name)
                         i += 1
                     elif width == CUT_OFF:
                         self._cut_off(file, seconds)
