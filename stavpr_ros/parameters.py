@@ -65,7 +65,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'map_path',
             '',
             'Map file made by build_map or save_map; ~ is the home folder, a relative path is in '
-            'the working directory. Without one, localization waits for the service '
+            'the working directory. Of a folder, all maps are used, each as a session with the '
+            'name of its file. Without one, localization waits for the service '
             '~/load_map, and mapping starts a new map. Or the address of the map of a fleet, such '
             'as qdrant://HOST:6333/NAME (docs/fleet.md).',
         ),

@@ -5,8 +5,9 @@ Crashes of a recording node, for as long as wanted: nothing that it acknowledged
 
 A node in mapping gets images, is killed or stopped, and started again. In between, at random: its
 map is saved, another map is copied over it, its folder is removed, its disk is full, or many
-clients call its services. Each image that is answered as MAPPED is acknowledged; at the end of a
-round its stamp must be in a map of the folder, or in one recovered from a journal there.
+clients call its services. Each image that is answered as MAPPED, or as MATCH, is acknowledged; at
+the end of a round its stamp must be in a map of the folder, or in one recovered from a journal
+there.
 
 ``make crash-test HOURS=2``, or ``python3 test/crash_run.py HOURS [SEED]`` with test/shared on
 PYTHONPATH.
@@ -87,7 +88,7 @@ class Round:
         """Show images; those that are mapped are acknowledged."""
         for _ in range(self.rng.randrange(1, 40)):
             match = self.robot.show(self.rng.choice(self.images))
-            if match.status == PlaceMatch.MAPPED:
+            if match.status in (PlaceMatch.MAPPED, PlaceMatch.MATCH):
                 self.due[self.robot.stamp] = self.settled
 
     def end(self) -> None:

@@ -242,6 +242,10 @@ PLACE_CANDIDATES: Checks = {
         m.candidates[0].place_index == d.around.sequence_middle and ([c.place_index for c in
         m.candidates[1:2]] in ([], [d.around.second_best_index])) and (np.diff([c.distance for
         c in m.candidates[1:]]) >= 0).all()),
+    'session_probabilities': ('of each of MapInfo.sessions, that the newest image is on it; '
+        'empty in mode paper, and of a map without sessions',
+        lambda m, d: len(m.session_probabilities) == (len(d.infos[-1].sessions) if d.mode ==
+        'robust' else 0) and sum(m.session_probabilities) < 1.001),
 }
 
 PLACE_CANDIDATE: Checks = {

@@ -220,3 +220,15 @@ def test_calibration_stays_with_its_route_only(town):
     assert select_places(one, np.arange(9)).error_risks == risks
     assert GrowingMap.from_map(one, PLACES).snapshot().error_risks is None
     assert with_principal_components(one, 4).error_risks is None
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_refuted_path_is_not_sought_in_a_session_without_its_states(town, seed):
+    """A route and the way back along it: each place is one position, which is passed one way."""
+    back = map_of(town[0].features[::-1])
+    same_as = np.r_[:PLACES, PLACES - 1 : -1 : -1].astype(np.int32)
+    both = replace(merge_maps([town[0], back], 'ab'), same_as=same_as)
+    strips, other = route(0)[:, ::-1].copy(), np.random.default_rng(seed).random(PLACES) < 0.4
+    strips[:, other] = route(5)[:, other]
+    matches = recognize(both, features_of(strips, 0.8, seed))
+    assert sum(match.sequence is not None for match in matches) > PLACES // 2

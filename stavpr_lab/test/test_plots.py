@@ -133,3 +133,5 @@ def test_animation_has_every_fifth_image_beside_its_place(tmp_path, small_map, r
             animation.seek(i)
             bars.append(np.asarray(animation.convert('RGB'))[-5, 2])
     np.testing.assert_allclose(bars, [NO_MATCH, NO_MATCH, RIGHT], atol=25)
+    write_animation(tmp_path, tmp_path / 'subgoal.webp', ahead=3)
+    assert (tmp_path / 'subgoal.webp').read_bytes() != (tmp_path / 'demo.webp').read_bytes()

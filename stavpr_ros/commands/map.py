@@ -323,11 +323,12 @@ def _colmap(arguments: argparse.Namespace) -> None:
 def _recover(arguments: argparse.Namespace) -> int:
     from stavpr_ros.mapping.journal import SUFFIX
     from stavpr_ros.mapping.journal_map import recover
+    from stavpr_ros.recognition.same_places import with_last_related
 
     journal = arguments.journal
     if arguments.output is None and not journal.endswith(SUFFIX):
         raise SourceError(f'{journal} does not end with {SUFFIX}: name the map, --output')
-    recovery = recover(journal, arguments.output)
+    recovery = recover(journal, arguments.output, with_last_related)
     say(f'{recovery.path}: {recovery.places} places, {recovery.recorded} of them from {journal}')
     for problem in recovery.problems:
         say(problem)

@@ -127,13 +127,13 @@ class PathChoice:
 
         :param belief: of the image at the position; it has at least one place.
         """
-        places, probabilities, best = self._layout.merge_sessions(belief, images.n)
+        places, probabilities, own, best = self._layout.merge_sessions(belief, images.n)
         candidates: list[PathCandidate] = []
         while len(candidates) < CANDIDATES:
             candidate = self._candidate(belief, places[best], probabilities[best], images)
             candidates.append(candidate)
             probabilities[np.abs(places - places[best]) <= BAND] *= candidate.factor
-            best = int(np.argmax(probabilities))
+            best = int(np.argmax(np.where(own, probabilities, 0)))
             if candidate.factor >= REFUTED or probabilities[best] < MIN_CANDIDATE:
                 break
         chosen = max(candidates, key=lambda candidate: candidate.weight)

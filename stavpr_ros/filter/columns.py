@@ -106,18 +106,22 @@ class ColumnLayout:
         runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
         return np.array([[run[0], run[-1] + 1] for run in runs])
 
-    def merge_sessions(self, belief: Belief, n: int) -> tuple[np.ndarray, np.ndarray, int]:
+    def merge_sessions(
+        self, belief: Belief, n: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """
         Let places of one position share their probability.
 
         :param n: columns that the filter was updated with.
-        :returns: columns whose probability, close ones included, is not 0, ascending, and
-            their probabilities; among them the most probable one: of the session that is most
-            probable at the most probable position.
+        :returns: columns whose probability, close ones included, is not 0, ascending, their
+            probabilities, and which of them states of their own session lead to, bool; among them
+            the most probable one: of the session that is most probable at the most probable
+            position.
         """
         if self.columns is None:
             places, probabilities = belief.probabilities(n)
-            return places, probabilities, int(np.argmax(probabilities))
+            own_states = np.ones(len(places), bool)
+            return places, probabilities, own_states, int(np.argmax(probabilities))
         weights, own = np.zeros(self._width), np.zeros(self._width)
         weights[belief.places] = belief.weights
         near, probabilities_near = belief.probabilities(self._width)
@@ -132,4 +136,5 @@ class ColumnLayout:
         column = int(np.argmax(np.where(at_position, own, 0)))
         probabilities[column] = probabilities[best]
         columns = np.flatnonzero(probabilities)
-        return columns, probabilities[columns], int(np.searchsorted(columns, column))
+        index = int(np.searchsorted(columns, column))
+        return columns, probabilities[columns], own[columns] > 0, index

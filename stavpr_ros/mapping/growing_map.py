@@ -59,7 +59,9 @@ class GrowingMap:
         self.camera: Camera | None = None  # of the images, None = unknown
         self.sessions: tuple[Session, ...] = ()  # of the map that is continued
         self._session_index: np.ndarray | None = None
+        self._session_id = ''  # of the added places, '' = chosen when the map is copied
         self._same_as: np.ndarray | None = None
+        self._related: dict[int, int] = {}  # added places that show the same as an earlier one
         self.ids: list[str] = []  # '' = none
         self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
 
@@ -92,6 +94,31 @@ class GrowingMap:
         growing.thumbnails = list(place_map.thumbnails) or [b''] * n
         growing._count = n
         return growing
+
+    def begin_session(self, before: str, identifier: str = '') -> None:
+        """
+        Make the places that are added from now on a session of their own.
+
+        :param before: id of the session that the places of a map without sessions become.
+        :param identifier: of the new session, or of one of the map that goes on; '' = a free one.
+        """
+        if self._session_index is None:
+            self.sessions = (Session(before[:64], start=max(int(self.stamps[0]), 0)),)
+            self._session_index = np.zeros(self._count, np.int32)
+        own_ids = {session.id for session in self.sessions}
+        names = (f'recorded-{number}' for number in itertools.count(1))
+        self._session_id = identifier or next(name for name in names if name not in own_ids)
+
+    def relate(self, place: int, earlier: int, replaces: bool = True) -> None:
+        """
+        Note that an added place shows the same as a place of an earlier session.
+
+        :param replaces: also where the place is related already.
+        """
+        if replaces or place not in self._related:
+            self._related[place] = (
+                earlier if self._same_as is None else int(self._same_as[earlier])
+            )
 
     def __len__(self) -> int:
         return self._count
@@ -127,11 +154,13 @@ class GrowingMap:
         return self._rows['poses'][: self._count]
 
     def place(self, index: int) -> Place:
-        """Return stamp, identifier and pose of a place; counted as by :meth:`add`."""
-        i = index - self.first
+        """Return stamp, identifier, pose and session of a place; counted as by :meth:`add`."""
+        i, session = index - self.first, self._session_id
         pose = self.poses[i]
         copy = pose.copy() if np.isfinite(pose).all() else None
-        return Place(int(self.stamps[i]), self.ids[i], copy)
+        if self._session_index is not None and i < len(self._session_index):
+            session = self.sessions[self._session_index[i]].id
+        return Place(int(self.stamps[i]), self.ids[i], copy, session)
 
     def thumbnail(self, index: int) -> np.ndarray | None:
         """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted likewise."""
@@ -196,9 +225,10 @@ class GrowingMap:
             features = features[np.arange(self._count)]
         sessions, session_index = self._with_session()
         same_as = self._same_as
-        if same_as is not None:
-            added = np.arange(len(same_as), self._count, dtype=np.int32)
-            same_as = np.concatenate([same_as, added])
+        if same_as is not None or self._related:
+            own = np.arange(self._count, dtype=np.int32)
+            same_as = own if same_as is None else np.concatenate([same_as, own[len(same_as) :]])
+            same_as[list(self._related)] = list(self._related.values())
         return PlaceMap(
             same_as=same_as,
             sessions=sessions,
@@ -217,12 +247,15 @@ class GrowingMap:
         index = self._session_index
         if index is None or len(index) == self._count:
             return self.sessions, index
-        own_ids = {session.id for session in self.sessions}
-        names = (f'recorded-{number}' for number in itertools.count(1))
-        name = next(name for name in names if name not in own_ids)
-        session_of_route = Session(name, start=max(int(self.stamps[len(index)]), 0))
-        added = np.full(self._count - len(index), len(self.sessions), np.int32)
-        return (*self.sessions, session_of_route), np.concatenate([index, added])
+        if not self._session_id:
+            self.begin_session('')
+        sessions, ids = self.sessions, [session.id for session in self.sessions]
+        if self._session_id not in ids:
+            start = max(int(self.stamps[len(index)]), 0)
+            sessions = (*sessions, Session(self._session_id, start=start))
+        number = [session.id for session in sessions].index(self._session_id)
+        added = np.full(self._count - len(index), number, np.int32)
+        return sessions, np.concatenate([index, added])
 
     def _checked(self, features: LocalFeatures) -> dict[str, np.ndarray]:
         """Return the rows of the features of an image that fits."""

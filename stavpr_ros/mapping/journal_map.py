@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps made of journals: after an interrupted recording, and of what build_map has read."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 import io
@@ -15,7 +16,7 @@ from stavpr_ros.mapping.growing_map import GrowingMap
 from stavpr_ros.mapping.journal import Base, JournalReader, row_of, SUFFIX
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.place_map import PlaceMap, Session
 from stavpr_ros.mapping.stored_features import StoredFeatures, StoredThumbnails
 from stavpr_ros.output_file import explained, FileVersion, numbered, write_at
 
@@ -111,7 +112,11 @@ def journals(target: str | Path) -> list[Path]:
         return []
 
 
-def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
+def recover(
+    journal: str | Path,
+    output: str | Path | None = None,
+    relate: Callable[[PlaceMap], PlaceMap] = lambda place_map: place_map,
+) -> Recovered:
     """
     Make a map of the places in a journal and of the map that they continue; delete the journal.
 
@@ -120,6 +125,8 @@ def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
     :param output: file of the map, which must not exist; None = the journal's name without its
         suffix. That may be the map that is continued, which is replaced then; beside another map,
         a numbered name is taken.
+    :param relate: relates places of the last session to places of the map, see
+        :func:`stavpr_ros.recognition.same_places.with_last_related`.
     :raises JournalError: no journal, one without places, or one that is being written.
     :raises OutputError: the map cannot be written; the journal stays.
     """
@@ -129,7 +136,8 @@ def recover(journal: str | Path, output: str | Path | None = None) -> Recovered:
         place_map = _recorded(reader, target.parent)
         base, problem = _base_map(reader.base)
         if base is not None:
-            place_map = _continued(base, place_map, reader.base.places)
+            sessions = reader.template.sessions
+            place_map = relate(_continued(base, place_map, reader.base, sessions))
         if output is None:
             target = _save_beside(place_map, target)
         else:
@@ -159,11 +167,20 @@ def _base_map(base: Base) -> tuple[PlaceMap | None, str]:
     return place_map, ''
 
 
-def _continued(base: PlaceMap, recorded: PlaceMap, count: int) -> PlaceMap:
-    """Return a map with the recorded places behind it; ``count`` were there when it was opened."""
+def _continued(
+    base: PlaceMap, recorded: PlaceMap, opened: Base, sessions: tuple[Session, ...]
+) -> PlaceMap:
+    """
+    Return a map with the recorded places behind it.
+
+    :param opened: the map when the journal was opened.
+    :param sessions: the one that the recorded places are of; empty = they have none.
+    """
     growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
+    if sessions:
+        growing.begin_session(Path(opened.path).stem, sessions[0].id)
     # a map that was saved just before the end has the first places of its journal already
-    stamps = base.stamps[count : count + n]
+    stamps = base.stamps[opened.places : opened.places + n]
     first = int(np.cumprod(stamps == recorded.stamps[: len(stamps)]).sum())
     thumbnails = recorded.thumbnails or [b''] * n
     for i in range(first, n):

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 import math
+import os
+from pathlib import Path
 import time
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -27,6 +29,7 @@ from stavpr_ros.pipeline.view_bank import ViewBank
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
+from stavpr_ros.recognition.same_places import SURE
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes
@@ -90,6 +93,7 @@ class Operation(ABC):
     ) -> None:
         self.settings, self.extractor, self.save_state = settings, extractor, save_state
         self.places: PlaceMap | GrowingMap | None = place_map
+        self.reference = place_map  # that images are matched with; None = the recorded route
         self._recognizer: SequenceRecognizer | ViewBank | None = None
         self._start(place_map)
         self._to_bytes: ToBytes | None = None
@@ -111,8 +115,13 @@ class Operation(ABC):
         """Match the window that ends with an image, or make the image a place, or both."""
 
     @property
+    def matched_places(self) -> PlaceMap | GrowingMap | None:
+        """Return the places that matches are of: the map, or the recorded route."""
+        return self.places if self.reference is None else self.reference
+
+    @property
     def recognizer(self) -> SequenceRecognizer | None:
-        """Return the recognizer, of the present view; None in mapping, or without a map."""
+        """Return the recognizer, of the present view; None without a map."""
         own = self._recognizer  # once: other threads read this while the worker changes it
         return own.recognizer if isinstance(own, ViewBank) else own
 
@@ -137,7 +146,7 @@ class Operation(ABC):
         if not isinstance(places, GrowingMap):
             return 'none' if places is None else 'loaded'
         # a full route evicts places instead
-        return 'full' if places.full and self.recognizer is None else 'growing'
+        return 'full' if places.full and self.name == 'mapping' else 'growing'
 
     @property
     def threshold(self) -> float | None:
@@ -217,9 +226,21 @@ class Operation(ABC):
             result = ImageResult(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
         if list_candidates and self.recognizer is not None and result.nearest_index >= 0:
             result = result.with_candidates(self.recognizer.ranked(self.settings.candidates))
+            result = replace(result, session_probabilities=self._session_probabilities())
         if math.isnan(result.threshold):  # none has applied
             result = replace(result, threshold=threshold)
         return replace(result, stages=stages)
+
+    def _session_probabilities(self) -> tuple[float, ...]:
+        """Return the probability of each session of the map, by the newest image."""
+        places, recognizer = self.reference, self.recognizer
+        if places is None or places.session_index is None or recognizer is None:
+            return ()
+        by_place = recognizer.place_probabilities()
+        if len(by_place) != len(places):
+            return ()
+        sums = np.bincount(places.session_index, by_place, len(places.sessions))
+        return tuple(sums.tolist())
 
     def _process(
         self, stages: dict[str, float], message: Any, row: WindowRow, camera: Camera | None
@@ -268,9 +289,9 @@ class Operation(ABC):
 
     def _checked(self, result: ImageResult) -> ImageResult:
         """Return a result, and its late ones that are matches, after the geometric check."""
-        check, places, late = self._check, self.places, result.late
+        check, places, late = self._check, self.matched_places, result.late
         if check is not None and places is not None:
-            is_weighed = isinstance(places, PlaceMap) and not math.isnan(result.probability)
+            is_weighed = self.reference is not None and not math.isnan(result.probability)
             late = tuple(check.checked(each, places, self._query(each), False) for each in late)
             result = check.checked(result, places, self._query(result), is_weighed)
         return replace(result, late=tuple(each for each in late if each.accepted))
@@ -303,7 +324,7 @@ class Operation(ABC):
             raise InputError(
                 f'operation {self.name} recognizes no places: set_operation localization first'
             )
-        if last is None or last.status is Status.WARMING_UP:
+        if last is None or last.match is None or last.match.status is Status.WARMING_UP:
             length = self.settings.sequence.length
             raise InputError(f'{self.window_fill} of {length} images in the window')
         return last.with_candidates(recognizer.ranked(count))
@@ -315,7 +336,7 @@ class Operation(ABC):
         :param relative_pose: the parameter of this name.
         :returns: None without a match, or where the place of a map can have no edge.
         """
-        match, places, recognizer = result.match, self.places, self.recognizer
+        match, places, recognizer = result.match, self.matched_places, self.recognizer
         if not result.accepted or match is None or places is None or recognizer is None:
             return None
         place = result.place_index
@@ -344,19 +365,9 @@ class Localizer(Operation):
         settings = self.settings
         if self.extractor is None or place_map is None:
             return
-        if place_map.partial:
-            recognizer = _partial_recognizer(settings, place_map)
-        else:
-            backend = settings.matching_backend(self.name)
-            recognizer = PlaceRecognizer(
-                place_map, settings.recognition(), backend, settings.precision
-            )
-        count, of_map = settings.sequence.length + WARM_IMAGES, None
-        images = _noise(self.extractor.extract([BLANK_IMAGE]), count)
-        if isinstance(recognizer, PlaceRecognizer):  # images of the map match it
-            images, of_map = place_map.features[:count], place_map
-        _warm_up(recognizer, images, of_map)
-        self._recognizer = recognizer
+        self._recognizer = recognizer = _map_recognizer(
+            settings, self.name, place_map, self.extractor
+        )
         if settings.other_views and isinstance(recognizer, PlaceRecognizer):
             self._recognizer = ViewBank(recognizer, place_map)
 
@@ -366,7 +377,12 @@ class Localizer(Operation):
 
 
 class Mapper(Operation):
-    """Records places, of a new map or of one that it extends."""
+    """
+    Records places, of a new map or of one that it extends by a session.
+
+    On a map, each image is matched with the places that were there at the start, and related to
+    the place that it shows.
+    """
 
     name = 'mapping'
     places: GrowingMap
@@ -383,12 +399,50 @@ class Mapper(Operation):
                 'operation mapping does not extend the map of a fleet: record a map of its own, '
                 'without map_path'
             )
+        if os.path.isdir(path := self.save_state.path):
+            raise SettingsError(
+                f'operation mapping does not extend the folder {path}: name one of its maps, or '
+                'make one map of them, `stavpr map merge`'
+            )
         verify_map(place_map)  # damage would be saved again, with correct hashes
         self.places = GrowingMap.from_map(place_map, limit)
+        if len(place_map):
+            self.places.begin_session(Path(path).stem or 'recorded')
+            self._recognizer = _map_recognizer(self.settings, self.name, place_map, extractor)
+
+    @property
+    def missing(self) -> str:
+        """Return why no image can be recorded; without a threshold, none is matched."""
+        return ''
 
     def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
-        index = self.places.add(features, row.stamp, pose=row.pose, thumbnail=row.jpeg)
-        return ImageResult(Status.MAPPED, image_index=index)
+        jpeg, recognizer = row.jpeg, self.recognizer  # first, since it may fail
+        if recognizer is None:
+            index = self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
+            return ImageResult(Status.MAPPED, image_index=index)
+        result = ImageResult.of_match(recognizer.update(features, row.stamp, row.pose))
+        index = self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
+        return replace(result, image_index=index)
+
+    def _checked(self, result: ImageResult) -> ImageResult:
+        """Return a result after the geometric check; without a match, it is of a place only."""
+        result = super()._checked(result)
+        if not result.accepted:
+            return replace(result, status=Status.MAPPED, reason='')
+        self._relate(result)
+        return result
+
+    def _relate(self, result: ImageResult) -> None:
+        """Relate the images of a full window that is certain to the places that they show."""
+        match = result.match
+        assert match is not None
+        count = len(match.window_stamps)
+        if count < self.settings.sequence.length or not result.probability > SURE:
+            return
+        first = result.image_index - count + 1
+        for image, place in match.path.tolist():
+            self.places.relate(first + image, place, replaces=image >= match.position)
+        self.places.relate(first + match.position, result.place_index)
 
 
 class RouteCloser(Operation):
@@ -398,7 +452,7 @@ class RouteCloser(Operation):
     places: GrowingMap
 
     def _start(self, place_map: PlaceMap | None) -> None:
-        settings = self.settings
+        settings, self.reference = self.settings, None
         self.extractor = extractor = self.extractor or settings.extractor()
         self._recognizer = self._closer = _loop_closer(
             settings, settings.exclude_places, extractor
@@ -424,6 +478,26 @@ class RouteCloser(Operation):
 
 
 CLASSES = {each.name: each for each in (Localizer, Mapper, RouteCloser)}
+
+
+def _map_recognizer(
+    settings: PipelineSettings, operation: str, place_map: PlaceMap, extractor: FeatureExtractor
+) -> SequenceRecognizer:
+    """Return the recognizer of a map, compiled and with an empty window."""
+    recognizer: SequenceRecognizer
+    if place_map.partial:
+        recognizer = _partial_recognizer(settings, place_map)
+    else:
+        backend = settings.matching_backend(operation)
+        recognizer = PlaceRecognizer(
+            place_map, settings.recognition(), backend, settings.precision
+        )
+    count, of_map = settings.sequence.length + WARM_IMAGES, None
+    images = _noise(extractor.extract([BLANK_IMAGE]), count)
+    if isinstance(recognizer, PlaceRecognizer):  # images of the map match it
+        images, of_map = place_map.features[:count], place_map
+    _warm_up(recognizer, images, of_map)
+    return recognizer
 
 
 def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, open_map, PlaceMap
+from stavpr_ros.mapping import GrowingMap, load_map, merge_maps, open_map, PlaceMap
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.stores import is_address, store_of
@@ -30,16 +30,33 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     """
     Read a map, on any thread; its features stay in the file until an operation takes them.
 
-    :param path: of a file, or the address of a fleet's map.
+    :param path: of a file, or the address of a fleet's map; of a folder, its maps become one, in
+        memory, whose sessions have the names of the files.
     :raises StavprError: an invalid file, or a missing model.
     """
     if os.path.isdir(path):
-        maps = ', '.join(sorted(file.name for file in Path(path).glob('*.stavpr')))
-        remedy = f'name one of its maps: {maps}' if maps else 'build a map of its images'
-        raise MapFileError(f'{path} is a folder, not a map: {remedy} (build_map makes map files)')
-    place_map = store_of(path).open_map(path) if is_address(path) else open_map(path)
+        place_map = _joined(Path(path))
+    else:
+        place_map = store_of(path).open_map(path) if is_address(path) else open_map(path)
     extractor = place_map.extractor(settings.extraction_device, settings.model_path)
     return LoadedMap(path, place_map, extractor)
+
+
+def _joined(folder: Path) -> PlaceMap:
+    """Return the maps of a folder as one."""
+    files = sorted(folder.glob('*.stavpr'))
+    if not files:
+        raise MapFileError(
+            f'{folder} is a folder without maps: build a map of its images, build_map'
+        )
+    place_maps = [load_map(file) for file in files]
+    for file, place_map in zip(files, place_maps, strict=True):
+        if place_map.settings != place_maps[0].settings:
+            raise MapFileError(
+                f'{file} has other settings of the features than {files[0]}: move one of them '
+                'elsewhere, or build it again'
+            )
+    return merge_maps(place_maps, [file.stem for file in files])
 
 
 class Pipeline:

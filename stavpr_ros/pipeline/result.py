@@ -28,6 +28,8 @@ class ImageResult:
     :param probability: NaN in mode paper.
     :param inliers: of the geometric check, -1 = not checked.
     :param candidates: nearest places, nearest first.
+    :param session_probabilities: of each session of the map, that the newest image is on it;
+        empty in mode paper, and of a map without sessions.
     :param late: loop closure: results of earlier images that had no match until now.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param image: the decoded image, RGB; None = not decoded.
@@ -43,6 +45,7 @@ class ImageResult:
     probability: float = math.nan
     inliers: int = -1
     candidates: tuple[Candidate, ...] = ()
+    session_probabilities: tuple[float, ...] = ()
     late: 'tuple[ImageResult, ...]' = ()
     image_index: int = -1
     image: np.ndarray | None = None

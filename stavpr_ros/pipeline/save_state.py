@@ -3,12 +3,12 @@
 """The files of a map, and its recorded places that are in none of them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import os
 
 import numpy as np
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap, Session
 from stavpr_ros.mapping.journal import Base, JournalPlace
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.output_file import FileVersion, Force
@@ -63,6 +63,10 @@ class SaveState:
         if self.journal is None and self.recorded == self.saved:
             stamps, ids = np.array([newest.stamp]), (newest.identifier,)
             template = PlaceMap(features, places.projection, stamps, ids, camera=places.camera)
+            if newest.session:
+                session = (Session(newest.session),)
+                index = np.zeros(1, np.int32)
+                template = replace(template, sessions=session, session_index=index)
             self.journal = self.open_journal(self.base, template)
         if self.journal is not None:
             thumbnail = places.thumbnails[-1]

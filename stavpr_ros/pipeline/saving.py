@@ -15,6 +15,7 @@ from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
+from stavpr_ros.recognition.same_places import with_last_related
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
@@ -81,7 +82,7 @@ def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -
             )
             continue
         try:
-            recovery = recover(journal)
+            recovery = recover(journal, relate=with_last_related)
         except Exception as error:  # any error: the node must start
             cause = str(error) if isinstance(error, StavprError) else repr(error)
             log.warning(f'the journal {journal} was left as it is: {cause}')

@@ -190,6 +190,13 @@ class SequenceRecognizer(ABC):
         window = self._window
         return window.layout.to_places(window.buffer.newest())
 
+    def place_probabilities(self) -> np.ndarray:
+        """Return the probability of each place for the newest image, (n,); mode paper: none."""
+        window = self._window
+        if not isinstance(window, FilterWindow):
+            return np.empty(0)
+        return window.layout.to_places(window.filter.places_of_states())
+
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
         Return the distances of the images in the window, as :meth:`newest_row`, to certain places.

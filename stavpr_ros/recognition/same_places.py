@@ -13,19 +13,27 @@ from stavpr_ros.recognition.settings import RecognizerSettings
 SURE = 0.9  # probability above which two places are taken to be the same
 
 
-def with_same_places(place_map: PlaceMap) -> PlaceMap:
+def with_last_related(place_map: PlaceMap) -> PlaceMap:
+    """Return the map with the places of its last session related, as by with_same_places."""
+    return with_same_places(place_map, len(place_map.sessions) - 1)
+
+
+def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
     """
     Return the map with the places of its sessions related (:attr:`PlaceMap.same_as`).
 
     Each session is driven, as a query of mode robust, on a map of the sessions before it. Where it
     is matched, its place is the matched one. The time grows with the square of the places, and a
     terminal shows the progress.
+
+    :param first: session to begin with; earlier ones stay as they are.
     """
     index, n = place_map.session_index, len(place_map)
     if index is None:
         return place_map
-    same_as = np.arange(n)
-    numbers = range(1, len(place_map.sessions))
+    same_as, numbers = np.arange(n), range(max(first, 1), len(place_map.sessions))
+    if first > 1 and place_map.same_as is not None:
+        same_as = place_map.same_as.astype(np.int64)
     for session in Progress(numbers, desc='same places', unit='session'):
         earlier, places = np.flatnonzero(index < session), np.flatnonzero(index == session)
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)

@@ -84,7 +84,7 @@ class EdgePublisher:
         :returns: the edge for the message of the match, None without a match; the closures of the
             match and of its late ones.
         """
-        places, edge = operation.places, None
+        places, edge = operation.matched_places, None
         closures: list[WaitingClosure] = []
         if not result.accepted:
             return edge, closures

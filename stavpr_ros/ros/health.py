@@ -182,7 +182,10 @@ def _map_finding(health: Health) -> Finding:
 def _recognition_finding(health: Health) -> Finding:
     counts, length = health.counts, health.settings.pipeline.sequence.length
     if health.settings.operation == 'mapping':
-        return OK, 'mapping: images become places, none is recognized'
+        hits, others = (counts.answered.recent[status] for status in ('match', 'mapped'))
+        matched = f'{hits} of {_plural(hits + others, "image")} matched {RECENTLY}'
+        matched = matched if counts.answered.total['match'] else 'none is recognized'
+        return OK, f'mapping: images become places, {matched}'
     if health.map_info.state == 'loading' and not health.map_info.places:
         return OK, 'waiting for the map'
     if health.missing:

@@ -153,6 +153,7 @@ def candidates_message(
     message = PlaceCandidates(
         header=header, **origin(robot_id, places), threshold=result.threshold
     )
+    message.session_probabilities = list(result.session_probabilities)
     for candidate in result.candidates:
         place = places.place(candidate.place)
         message.candidates.append(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
@@ -398,7 +398,7 @@ class Runtime:
             self._pipeline_epoch = item.epoch
             self._reset_window()
         operation, waiting = self.pipeline.operation, time.monotonic() - item.arrival
-        header, places, view = item.message.header, operation.places, operation.view
+        header, places, view = item.message.header, operation.matched_places, operation.view
         pose, frames = self._pose_at(nanoseconds(header.stamp))
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
@@ -433,7 +433,8 @@ class Runtime:
         if odometry is None:
             return None, PoseFrames(map_frame)
         # places of a route have the poses of the odometry
-        frame = map_frame if self.pipeline.operation.name == 'localization' else odometry.frame
+        on_route = isinstance(self.pipeline.operation.matched_places, GrowingMap)
+        frame = odometry.frame if on_route else map_frame
         return odometry.trajectory.at(stamp), PoseFrames(
             frame, odometry.child_frame, odometry.frame
         )
@@ -459,9 +460,10 @@ class Runtime:
     def _publish_route(self) -> None:
         """Publish the route for a new subscriber, in the frame of the last image if it grows."""
         if self._pipeline is not None:  # a subscriber may come first
-            in_map = self.pipeline.operation.name == 'localization'
-            frame = self.settings.map_frame if in_map else self._views.frame
-            self._views.publish_route(self.pipeline.places, frame)
+            places = self.pipeline.operation.matched_places
+            on_route = isinstance(places, GrowingMap)
+            frame = self._views.frame if on_route else self.settings.map_frame
+            self._views.publish_route(places, frame)
 
     def _log_skips(self, result: ImageResult, stamp: int) -> None:
         """Log that a rule of keyframes skips every image, and the remedy."""

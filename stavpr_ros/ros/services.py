@@ -106,7 +106,9 @@ class Services:
     def _save_map(self, runtime: Runtime, request: Any, response: Any) -> str:
         if request.path:
             path = inside(runtime.settings.maps_path, request.path)
-        elif own := runtime.settings.save_path or runtime.pipeline.save_state.path:
+        elif (
+            own := runtime.settings.save_path or runtime.pipeline.save_state.path
+        ) and not os.path.isdir(own):  # the maps of a folder are no file
             path = os.path.abspath(own)
         else:
             raise StavprError(
@@ -128,7 +130,7 @@ class Services:
             # call
             result = runtime.pipeline.operation.relocalize(count)
             response.match = runtime.last_match
-            header, places = response.match.header, runtime.pipeline.places
+            header, places = response.match.header, runtime.pipeline.operation.matched_places
             candidates = candidates_message(header, result, places)
             response.candidates = candidates.candidates if candidates is not None else []
             pose = matched_pose_message(header, result, places, runtime.last_frame)

@@ -79,7 +79,7 @@ class Visualization:
         :param frame: of the poses of the places.
         :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
         """
-        places = operation.places
+        places = operation.matched_places
         place_map = places if isinstance(places, PlaceMap) else None
         if frame != self.frame or place_map is not self._map:
             self.frame, self._map, self._correction = frame, place_map, None
@@ -132,7 +132,7 @@ class Visualization:
     def _publish_distances(
         self, header: Header, result: ImageResult, operation: Operation
     ) -> None:
-        recognizer, places = operation.recognizer, operation.places
+        recognizer, places = operation.recognizer, operation.matched_places
         if recognizer is None or places is None or not recognizer.window_fill:
             return
         row = recognizer.newest_row()
@@ -167,7 +167,7 @@ class Visualization:
             stamped = Header(stamp=header.stamp, frame_id=self.frame)
             self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
         query = None
-        if result.image_index >= 0:
+        if result.match is not None and result.match.image_index >= 0:
             query = places.place(result.image_index).pose
         elif pose is not None and odometry is not None:
             if self._correction is not None:

@@ -28,12 +28,14 @@ def write_video(
     options: dict[str, str] | None = None,
     metadata: dict[str, str] | None = None,
     times=None,
+    high_dynamic_range: bool = False,
 ) -> Path:
     """
     Write a video.
 
     :param images: RGB, uint8; of ``colored_images`` if not given.
     :param times: of the frames, in frames; 0, 1, 2, ... if not given.
+    :param high_dynamic_range: state BT.2020 and SMPTE ST 2084; the images are not changed.
     """
     images = colored_images() if images is None else images
     with av.open(str(path), 'w') as container:
@@ -41,6 +43,8 @@ def write_video(
         stream = container.add_stream(codec, rate=rate, options=options or {})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt, stream.bit_rate = pixels, 1_000_000
+        if high_dynamic_range:
+            stream.color_primaries, stream.color_trc, stream.colorspace = 9, 16, 9  # ITU-T H.273
         for i, image in enumerate(images):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
             frame.pts = int(i if times is None else times[i])
