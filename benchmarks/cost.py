@@ -133,9 +133,10 @@ def stages(path: str, precision: str, threads: int) -> dict[str, float]:
 
 
 @contextmanager
-def process(command: list[str]) -> Iterator[int]:
-    """Run a process while the block runs; yield its number."""
-    one = subprocess.Popen(command)
+def process(command: list[str], *without: str) -> Iterator[int]:
+    """Run a process while the block runs, without these variables; yield its number."""
+    environment = {name: value for name, value in os.environ.items() if name not in without}
+    one = subprocess.Popen(command, env=environment)
     try:
         yield one.pid
     finally:
@@ -150,12 +151,14 @@ def node_cost(path: str, rate: float, arguments: argparse.Namespace) -> dict[str
     """Return the percent of a core that the node and the empty subscriber take."""
     from rclpy.qos import qos_profile_sensor_data
     from stavpr_lab.demonstration.live import executable
+    from stavpr_ros.ros.process import PROFILES_VARIABLE
 
     options = ['--ros-args', '-p', f'map_path:={path}', '--log-level', 'error']
     arguments.rate, marks = rate, {}
     images = [image_message(image) for image in texture_route(VIEWS)]
     with (
-        process([executable('node'), *options]) as node,
+        # the large segment of prepare_transport is for the publisher
+        process([executable('node'), *options], PROFILES_VARIABLE) as node,
         process([sys.executable, '-c', SUBSCRIBER]) as subscriber,
     ):
 
