@@ -1,9 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``ros2 run stavpr_ros map``: show, check, compact, merge and recover maps."""
+"""``ros2 run stavpr_ros map``: show, check, compact, merge, update and recover maps."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import datetime, UTC
 from pathlib import Path
 import sys
@@ -33,13 +34,16 @@ examples:
   map sessions both.stavpr day.stavpr --keep day
   map recover route.stavpr.journal
   map upload route.stavpr qdrant://host:6333/city
+  map update route.stavpr tuesday.bag
+  map log route.stavpr
+  map rollback route.stavpr
 
 exit codes: 0 done, or all maps are sound; 1 not (the reason is printed); 2 usage
 """
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('map', 'Show, check, compact, merge and recover maps.', EPILOG)
+    parser = make_parser('map', 'Show, check, compact, merge, update and recover maps.', EPILOG)
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
 
     def add(
@@ -148,6 +152,30 @@ def _parser() -> argparse.ArgumentParser:
         metavar='MAP',
         help="the file to write; by default the recording's, or a numbered name beside it",
     )
+    text = 'Let a drive that is certain where it is update a map, docs/upkeep.md.'
+    action = add('update', _update, text, 'map')
+    action.add_argument(
+        'drive', metavar='DRIVE', help='folder of images, bag or video, or the map of the drive'
+    )
+    action.add_argument('--topic', help="the bag's image topic, if there are several")
+    action.add_argument(
+        '--max-places',
+        type=int,
+        default=0,
+        metavar='N',
+        help='places of the map, above which those that helped least to recognize are removed '
+        '(half more than before the first update)',
+    )
+    action.add_argument(
+        '--max-age',
+        type=int,
+        default=5,
+        metavar='DRIVES',
+        help='in a row that pass a stretch unrecognized until it is removed (%(default)s)',
+    )
+    add('log', _log, 'Show the versions of a map, and what each update added and removed.', 'map')
+    action = add('rollback', _rollback, 'Make an earlier version the map again.', 'map')
+    action.add_argument('--to', metavar='ID', default='', help='of the version (the one before)')
     return parser
 
 
@@ -333,6 +361,71 @@ def _recover(arguments: argparse.Namespace) -> int:
     for problem in recovery.problems:
         say(problem)
     return int(bool(recovery.problems))
+
+
+def _update(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping.versions import current_version, save_version
+    from stavpr_ros.output_file import FileVersion
+    from stavpr_ros.prepare.prepared_map import statistics_of_map
+    from stavpr_ros.recognition.upkeep import update_map, UpkeepSettings
+
+    settings = UpkeepSettings(arguments.max_places, arguments.max_age)
+    opened, place_map = FileVersion.of(arguments.map), _verified(arguments.map)
+    before, name = current_version(arguments.map), Path(arguments.drive).stem[:40]
+    with _drive(arguments, place_map) as drive:
+        updated, version = update_map(place_map, drive, name, before, settings)
+        statistics = statistics_of_map(updated)
+        version = save_version(arguments.map, opened, updated, before, version, statistics)
+    say('\n'.join(version.changes))
+    say(f'{arguments.map}: {len(updated)} places, id {version.map_id}, was {before.map_id}')
+
+
+@contextmanager
+def _drive(arguments: argparse.Namespace, place_map: 'PlaceMap') -> 'Iterator[PlaceMap]':
+    """
+    Yield the images of a drive, with the features of a map.
+
+    They are in a journal: an interrupted update continues there.
+    """
+    from stavpr_ros.mapping import is_map, load_map
+    from stavpr_ros.mapping.builder import build_journal
+    from stavpr_ros.mapping.journal_map import journal_map
+    from stavpr_ros.mapping.versions import history_of
+    from stavpr_ros.sources import open_source
+
+    if is_map(arguments.drive):
+        drive = load_map(arguments.drive)
+        drive.features.require_same_settings(place_map.settings, 'the map')
+        yield drive
+        return
+    folder, extractor = history_of(arguments.map), place_map.extractor()
+    folder.mkdir(exist_ok=True)
+    source = f'{Path(arguments.drive).resolve()} {arguments.topic or ""}'
+    images = open_source(arguments.drive, arguments.topic)
+    journal = build_journal(
+        images, extractor, folder / 'drive', source, thumbnails=bool(len(place_map.thumbnails))
+    )
+    try:
+        yield journal_map(journal)
+    finally:
+        journal.unlink()
+
+
+def _log(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping.versions import versions
+
+    for each in versions(arguments.map):
+        when = _time(each.time * SECOND) if each.time else 'before the first update'
+        drive = f', {each.drive}' if each.drive else ''
+        lines = [f'{each.map_id}  {when}{drive}', *(f'    {text}' for text in each.changes)]
+        print('\n'.join(map(printable, lines)))
+
+
+def _rollback(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.mapping.versions import roll_back
+
+    version = roll_back(arguments.map, arguments.to)
+    say(f'{arguments.map} is version {version.map_id} again')
 
 
 def _upload(arguments: argparse.Namespace) -> None:

@@ -80,8 +80,8 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     """
     Return a map of selected places.
 
-    A place that is the same as one left out is the same as itself only. Threshold and error risks
-    stay: they are of drives on the same route.
+    Places that are the same stay so. Threshold and error risks stay: they are of drives on this
+    route.
 
     :param places: ascending, (m,), int64.
     """
@@ -90,11 +90,9 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     if index is not None:
         numbers, index = np.unique(index[places], return_inverse=True)
         sessions, index = tuple(sessions[i] for i in numbers), index.astype(np.int32)
-    if same_as is not None:
-        renumbered = np.full(len(place_map), -1, np.int32)
-        renumbered[places] = np.arange(len(places))
-        same_as = renumbered[same_as[places]]
-        same_as = np.where(same_as < 0, np.arange(len(places), dtype=np.int32), same_as)
+    if same_as is not None:  # the earliest of those that show the same is the one that they name
+        _, first, group = np.unique(same_as[places], return_index=True, return_inverse=True)
+        same_as = first[group].astype(np.int32)
     return replace(
         place_map,
         features=place_map.features[places],
@@ -107,6 +105,31 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
         same_as=same_as,
         map_id='',
     )
+
+
+def keep_places(place_map: PlaceMap, places: np.ndarray, shortest: int = 10) -> PlaceMap:
+    """
+    Return a map of selected places, in which no path leads across those left out.
+
+    :param places: ascending, (m,), int64.
+    :param shortest: places; parts of sessions with fewer are left out as well.
+    :raises InputError: nothing is left.
+    """
+    index = place_map.session_index
+    runs = np.zeros(len(place_map), np.int32) if index is None else index
+    begins = (np.diff(places, prepend=-2) > 1) | (np.diff(runs[places], prepend=-1) != 0)
+    parts = [part for part in np.split(places, np.flatnonzero(begins)) if len(part) >= shortest]
+    if not parts:
+        raise InputError('no place is left')
+    chosen = select_places(place_map, np.concatenate(parts))
+    if index is None and len(parts) == 1:
+        return chosen
+    sessions: list[Session] = []
+    for part in parts:
+        session = place_map.session(int(part[0])) or Session('first')
+        sessions.append(replace(session, id=_free_id(session.id, sessions)))
+    numbers = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+    return replace(chosen, sessions=tuple(sessions), session_index=numbers, error_risks=None)
 
 
 def _free_id(base: str, sessions: list[Session]) -> str:

@@ -7,10 +7,37 @@ from dataclasses import replace
 import numpy as np
 from stavpr_ros.mapping import PlaceMap, select_places
 from stavpr_ros.progress import Progress
+from stavpr_ros.recognition.match import Match
 from stavpr_ros.recognition.recognizer import PlaceRecognizer
 from stavpr_ros.recognition.settings import RecognizerSettings
 
 SURE = 0.9  # probability above which two places are taken to be the same
+
+
+class SamePlaces:
+    """
+    The place of each image of a drive, as matches of windows come; -1 = none.
+
+    The middle image of a full window has the matched place, its others the places of the path
+    until they are the middle themselves.
+
+    :param count: of the images.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._matched, self._near = (np.full(count, -1) for _ in range(2))
+
+    def add(self, match: Match, image: int, length: int) -> None:
+        """Take the match of the window that ends with an image; only a full one counts."""
+        if match.accepted and len(match.window_stamps) == length:
+            window = image - length + 1 + match.path[:, 0]
+            self._near[window] = match.path[:, 1]
+            self._matched[window[(len(window) - 1) // 2]] = match.place_index
+
+    @property
+    def places(self) -> np.ndarray:
+        """Return the place of each image, (N,)."""
+        return np.where(self._matched >= 0, self._matched, self._near)
 
 
 def with_last_related(place_map: PlaceMap) -> PlaceMap:
@@ -47,11 +74,7 @@ def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) ->
     """Return the place of a reference that each image shows, -1 = none, (m,)."""
     settings = RecognizerSettings(min_probability=SURE)
     recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length
-    matched, near = (np.full(len(images), -1) for _ in range(2))
+    same = SamePlaces(len(images))
     for i, image in enumerate(images.tolist()):
-        match = recognizer.update(place_map.features[image : image + 1])
-        if match.accepted and len(match.window_stamps) == length:
-            window = i - len(match.window_stamps) + 1 + match.path[:, 0]
-            near[window] = match.path[:, 1]
-            matched[window[(len(window) - 1) // 2]] = match.place_index
-    return np.where(matched >= 0, matched, near)
+        same.add(recognizer.update(place_map.features[image : image + 1]), i, length)
+    return same.places

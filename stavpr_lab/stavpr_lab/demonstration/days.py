@@ -1,0 +1,145 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A map that is updated day by day, beside the first session alone and all sessions kept.
+
+``python3 -m stavpr_lab.demonstration.days 30 benchmarks/results/days`` (``make days``) drives
+the synthetic street and writes a table and a plot, in ten minutes.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+import sys
+
+import matplotlib as mpl
+import numpy as np
+from stavpr_lab.demonstration.street.days import Days
+from stavpr_ros.errors import InputError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import build_map, merge_maps, PlaceMap
+from stavpr_ros.mapping.versions import Version
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.same_places import with_last_related
+from stavpr_ros.recognition.upkeep import update_map, UpkeepSettings
+
+TOLERANCE = 8.0  # meters from the right position
+DETOUR = -1000.0  # meters, of positions in the detour
+MAPS = ('first session', 'all sessions', 'updated map')
+
+
+@dataclass(frozen=True)
+class Day:
+    """
+    The result of a day, of each of ``MAPS`` before it learns from it.
+
+    :param recall: share of the images that are rightly matched.
+    :param wrong: number of wrong matches.
+    :param places: of the map after the day.
+    :param changes: of the update.
+    """
+
+    number: int
+    recall: tuple[float, ...]
+    wrong: tuple[int, ...]
+    places: tuple[int, ...]
+    changes: tuple[str, ...]
+
+
+def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
+    """
+    Return the drive of a day as a map of all its images.
+
+    :param positions: meters by stamp; the images are added.
+    """
+    traverse = days.drive(day)
+    meters = np.where(traverse.detour, DETOUR - traverse.along, traverse.along)
+    positions |= dict(zip(traverse.stamps.tolist(), meters.tolist(), strict=True))
+    return build_map(traverse, FeatureExtractor(), progress=False)
+
+
+def judge(place_map: PlaceMap, drive: PlaceMap, positions: dict[int, float]) -> tuple[float, int]:
+    """Return the share of the images that are rightly matched, and the number of wrong ones."""
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings())
+    right = wrong = 0
+    for i in range(len(drive)):
+        match = recognizer.update(drive.features[i : i + 1], int(drive.stamps[i]))
+        if match.accepted:
+            image = i - len(match.window_stamps) + 1 + match.position
+            stamps = int(drive.stamps[image]), int(place_map.stamps[match.place_index])
+            is_right = abs(positions[stamps[0]] - positions[stamps[1]]) <= TOLERANCE
+            right, wrong = right + is_right, wrong + (not is_right)
+    return right / len(drive), wrong
+
+
+def run(days: Days, count: int, settings: UpkeepSettings) -> Iterator[Day]:
+    """Yield the results of days 1 to ``count``; the drive of day 0 is the map."""
+    positions: dict[int, float] = {}
+    first = drive_of(days, 0, positions)
+    updated, version = first, Version('', base_places=len(first))
+    everything = merge_maps([first], ['day 0'])
+    for number in range(1, count + 1):
+        drive = drive_of(days, number, positions)
+        judged = [judge(each, drive, positions) for each in (first, everything, updated)]
+        try:
+            updated, version = update_map(updated, drive, f'day {number}', version, settings)
+            changes = version.changes
+        except InputError as error:
+            changes = (str(error),)
+        everything = with_last_related(merge_maps([everything, drive], ['', f'day {number}']))
+        recall, wrong = zip(*judged, strict=True)
+        places = len(first), len(everything), len(updated)
+        yield Day(number, recall, wrong, places, changes)
+
+
+def table(results: list[Day]) -> str:
+    """Return the results as a table in Markdown."""
+    lines = [
+        f'| day | recall: {" | ".join(MAPS)} | wrong: {" | ".join(MAPS)} | places: updated map | '
+        'update |',
+        '|' + '---|' * 9,
+    ]
+    for day in results:
+        recall = ' | '.join(f'{value:.3f}' for value in day.recall)
+        wrong = ' | '.join(map(str, day.wrong))
+        text = '; '.join(day.changes)
+        lines.append(f'| {day.number} | {recall} | {wrong} | {day.places[-1]} | {text} |')
+    return '\n'.join(lines)
+
+
+def plot(results: list[Day], path: Path) -> None:
+    """Draw recall and places by day."""
+    mpl.use('Agg')
+    from matplotlib import pyplot as plt
+
+    figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True)
+    numbers = [day.number for day in results]
+    for i, name in enumerate(MAPS):
+        above.plot(numbers, [day.recall[i] for day in results], label=name)
+        below.plot(numbers, [day.places[i] for day in results], label=name)
+    above.set_ylabel('recall')
+    below.set_ylabel('places')
+    below.set_yscale('log')
+    below.set_xlabel('day')
+    above.legend()
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Run the days, and write table and plot."""
+    count, target = int(sys.argv[1]), Path(sys.argv[2])
+    results = []
+    for day in run(Days(), count, UpkeepSettings()):
+        results.append(day)
+        print(table([day]).splitlines()[-1], flush=True)
+    command = f'`python3 -m stavpr_lab.demonstration.days {count}`'
+    text = f'# Days\n\n{command}; the images of a day are matched before the map learns from them.'
+    picture = f'![recall and places]({target.name}.png)'
+    target.with_suffix('.md').write_text(f'{text}\n\n{picture}\n\n{table(results)}\n')
+    plot(results, target.with_suffix('.png'))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,180 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Versions of a map that is updated by drives: its history, and the way back.
+
+``route.stavpr.history`` has each version as ``ID.stavpr``, and ``ID.json`` says how it came about.
+Both are complete before the version replaces the map, which is one step: whatever ends the
+program, the map is the version before or the new one.
+"""
+
+from dataclasses import asdict, dataclass, replace
+import json
+from pathlib import Path
+import shutil
+import time
+
+from stavpr_ros.errors import InputError, MapFileError
+from stavpr_ros.mapping.map_container import read_json
+from stavpr_ros.mapping.map_file import load_map, open_map, save_map
+from stavpr_ros.mapping.map_schema import integer, list_of, number, record, text
+from stavpr_ros.mapping.map_statistics import MapStatistics
+from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.stored_features import StoredFeatures
+from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output
+
+SUFFIX = '.history'
+KEPT = 10  # versions; older ones are deleted
+MAX_PLACES = 2**24
+
+
+@dataclass(frozen=True)
+class Version:
+    """
+    A version of a map.
+
+    :param map_id: of its file.
+    :param parent: id of the version before it, '' = none.
+    :param number: of updates up to it.
+    :param drive: name of the drive of the last update.
+    :param time: when it was made, seconds since 1970.
+    :param base_places: number of places before the first update.
+    :param changes: what the update added and removed, and why: sentences.
+    :param use: of each place, the decayed number of drives that were recognized there; empty = 1.
+    :param missed: of each place, the drives in a row that passed it unrecognized; empty = 0.
+    """
+
+    map_id: str
+    parent: str = ''
+    number: int = 0
+    drive: str = ''
+    time: int = 0
+    base_places: int = 0
+    changes: tuple[str, ...] = ()
+    use: tuple[float, ...] = ()
+    missed: tuple[int, ...] = ()
+
+
+_check = record(
+    {
+        **dict.fromkeys(('map_id', 'parent'), text(16)),
+        **dict.fromkeys(('number', 'time', 'base_places'), integer(0, 2**40)),
+        'drive': text(4096),
+        'changes': list_of(text(4096), 0, 4096),
+        'use': list_of(number, 0, MAX_PLACES),
+        'missed': list_of(integer(0, 2**31), 0, MAX_PLACES),
+    }
+)
+
+
+def history_of(path: str | Path) -> Path:
+    """Return the folder with the versions of a map."""
+    return Path(f'{path}{SUFFIX}')
+
+
+def current_version(path: str | Path) -> Version:
+    """
+    Return the version that a map is now; without a record, the first one.
+
+    :raises MapFileError: no map, or a damaged record.
+    """
+    place_map = open_map(path)
+    found = _read(history_of(path), place_map.map_id)
+    return found or Version(place_map.map_id, base_places=len(place_map))
+
+
+def versions(path: str | Path) -> list[Version]:
+    """
+    Return the versions of a map, the present one first.
+
+    :raises MapFileError: as :func:`current_version`.
+    """
+    chain = [current_version(path)]
+    while (parent := chain[-1].parent) and parent not in {each.map_id for each in chain}:
+        chain.append(_read(history_of(path), parent) or Version(parent))
+    return chain
+
+
+def save_version(
+    path: str | Path,
+    opened: FileVersion | None,
+    place_map: PlaceMap,
+    before: Version,
+    version: Version,
+    statistics: MapStatistics | None,
+) -> Version:
+    """
+    Replace a map by its next version.
+
+    :param opened: the file when it was read; another one is not replaced.
+    :param before: the present version; version: the next one, whose id and parent are filled in.
+    :raises OutputError: it cannot be written, or the file has changed; the map stays as it is.
+    """
+    folder = history_of(path)
+    folder.mkdir(exist_ok=True)
+    if not (old := folder / f'{before.map_id}.stavpr').exists():
+        _copy(Path(path), old, False)
+    features = open_map(path).features
+    storage = features.storage if isinstance(features, StoredFeatures) else ''
+    new = folder / 'new.stavpr'
+    map_id = save_map(place_map, new, storage, force=True, statistics=statistics)
+    new.replace(folder / f'{map_id}.stavpr')
+    version = replace(
+        version,
+        map_id=map_id,
+        parent=before.map_id,
+        number=before.number + 1,
+        base_places=before.base_places,
+        time=int(time.time()),
+    )
+    content = json.dumps(asdict(version), allow_nan=False)
+    write_output(folder / f'{map_id}.json', content, JSON, True)
+    _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
+    for each in versions(path)[KEPT:]:
+        (folder / f'{each.map_id}.stavpr').unlink(missing_ok=True)
+    return version
+
+
+def roll_back(path: str | Path, map_id: str = '') -> Version:
+    """
+    Make an earlier version the map again.
+
+    :param map_id: of the version; '' = the one before.
+    :raises InputError: there is no such version.
+    :raises StavprError: its file is damaged, or the map cannot be written.
+    """
+    opened, chain = FileVersion.of(path), versions(path)
+    target = map_id or chain[0].parent
+    file = history_of(path) / f'{target}.stavpr'
+    known = [each.map_id for each in chain[1:] if _file(path, each).exists()]
+    if target not in known:
+        raise InputError(f'{target or "an earlier one"} is no version of {path}: it has {known}')
+    if load_map(file).map_id != target:
+        raise MapFileError(f'{file} is another map than its name says')
+    _copy(file, Path(path), opened or False)
+    return current_version(path)
+
+
+def _file(path: str | Path, version: Version) -> Path:
+    return history_of(path) / f'{version.map_id}.stavpr'
+
+
+def _copy(source: Path, target: Path, force: Force) -> None:
+    with source.open('rb') as file, atomic_output(target, MAP, force) as output:
+        shutil.copyfileobj(file, output)
+
+
+def _read(folder: Path, map_id: str) -> Version | None:
+    """Return the record of a version; None = there is none."""
+    file = folder / f'{map_id}.json'
+    try:
+        data = read_json(file.read_bytes(), file.name)
+        _check(data, file.name)
+        if data['map_id'] != map_id:
+            raise ValueError('it is of another version')
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise MapFileError(f'{file} is damaged ({error}): move it elsewhere') from error
+    lists = {name: tuple(data[name]) for name in ('changes', 'use', 'missed')}
+    return Version(**data | lists)

@@ -1,0 +1,396 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a drive teaches a map: the upkeep of a map of a route that is driven for years.
+
+An update has four steps; docs/upkeep.md tells them on one page.
+
+1. The drive is recognized on the map. It teaches nothing unless it is certain where it is.
+2. Between two certain images, images that are not recognized are a stretch to be learned: an
+   experience of places that look otherwise today, or a detour.
+3. A stretch that is not recognized by ``max_age`` drives in a row is removed, where the places
+   beside it were.
+4. Above ``max_places``, the places that helped least to recognize are removed.
+
+Every stretch is a session of the map, so that no path leads from one into the other. The root of a
+place is the place of an earlier session that shows the same, or itself.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import merge_maps, PlaceMap
+from stavpr_ros.mapping.merging import keep_places
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.mapping.versions import Version
+from stavpr_ros.recognition.error_rate import least_probability
+from stavpr_ros.recognition.recognizer import PlaceRecognizer
+from stavpr_ros.recognition.same_places import SamePlaces
+from stavpr_ros.recognition.settings import RecognizerSettings
+from stavpr_ros.recognition.verification import GeometricSettings, PlaceVerifier
+
+MAX_ERROR = 0.01  # rate of wrong matches that a certain image keeps
+MIN_CERTAIN = 0.3  # share of the images of a drive
+FASTEST = 3.0  # places an image, and images a place: of the same road, driven at another speed
+SLACK = 4  # places by which two certain images may disagree
+MIN_HARD = 20  # images without a match, between two certain ones
+MARGIN = 10  # certain images beside a stretch that are part of it
+MIN_SESSION = 40  # places: fewer say little about the distances of others
+NEAR = 40  # places beside a missed one: their session fits the light of the drive
+MIN_MISSED = 10  # places in a row that are removed as one stretch
+PIECE = 20  # places that are removed together
+DECAY = 0.9  # of the use, a drive
+PROBES, FAR = 24, 25  # images of the geometric check; places to where another one is
+SAME_ROAD = (
+    0.05  # rank of the straight path among its shifted ones, below which it is the same road
+)
+
+
+@dataclass(frozen=True)
+class UpkeepSettings:
+    """
+    Settings of the upkeep.
+
+    :param max_places: of the map; 0 = half more than before the first update.
+    :param max_age: drives in a row that pass a stretch unrecognized until it is removed.
+    """
+
+    max_places: int = 0
+    max_age: int = 5
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """
+    Images of a drive to be learned.
+
+    :param images: numbers in the drive, ascending, (m,).
+    :param places: of the map that they show, (m,); -1 = none.
+    """
+
+    images: np.ndarray
+    places: np.ndarray
+    is_detour: bool
+
+
+def update_map(
+    place_map: PlaceMap, drive: PlaceMap, name: str, version: Version, settings: UpkeepSettings
+) -> tuple[PlaceMap, Version]:
+    """
+    Return a map after a drive, and its version, without id and parent.
+
+    :param drive: all its images, as a map with the features of this one.
+    :param name: of the drive, for the sessions.
+    :param version: of the map.
+    :raises InputError: the drive is not certain where it is; it teaches nothing.
+    """
+    n = len(place_map)
+    place_map = replace(place_map, ids=_with_ids(place_map.ids))
+    roots = np.arange(n) if place_map.same_as is None else place_map.same_as.astype(np.int64)
+    driven = _drive(place_map, drive)
+    _require_certain(place_map, drive, driven, roots)
+    use, missed = _used(place_map, driven, roots, version)
+    changes, stretches = [], []
+    for stretch in _stretches(place_map, drive, driven, roots):
+        stretches.append(stretch)
+        kind = 'a detour' if stretch.is_detour else 'an experience'
+        first, last = (place_map.ids[stretch.places[i]] for i in (0, -1))
+        text = f'added {kind} of {len(stretch.images)} images, from place {first} to {last}'
+        changes.append(text)
+    grown = _with_stretches(place_map, drive, name, stretches)
+    use = np.concatenate([use, np.ones(len(grown) - n)])
+    missed = np.concatenate([missed, np.zeros(len(grown) - n, np.int64)])
+    is_kept = ~_long(missed >= settings.max_age, _runs(grown))
+    if removed := int((~is_kept).sum()):
+        changes.append(f'removed {removed} places not recognized by {settings.max_age} drives')
+    limit = settings.max_places or round(1.5 * (version.base_places or n))
+    fits = _within(grown, use, is_kept, limit)
+    if removed := int((is_kept & ~fits).sum()):
+        changes.append(f'removed {removed} places that helped least, above {limit} places')
+    kept = np.flatnonzero(fits)
+    matched = f'matched {driven.is_matched.mean():.0%} of {len(drive)} images'
+    changes.insert(0, f'{matched}, certain of {len(driven.certain) / len(drive):.0%}')
+    return keep_places(grown, kept), replace(
+        version,
+        drive=name,
+        changes=tuple(changes),
+        use=tuple(np.round(use[kept], 3).tolist()),
+        missed=tuple(missed[kept].tolist()),
+    )
+
+
+def _with_ids(ids: tuple[str, ...]) -> tuple[str, ...]:
+    """Return identifiers that stay when places come and go: their numbers where there is none."""
+    return tuple(each or str(i) for i, each in enumerate(ids))
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """
+    A drive on the map.
+
+    :param places: that its images are certain of, (N,); -1 = none.
+    :param is_matched: whether they are matched, certain or not, (N,).
+    :param driven: number of images in motion up to each, (N,).
+    """
+
+    places: np.ndarray
+    is_matched: np.ndarray
+    driven: np.ndarray
+    recognizer: PlaceRecognizer
+
+    @cached_property
+    def certain(self) -> np.ndarray:
+        """Return the images that are certain where they are, ascending."""
+        return np.flatnonzero(self.places >= 0)
+
+    @cached_property
+    def moves(self) -> np.ndarray:
+        """Return whether the camera has moved since the image before, (N,)."""
+        return np.diff(self.driven, prepend=0) > 0
+
+
+def _drive(place_map: PlaceMap, drive: PlaceMap) -> _Driven:
+    """Recognize a drive on the map."""
+    settings, n = RecognizerSettings(), len(drive)
+    recognizer, least = PlaceRecognizer(place_map, settings), least_probability(MAX_ERROR)
+    matched, certain, moves = SamePlaces(n), SamePlaces(n), np.ones(n, bool)
+    for i in range(n):
+        match = recognizer.update(drive.features[i : i + 1], int(drive.stamps[i]))
+        matched.add(match, i, settings.sequence.length)
+        if match.probability > least:
+            certain.add(match, i, settings.sequence.length)
+        moves[i] = not recognizer.is_standstill
+    return _Driven(certain.places, matched.places >= 0, np.cumsum(moves), recognizer)
+
+
+def _require_certain(
+    place_map: PlaceMap, drive: PlaceMap, driven: _Driven, roots: np.ndarray
+) -> None:
+    """
+    Reject a drive that may be wrong about where it is.
+
+    :raises InputError: too few images are certain, later ones disagree, or the thumbnails do.
+    """
+    certain, places = driven.certain, driven.places
+    if len(certain) < max(MIN_SESSION, MIN_CERTAIN * driven.driven[-1]):
+        raise InputError(
+            f'{len(certain)} of {len(drive)} images are certain where they are: expected '
+            f'{MIN_SESSION}, and {MIN_CERTAIN:.0%} of those in motion; the map stays as it is'
+        )
+    runs = _runs(place_map)
+    for a, b in pairwise(certain):
+        p, q = roots[places[a]], roots[places[b]]
+        allowed = FASTEST * (driven.driven[b] - driven.driven[a]) + SLACK
+        if runs[p] == runs[q] and not -SLACK <= q - p <= allowed:
+            raise InputError(
+                f'images {a} and {b} are certain of places {p} and {q}, which they cannot both '
+                'be right about; the map stays as it is'
+            )
+    if not (len(place_map.thumbnails) and len(drive.thumbnails)):
+        return
+    verifier, score = PlaceVerifier(GeometricSettings('orb')), 0
+    for image in certain[np.linspace(0, len(certain) - 1, PROBES).astype(int)].tolist():
+        query, place = drive.thumbnail(image), int(places[image])
+        if query is None:
+            continue
+        other = (place + max(FAR, len(place_map) // 2)) % len(place_map)
+        right, wrong = (verifier.inliers(query, place_map, each) or 0 for each in (place, other))
+        score += int(right > wrong) - int(right < wrong)
+    if score < 0:
+        raise InputError(
+            'the thumbnails of the certain images fit other places better; the map stays as it is'
+        )
+
+
+def _runs(place_map: PlaceMap) -> np.ndarray:
+    """Return the session of each place, (n,)."""
+    index = place_map.session_index
+    return np.zeros(len(place_map), np.int32) if index is None else index
+
+
+def _used(
+    place_map: PlaceMap, driven: _Driven, roots: np.ndarray, version: Version
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return use and missed drives of each place (:class:`Version`), after this drive."""
+    n, runs = len(place_map), _runs(place_map)
+    use, missed = np.array(version.use), np.array(version.missed, np.int64)
+    use = use * DECAY if len(use) == n else np.full(n, DECAY)
+    missed = missed if len(missed) == n else np.zeros(n, np.int64)
+    helped, passed = np.zeros(n, bool), np.zeros(n, bool)
+    certain, places = driven.certain, driven.places
+    for a, b in pairwise(certain):
+        p, q = places[a], places[b]
+        if runs[p] == runs[q] and 0 <= q - p <= FASTEST * (b - a) + SLACK and b - a <= SLACK:
+            helped[p : q + 1] = True
+        p, q = roots[p], roots[q]
+        if runs[p] == runs[q] and (b - a < MIN_HARD or 0.8 <= (q - p) / (b - a) <= 1.25):
+            passed[p : q + 1] = True
+    helped[places[certain]] = True
+    fits = np.zeros(n, bool)  # a place of the same session beside it was recognized
+    for run in np.unique(runs):
+        own = np.flatnonzero(runs == run)
+        near = np.convolve(helped[own], np.ones(2 * NEAR + 1), 'full')[NEAR : NEAR + len(own)]
+        fits[own] = near > 0.5
+    missed = np.where(helped, 0, missed + (passed[roots] & fits))
+    return use + helped, missed
+
+
+def _stretches(
+    place_map: PlaceMap, drive: PlaceMap, driven: _Driven, roots: np.ndarray
+) -> list[_Stretch]:
+    """Return the stretches of a drive that are not recognized, between images that are."""
+    runs, found, certain = _runs(place_map), [], driven.certain
+    places, moves, count = driven.places, driven.moves, driven.driven
+    for a, b in pairwise(certain.tolist()):
+        inside = a + 1 + np.flatnonzero(moves[a + 1 : b])
+        p, q = int(roots[places[a]]), int(roots[places[b]])
+        if (~driven.is_matched[inside]).sum() < MIN_HARD:
+            continue
+        line = p + (count - count[a]) * (q - p) / max(count[b] - count[a], 1)
+        is_same = bool(runs[p] == runs[q]) and _is_same_road(
+            driven, drive, roots, (a, b), line, runs == runs[p]
+        )
+        of_gap = np.rint(line[inside]).astype(np.int64) if is_same else np.full(len(inside), -1)
+        margin = max(MARGIN, -(-(MIN_SESSION - len(inside)) // 2))
+        before = certain[(certain <= a) & (certain > a - margin) & moves[certain]]
+        after = certain[(certain >= b) & (certain < b + margin) & moves[certain]]
+        found.append(
+            _Stretch(
+                np.concatenate([before, inside, after]),
+                np.concatenate([places[before], of_gap, places[after]]),
+                not is_same,
+            )
+        )
+    return found
+
+
+def _is_same_road(
+    driven: _Driven,
+    drive: PlaceMap,
+    roots: np.ndarray,
+    ends: tuple[int, int],
+    line: np.ndarray,
+    is_run: np.ndarray,
+) -> bool:
+    """
+    Return whether the images between two certain ones show the places between theirs.
+
+    They do if the camera moves as far as from place to place, or if they are nearer to these places
+    than to places on paths beside.
+
+    :param line: the places by even motion, (N,); is_run: those of the session, (n,).
+    """
+    a, b = ends
+    inside, run = np.arange(a + 1, b), np.flatnonzero(is_run)
+    d = driven.recognizer.distances(drive.features[inside])[:, run]
+    z = (d - d.mean(axis=1, keepdims=True)) / d.std(axis=1, keepdims=True).clip(1e-9)
+    path, count, rows = (
+        np.rint(line[inside] - run[0]).astype(int),
+        len(run),
+        np.arange(len(inside)),
+    )
+    near = [
+        np.mean([z[rows, (path + shift + k) % count] for k in range(-2, 3)], axis=0).mean()
+        for shift in range(count)
+    ]
+    others = np.array(near[FAR : count - FAR + 1])
+    rank = float((others <= near[0]).mean()) if len(others) else 1.0
+    speeds = []
+    for low, high in ((a - NEAR, a), (b, b + NEAR)):
+        beside = driven.certain[(driven.certain >= low) & (driven.certain <= high)]
+        at, images = roots[driven.places[beside]], driven.driven[beside]
+        if len(beside) > NEAR // 4 and images[-1] > images[0]:
+            speeds.append((at[-1] - at[0]) / (images[-1] - images[0]))
+    even = np.mean(speeds) * (driven.driven[b] - driven.driven[a]) if speeds else np.inf
+    ratio = (line[b] - line[a]) / max(even, 1e-9)
+    return 0.8 <= ratio <= 1.25 or (rank <= SAME_ROAD and 0.5 <= ratio <= 2)
+
+
+def _with_stretches(
+    place_map: PlaceMap, drive: PlaceMap, name: str, stretches: list[_Stretch]
+) -> PlaceMap:
+    """Return the map with stretches as sessions, related where they show its places."""
+    roots = np.arange(len(place_map)) if place_map.same_as is None else place_map.same_as
+    parts, same_as = [place_map], [roots]
+    first = len(place_map)
+    for stretch in stretches:
+        images, places = stretch.images, stretch.places
+        has = places >= 0
+        own = np.arange(first, first + len(images))
+        same_as.append(np.where(has, roots[places], own))
+        ids = [
+            place_map.ids[place] if place >= 0 else f'{name}/{drive.ids[image] or image}'
+            for image, place in zip(images.tolist(), places.tolist(), strict=True)
+        ]
+        thumbnails = drive.thumbnails or [b''] * len(drive)
+        parts.append(
+            PlaceMap(
+                drive.features[images],
+                place_map.projection,
+                drive.stamps[images],
+                tuple(ids),
+                _poses(place_map, drive, stretch),
+                tuple(thumbnails[i] for i in images.tolist()) if place_map.thumbnails else (),
+                camera=place_map.camera,
+            )
+        )
+        first += len(images)
+    merged = merge_maps(parts, ['first', *[name] * len(stretches)])
+    return replace(
+        merged,
+        threshold=place_map.threshold,
+        same_as=np.concatenate(same_as).astype(np.int32),
+    )
+
+
+def _poses(place_map: PlaceMap, drive: PlaceMap, stretch: _Stretch) -> np.ndarray | None:
+    """Return the poses of a stretch in the frame of the map: of its places, else by odometry."""
+    if place_map.poses is None:
+        return None
+    poses = np.full((len(stretch.images), 7), np.nan)
+    has = stretch.places >= 0
+    poses[has] = place_map.poses[stretch.places[has]]
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    if drive.poses is None or not len(known):
+        return poses
+    own = drive.poses[stretch.images]
+    for i in np.flatnonzero(~has & np.isfinite(own).all(axis=1)).tolist():
+        at = known[max(int(np.searchsorted(known, i)) - 1, 0)]  # the last one that it passed
+        if np.isfinite(own[at]).all():
+            moved = inverse(matrices(own[at])) @ matrices(own[i])
+            poses[i] = to_poses(matrices(poses[at]) @ moved)
+    return poses
+
+
+def _long(is_missed: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Return which of the missed places are of a stretch of them, (n,): others are noise."""
+    begins = (np.diff(is_missed, prepend=False) != 0) | (np.diff(runs, prepend=runs[0]) != 0)
+    part = np.cumsum(begins)
+    return is_missed & (np.bincount(part)[part] >= MIN_MISSED)
+
+
+def _within(grown: PlaceMap, use: np.ndarray, is_kept: np.ndarray, limit: int) -> np.ndarray:
+    """Return which places stay, (n,): whole pieces that helped least go, the only ones last."""
+    is_kept, runs = is_kept.copy(), _runs(grown)
+    roots = np.arange(len(grown)) if grown.same_as is None else grown.same_as
+    pieces = [
+        piece
+        for run in np.unique(runs)
+        for own in [np.flatnonzero(runs == run)]
+        for piece in np.array_split(own, max(1, round(len(own) / PIECE)))
+    ]
+    order = sorted(pieces, key=lambda piece: float(use[piece].mean()))
+    for spares_the_only_ones in (True, False):
+        for piece in order:
+            if is_kept.sum() <= limit:
+                return is_kept
+            others = is_kept.copy()
+            others[piece] = False
+            covered = np.isin(roots[piece], roots[others]).mean() > 0.5
+            if covered or not spares_the_only_ones:
+                is_kept[piece] = False
+    return is_kept

@@ -1,0 +1,320 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What drives teach a map, what is removed from it, and the versions of its file."""
+
+from dataclasses import replace
+import os
+from pathlib import Path
+
+from evaluation_commands import write_images
+from fixtures import route_images
+import numpy as np
+import pytest
+from stavpr_ros.commands.map import main
+from stavpr_ros.errors import InputError, OutputError, StavprError
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import (
+    build_map,
+    builder,
+    load_map,
+    merge_maps,
+    save_map,
+    select_places,
+    versions,
+)
+from stavpr_ros.mapping.merging import keep_places
+from stavpr_ros.mapping.versions import current_version, roll_back, save_version, Version
+from stavpr_ros.output_file import FileVersion
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.upkeep import MIN_MISSED, update_map, UpkeepSettings
+from stavpr_ros.sources.frame import Frame
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+ROUTE, OTHER, BYPASS = (route_images(count, seed) for count, seed in ((200, 0), (120, 5), (70, 9)))
+SETTINGS = UpkeepSettings(max_places=1000, max_age=3)
+
+
+def built(images, day=0, poses=None):
+    """Return the map of a drive, with noise of its own."""
+    dice = np.random.default_rng(day)
+    frames = [
+        Frame(
+            np.clip(image + 3.0 * dice.standard_normal(image.shape), 0, 255).astype(np.uint8),
+            (day * 10_000 + i + 1) * 10**9,
+            '',
+        )
+        for i, image in enumerate(images)
+    ]
+    return build_map(frames, FeatureExtractor(), poses, progress=False)
+
+
+@pytest.fixture(scope='module')
+def first():
+    poses = np.zeros((len(ROUTE), 7))
+    poses[:, 0], poses[:, 6] = np.arange(len(ROUTE)), 1
+    return built(ROUTE, poses=poses)
+
+
+@pytest.fixture(scope='module')
+def rebuilt():
+    """Return a drive on which 60 places look otherwise."""
+    return built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 1)
+
+
+@pytest.fixture(scope='module')
+def around():
+    """Return a drive that leaves the map at place 80, and comes back at 90."""
+    poses = np.zeros((240, 7))
+    poses[:, 1], poses[:, 6] = np.arange(240), 1  # of another frame
+    return built([*ROUTE[:80], *BYPASS, *ROUTE[90:180]], 2, poses)
+
+
+def updated(place_map, drive, version=None, name='drive', settings=SETTINGS):
+    version = version or Version('', base_places=len(place_map))
+    return update_map(place_map, drive, name, version, settings)
+
+
+def recall(place_map, drive):
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings())
+    matches = [recognizer.update(drive.features[i : i + 1]) for i in range(len(drive))]
+    return np.mean([match.accepted for match in matches])
+
+
+def test_drive_like_the_map_changes_the_use_of_its_places_only(first):
+    place_map, version = updated(first, built(ROUTE[20:180], 1))
+    assert len(place_map) == len(first)
+    assert place_map.ids == tuple(map(str, range(200)))  # so that they stay
+    assert version.use[100] > version.use[5] == 0.9
+    assert set(version.missed) == {0}
+    assert version.changes == ('matched 100% of 160 images, certain of 100%',)
+
+
+def test_stretch_that_looks_otherwise_becomes_an_experience(first, rebuilt):
+    place_map, version = updated(first, rebuilt)
+    added = np.arange(200, len(place_map))
+    assert 60 <= len(added) <= 100
+    assert [session.id for session in place_map.sessions] == ['first', 'drive']
+    assert (place_map.session_index[200:] == 1).all()
+    related = place_map.same_as[added]
+    assert (np.diff(related) >= 0).all()
+    assert related.min() >= 60
+    assert related.max() <= 160
+    assert [place_map.ids[i] for i in added] == [str(i) for i in related]
+    np.testing.assert_array_equal(place_map.poses[added], first.poses[related])
+    assert any('experience' in text for text in version.changes)
+    again = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 3)
+    assert recall(place_map, again) > recall(first, again) + 0.1
+    stays, _ = updated(place_map, again, version)
+    assert len(stays) <= len(place_map)  # it is known now
+
+
+def test_detour_joins_the_map_as_a_stretch_of_its_own(first, around):
+    place_map, version = updated(first, around)
+    own = np.flatnonzero(place_map.same_as[200:] == np.arange(200, len(place_map)))
+    assert 60 <= len(own) <= 75
+    assert any('detour' in text for text in version.changes)
+    ids = [place_map.ids[200 + i] for i in own]
+    assert len(set(ids)) == len(ids)
+    assert all(each.startswith('drive/') for each in ids)
+    poses = place_map.poses[200 + own]  # by odometry from where the drive left the map
+    np.testing.assert_allclose(poses[:, 0], poses[0, 0], atol=1e-6)
+    np.testing.assert_allclose(np.diff(poses[:, 1]), 1, atol=1e-6)
+    assert recall(place_map, built([*ROUTE[60:80], *BYPASS, *ROUTE[90:120]], 4)) > 0.8
+
+
+def test_stretch_that_vanished_is_removed_after_max_age_drives(first, rebuilt):
+    place_map, version = updated(first, rebuilt)
+    before = len(place_map)
+    for day in range(3, 6):
+        drive = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], day)
+        place_map, version = updated(place_map, drive, version)
+    old = [i for i in range(len(place_map)) if place_map.stamps[i] < 10_000 * 10**9]
+    numbers = {int(place_map.stamps[i] // 10**9) - 1 for i in old}
+    assert not numbers & set(range(90, 130))
+    assert numbers >= set(range(70)) | set(range(150, 200))
+    assert len(place_map) < before
+    assert 'removed' in ' '.join(version.changes) or len(place_map) < before
+    drive = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 9)
+    assert recall(place_map, drive) > 0.8
+
+
+def test_fewer_missed_places_than_a_stretch_stay(first):
+    missed = np.zeros(200, np.int64)
+    missed[50 : 50 + MIN_MISSED - 1] = 10
+    version = Version('', base_places=200, use=(1.0,) * 200, missed=tuple(missed.tolist()))
+    drive = built(ROUTE[100:190], 1)
+    assert len(updated(first, drive, version)[0]) == 200
+
+
+def test_map_stays_within_its_budget_and_keeps_what_helps(first, rebuilt, around):
+    settings = UpkeepSettings(max_places=250)
+    place_map, version = updated(first, rebuilt, settings=settings)
+    assert len(place_map) <= 250
+    assert any('helped least' in text for text in version.changes)
+    place_map, version = updated(place_map, around, version, settings=settings)
+    assert len(place_map) <= 250
+    assert recall(place_map, built(ROUTE, 7)) > 0.7
+
+
+@pytest.mark.parametrize(
+    ('images', 'reason'),
+    [
+        (OTHER, 'are certain where they are'),
+        ([np.ascontiguousarray(image[:, ::-1]) for image in ROUTE], 'are certain where they are'),
+        ([*ROUTE[100:180], *ROUTE[10:90]], 'cannot both be right'),
+        (ROUTE[:30], 'are certain where they are'),
+    ],
+    ids=['another route', 'mirrored', 'wrong start', 'short'],
+)
+def test_drive_that_may_be_wrong_teaches_nothing(first, images, reason):
+    with pytest.raises(InputError, match=reason):
+        updated(first, built(images, 1))
+
+
+def test_drive_whose_thumbnails_fit_other_places_teaches_nothing(first):
+    drive = built(ROUTE, 1)
+    shifted = drive.thumbnails[100:] + drive.thumbnails[:100]
+    with pytest.raises(InputError, match='thumbnails'):
+        updated(first, replace(drive, thumbnails=shifted))
+
+
+def test_places_left_out_end_their_session(first):
+    places = np.r_[0:50, 52:55, 100:200]
+    chosen = keep_places(first, places)
+    assert [session.id for session in chosen.sessions] == ['first', 'first-2']
+    assert np.bincount(chosen.session_index).tolist() == [50, 100]
+    assert keep_places(first, np.arange(10, 60)).sessions == ()
+    with pytest.raises(InputError, match='no place is left'):
+        keep_places(first, np.arange(5))
+
+
+def test_places_that_are_the_same_stay_so_without_the_first_of_them(first):
+    three = merge_maps([select_places(first, np.arange(20))] * 3, 'abc')
+    three = replace(three, same_as=np.tile(np.arange(20, dtype=np.int32), 3))
+    chosen = select_places(three, np.arange(20, 60))
+    assert chosen.same_as.tolist() == [*range(20), *range(20)]
+
+
+# --------------------------------------------------------------------------------------- versions
+
+
+@pytest.fixture
+def path(first, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    save_map(first, path)
+    return path
+
+
+@pytest.fixture
+def drives(rebuilt, around, tmp_path):
+    files = [tmp_path / 'rebuilt.stavpr', tmp_path / 'around.stavpr']
+    for file, drive in zip(files, (rebuilt, around), strict=True):
+        save_map(drive, file)
+    return [str(file) for file in files]
+
+
+def test_update_log_and_rollback(path, drives, capsys):
+    ids = [load_map(path).map_id]
+    for drive in drives:
+        assert main(['update', str(path), drive]) == 0
+        ids.append(load_map(path).map_id)
+    assert len(set(ids)) == 3
+    capsys.readouterr()
+    assert main(['log', str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:16] for line in lines if not line.startswith(' ')] == ids[::-1]
+    assert any('a detour' in line for line in lines)
+    assert current_version(path).number == 2
+    assert main(['rollback', str(path)]) == 0
+    assert load_map(path).map_id == ids[1]
+    assert main(['rollback', str(path), '--to', ids[0]]) == 0
+    assert load_map(path).map_id == ids[0]
+    assert main(['rollback', str(path)]) == 1
+    assert main(['update', str(path), drives[0]]) == 0
+    assert load_map(path).map_id == ids[1]  # the same again, to the last bit
+
+
+def test_poisoned_drive_leaves_the_file_as_it_is(path, tmp_path, capsys):
+    save_map(built(OTHER, 1), tmp_path / 'other.stavpr')
+    before = path.read_bytes()
+    assert main(['update', str(path), str(tmp_path / 'other.stavpr')]) == 1
+    assert 'stays as it is' in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert sorted(os.listdir(tmp_path)) == ['other.stavpr', 'route.stavpr']
+
+
+@pytest.mark.parametrize('step', ['_copy', 'save_map', 'write_output'])
+@pytest.mark.parametrize('call', [1, 2])
+def test_update_that_ends_early_leaves_the_map(path, drives, monkeypatch, step, call):
+    before, calls = path.read_bytes(), []
+    real = getattr(versions, step)
+
+    def fails(*arguments, **options):
+        calls.append(step)
+        if len(calls) == call:
+            raise OutputError('the program was killed')
+        return real(*arguments, **options)
+
+    with monkeypatch.context() as ended:
+        ended.setattr(versions, step, fails)
+        code = main(['update', str(path), drives[0]])
+    if code:
+        assert path.read_bytes() == before
+        assert main(['update', str(path), drives[0]]) == 0
+    assert current_version(path).drive == 'rebuilt'
+    assert roll_back(path).map_id
+    assert path.read_bytes() == before
+
+
+def test_map_that_another_program_has_replaced_stays(path, first, rebuilt):
+    opened, before = FileVersion.of(path), current_version(path)
+    place_map, version = updated(first, rebuilt, before)
+    save_map(replace(first, stamps=first.stamps + 1), path, force=True)
+    other = path.read_bytes()
+    with pytest.raises(StavprError):
+        save_version(path, opened, place_map, before, version, None)
+    assert path.read_bytes() == other
+
+
+def test_old_versions_are_deleted(path, first, monkeypatch):
+    monkeypatch.setattr(versions, 'KEPT', 2)
+    for day in range(1, 4):
+        opened, before = FileVersion.of(path), current_version(path)
+        changed = replace(first, stamps=first.stamps + day)
+        save_version(path, opened, changed, before, Version('', changes=(f'{day}',)), None)
+    files = sorted(Path(f'{path}.history').glob('*.stavpr'))
+    assert len(files) == 2
+    assert [each.changes for each in versions.versions(path)][:3] == [('3',), ('2',), ('1',)]
+    with pytest.raises(InputError, match='is no version'):
+        roll_back(path, versions.versions(path)[2].map_id)
+
+
+@pytest.mark.parametrize('content', ['{', '[]', '{"map_id": "x"}', '\ud800'])
+def test_damaged_record_is_rejected(path, content):
+    folder = Path(f'{path}.history')
+    folder.mkdir()
+    (folder / f'{load_map(path).map_id}.json').write_text(content, errors='surrogatepass')
+    with pytest.raises(StavprError, match='is damaged'):
+        current_version(path)
+    assert main(['log', str(path)]) == 1
+
+
+def test_interrupted_update_of_images_continues(path, tmp_path, monkeypatch):
+    write_images(tmp_path / 'tuesday', [*ROUTE[:80], *OTHER[:60], *ROUTE[140:]])
+    extracted = []
+    real = FeatureExtractor.extract
+
+    def extract(self, images):
+        extracted.append(len(images))
+        if len(images) == builder.BATCH and len(extracted) == 6:
+            raise KeyboardInterrupt
+        return real(self, images)
+
+    monkeypatch.setattr(FeatureExtractor, 'extract', extract)
+    assert main(['update', str(path), str(tmp_path / 'tuesday')]) != 0
+    assert current_version(path).number == 0
+    before = sum(extracted)
+    assert main(['update', str(path), str(tmp_path / 'tuesday')]) == 0
+    assert sum(extracted) - before < 200
+    assert current_version(path).number == 1
+    assert not list(Path(f'{path}.history').glob('*.journal'))
