@@ -152,6 +152,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar='MAP',
         help="the file to write; by default the recording's, or a numbered name beside it",
     )
+    _add_upkeep(add)
+    return parser
+
+
+def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
+    """Add the actions on versions of a map."""
     text = 'Let a drive that is certain where it is update a map, docs/upkeep.md.'
     action = add('update', _update, text, 'map')
     action.add_argument(
@@ -176,7 +182,6 @@ def _parser() -> argparse.ArgumentParser:
     add('log', _log, 'Show the versions of a map, and what each update added and removed.', 'map')
     action = add('rollback', _rollback, 'Make an earlier version the map again.', 'map')
     action.add_argument('--to', metavar='ID', default='', help='of the version (the one before)')
-    return parser
 
 
 def _info(arguments: argparse.Namespace) -> None:

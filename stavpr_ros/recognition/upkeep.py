@@ -44,9 +44,7 @@ MIN_MISSED = 10  # places in a row that are removed as one stretch
 PIECE = 20  # places that are removed together
 DECAY = 0.9  # of the use, a drive
 PROBES, FAR = 24, 25  # images of the geometric check; places to where another one is
-SAME_ROAD = (
-    0.05  # rank of the straight path among its shifted ones, below which it is the same road
-)
+SAME_ROAD = 0.05  # rank of the straight path among shifted ones, of the same road
 
 
 @dataclass(frozen=True)
@@ -279,8 +277,8 @@ def _is_same_road(
     """
     Return whether the images between two certain ones show the places between theirs.
 
-    They do if the camera moves as far as from place to place, or if they are nearer to these places
-    than to places on paths beside.
+    They do if the camera moves as far as from place to place, or if they are nearer to these
+    places than to places on paths beside.
 
     :param line: the places by even motion, (N,); is_run: those of the session, (n,).
     """

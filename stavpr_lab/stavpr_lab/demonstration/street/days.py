@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Days on the synthetic street: light, weather, traffic and shops change, and parts of the road."""
+"""Days on the synthetic street: light, weather, traffic, shops and parts of the road change."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
