@@ -31,8 +31,8 @@ def test_updated_map_knows_the_detour_and_stays_small(results):
 def test_results_are_a_table_and_a_plot(results, tmp_path):
     assert len(table(results).splitlines()) == 7
     plot(results, tmp_path / 'days.png')
-    with Image.open(tmp_path / 'days.png') as picture:
-        assert np.asarray(picture).std() > 5
+    with Image.open(tmp_path / 'days.png') as image:
+        assert np.asarray(image).std() > 5
 
 
 def test_days_change_light_shops_and_buildings():

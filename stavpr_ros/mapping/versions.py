@@ -1,9 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Versions of a map that is updated by drives: its history, and the way back.
+Versions of a map that is updated by drives: its history, and the return to one.
 
-``route.stavpr.history`` has each version as ``ID.stavpr``, and ``ID.json`` says how it came about.
+``route.stavpr.history`` has each version as ``ID.stavpr``, and in ``ID.json`` how it came about.
 Both are complete before the version replaces the map, which is one step: whatever ends the
 program, the map is the version before or the new one.
 """
@@ -150,7 +150,7 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
     if target not in known:
         raise InputError(f'{target or "an earlier one"} is no version of {path}: it has {known}')
     if load_map(file).map_id != target:
-        raise MapFileError(f'{file} is another map than its name says')
+        raise MapFileError(f'{file} is another map than its name states')
     _copy(file, Path(path), opened or False)
     return current_version(path)
 

@@ -3,7 +3,7 @@
 """
 What a drive teaches a map: the upkeep of a map of a route that is driven for years.
 
-An update has four steps; docs/upkeep.md tells them on one page.
+An update has four steps; docs/upkeep.md describes them.
 
 1. The drive is recognized on the map. It teaches nothing unless it is certain where it is.
 2. Between two certain images, images that are not recognized are a stretch to be learned: an
@@ -280,7 +280,7 @@ def _is_same_road(
     They do if the camera moves as far as from place to place, or if they are nearer to these
     places than to places on paths beside.
 
-    :param line: the places by even motion, (N,); is_run: those of the session, (n,).
+    :param line: the places by even motion, (N,); is_run: whether a place is of the session, (n,).
     """
     a, b = ends
     inside, run = np.arange(a + 1, b), np.flatnonzero(is_run)

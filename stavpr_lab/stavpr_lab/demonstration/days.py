@@ -58,7 +58,9 @@ def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
     return build_map(traverse, FeatureExtractor(), progress=False)
 
 
-def judge(place_map: PlaceMap, drive: PlaceMap, positions: dict[int, float]) -> tuple[float, int]:
+def measure(
+    place_map: PlaceMap, drive: PlaceMap, positions: dict[int, float]
+) -> tuple[float, int]:
     """Return the share of the images that are rightly matched, and the number of wrong ones."""
     recognizer = PlaceRecognizer(place_map, RecognizerSettings())
     right = wrong = 0
@@ -80,14 +82,14 @@ def run(days: Days, count: int, settings: UpkeepSettings) -> Iterator[Day]:
     everything = merge_maps([first], ['day 0'])
     for number in range(1, count + 1):
         drive = drive_of(days, number, positions)
-        judged = [judge(each, drive, positions) for each in (first, everything, updated)]
+        measured = [measure(each, drive, positions) for each in (first, everything, updated)]
         try:
             updated, version = update_map(updated, drive, f'day {number}', version, settings)
             changes = version.changes
         except InputError as error:
             changes = (str(error),)
         everything = with_last_related(merge_maps([everything, drive], ['', f'day {number}']))
-        recall, wrong = zip(*judged, strict=True)
+        recall, wrong = zip(*measured, strict=True)
         places = len(first), len(everything), len(updated)
         yield Day(number, recall, wrong, places, changes)
 
@@ -136,8 +138,8 @@ def main() -> None:
         print(table([day]).splitlines()[-1], flush=True)
     command = f'`python3 -m stavpr_lab.demonstration.days {count}`'
     text = f'# Days\n\n{command}; the images of a day are matched before the map learns from them.'
-    picture = f'![recall and places]({target.name}.png)'
-    target.with_suffix('.md').write_text(f'{text}\n\n{picture}\n\n{table(results)}\n')
+    image_link = f'![recall and places]({target.name}.png)'
+    target.with_suffix('.md').write_text(f'{text}\n\n{image_link}\n\n{table(results)}\n')
     plot(results, target.with_suffix('.png'))
 
 

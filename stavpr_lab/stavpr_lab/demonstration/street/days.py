@@ -30,11 +30,11 @@ class Days:
     The days of a street.
 
     :param seed: of the street and of its days.
-    :param length: meters of the street; of the detour, see ``traverses``.
+    :param length: meters of the street.
     :param images: of a drive.
     :param size: width and height of the images.
     :param closed: first and last day on which a part of the road is closed, and where, meters.
-    :param built: day from which a row of new buildings stands, and where, meters.
+    :param built: day from which on there is a row of new buildings, and where, meters.
     """
 
     seed: int = 7
