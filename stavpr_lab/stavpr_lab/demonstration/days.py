@@ -4,7 +4,7 @@
 A map that is updated day by day, beside the first session alone and all sessions kept.
 
 ``python3 -m stavpr_lab.demonstration.days 30 benchmarks/results/days`` (``make days``) drives
-the synthetic street and writes a table and a plot, in ten minutes.
+the synthetic street and writes a table and a plot, in half an hour.
 """
 
 from collections.abc import Iterator
