@@ -235,6 +235,16 @@ def test_update_log_and_rollback(path, drives, capsys):
     assert load_map(path).map_id == ids[1]  # the same again, to the last bit
 
 
+def test_update_without_other_places_keeps_the_version_before(path, first):
+    before = current_version(path)
+    for day in (1, 1):
+        opened, place_map = FileVersion.of(path), replace(first, stamps=first.stamps + day)
+        version = Version('', use=(float(day),) * 200)
+        save_version(path, opened, place_map, current_version(path), version, None)
+    assert [each.number for each in versions.versions(path)] == [2, 0]
+    assert roll_back(path).map_id == before.map_id
+
+
 def test_poisoned_drive_leaves_the_file_as_it_is(path, tmp_path, capsys):
     save_map(built(OTHER, 1), tmp_path / 'other.stavpr')
     before = path.read_bytes()

@@ -122,7 +122,8 @@ def save_version(
     version = replace(
         version,
         map_id=map_id,
-        parent=before.map_id,
+        # a drive that has changed the use of the places only
+        parent=before.parent if map_id == before.map_id else before.map_id,
         number=before.number + 1,
         base_places=before.base_places,
         time=int(time.time()),
