@@ -7,22 +7,22 @@ z at right places has another mean for each kind of features, each map and each 
 depend on it:
 
 - p, the probability of the path by the filter, after the checks;
-- the **gap** g = (m - m') / m: m is the mean of -z along the path, m' the largest along straight
-  paths of the same images elsewhere, more than ``APART`` places from its position
-  (:func:`best_elsewhere`): how near look-alikes come in this window, in this light;
+- the **lead** d = max(0, m - max(0, m')): m is the mean of -z along the path, m' the largest along
+  straight paths of the same images elsewhere, more than ``APART`` places from its position
+  (:func:`best_elsewhere`): how much nearer it is than its look-alikes, in this window and light;
+- the number l of images that are matched: a window, or the newest images alone;
 - r, the **recent** mean of p over the windows of the drive, from .5 on: whether this drive is on
-  the map at all;
-- the number l of images that are matched: a window, or the newest images alone.
+  the map at all.
 
 The probability is 1 / (1 + exp(-x)) with::
 
-    x = -0.282 + 0.29 ln(p / (1 - p)) + 3.243 g + 1.924 min(0, ln(r / (1 - r))) + 1.359 ln(l / 20)
+    x = -3.01 + 0.276 ln(p / (1 - p)) + 1.309 ln(1 + l d) + 1.637 min(0, ln(r / (1 - r)))
 
-by logistic regression on features ``gradient`` and ``efficientnet_lite1`` together. Each of six
-routes has the same weight; floors that look alike, and unrelated routes, have four times as much:
-a little more than half of the drives is off the map. benchmarks/results/evidence.md names them,
-and has the results on data sets left out, other quantities, and what half and double of each
-factor does.
+by logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
+windows of drives, half of them with detours, and on the first images of drives. Each of six
+routes has the same weight, floors that look alike, and unrelated routes four times as much.
+benchmarks/results/evidence.md names them, and has the results on data sets left out, other
+quantities, and what half and double of each factor does.
 """
 
 import math
@@ -31,11 +31,9 @@ import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
 
-CONSTANT, POSTERIOR, GAP, RECENT, IMAGES = -0.282, 0.29, 3.243, 1.924, 1.359
-WINDOW = 20  # images for which the constant holds
+CONSTANT, POSTERIOR, LEAD, RECENT = -3.01, 0.276, 1.309, 1.637
 APART = 20  # places: paths nearer than that to the path are not elsewhere
 SPEEDS = np.array([1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0])  # of straight paths
-MIN_SCORE = 0.05  # of a path, for the gap
 CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do not grow
 MIN_RECENT = 0.04  # a drive that comes to the map late is recognized there
 FIRST, LAST = 8, 108  # windows that count as the mean .5 at first, and that the mean goes back
@@ -67,9 +65,9 @@ def path_probability(
     :param recent: r, of the windows before.
     :param images: l.
     """
-    gap = (score - elsewhere) / max(score, MIN_SCORE) if score > 0 else -1.0
-    x = CONSTANT + POSTERIOR * _log_odds(posterior, CERTAIN) + GAP * min(max(gap, -1.0), 1.0)
-    x += RECENT * min(_log_odds(recent, MIN_RECENT), 0.0) + IMAGES * math.log(images / WINDOW)
+    lead = max(score - max(elsewhere, 0.0), 0.0)
+    x = CONSTANT + POSTERIOR * _log_odds(posterior, CERTAIN) + LEAD * math.log1p(images * lead)
+    x += RECENT * min(_log_odds(recent, MIN_RECENT), 0.0)
     return 1 / (1 + math.exp(-x)) if posterior > 0 else 0.0
 
 
