@@ -153,13 +153,13 @@ def test_calibration_in_a_map_is_that_of_max_error(command, traverses, tmp_path)
     for options, probability, is_noted in (
         (['--max-error', 0.2], least_probability(0.2, risks), False),
         (['--max-error', 0.1], least_probability(0.1, risks), True),
-        (['--max-error', 0.2, '--beta', 3], 0.1, True),
+        (['--max-error', 0.2, '--beta', 3], least_probability(0.2), True),
     ):
         code, output, errors = run(*options, '--json', tmp_path / 'out.json', '--force')
         assert (code, 'not kept by the calibration' in output) == (0, is_noted), errors
         found = read_json((tmp_path / 'out.json').read_text())['default_threshold']
         assert found['threshold'] == pytest.approx(1 - probability)
-    assert least_probability(0.2, risks) != pytest.approx(0.1)
+    assert least_probability(0.2, risks) != pytest.approx(least_probability(0.2))
     content = path.read_bytes()
     code, output, errors = run('--calibrate', 'add')  # the same recording counts once
     assert (code, 'is in the calibration already' in output) == (0, True), errors
