@@ -248,6 +248,14 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             bounds=(0.0, 1e6),
         ),
         NodeParameter(
+            'direction',
+            'forward',
+            'Localization in mode robust: forward, the camera moves along the map, or both, it '
+            'may move against it as well: a robot that reverses, or one that comes back and has a '
+            'map of its rear camera. ~/match names the direction.',
+            choices=('forward', 'both'),
+        ),
+        NodeParameter(
             'other_views',
             False,
             'Localization in mode robust: compare images rotated by 8 degrees and moved by a '

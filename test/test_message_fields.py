@@ -66,6 +66,7 @@ class Drive:
     candidates: list[PlaceCandidates] = field(default_factory=list)
     infos: list[MapInfo] = field(default_factory=list)
     around: Any = None
+    is_back: bool = False
 
     @property
     def map_id(self) -> str:
@@ -191,10 +192,14 @@ PLACE_MATCH: Checks = {
         lambda m, d: m.sequence_middle == (-1 if not m.path else (m.sequence_first +
         m.sequence_last) // 2 if d.mode == 'paper' else m.path[(len(m.path) - 1) //
         2].place_index)),
+    'direction': ('1 = the camera moves along the map, -1 = against it (parameter direction: '
+        'both), 0 = no sequence',
+        lambda m, d: m.direction in ((0,) if not m.path else (1,) if not d.is_back else
+        (-1,) if matched(m) else (1, -1))),
     'path': ('its warping path, from the oldest image to the newest',
         lambda m, d: not m.path or (sorted({pair.query_index for pair in m.path}) ==
-        list(range(len(d.window(m)))) and (np.diff([(p.query_index, p.place_index) for p in
-        m.path], axis=0) >= 0).all())),
+        list(range(len(d.window(m)))) and (np.diff([(p.query_index, m.direction * p.place_index)
+        for p in m.path], axis=0) >= 0).all())),
     'path_probabilities': ('that each place of path is right, the last one thus that '
         'newest_index is; empty in mode paper and off the map',
         lambda m, d: len(m.path_probabilities) == (len(m.path) if m.probability > 0 else 0) and
@@ -556,7 +561,11 @@ def drives(robot, small_map, tmp_path_factory):
     early = Drive(path=path, places=load_map(path))
     with running(robot, early):
         show(robot, early, range(40, 46))
-    return [robust, paper, mapping, loop, others, without_map, early]
+
+    back = Drive(**on_map, is_back=True)
+    with running(robot, back, direction='both'):
+        show(robot, back, np.arange(49, 35, -1) + AHEAD)
+    return [robust, paper, mapping, loop, others, without_map, early, back]
 
 
 def reset(robot: Robot, drive: Drive) -> None:
@@ -619,10 +628,11 @@ def test_every_field_has_a_check_beside_its_sentence(file):
 
 def test_drives_show_what_the_fields_distinguish(drives):
     """Or a check would hold for want of messages."""
-    robust, paper, mapping, loop, _, _, early = drives
+    robust, paper, mapping, loop, _, _, early, back = drives
     assert {match.status for drive in drives for match in drive.matches} == set(range(8))
     assert {0.2, 0.15} == {round(match.threshold, 6) for match in early.matches}
     assert 0.0 in {match.threshold for match in loop.matches}
+    assert any(matched(match) for match in back.matches)
     for drive in (robust, paper):
         assert {matched(match) for match in drive.matches} == {True, False}
         assert drive.candidates

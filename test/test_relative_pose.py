@@ -172,15 +172,17 @@ def test_edge_without_what_pnp_needs_names_it(changes, cameras, source, words):
     assert words in edge.reason
 
 
-def plain_pair(query_poses, middle, distances, poses=None):
+def plain_pair(query_poses, middle, distances, poses=None, direction=1):
     poses = np.array([pose(i * SPACING) for i in range(PLACES)]) if poses is None else poses
-    return MatchedPair(object(), PLACE, None, query_poses, middle, distances, 0, poses, {})
+    return MatchedPair(
+        object(), PLACE, None, query_poses, middle, distances, 0, poses, {}, direction
+    )
 
 
-@pytest.mark.parametrize('speed', [0.5, 0.91, 1.0, 1.6])
+@pytest.mark.parametrize('speed', [0.5, 0.91, 1.0, 1.6, -1.0])
 @pytest.mark.parametrize('ahead', [-0.7, 0.0, 0.3, 2.2])
 def test_align_finds_the_offset_at_any_speed(speed, ahead):
-    edge = align(plain_pair(*driven(ahead, speed)))
+    edge = align(plain_pair(*driven(ahead, speed), direction=1 if speed > 0 else -1))
     assert (edge.source, edge.reason) == (Source.ALIGNED, '')
     np.testing.assert_allclose(edge.pose[:3], [ahead * SPACING, 0, 0], atol=0.06)
     along, across = edge.covariance[0, 0], edge.covariance[1, 1]

@@ -37,6 +37,7 @@ def test_place_ahead_stays_in_its_session(small_map):
         session_index=np.repeat(np.arange(2, dtype=np.int32), 30),
     )
     assert [place_ahead(two, index, 5.0) for index in (20, 27, 29, 30)] == [25, 29, 29, 35]
+    assert [place_ahead(two, index, 5.0, -1) for index in (2, 20, 30, 36)] == [0, 15, 30, 31]
 
 
 def test_thumbnail_has_the_width(small_map):

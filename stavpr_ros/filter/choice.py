@@ -116,9 +116,11 @@ class PathChoice:
 
         :param stamps: ns, (n,), int64; 0 = unknown.
         """
-        columns = self._layout.columns_of(np.arange(len(stamps)))
-        steps = np.ones(len(self._place_times))
-        steps[columns[1:]] = np.diff(image_times(stamps, columns))
+        columns = self._layout.columns_of(np.arange(self._layout.passes(len(stamps))))
+        steps, n = np.ones(len(self._place_times)), len(stamps)
+        between = np.diff(image_times(stamps, columns[:n]))
+        steps[columns[1:n]] = between
+        steps[columns[n + 1 :]] = between[::-1][: len(columns) - n]
         self._place_times = steps.cumsum()
 
     def choose(self, belief: Belief, images: WindowImages) -> ChosenPath:
@@ -226,10 +228,10 @@ class PathChoice:
         ends = self._layout.first_column(path[-1]), images.n - 1
         checked, placed = ascending(path, means[0], *ends), ascending(path, means[1], *ends)
         close = np.abs(places - placed[:, None]) <= CLOSE
-        first, last = self._layout.place_before(inside[[0, -1], [0, -1]]).tolist()
+        first, last = self._layout.pass_before(inside[[0, -1], [0, -1]]).tolist()
         stretches = self._change.stretches(first, last + 1)
         if stretches[-1] - stretches[0] < last - first:  # equal places are as one
-            own, others = map(self._layout.place_before, (inside, placed[:, None]))
+            own, others = map(self._layout.pass_before, (inside, placed[:, None]))
             close |= stretches[own - first] == stretches[others - first]
         offsets = np.minimum(np.maximum(checked - path, -BAND), BAND) + BAND
         shares = (masses * close).sum(axis=1)

@@ -7,6 +7,14 @@ Columns of a gap have infinite distances, and a state that enters one leaves the
 path continues from one session into another. A place and the place of an earlier session with the
 same view (:attr:`stavpr_ros.mapping.PlaceMap.same_as`) are one position: their probabilities add
 up, and neither is the second best of the other.
+
+A place in a direction is a **pass**: n passes along the map have the numbers of their places, and
+n passes against it follow, from the last place to the first, so that the camera always moves on to
+the next pass. The two passes of a place are one position with one distance. Sessions of passes
+have gaps as those of places::
+
+    place      0 1 2 ... n-1     |  gap  |  n-1 ... 2 1 0
+    pass       0 1 2 ... n-1     |       |  n   ...   2n-1
 """
 
 import sys
@@ -26,27 +34,57 @@ class ColumnLayout:
     :param same_as: for each place, itself, or the place of an earlier session that shows the
         same, (n,); not needed for one session.
     :param gap: columns between two sessions: more than a camera moves from image to image.
+    :param against: the camera may move against the map, too; not without places.
 
-    ``runs`` are the places of each session, ``gaps`` the columns between them.
+    ``runs`` are the places of each session, ``firsts`` the first passes of each, ``columns`` their
+    columns, None where each pass is the column of its number, and ``gaps`` the columns between.
     """
 
     def __init__(
-        self, firsts: np.ndarray = ONE_SESSION, same_as: np.ndarray = NO_PLACES, gap: int = 0
+        self,
+        firsts: np.ndarray = ONE_SESSION,
+        same_as: np.ndarray = NO_PLACES,
+        gap: int = 0,
+        against: bool = False,
     ) -> None:
         self.firsts, self.runs, self.gaps = firsts, [slice(None)], NO_PLACES
         self.columns: np.ndarray | None = None
-        if len(firsts) == 1:
+        if len(firsts) == 1 and not against:
             return
         n = len(same_as)
         self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
-        self.columns = np.arange(n) + gap * np.repeat(
-            np.arange(len(firsts)), np.diff(firsts, append=n)
+        self._places = np.arange(n)  # of each pass
+        if against:
+            self._places = np.append(self._places, self._places[::-1])
+            self.firsts = np.append(firsts, 2 * n - np.append(firsts[1:], n)[::-1])
+        passes = len(self._places)
+        self.columns = np.arange(passes) + gap * np.repeat(
+            np.arange(len(self.firsts)), np.diff(self.firsts, append=passes)
         )
         self._width = int(self.columns[-1]) + 1
         self._same_as = same_as
         self._shared = np.arange(self._width)  # column where the position's probability is summed
-        self._shared[self.columns] = self.columns[same_as]
+        self._shared[self.columns] = self.columns[same_as[self._places]]
         self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
+
+    def passes(self, places: int) -> int:
+        """Return the number of passes of so many places."""
+        return places if self.columns is None else len(self._places)
+
+    def places(self, passes: int) -> int:
+        """Return the number of places of so many passes."""
+        return passes if self.columns is None else len(self._same_as)
+
+    def of_passes(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of places (..., n) as values of their passes."""
+        return values if self.columns is None else values[..., self._places]
+
+    def changes_of_passes(self, changes: np.ndarray) -> np.ndarray:
+        """Return changes from the places 1, 2, ... before (L, n) as changes of passes."""
+        changes, n = self.of_passes(changes), changes.shape[1]
+        for apart, row in enumerate(changes, 1):  # against the map, they are from the other place
+            row[n + apart :] = row[n : row.shape[0] - apart].copy()
+        return changes
 
     def width(self, places: int) -> int:
         """Return the number of columns of so many places."""
@@ -57,26 +95,35 @@ class ColumnLayout:
         if self.columns is None:
             return row
         out: np.ndarray = np.full(self._width, np.inf, row.dtype)
-        out[self.columns] = row
+        out[self.columns] = row[self._places]
         return out
 
     def to_places(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the columns that are places, (n,)."""
+        """Return the values of the columns that are places, passed along the map, (n,)."""
+        return values if self.columns is None else values[self.columns[: len(self._same_as)]]
+
+    def to_passes(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the columns that are passes."""
         return values if self.columns is None else values[self.columns]
 
-    def columns_of(self, places: np.ndarray) -> np.ndarray:
-        """Return the columns of places."""
-        return places if self.columns is None else self.columns[places]
+    def columns_of(self, passes: np.ndarray) -> np.ndarray:
+        """Return the columns of passes; those along the map have the numbers of their places."""
+        return passes if self.columns is None else self.columns[passes]
 
-    def place_before(self, columns: np.ndarray) -> np.ndarray:
-        """Return the place of each column; in a gap, the place before it."""
+    def pass_before(self, columns: np.ndarray) -> np.ndarray:
+        """Return the pass of each column; in a gap, the pass before it."""
         if self.columns is None:
             return columns
         return self.columns.searchsorted(columns, 'right') - 1
 
     def names_of(self, columns: np.ndarray) -> np.ndarray:
         """Return the places of columns as matches number them."""
-        return self.place_before(columns)
+        return columns if self.columns is None else self._places[self.pass_before(columns)]
+
+    def direction_of(self, column: int) -> int:
+        """Return 1 of a pass along the map, -1 of one against it."""
+        is_along = self.columns is None or column <= self.columns[len(self._same_as) - 1]
+        return 1 if is_along else -1
 
     def first_column(self, column: int) -> int:
         """Return the first column of a column's session."""
@@ -100,9 +147,9 @@ class ColumnLayout:
         """Return the columns of positions near a column's, as first ones and ends, (m, 2)."""
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
-        positions = self.columns[self._same_as]
-        place = int(self.place_before(np.array(column)))
-        near = self.columns[np.abs(positions - positions[place]) <= radius]
+        positions = self._shared[self.columns]
+        own = positions[int(self.pass_before(np.array(column)))]
+        near = self.columns[np.abs(positions - own) <= radius]
         runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
         return np.array([[run[0], run[-1] + 1] for run in runs])
 

@@ -501,11 +501,13 @@ def _map_recognizer(
 
 
 def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
-    if settings.backend == 'cuda' or settings.precision != 'float32' or settings.other_views:
+    others = settings.precision, settings.other_views, settings.direction
+    if settings.backend == 'cuda' or others != ('float32', False, 'forward'):
         raise SettingsError(
             f'backend {settings.backend}, precision {settings.precision}, other_views '
-            f'{settings.other_views}: the map of a fleet is matched on the CPU in float32; take '
-            'backend auto or cpu, precision float32, and other_views false'
+            f'{settings.other_views}, direction {settings.direction}: the map of a fleet is '
+            'matched on the CPU in float32; take backend auto or cpu, precision float32, '
+            'other_views false, and direction forward'
         )
     assert isinstance(place_map, PartialMap)
     return place_map.recognizer(settings.recognition())

@@ -67,6 +67,7 @@ class PipelineSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     geometric: GeometricSettings | None = None
     other_views: bool = default('other_views')
+    direction: str = default('direction')
 
     def __post_init__(self) -> None:
         settings_class(self.features)  # rejects an unknown kind
@@ -90,6 +91,7 @@ class PipelineSettings:
             time_budget_ms=self.time_budget_ms,
             min_probability=self.min_probability,
             max_error=self.max_error,
+            direction=self.direction,
         )
 
     def require_operation(self, operation: str) -> None:
@@ -109,6 +111,11 @@ class PipelineSettings:
             raise SettingsError(
                 f'other_views with operation {operation}, mode {self.mode}, time_budget_ms = '
                 f'{self.time_budget_ms:g}: take operation localization, mode robust, budget 0'
+            )
+        if self.direction != 'forward' and operation != 'localization':
+            raise SettingsError(
+                f'direction = {self.direction} with operation {operation}: a route that grows is '
+                'recognized along it; take operation localization, or forward'
             )
         if operation == 'loop_closure':
             self._require_loop_closure()

@@ -92,8 +92,9 @@ class RowColumns:
     ) -> None:
         self._layout = layout
         self._counted = None if counted is None else torch.from_numpy(counted).to(device)
-        columns = torch.from_numpy(layout.columns_of(np.arange(places)))
+        columns = torch.from_numpy(layout.columns_of(np.arange(layout.passes(places))))
         self._columns = columns.to(device)
+        self._places = torch.from_numpy(layout.of_passes(np.arange(places))).to(device)
         self._row = torch.zeros(places, device=device)
         self._out = torch.full((layout.width(places),), torch.inf, device=device)
         self._graph = DeviceGraph(device, self._compute)
@@ -110,7 +111,7 @@ class RowColumns:
         if (counted := self._counted) is not None:
             runs = self._layout.runs
             row = torch.cat([z_normalized_on_device(row[run], counted[run]) for run in runs])
-        self._out.index_copy_(0, self._columns, row)
+        self._out.index_copy_(0, self._columns, row[self._places])
 
 
 class DeviceFilterWindow(FilterWindow):

@@ -64,7 +64,7 @@ class FilterWindow(QueryWindow):
         self._middle, self._to_oldest = (length - 1) // 2, to_oldest
         lag = length - 1 - (0 if to_oldest else self._middle)
         self.filter: Filter = self.filter_class(width, lag, settings, layout.gaps)
-        self.change = ImageChange(places, settings, length)
+        self.change = ImageChange(layout.passes(places), settings, length)
         self.choice = PathChoice(self.filter, self.change, layout, width)
         self._recent = RecentMean()
         self._posterior = self._of_window = 0.0  # of the latest match, and of the full window
@@ -142,8 +142,8 @@ class FilterWindow(QueryWindow):
             not_near = at_rest[at_rest < len(z)]
             self.filter.update(z, weight, speeds, likelihoods, not_near)
         else:
-            by_place = self.layout.to_places(self.filter.places_of_states()[: len(z)])
-            if self.change.is_dark_stretch(by_place):
+            by_pass = self.layout.to_passes(self.filter.places_of_states()[: len(z)])
+            if self.change.is_dark_stretch(by_pass):
                 self.filter.update(z, 0.0, ones, ones)
         self.images.append(WindowImage(stamp, change, weight, self.filter.count - 1))
         if self._at_rest is not None:

@@ -77,6 +77,7 @@ class WindowMatch:
     :param sequences: returns all sequences; valid until the next match of the window.
     :param min_probability: below which it is no match whatever the limits: of a camera at rest.
     :param images: number of the newest images that are matched; 0 = the whole window.
+    :param direction: 1 = along the map, -1 = against it.
     """
 
     nearest: SequenceMatch | None = None
@@ -86,6 +87,7 @@ class WindowMatch:
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
     min_probability: float = 0.0
     images: int = 0
+    direction: int = 1
 
     def path_ratios(self, position: int) -> np.ndarray:
         """Return the shares, divided by the share of the place at a position, (m,)."""
@@ -155,6 +157,7 @@ class Match:
         mode paper.
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param is_oldest: it is the place of the oldest image of the window, not of the middle one.
+    :param direction: 1 = the camera moves along the map, -1 = against it, as a path that falls.
     :param columns: of a late match: image distances of its window to places from ``first_column``
         on, (l, k), float32.
     """
@@ -174,6 +177,7 @@ class Match:
     window_changes: tuple[float, ...] = ()
     image_index: int = -1
     is_oldest: bool = False
+    direction: int = 1
     first_column: int = 0
     columns: np.ndarray = field(default_factory=lambda: NO_COLUMNS)
 

@@ -15,6 +15,7 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.filter.model import MODEL
+from stavpr_ros.filter.paths import BLOCK
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
@@ -195,7 +196,9 @@ class SequenceRecognizer(ABC):
         window = self._window
         if not isinstance(window, FilterWindow):
             return np.empty(0)
-        return window.layout.to_places(window.filter.places_of_states())
+        states = window.layout.to_passes(window.filter.places_of_states())
+        n = window.layout.places(len(states))
+        return states[:n] + states[n:][::-1] if n < len(states) else states
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
@@ -293,6 +296,7 @@ class SequenceRecognizer(ABC):
             window_stamps=tuple(image.stamp for image in window.images)[-images:],
             window_changes=window.changes[-images:],
             is_oldest=is_oldest,
+            direction=match.direction,
             **fields,
         )
 
@@ -351,7 +355,8 @@ class PlaceRecognizer(SequenceRecognizer):
         numbers = place_map.settings.strips * len(features) * self._dimension
         self._is_small = numbers * (1 if precision == 'int8' else 4) < SMALL_MAP
         if isinstance(self._window, FilterWindow):
-            self._window.change.learn(prepared.changes, self._window.layout.firsts)
+            layout = self._window.layout
+            self._window.change.learn(layout.changes_of_passes(prepared.changes), layout.firsts)
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time budget
         self.start_notes = '; '.join(filter(None, [prepared.note, settings.error_note]))
@@ -423,7 +428,11 @@ class PlaceRecognizer(SequenceRecognizer):
         """Return the first places of the most probable blocks of the filter."""
         assert isinstance(self._window, FilterWindow)
         assert isinstance(self._window.filter, PlaceFilter)
-        return self._window.layout.place_before(self._window.filter.probable_blocks() - 1) + 1
+        layout, blocks = self._window.layout, self._window.filter.probable_blocks()
+        if self._settings.moves_against:  # the last column may have the first place
+            ends = np.minimum(blocks + BLOCK, layout.width(self.places)) - 1
+            return np.minimum(layout.names_of(blocks), layout.names_of(ends))
+        return layout.pass_before(blocks - 1) + 1
 
     @property
     def places(self) -> int:
@@ -483,7 +492,7 @@ def _window_of(
 ) -> QueryWindow:
     """Return an empty window for a map."""
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
-    layout = layout_of(place_map, settings.nms_radius, MODEL)
+    layout = layout_of(place_map, settings.nms_radius, MODEL, settings.moves_against)
     if options.place_filter:
         window: FilterWindow
         arguments = sequence, n, MODEL, layout, options.query_znorm

@@ -69,21 +69,22 @@ class RelativeMotion:
         """
         assert match.nearest is not None
         place, newest = match.nearest.middle, int(match.path[-1, 1])
-        follows = accepted and 0 <= place - self._last <= FARTHEST
+        follows = accepted and 0 <= match.direction * (place - self._last) <= FARTHEST
         self._followed = self._followed + 1 if follows else 0
         self._last = place
         reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
         low = max(first, session[0], place - reach)
         high = min(first + len(self.positions), session[1], place + reach)
         track = np.array(self.positions[low - first : high - first])
+        ends = place - low, newest - low
+        if match.direction < 0:
+            track, ends = track[::-1], (high - 1 - place, high - 1 - newest)
         trajectory = np.array(self.trajectory)
         length, agreed = len(match.path), 1.0
         after = length - 1 - position
         for count in {length, min(len(trajectory), length + self._followed)}:
             part = trajectory[-count:]
-            p_value = agreement(
-                track, (place - low, newest - low), part, count - 1 - after, self._error
-            )
+            p_value = agreement(track, ends, part, count - 1 - after, self._error)
             agreed = agreed if np.isnan(p_value) else min(agreed, p_value)
         return agreed
 

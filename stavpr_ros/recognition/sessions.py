@@ -5,21 +5,25 @@
 from dataclasses import replace
 
 import numpy as np
-from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.filter.columns import ColumnLayout, ONE_SESSION
 from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 
 
-def layout_of(place_map: PlaceMap, nms_radius: int, model: FilterSettings) -> ColumnLayout:
-    """Return the layout of a map, for a window of the same model."""
-    if place_map.session_index is None or not len(place_map):
+def layout_of(
+    place_map: PlaceMap, nms_radius: int, model: FilterSettings, against: bool = False
+) -> ColumnLayout:
+    """Return the layout of a map, for a window of the same model, that may move against it."""
+    index = place_map.session_index
+    if (index is None and not against) or not len(place_map):
         return ColumnLayout()
-    firsts = np.flatnonzero(np.diff(place_map.session_index, prepend=-1))
+    firsts = ONE_SESSION if index is None else np.flatnonzero(np.diff(index, prepend=-1))
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(len(place_map))
-    return ColumnLayout(firsts, same_as.astype(np.int64), session_gap(nms_radius, model))
+    gap = session_gap(nms_radius, model)
+    return ColumnLayout(firsts, same_as.astype(np.int64), gap, against)
 
 
 def session_gap(nms_radius: int, model: FilterSettings) -> int:
@@ -51,4 +55,5 @@ def in_places(match: WindowMatch, layout: ColumnLayout, nms_radius: int) -> Wind
     )
     path = match.path.copy()
     path[:, 1] = layout.names_of(path[:, 1])
-    return replace(match, nearest=nearest, path=path, sequences=sequences)
+    direction = layout.direction_of(match.nearest.middle)
+    return replace(match, nearest=nearest, path=path, sequences=sequences, direction=direction)

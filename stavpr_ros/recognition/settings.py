@@ -5,12 +5,20 @@
 from dataclasses import dataclass, field
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
-from stavpr_ros.checks import require_above, require_at_least, require_between, require_number
+from stavpr_ros.checks import (
+    require_above,
+    require_at_least,
+    require_between,
+    require_choice,
+    require_number,
+)
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.parameters import default
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.robust import options_of, RobustOptions
+
+DIRECTIONS = ('forward', 'both')
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,8 @@ class RecognizerSettings:
     :param max_error: mode robust: rate of wrong matches that chooses this probability instead
         (:func:`stavpr_ros.recognition.error_rate.least_probability`), 0 = off. A
         ``min_probability`` other than the default applies as well where it is stricter.
+    :param direction: mode robust: ``forward``, the camera moves along the map, or ``both``, it may
+        move against it as well: a robot that reverses, or whose rear camera made the map.
     :param error_risks: of drives with these settings, for ``max_error``; :class:`PlaceRecognizer`
         takes its map's.
     """
@@ -52,6 +62,7 @@ class RecognizerSettings:
     time_budget_ms: float = default('time_budget_ms')
     min_probability: float = default('min_probability')
     max_error: float = default('max_error')
+    direction: str = default('direction')
     error_risks: ErrorRisks | None = None
 
     def __post_init__(self) -> None:
@@ -73,6 +84,12 @@ class RecognizerSettings:
         require_at_least('nms_radius', self.nms_radius, 0, 'places')
         require_between('odometry_error', self.odometry_error, 0, 1, '(share of the distance)')
         require_at_least('time_budget_ms', self.time_budget_ms, 0)
+        require_choice('direction', self.direction, DIRECTIONS)
+        if self.moves_against and not self.has_probability:
+            raise SettingsError(
+                f'direction = both is of mode robust: in mode {self.mode}, sequences of the map '
+                'are along it; take forward'
+            )
         with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
         if self.time_budget_ms and not (self.has_probability and with_dtw):
             raise SettingsError(
@@ -89,6 +106,11 @@ class RecognizerSettings:
     def has_probability(self) -> bool:
         """Whether matches have a probability: their distance is 1 - probability then."""
         return self.applied_options.place_filter
+
+    @property
+    def moves_against(self) -> bool:
+        """Whether the camera may move against the map."""
+        return self.direction == 'both'
 
     @property
     def applied_threshold(self) -> float | None:
@@ -112,7 +134,7 @@ class RecognizerSettings:
         return (
             f'{mode} by evidence, length {sequence.length}, beta {sequence.beta:g}, '
             f'{spatial.strategy}, sigma {spatial.sigma:g}, xi {spatial.xi}, '
-            f'vertical {spatial.vertical}'
+            f'vertical {spatial.vertical}' + ', both directions' * self.moves_against
         )
 
     @property

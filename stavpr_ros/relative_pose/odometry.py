@@ -47,7 +47,7 @@ def align(pair: MatchedPair) -> Edge:
     grid = np.arange(track[apart[0]], track[apart[-1]], STEP * pair.spacing)
     smooth = CubicSpline(track[apart], rows.T)(grid)
     for column, image in enumerate(images):
-        at = start + offsets + driven[image] - driven[pair.middle]
+        at = start + offsets + pair.direction * (driven[image] - driven[pair.middle])
         total += np.interp(at, grid, smooth[:, column])
     at = start + _least(offsets, total)
     place = matrices(pair.pose(pair.place))

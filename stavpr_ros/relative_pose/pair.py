@@ -32,6 +32,7 @@ class MatchedPair:
         compared. Empty where alignment by odometry is impossible or not wanted.
     :param first: index of the first of the places around it.
     :param poses: of the base at those places, shape (k, 7); NaN = unknown.
+    :param direction: 1 = the camera moves along the places, -1 = against them.
     :param thumbnails: of places of the same session at most ``TRIANGULATION_RADIUS`` away, by
         index: JPEG images, empty = none.
     """
@@ -45,6 +46,7 @@ class MatchedPair:
     first: int
     poses: np.ndarray
     thumbnails: dict[int, bytes]
+    direction: int = 1
 
     def pose(self, place: int) -> np.ndarray:
         """Return the pose of a place near by, shape (7,); NaN = unknown."""
@@ -97,8 +99,9 @@ def matched_pair(
             if places.place(index).session == session:
                 thumbnails[index] = _thumbnail(places, index - start)
     return MatchedPair(
-        places, place, query, query_poses, match.position, distances, low, poses, thumbnails
-    )
+        places, place, query, query_poses, match.position, distances, low, poses, thumbnails,
+        match.direction,
+    )  # fmt: skip
 
 
 def _thumbnail(places: PlaceMap | GrowingMap, position: int) -> bytes:

@@ -121,7 +121,7 @@ def match_message(
     if match is not None and match.sequence is not None:
         sequence = match.sequence
         message.sequence_first, message.sequence_last = sequence.first, sequence.last
-        message.sequence_middle = sequence.middle
+        message.sequence_middle, message.direction = sequence.middle, match.direction
         message.path_probabilities = result.path_probabilities.tolist()
         message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
         message.second_best_index = sequence.second_best_index

@@ -39,7 +39,9 @@ class SubgoalPublisher:
             return
         if not any(is_requested(self._node, each) for each in (self._image, self._place)):
             return
-        index = place_ahead(places, result.newest_index, self._settings.subgoal_distance)
+        direction = result.match.direction if result.match else 1
+        distance = self._settings.subgoal_distance
+        index = place_ahead(places, result.newest_index, distance, direction)
         place = places.place(index)
         candidate = PlaceCandidate(
             place_index=index,
@@ -67,15 +69,19 @@ class SubgoalPublisher:
             self._node.destroy_publisher(publisher)
 
 
-def place_ahead(places: PlaceMap, index: int, distance: float) -> int:
+def place_ahead(places: PlaceMap, index: int, distance: float, direction: int = 1) -> int:
     """
     Return the first place at least so far ahead on the route, or the last one of its session.
 
     :param distance: along the route, meters; on a map without poses, number of places.
+    :param direction: 1 = along the map, -1 = against it.
     """
     session, ahead, moved, here = places.session(index), index, 0.0, places.pose(index)
-    while moved < distance and ahead + 1 < len(places) and places.session(ahead + 1) == session:
-        ahead += 1
+    while moved < distance:
+        following = ahead + direction
+        if not 0 <= following < len(places) or places.session(following) != session:
+            break
+        ahead = following
         pose = places.pose(ahead)
         if not places.has_poses:
             moved += 1

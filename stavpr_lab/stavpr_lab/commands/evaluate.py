@@ -179,6 +179,8 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add_parameter(group, 'min_probability', least, metavar='P')
     rate = 'mode robust: rate of wrong matches that chooses --min-probability; 0 = off'
     add_parameter(group, 'max_error', rate, metavar='E')
+    against = 'mode robust: both: the camera may move against the map (%(default)s)'
+    add_parameter(group, 'direction', against)
     add_parameter(group, 'sequence_length', 'images in a window (%(default)s)', metavar='L')
     add, spatial = group.add_argument, SpatialSettings
     beta = 'mode paper: places per image of a window (%(default)g)'

@@ -91,6 +91,7 @@ def recognizer_settings(arguments: argparse.Namespace) -> RecognizerSettings:
         mode=arguments.mode,
         min_probability=arguments.min_probability,
         max_error=arguments.max_error,
+        direction=arguments.direction,
         spatial=SpatialSettings(
             arguments.strategy, arguments.sigma, arguments.xi, arguments.vertical
         ),
@@ -107,8 +108,8 @@ def settings_json(arguments: argparse.Namespace, sequences: Sequences) -> dict[s
         *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
         *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
-        *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta'),
-        'nms_radius',
+        *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta', 'nms_radius'),
+        'direction',
         *('strategy', 'sigma', 'xi', 'vertical'),
         *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
     ]

@@ -1,0 +1,132 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera that moves against the map: direction ``both``."""
+
+from dataclasses import replace
+
+import numpy as np
+from places import features_of, map_of, route_strips
+import pytest
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.mapping import merge_maps
+from stavpr_ros.pipeline import PipelineSettings
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition.robust import ROBUST
+from test_relative_motion import poses_of, track
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+N, LENGTH = 90, 10
+BOTH = RecognizerSettings(sequence=SequenceSettings(LENGTH), nms_radius=8, direction='both')
+FORWARD = replace(BOTH, direction='forward')
+
+
+def view(seed, noise, against=False):
+    strips = route_strips(seed, N)
+    return features_of(strips[:, ::-1] if against else strips, noise, seed + 1)
+
+
+def recognize(place_map, query, settings=BOTH, backend='cpu', poses=None):
+    one = PlaceRecognizer(place_map, settings, backend)
+    poses = [None] * len(query) if poses is None else poses
+    return [one.update(query[i : i + 1], i + 1, poses[i]) for i in range(len(query))]
+
+
+@pytest.mark.parametrize('against', [False, True])
+def test_camera_is_recognized_in_both_directions(against):
+    place_map, query = map_of(view(0, 0.6)), features_of(route_strips(0, N), 0.8, 9)
+    query = query[::-1] if against else query
+    matches = recognize(place_map, query)[LENGTH:]
+    assert all(match.accepted for match in matches)
+    direction = -1 if against else 1
+    for i, match in enumerate(matches, LENGTH):
+        assert match.direction == direction
+        assert (np.diff(match.path[:, 1]) * direction >= 0).all()
+        assert abs(match.newest_index - (N - 1 - i if against else i)) <= 2
+        path = match.sequence.first, match.sequence.middle, match.sequence.last
+        assert list(path) == sorted(path, reverse=against)
+        assert abs(match.sequence.second_best_index - match.sequence.middle) > 8
+    one = PlaceRecognizer(place_map, BOTH)
+    for i in range(30):
+        newest = one.update(query[i : i + 1]).newest_index
+    probabilities = one.place_probabilities()
+    assert probabilities.shape == (N,)
+    assert abs(probabilities.argmax() - newest) <= 1
+    forward = recognize(place_map, query, FORWARD)[LENGTH:]
+    assert [match.accepted for match in forward] == [not against] * len(forward)
+
+
+@pytest.mark.parametrize('sessions', [1, 2])
+def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
+    """Whose features are twice in memory: the same probabilities, of half the distances."""
+    maps = [map_of(view(seed, 0.6)) for seed in (0, 5)[:sessions]]
+    there_and_back = [*maps, *(map_of(each.features[::-1]) for each in maps[::-1])]
+    same_as = np.arange(sessions * N, dtype=np.int32)
+    twice = replace(
+        merge_maps(there_and_back, 'abcd'[: 2 * sessions]),
+        same_as=np.append(same_as, same_as[::-1]),
+    )
+    strips = np.concatenate([route_strips(0, N)[:, 50:], route_strips(0, N)[:, :60:-1]], axis=1)
+    query = features_of(strips, 1.0, 9)
+    options = ROBUST.without('mean_centering', 'whitening')  # statistics of other samples
+    settings, forward = (replace(each, robust_options=options) for each in (BOTH, FORWARD))
+    both = recognize(merge_maps(maps, 'ab'[:sessions]), query, settings)
+    for match, expected in zip(both, recognize(twice, query, forward), strict=True):
+        assert match.status is expected.status
+        if match.sequence is None:
+            continue
+        assert match.probability == pytest.approx(expected.probability, abs=1e-4)
+        if match.probability > 0.1:
+            place = expected.sequence.middle
+            assert match.sequence.middle == np.append(same_as, same_as[::-1])[place]
+            assert match.direction == (-1 if place >= len(same_as) else 1)
+    assert {match.direction for match in both if match.accepted} == {1, -1}
+
+
+def test_changes_of_passes_are_to_the_passes_before():
+    changes = np.array([[0.0, 1, 2, 3], [0, 0, 12, 13]])
+    layout = ColumnLayout(same_as=np.arange(4), gap=3, against=True)
+    near, farther = layout.changes_of_passes(changes)
+    assert (near[5:].tolist(), farther[6:].tolist()) == ([3, 2, 1], [13, 12])
+    assert [layout.direction_of(column) for column in layout.columns] == [1] * 4 + [-1] * 4
+    assert layout.names_of(layout.columns).tolist() == [0, 1, 2, 3, 3, 2, 1, 0]
+    assert layout.around(1, 0).tolist() == layout.around(int(layout.columns[6]), 0).tolist()
+
+
+def test_device_equals_cpu(device):
+    place_map, query = map_of(view(0, 0.6)), features_of(route_strips(0, N)[:, ::-1], 0.8, 9)
+    found = recognize(place_map, query, backend=device)
+    for expected, match in zip(recognize(place_map, query), found, strict=True):
+        assert match.status is expected.status
+        if match.accepted:
+            assert match.probability == pytest.approx(expected.probability, abs=1e-5)
+            np.testing.assert_array_equal(match.path, expected.path)
+    assert match.direction == -1
+
+
+def test_first_stage_compares_the_probable_places_of_both_directions():
+    place_map, query = map_of(view(0, 0.6)), features_of(route_strips(0, N)[:, ::-1], 0.8, 9)
+    coarse = recognize(place_map, query, replace(BOTH, time_budget_ms=1e-6))
+    exact = recognize(place_map, query)
+    assert [match.place_index for match in coarse] == [match.place_index for match in exact]
+
+
+@pytest.mark.parametrize('turn', [90, -90])
+def test_odometry_is_compared_with_the_map_backward(turn):
+    """A map that turns left turns right on the way back."""
+    place_map = map_of(view(0, 0.3), poses_of(track(90)))
+    query = features_of(route_strips(0, N)[:, ::-1], 0.5, 9)
+    matches = recognize(place_map, query, poses=poses_of(track(turn)))
+    beyond = matches[N // 2 + 6 : N // 2 + 3 * LENGTH]
+    assert {match.status for match in beyond} == {Status.MATCH if turn == -90 else Status.NO_MATCH}
+
+
+def test_settings_without_directions_are_rejected():
+    with pytest.raises(SettingsError, match='direction = both is of mode robust'):
+        RecognizerSettings(0.5, mode='paper', direction='both')
+    with pytest.raises(SettingsError, match='take one of forward, both'):
+        RecognizerSettings(direction='sideways')
+    for operation in ('mapping', 'loop_closure'):
+        with pytest.raises(SettingsError, match=f'direction = both with operation {operation}'):
+            PipelineSettings(direction='both').require_operation(operation)
