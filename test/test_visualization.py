@@ -202,7 +202,7 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     row = np.arange(1200, dtype=np.float32)
     views, publishers = views_of('distances')
     recognizer = SimpleNamespace(window_fill=1, newest_row=lambda: row)
-    operation = SimpleNamespace(places=route, recognizer=recognizer)
+    operation = SimpleNamespace(matched_places=route, recognizer=recognizer)
     views.publish(header(), ImageResult(Status.NO_MATCH), operation, 'map')
     (message,) = publishers.messages('distances')
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
