@@ -10,8 +10,8 @@ up, and neither is the second best of the other.
 
 A place in a direction is a **pass**: n passes along the map have the numbers of their places, and
 n passes against it follow, from the last place to the first, so that the camera always moves on to
-the next pass. The two passes of a place are one position with one distance. Sessions of passes
-have gaps as those of places::
+the next pass. The two passes of a place are one position with one distance. Between
+two sessions of passes is a gap, too::
 
     place      0 1 2 ... n-1     |  gap  |  n-1 ... 2 1 0
     pass       0 1 2 ... n-1     |       |  n   ...   2n-1
@@ -71,10 +71,6 @@ class ColumnLayout:
         """Return the number of passes of so many places."""
         return places if self.columns is None else len(self._places)
 
-    def places(self, passes: int) -> int:
-        """Return the number of places of so many passes."""
-        return passes if self.columns is None else len(self._same_as)
-
     def of_passes(self, values: np.ndarray) -> np.ndarray:
         """Return the values of places (..., n) as values of their passes."""
         return values if self.columns is None else values[..., self._places]
@@ -101,6 +97,12 @@ class ColumnLayout:
     def to_places(self, values: np.ndarray) -> np.ndarray:
         """Return the values of the columns that are places, passed along the map, (n,)."""
         return values if self.columns is None else values[self.columns[: len(self._same_as)]]
+
+    def sums_of_places(self, values: np.ndarray) -> np.ndarray:
+        """Return the sums of the values of each place's columns, (n,)."""
+        if self.columns is None:
+            return values
+        return np.bincount(self._places, values[self.columns])
 
     def to_passes(self, values: np.ndarray) -> np.ndarray:
         """Return the values of the columns that are passes."""

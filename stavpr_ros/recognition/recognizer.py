@@ -196,9 +196,7 @@ class SequenceRecognizer(ABC):
         window = self._window
         if not isinstance(window, FilterWindow):
             return np.empty(0)
-        states = window.layout.to_passes(window.filter.places_of_states())
-        n = window.layout.places(len(states))
-        return states[:n] + states[n:][::-1] if n < len(states) else states
+        return window.layout.sums_of_places(window.filter.places_of_states())
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """

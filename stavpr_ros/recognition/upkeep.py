@@ -241,7 +241,7 @@ def _stretches(
     place_map: PlaceMap, drive: PlaceMap, driven: _Driven, roots: np.ndarray
 ) -> list[_Stretch]:
     """Return the stretches of a drive that are not recognized, between images that are."""
-    runs, found, certain = _runs(place_map), [], driven.certain
+    runs, stretches, certain = _runs(place_map), [], driven.certain
     places, moves, count = driven.places, driven.moves, driven.driven
     for a, b in pairwise(certain.tolist()):
         inside = a + 1 + np.flatnonzero(moves[a + 1 : b])
@@ -256,14 +256,14 @@ def _stretches(
         margin = max(MARGIN, -(-(MIN_SESSION - len(inside)) // 2))
         before = certain[(certain <= a) & (certain > a - margin) & moves[certain]]
         after = certain[(certain >= b) & (certain < b + margin) & moves[certain]]
-        found.append(
+        stretches.append(
             _Stretch(
                 np.concatenate([before, inside, after]),
                 np.concatenate([places[before], of_gap, places[after]]),
                 not is_same,
             )
         )
-    return found
+    return stretches
 
 
 def _is_same_road(
@@ -352,12 +352,13 @@ def _poses(place_map: PlaceMap, drive: PlaceMap, stretch: _Stretch) -> np.ndarra
     poses = np.full((len(stretch.images), 7), np.nan)
     has = stretch.places >= 0
     poses[has] = place_map.poses[stretch.places[has]]
-    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
-    if drive.poses is None or not len(known):
+    with_pose = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    if drive.poses is None or not len(with_pose):
         return poses
     own = drive.poses[stretch.images]
     for i in np.flatnonzero(~has & np.isfinite(own).all(axis=1)).tolist():
-        at = known[max(int(np.searchsorted(known, i)) - 1, 0)]  # the last one that it passed
+        # the last one that it passed
+        at = with_pose[max(int(np.searchsorted(with_pose, i)) - 1, 0)]
         if np.isfinite(own[at]).all():
             moved = inverse(matrices(own[at])) @ matrices(own[i])
             poses[i] = to_poses(matrices(poses[at]) @ moved)
