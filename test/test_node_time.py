@@ -30,8 +30,9 @@ def set_clock(robot):
 
 
 def test_max_rate_skips_images_by_their_stamps(robot, start, route):
-    start(max_rate=5.0)
-    before = robot.counts('processing')  # probes may exceed the rate
+    start()
+    robot.set(max_rate=5.0)  # probes would be skipped, and overtake others
+    before = robot.counts('processing')
     statuses = robot.statuses(route, SECOND // 30)
     assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(range(0, 60, 6))
     assert 'exceeds max_rate = 5 Hz' in robot.answers[-1].reason
@@ -44,7 +45,8 @@ def test_max_rate_skips_images_by_their_stamps(robot, start, route):
 
 
 def test_max_rate_without_stamps_uses_arrival(robot, start, route):
-    start(max_rate=0.001)
+    start()
+    robot.set(max_rate=0.001)
     matches = [robot.ask(image_message(image, 0)) for image in route[:3]]
     assert [match.status for match in matches] == [WARMING_UP, SKIPPED, SKIPPED]
     robot.set(max_rate=5.0)
