@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import sys
 
 import numpy as np
+from stavpr_ros.compilation import kernel
 from stavpr_ros.filter.checks import (
     least_at_rest,
     NEWEST,
@@ -29,11 +30,12 @@ from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
 from stavpr_ros.filter.protocol import Filter
-from stavpr_ros.filter.refine import ascending, BAND, image_times, OFFSETS, refine
+from stavpr_ros.filter.refine import BAND, image_times, OFFSETS, refined
 
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
 MIN_CANDIDATE = REFUTED  # probability of its place, at least: above refuted ones
+AROUND = np.array([-BAND, -CLOSE, CLOSE + 1, BAND + 1])  # ends of slices around a place
 NEAR_LEVEL = -2.3  # mean z of right places, at most, as evidence between near places
 
 
@@ -109,6 +111,7 @@ class PathChoice:
     def grow(self, width: int) -> None:
         """Make room for more columns, at equal times."""
         self._place_times = np.arange(width, dtype=np.float64)  # of each column
+        self._passes = self._layout.pass_before(np.arange(width, dtype=np.int32))  # likewise
 
     def learn_times(self, stamps: np.ndarray) -> None:
         """
@@ -134,8 +137,7 @@ class PathChoice:
         while len(candidates) < CANDIDATES:
             candidate = self._candidate(belief, places[best], probabilities[best], images)
             candidates.append(candidate)
-            probabilities[np.abs(places - places[best]) <= BAND] *= candidate.factor
-            best = int(np.argmax(np.where(own, probabilities, 0)))
+            best = _check(places, probabilities, own, best, candidate.factor)
             if candidate.factor >= REFUTED or probabilities[best] < MIN_CANDIDATE:
                 break
         chosen = max(candidates, key=lambda candidate: candidate.weight)
@@ -155,27 +157,30 @@ class PathChoice:
         """Return the most probable column beyond a radius, and its probability, 0 if none."""
         places, probabilities = chosen.places, chosen.probabilities
         around = np.arange(max(0, place - radius), min(n, place + radius + 1))
-        now, faint = self._filter.most_probable(np.sort(np.append(around, places)))
-        faint *= NEGLIGIBLE
-        apart = np.abs(places - place) > radius
-        if apart.any():
-            second = int(np.argmax(np.where(apart, probabilities, 0)))
-            if probabilities[second] >= faint:
-                return int(places[second]), float(probabilities[second])
-        return now, faint
+        excluded = np.concatenate([around, places])
+        excluded.sort()
+        now, faint = self._filter.most_probable(excluded)
+        second = _best_beyond(places, probabilities, place, radius)
+        if second >= 0 and probabilities[second] >= faint * NEGLIGIBLE:
+            return int(places[second]), float(probabilities[second])
+        return now, faint * NEGLIGIBLE
 
     def _candidate(
         self, belief: Belief, place: int, probability: float, images: WindowImages
     ) -> PathCandidate:
         """Return the path of the window through a place at the position, and its checks."""
-        apart = np.abs(belief.places - place)
-        near = apart <= CLOSE
+        low, first, end, high = belief.places.searchsorted(place + AROUND).tolist()
         # of the path: its places are certain within the band
-        of_path = max(float(probability), min(float(belief.weights[apart <= BAND].sum()), 1.0))
-        state = belief.states[near][np.argmax(belief.weights[near])]
+        of_path = max(float(probability), min(float(belief.weights[low:high].sum()), 1.0))
+        state = belief.states[first + belief.weights[first:end].argmax()]
         mean, numbers = self._filter.mean_z(state), images.numbers
         path = self._path(state, images)
-        path, shares, placed, z = self._refined(path, images, mean)
+        z = images.z(np.minimum(np.maximum(path[:, None] + OFFSETS, 0), images.n - 1))
+        path, placed, z, masses = refined(
+            z, path, images.weights * mean, images.numbers, images.stamps,
+            self._place_times[: images.n], min(mean, NEAR_LEVEL) / mean,
+            self._layout.first_column(path[-1]), self._change.equal, self._passes,
+        )  # fmt: skip
         moved = int(numbers[-1] - numbers[0])
         speed = float(path[-1] - path[0]) / max(moved, 1)
         excess = self._change.excess(speed) if moved and images.is_whole else 0.0
@@ -185,54 +190,59 @@ class PathChoice:
             at_rest = z[numbers == numbers[-1]]
             least = least_at_rest(at_rest, mean, self._filter.settings.weight)
         compared = z[np.isfinite(z)]
-        score = -float(compared.mean()) if len(compared) else 0.0
-        return PathCandidate(placed, shares, of_path, factor, least, score)
+        score = -float(compared.sum() / len(compared)) if len(compared) else 0.0
+        return PathCandidate(placed, masses.sum(axis=1), of_path, factor, least, score)
 
     def _path(self, state: np.ndarray, images: WindowImages) -> np.ndarray:
         """Return the column of each image, (l,); before the image at the position at one speed."""
         numbers = images.numbers
-        back = numbers[-1] - numbers
-        lag = int(back[images.position])
+        lag = numbers[-1] - numbers[images.position]
         if images.lag_at_rest is not None:  # images before the standstill as well
-            lag = max(lag, int(min(back[0], images.lag_at_rest)))
-        places = self._filter.path(state, lag)
-        lag = int(np.count_nonzero(places >= 0)) - 1  # since the path has entered the map
-        slope = (places[0] - places[lag]) / lag if lag else self._filter.speed(state)
-        earlier = np.maximum(back - lag, 0) * slope
-        path = places[np.minimum(back, lag)].astype(np.int64) - np.rint(earlier).astype(np.int64)
-        return np.maximum(path, self._layout.first_column(places[0]))
+            lag = max(lag, min(numbers[-1] - numbers[0], images.lag_at_rest))
+        places, speed = self._filter.path(state, int(lag)), self._filter.speed(state)
+        first = self._layout.first_column(places[0])
+        path: np.ndarray = _extended(places, numbers, speed, first)
+        return path
 
-    def _refined(
-        self, path: np.ndarray, images: WindowImages, mean: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """
-        Return the places near a path that explain the images of the window best.
 
-        Bad conditions bring the right place nearer to all others, less to those around it: places
-        are estimated with the evidence of usual conditions. The path is checked where the evidence
-        of the filter has its mean: more would make paths through look-alike places more even.
+# ------------------------------------------------ kernels
 
-        :param path: column of each image, ascending, (l,).
-        :param mean: z of right places, at the path's level.
-        :returns: columns that are checked, (l,), probability of columns close to the estimated
-            ones, (l,), these, (l,), and z of each image at the column that is checked, (l,).
-        """
-        places = path[:, None] + OFFSETS
-        inside = np.minimum(np.maximum(places, 0), images.n - 1)
-        z = images.z(inside)
-        masses, means = refine(
-            z, path, images.weights * mean, images.numbers,
-            image_times(images.stamps, images.numbers), self._place_times[: images.n],
-            min(mean, NEAR_LEVEL) / mean,
-        )  # fmt: skip
-        ends = self._layout.first_column(path[-1]), images.n - 1
-        checked, placed = ascending(path, means[0], *ends), ascending(path, means[1], *ends)
-        close = np.abs(places - placed[:, None]) <= CLOSE
-        first, last = self._layout.pass_before(inside[[0, -1], [0, -1]]).tolist()
-        stretches = self._change.stretches(first, last + 1)
-        if stretches[-1] - stretches[0] < last - first:  # equal places are as one
-            own, others = map(self._layout.pass_before, (inside, placed[:, None]))
-            close |= stretches[own - first] == stretches[others - first]
-        offsets = np.minimum(np.maximum(checked - path, -BAND), BAND) + BAND
-        shares = (masses * close).sum(axis=1)
-        return checked, shares, placed, z[np.arange(len(path)), offsets]
+
+@kernel
+def _extended(places: np.ndarray, numbers: np.ndarray, speed: float, first: int) -> np.ndarray:
+    """
+    Return the column of each image, (l,), int64, at one speed before the path has entered the map.
+
+    :param places: of :meth:`Filter.path`; numbers: see :class:`WindowImages`.
+    :param speed: of a path that entered with the newest image; first: least column.
+    """
+    lag = np.count_nonzero(places >= 0) - 1
+    slope = (places[0] - places[lag]) / lag if lag else speed
+    path = np.empty(len(numbers), np.int64)
+    for i in range(len(path)):
+        back = numbers[-1] - numbers[i]
+        place = places[min(back, lag)] - int(np.rint(max(back - lag, 0) * slope))
+        path[i] = max(place, first)
+    return path
+
+
+@kernel
+def _check(
+    places: np.ndarray, probabilities: np.ndarray, own: np.ndarray, best: int, factor: float
+) -> int:
+    """Multiply the probabilities near a place by a factor; return the best of ``own`` then."""
+    for i in range(len(places)):
+        if abs(places[i] - places[best]) <= BAND:
+            probabilities[i] *= factor
+    return int(np.argmax(np.where(own, probabilities, 0)))
+
+
+@kernel
+def _best_beyond(places: np.ndarray, probabilities: np.ndarray, place: int, radius: int) -> int:
+    """Return the most probable of places, its index, farther from a place; -1 = none."""
+    best = -1
+    for i in range(len(places)):
+        is_more = best < 0 or probabilities[i] > probabilities[best]
+        if abs(places[i] - place) > radius and is_more:
+            best = i
+    return best

@@ -20,7 +20,7 @@ import numpy as np
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.filter.model import FilterSettings, MODEL
-from stavpr_ros.filter.paths import Belief, belief_of, NEGLIGIBLE, NO_PLACES, TOP
+from stavpr_ros.filter.paths import Belief, merged, NEGLIGIBLE, NO_PLACES, TOP
 from stavpr_ros.filter.protocol import Filter
 import torch
 from torch.nn.functional import conv1d
@@ -253,7 +253,7 @@ class DevicePlaceFilter(Filter):
         rows = np.flatnonzero((self._top_states >= max(least, 1e-300)) & (then >= 0))
         now = rows % (K * V) // V, rows % V, self._top[rows // (K * V)]
         states = np.stack([then[rows] // 16, *now, then[rows] % 16], axis=1).astype(np.int64)
-        return belief_of(states, self._top_states[rows].astype(np.float64))
+        return Belief(*merged(states, self._top_states[rows].astype(np.float64)))
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """See :meth:`PlaceFilter.most_probable`."""

@@ -38,6 +38,7 @@ CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do 
 MIN_RECENT = 0.04  # a drive that comes to the map late is recognized there
 FIRST, LAST = 8, 108  # windows that count as the mean .5 at first, and that the mean goes back
 FAR = np.float32(1)  # z beside the map, and of places that are not compared
+INF = np.float32(np.inf)
 CHUNK = 1024  # places whose sums stay in the cache
 
 
@@ -93,34 +94,32 @@ def best_elsewhere(
     :param steps: of :func:`straight_steps`.
     :param excluded: first ones and ends of the places whose paths do not count, (m, 2).
     """
-    best, sums, images = np.float32(np.inf), np.empty(CHUNK, np.float32), len(rows)
-    flat, infinite, far = memory.reshape(-1), splat(np.float32(np.inf)), splat(FAR)
+    sums, images, infinite, far = np.empty(CHUNK, np.float32), len(rows), splat(INF), splat(FAR)
+    flat, least = memory.reshape(-1), infinite
     for start in range(0, n, CHUNK):
         count = min(CHUNK, n - start)
         for v in range(len(steps)):
-            sums[:] = 0
+            sums[:count], sums[count:] = 0, INF
             for i in range(images):
                 shift = start + steps[v, i]
                 row = rows[i] * memory.shape[1] + shift
                 low = min(max(-shift, 0), count)
                 high = max(min(n - shift, count), low)
-                for x in range(low):
-                    sums[x] += FAR
                 whole = low + (high - low) // LANES * LANES
                 for x in range(low, whole, LANES):
                     z = load(flat, row + x)
                     near = select(z < infinite, z, far)
                     store(sums, x, load(sums, x) + near)
                 for x in range(whole, high):
-                    sums[x] += flat[row + x] if flat[row + x] < np.inf else FAR
-                for x in range(high, count):
-                    sums[x] += FAR
+                    sums[x] += flat[row + x] if flat[row + x] < INF else FAR
+                sums[:low] += FAR
+                sums[high:count] += FAR
             for first, end in excluded:
-                for x in range(max(first - start, 0), min(end - start, count)):
-                    sums[x] = np.inf
-            for x in range(count):
-                best = min(best, sums[x])
-    return -float(best) / images
+                sums[min(max(first - start, 0), count) : min(max(end - start, 0), count)] = INF
+            for x in range(0, CHUNK, LANES):
+                least = select(load(sums, x) < least, load(sums, x), least)
+    store(sums, 0, least)
+    return -float(sums[:LANES].min()) / images
 
 
 def _log_odds(probability: float, least: float) -> float:

@@ -40,7 +40,8 @@ class ImageChange:
     Changes of a map from place to place, and of a query from image to image.
 
     ``curve`` is the mean change of places 0, 1, ... ``MAX_LAG`` apart while the camera moves, 1
-    where none is known; ``standstill`` the change below which a camera is at rest.
+    where none is known; ``standstill`` the change below which a camera is at rest; ``equal`` which
+    places equal the one before up to noise.
 
     :param places: places that there is room for.
     :param length: images in the window of the query.
@@ -89,7 +90,7 @@ class ImageChange:
             for apart in range(1, min(MAX_LAG, last) + 1)
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
-        self._equal[n - 1] = self._from_before[n - 1] < self.standstill
+        self.equal[n - 1] = self._from_before[n - 1] < self.standstill
         if changes and not changes[0] < self.standstill:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
@@ -155,7 +156,7 @@ class ImageChange:
         return (high - low) * min(places - whole, 1) + low
 
     def _find_equal(self) -> None:
-        self._equal = self._from_before < self.standstill  # to the place before, up to noise
+        self.equal = self._from_before < self.standstill
 
     def is_dark_stretch(self, by_place: np.ndarray) -> bool:
         """
@@ -199,18 +200,14 @@ class ImageChange:
 
     def distinct(self, n: int) -> np.ndarray:
         """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
-        distinct = ~self._equal[:n]
+        distinct = ~self.equal[:n]
         return distinct if np.count_nonzero(distinct) >= MIN_DISTINCT else np.ones(n, bool)
 
     def at_rest(self) -> np.ndarray:
         """Return the places where the map's camera was at rest, ascending, (m,)."""
-        at_rest = self._equal.copy()
-        at_rest[:-1] |= self._equal[1:]
+        at_rest = self.equal.copy()
+        at_rest[:-1] |= self.equal[1:]
         return np.flatnonzero(at_rest)
-
-    def stretches(self, first: int, end: int) -> np.ndarray:
-        """Return the number of the stretch of equal places that each is in, (end - first,)."""
-        return np.cumsum(~self._equal[first:end])
 
     def weight(self, change: float) -> float:
         """Return the exponent alpha of the image's likelihood."""

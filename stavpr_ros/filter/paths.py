@@ -49,24 +49,8 @@ class Belief:
 
         :returns: places, ascending, (m,), and their probabilities.
         """
-        most = len(self.places) * (2 * CLOSE + 1)
-        near, sums = np.empty(most, np.int64), np.empty(most)
-        count = _sum_close(self.places, self.weights, n, near, sums)
-        return near[:count], sums[:count]
-
-
-def belief_of(states: np.ndarray, probabilities: np.ndarray) -> Belief:
-    """
-    Return the belief that states give.
-
-    :param states: (m, 5): place then, level, speed and place now, speed then.
-    :param probabilities: of each state, (m,), float64.
-    """
-    order = np.argsort(states[:, 0], kind='stable')
-    best, weights = np.empty(len(order), np.int64), np.zeros(len(order))
-    count = _merge(states, probabilities, order, best, weights)
-    merged = states[best[:count]]
-    return Belief(merged[:, 0], weights[:count], merged[:, 1:])
+        near, sums = sum_close(self.places, self.weights, n)
+        return near, sums
 
 
 # ------------------------------------------------ kernels
@@ -106,30 +90,34 @@ def trace_back(k, v, y, origins, steps, newest, count, places):
 
 
 @kernel
-def backtrack_states(a, least, tops, origins, steps, newest, count, states, probabilities):
+def backtrack(a, by_place, maxima, n, origins, steps, newest, count, scale):
     """
-    Follow states back over a number of images.
+    Follow the probable states of the most probable places back over a number of images.
 
-    :param a: states, (blocks, K, V, BLOCK).
-    :param least: states below it are excluded.
-    :param tops: places whose states count, (m,).
+    :param a: states, (blocks, K, V, BLOCK); scale: factor that makes probabilities of them.
+    :param by_place, maxima, n: see :func:`_largest`.
     :param count: images to go back; other parameters: see :func:`trace_back`.
-    :param states: (m K V, 5), written: place then, state now (k, v, y), speed then.
-    :param probabilities: (m K V,), written: of these states.
-    :returns: number of states that were on the map then.
+    :returns: places, weights and states of the :class:`Belief`.
     """
-    total = 0
+    _, K, V, _ = a.shape
+    tops, largest = _largest(by_place, maxima, n), np.float32(0)
     for y in tops:
-        for k in range(a.shape[1]):
-            for v in range(a.shape[2]):
+        for k in range(K):
+            for v in range(V):
+                largest = max(largest, a[y // BLOCK, k, v, y % BLOCK])
+    least = np.float32(NEGLIGIBLE) * largest
+    states, total = np.empty((len(tops) * K * V, 5), np.int64), 0
+    probabilities = np.empty(len(states))
+    for y in tops:
+        for k in range(K):
+            for v in range(V):
                 p = a[y // BLOCK, k, v, y % BLOCK]
-                if p >= least:
+                if p >= least and p > 0:
                     states[total, 0], states[total, 1], states[total, 2] = y, k, v
                     states[total, 3], states[total, 4] = y, v
-                    probabilities[total] = p
+                    probabilities[total] = p * scale
                     total += 1
-    _, blocks, _, halves, _ = origins.shape
-    flat = origins.reshape(-1)
+    blocks, halves, flat = origins.shape[1], origins.shape[3], origins.reshape(-1)
     for i in range(count):  # all together: each waits for its memory
         slot, remaining = (newest - i) % len(origins), 0
         earlier = (newest - i - 1) % len(origins) * blocks
@@ -142,18 +130,25 @@ def backtrack_states(a, least, tops, origins, steps, newest, count, states, prob
                     states[remaining, column] = states[at, column]
                 states[remaining, 0], states[remaining, 4] = place, speed
                 probabilities[remaining] = probabilities[at]
-                row = ((earlier + place // BLOCK) * a.shape[1] + states[at, 1]) * halves
+                row = ((earlier + place // BLOCK) * K + states[at, 1]) * halves
                 prefetch(flat, (row + speed // 2) * BLOCK + place % BLOCK)
                 remaining += 1
         total = remaining
-    return total
+    return merged(states[:total], probabilities)
 
 
 @kernel
-def find_largest(by_place, blocks, n, places):
-    """Write the places of blocks, below n, with the largest sums, the largest first."""
-    values, last = np.full(len(places), -1, np.float32), len(places) - 1
-    for block in blocks:
+def _largest(by_place, maxima, n):
+    """
+    Return the ``TOP`` most probable places, the most probable first.
+
+    :param by_place: sums of the states of n places, and maxima: the largest of each block.
+    """
+    count = min(TOP, n)
+    values, places, last = np.full(count, -1, np.float32), np.empty(count, np.int64), count - 1
+    for block in range((n + BLOCK - 1) // BLOCK):
+        if maxima[block] <= values[last]:
+            continue
         for y in range(block * BLOCK, min((block + 1) * BLOCK, n)):
             if by_place[y] <= values[last]:
                 continue
@@ -162,32 +157,39 @@ def find_largest(by_place, blocks, n, places):
                 values[at], places[at] = values[at - 1], places[at - 1]
                 at -= 1
             values[at], places[at] = by_place[y], y
+    return places
 
 
 @kernel
-def _merge(states, probabilities, order, best, weights):
+def merged(states, probabilities):
     """
     Add up the probabilities of states that were at one place.
 
-    :param states: see :func:`belief_of`; order: of their places, ascending.
-    :param best, weights: of each place, its most probable state and its sum, written.
-    :returns: number of places.
+    :param states: (m, 5): place then, level, speed and place now, speed then.
+    :param probabilities: of each state, (m,) or more, float64.
+    :returns: places, weights and states of the :class:`Belief`.
     """
-    last = -1
-    for i in order:
-        if last < 0 or states[i, 0] != states[best[last], 0]:
-            last += 1
-            best[last] = i
-        elif probabilities[i] > probabilities[best[last]]:
-            best[last] = i
-        weights[last] += probabilities[i]
-    return last + 1
+    places, weights = np.empty(len(states), np.int64), np.zeros(len(states))
+    best, count = np.empty(len(states), np.int64), 0
+    for i in range(len(states)):
+        at = np.searchsorted(places[:count], states[i, 0])
+        if at == count or places[at] != states[i, 0]:
+            for later in range(count, at, -1):
+                places[later], weights[later] = places[later - 1], weights[later - 1]
+                best[later] = best[later - 1]
+            places[at], weights[at], best[at] = states[i, 0], 0, i
+            count += 1
+        elif probabilities[i] > probabilities[best[at]]:
+            best[at] = i
+        weights[at] += probabilities[i]
+    return places[:count], weights[:count], states[best[:count]][:, 1:]
 
 
 @kernel
-def _sum_close(places, weights, n, near, sums):
-    """Write the places below n within ``CLOSE`` of any place, and their sums, at most 1."""
-    count = low = end = 0
+def sum_close(places, weights, n):
+    """Return the places below n within ``CLOSE`` of any place, and their sums, at most 1."""
+    near = np.empty(len(places) * (2 * CLOSE + 1), np.int64)
+    sums, count, low, end = np.empty(len(near)), 0, 0, 0
     for place in places:
         for y in range(max(place - CLOSE, end), min(place + CLOSE + 1, n)):
             while places[low] < y - CLOSE:
@@ -198,7 +200,7 @@ def _sum_close(places, weights, n, near, sums):
                 i += 1
             near[count], sums[count] = y, min(total, 1.0)
             count, end = count + 1, y + 1
-    return count
+    return near[:count], sums[:count]
 
 
 @kernel

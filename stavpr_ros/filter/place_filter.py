@@ -46,13 +46,10 @@ from stavpr_ros.filter.kernels import advance, PLACES
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import (
     ALL_ENTERED,
-    backtrack_states,
+    backtrack,
     Belief,
-    belief_of,
     BLOCK,
-    find_largest,
     find_most_probable,
-    NEGLIGIBLE,
     NO_PLACES,
     TOP,
     trace_back,
@@ -195,23 +192,11 @@ class PlaceFilter(Filter):
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """See :meth:`Filter.belief`."""
-        top = self._top(n)
-        least = NEGLIGIBLE * self._a[top // BLOCK, :, :, top % BLOCK].max(initial=0)
-        most = len(top) * len(self._levels) * len(self._speeds)
-        states, weights = np.empty((most, 5), np.int64), np.empty(most, np.float32)
-        count = backtrack_states(
-            self._a, np.float32(least or 1), top, self._origins, self._steps,
-            (self.count - 1) % len(self._steps), images_ago, states, weights,
-        )  # fmt: skip
-        return belief_of(states[:count], weights[:count].astype(np.float64) * self._scale)
-
-    def _top(self, n: int) -> np.ndarray:
-        """Return the ``TOP`` most probable places, int64; they lie in blocks with large maxima."""
-        blocks = max(1, -(-n // BLOCK))
-        part = np.sort(np.argpartition(self._maxima[:blocks], max(blocks - TOP, 0))[-TOP:])
-        places = np.empty(min(TOP, n), np.int64)
-        find_largest(self._by_place, part, n, places)
-        return places
+        newest = (self.count - 1) % len(self._steps)
+        states = self._a, self._by_place, self._maxima, n
+        return Belief(
+            *backtrack(*states, self._origins, self._steps, newest, images_ago, self._scale)
+        )
 
     def probable_blocks(self) -> np.ndarray:
         """Return the first places of the ``TOP`` blocks with the most probable places, (m,)."""

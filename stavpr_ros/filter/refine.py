@@ -15,6 +15,7 @@ evenly in time (:func:`straight_offsets`). Each counts by the likelihood of the 
 
 import numpy as np
 from stavpr_ros.compilation import kernel
+from stavpr_ros.filter.paths import CLOSE
 
 BAND = 5  # places to either side of the filter's path
 OFFSETS = np.arange(-BAND, BAND + 1)
@@ -26,36 +27,6 @@ END_DEVIATION = 1.25  # places, of these ends
 MIN_DEVIATION = 0.5  # places: of both where few images moved
 MIN_LIKELIHOOD = 1e-20  # least likelihood of an image
 LONGEST = 4.0  # intervals between images: beyond, the camera stopped, or its speed is unknown
-
-
-def refine(
-    z: np.ndarray, path: np.ndarray, exponents: np.ndarray, images: np.ndarray,
-    times: np.ndarray, place_times: np.ndarray, evidence: float,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """
-    Return where the camera was beside a path, by all images of the window.
-
-    The second mean offset is by other evidence, and by two models. With the likelihoods P of the
-    window if the camera advances evenly in time and Q if not, and the means by both, it is
-
-        (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q)
-
-    Their deviations are in proportion to the images that moved: the filter knows the path of a
-    slow camera by the images before the window.
-
-    :param z: z-normalized distances of each image to the places near the path, (l, S), float32.
-    :param path: place of each image, ascending, (l,), int64.
-    :param exponents: of their likelihoods: alpha times the mean of right places, (l,).
-    :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
-    :param times: of the images, ascending, (l,), float64, of any unit.
-    :param place_times: of the n places, ascending, (n,), float64, of any unit.
-    :param evidence: factor of the exponents for the second mean offset.
-    :returns: probability of each offset for each image, (l, S), and mean offsets by the first
-        model and by both, (2, l).
-    """
-    masses, means = np.empty(z.shape), np.zeros((2, len(path)))
-    _refine(z, path, exponents, images, times, place_times, evidence, masses, means)
-    return masses, means
 
 
 @kernel
@@ -84,9 +55,30 @@ def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _refine(z, path, exponents, images, times, place_times, evidence, masses, means):
-    """Write the results of :func:`refine`."""
+def refine(z, path, exponents, images, times, place_times, evidence):
+    """
+    Return where the camera was beside a path, by all images of the window.
+
+    The second mean offset is by other evidence, and by two models. With the likelihoods P of the
+    window if the camera advances evenly in time and Q if not, and the means by both, it is
+
+        (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q)
+
+    Their deviations are in proportion to the images that moved: the filter knows the path of a
+    slow camera by the images before the window.
+
+    :param z: z-normalized distances of each image to the places near the path, (l, S), float32.
+    :param path: place of each image, ascending, (l,), int64.
+    :param exponents: of their likelihoods: alpha times the mean of right places, (l,).
+    :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
+    :param times: of the images, ascending, (l,), float64, of any unit.
+    :param place_times: of the n places, ascending, (n,), float64, of any unit.
+    :param evidence: factor of the exponents for the second mean offset.
+    :returns: probability of each offset for each image, (l, S), and mean offsets by the first
+        model and by both, (2, l).
+    """
     l, n = len(path), len(place_times)
+    masses, means = np.empty(z.shape), np.zeros((2, l))
     likelihoods, moves = np.empty(z.shape), np.empty((l, len(STEPS)))
     _window_likelihoods(z, path, exponents, 1.0, images, n, likelihoods, moves)
     _start(START_DEVIATION, masses[0])
@@ -107,19 +99,55 @@ def _refine(z, path, exponents, images, times, place_times, evidence, masses, me
             means[0, i] += masses[i, s] * OFFSETS[s]
             mean += uneven[i, s] * OFFSETS[s]
         means[1, i] = share * means[1, i] + (1 - share) * mean
+    return masses, means
 
 
 @kernel
-def ascending(path, offsets, first, last):
+def refined(z, path, exponents, images, stamps, place_times, evidence, first, equal, passes):
+    """
+    Return the places near a path that explain the images of the window best.
+
+    Bad conditions bring the right place nearer to all others, less to those around it: places
+    are estimated with the evidence of usual conditions. The path is checked where the evidence
+    of the filter has its mean: more would make paths through look-alike places more even.
+
+    :param z, path, exponents, images, place_times, evidence: see :func:`refine`.
+    :param stamps: ns, (l,), int64; 0 = unknown.
+    :param first: least place.
+    :param equal: which passes equal the one before: such are as one.
+    :param passes: of each place.
+    :returns: columns that are checked, (l,), the estimated ones, (l,), z of each image at the
+        column that is checked, (l,), and the probability of each offset, (l, S), 0 where it is
+        not close to the estimated column.
+    """
+    times, n = image_times(stamps, images), len(place_times)
+    masses, means = refine(z, path, exponents, images, times, place_times, evidence)
+    checked, placed = _ascending(path, means[0], first, n), _ascending(path, means[1], first, n)
+    of_checked = np.empty(len(path), np.float32)
+    begin, end = passes[max(path[0] - BAND, 0)], passes[min(path[-1] + BAND, n - 1)]
+    has_equal = equal[begin + 1 : end + 1].any()
+    for i in range(len(path)):
+        of_checked[i] = z[i, min(max(checked[i] - path[i], -BAND), BAND) + BAND]
+        for s in range(len(OFFSETS)):
+            place = path[i] + OFFSETS[s]
+            if abs(place - placed[i]) > CLOSE:
+                own, other = passes[min(max(place, 0), n - 1)], passes[placed[i]]
+                between = equal[min(own, other) + 1 : max(own, other) + 1]
+                masses[i, s] *= has_equal and between.all()
+    return checked, placed, of_checked, masses
+
+
+@kernel
+def _ascending(path, offsets, first, n):
     """
     Return places at offsets from a path, (l,), int64, which never go back.
 
     :param path: places, (l,), int64, and offsets, (l,), float64.
-    :param first, last: least and largest place.
+    :param first: least place, and n: behind the largest.
     """
     places = np.empty(len(path), np.int64)
     for i in range(len(path)):
-        place = min(max(path[i] + int(np.rint(offsets[i])), first), last)
+        place = min(max(path[i] + int(np.rint(offsets[i])), first), n - 1)
         places[i] = max(place, places[i - 1]) if i else place
     return places
 
