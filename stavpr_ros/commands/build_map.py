@@ -31,7 +31,7 @@ RULES = {  # fields of KeyframeSettings
     'angle': ('DEG', 'degrees from the last place; needs --odometry or --poses'),
     'change': ('C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
 }
-MAX_SUGGESTED = 20_000  # places of a map that a threshold of mode paper is suggested for
+MAX_SUGGESTED = 20_000  # places of a map whose threshold and seam are sought
 
 EPILOG = """
 examples:
@@ -275,6 +275,8 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     megabytes = Path(output).stat().st_size / 1e6
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
     say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
+    if place_map.same_as is not None:
+        say(f'the route is closed: its last place shows place {place_map.same_as[-1]}')
     if place_map.threshold is not None:
         say(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
 
@@ -307,10 +309,13 @@ def main(args: list[str] | None = None) -> int:
         arguments.input = arguments.input[0]
         from stavpr_ros.mapping import save_map
         from stavpr_ros.prepare.prepared_map import statistics_of_map
+        from stavpr_ros.recognition.same_places import with_seam
 
         state = 'nothing was written; the same command continues the work'
         place_map, journal = _build(arguments)
         place_map = replace(place_map, threshold=_suggested(place_map, arguments))
+        if len(place_map) <= MAX_SUGGESTED:
+            place_map = with_seam(place_map)
         statistics = statistics_of_map(place_map)
         save_map(place_map, arguments.output, force=arguments.force, statistics=statistics)
         journal.unlink()

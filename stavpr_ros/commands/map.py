@@ -31,6 +31,7 @@ examples:
   map compact route.stavpr small.stavpr --drop-duplicates
   map colmap route.stavpr hloc --images drive.bag
   map merge both.stavpr day.stavpr night.stavpr
+  map close lap.stavpr closed.stavpr
   map sessions both.stavpr day.stavpr --keep day
   map recover route.stavpr.journal
   map upload route.stavpr qdrant://host:6333/city
@@ -132,11 +133,7 @@ def _parser() -> argparse.ArgumentParser:
         'each session once on a map of the earlier ones',
     )
     add_storage(action, '', halves)
-    text = 'Write selected sessions of a map to another map.'
-    action = add('sessions', _sessions, text, 'map', 'output', force=force)
-    group = action.add_mutually_exclusive_group(required=True)
-    group.add_argument('--keep', metavar='ID', help='only the places of this session')
-    group.add_argument('--remove', metavar='ID', help="all places except this session's")
+    _add_routes(add, force)
     text = 'Write a map to the home of a fleet, docs/fleet.md.'
     action = add('upload', _upload, text, 'map', force='replace the map that is there')
     action.add_argument(
@@ -154,6 +151,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_upkeep(add)
     return parser
+
+
+def _add_routes(add: Callable[..., argparse.ArgumentParser], force: str) -> None:
+    """Add the actions that write a map of another route."""
+    text = 'Write selected sessions of a map to another map.'
+    action = add('sessions', _sessions, text, 'map', 'output', force=force)
+    group = action.add_mutually_exclusive_group(required=True)
+    group.add_argument('--keep', metavar='ID', help='only the places of this session')
+    group.add_argument('--remove', metavar='ID', help="all places except this session's")
+    text = 'Write the map of a closed route so that recognition goes on from its end to its start.'
+    add('close', _close, text, 'map', 'output', force=force)
 
 
 def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
@@ -243,6 +251,8 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         positions = place_map.poses[~np.isnan(place_map.poses[:, 0]), :3]
         length = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
         rows['poses'] = f'a route of {length:.0f} m'
+    if len(place_map.sessions) < 2 and place_map.same_as is not None:
+        rows['route'] = f'closed: its last place shows place {place_map.same_as[-1]}'
     lines = [f'{name:<11}{value}' for name, value in rows.items()]
     for number, session in enumerate(place_map.sessions):
         assert place_map.session_index is not None
@@ -330,6 +340,15 @@ def _sessions(arguments: argparse.Namespace) -> None:
 
     place_map, keep = _verified(arguments.map), arguments.keep is not None
     _write(select_session(place_map, arguments.keep or arguments.remove, keep), arguments)
+
+
+def _close(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.recognition.same_places import with_seam
+
+    place_map = with_seam(_verified(arguments.map), is_closed=True)
+    assert place_map.same_as is not None
+    say(f'the last place shows place {place_map.same_as[-1]}')
+    _write(place_map, arguments)
 
 
 def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:

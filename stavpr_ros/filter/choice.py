@@ -119,11 +119,14 @@ class PathChoice:
 
         :param stamps: ns, (n,), int64; 0 = unknown.
         """
-        columns = self._layout.columns_of(np.arange(self._layout.passes(len(stamps))))
-        steps, n = np.ones(len(self._place_times)), len(stamps)
-        between = np.diff(image_times(stamps, columns[:n]))
-        steps[columns[1:n]] = between
-        steps[columns[n + 1 :]] = between[::-1][: len(columns) - n]
+        passes = self._layout.of_passes(np.arange(len(stamps)))
+        columns = self._layout.columns_of(np.arange(len(passes)))
+        between = np.append(np.diff(image_times(stamps, passes[: len(stamps)])), 1.0)
+        before, after = passes[:-1], passes[1:]
+        steps = np.ones(len(self._place_times))
+        steps[columns[1:]] = np.where(
+            np.abs(after - before) == 1, between[np.minimum(before, after)], 1.0
+        )
         self._place_times = steps.cumsum()
 
     def choose(self, belief: Belief, images: WindowImages) -> ChosenPath:

@@ -15,6 +15,13 @@ two sessions of passes is a gap, too::
 
     place      0 1 2 ... n-1     |  gap  |  n-1 ... 2 1 0
     pass       0 1 2 ... n-1     |       |  n   ...   2n-1
+
+On a closed route, whose last c places show the same as its first c, the first places follow the
+last one again, so that a path goes on over the seam. Once all of a window's path is there, the
+states of these columns are moved one lap back (:meth:`ColumnLayout.repeated`)::
+
+    place      0 1 ... c-1 ... n-c ... n-1 c c+1 ...
+                               |<- shows 0 ... c-1
 """
 
 import sys
@@ -35,9 +42,11 @@ class ColumnLayout:
         same, (n,); not needed for one session.
     :param gap: columns between two sessions: more than a camera moves from image to image.
     :param against: the camera may move against the map, too; not without places.
+    :param repeated: first places of a closed route of one session that follow its last one.
 
     ``runs`` are the places of each session, ``firsts`` the first passes of each, ``columns`` their
     columns, None where each pass is the column of its number, and ``gaps`` the columns between.
+    ``lap`` is the number of places of a closed route's lap, 0 of another route.
     """
 
     def __init__(
@@ -46,17 +55,23 @@ class ColumnLayout:
         same_as: np.ndarray = NO_PLACES,
         gap: int = 0,
         against: bool = False,
+        repeated: int = 0,
     ) -> None:
         self.firsts, self.runs, self.gaps = firsts, [slice(None)], NO_PLACES
         self.columns: np.ndarray | None = None
-        if len(firsts) == 1 and not against:
+        self.lap = 0
+        if len(firsts) == 1 and not against and not repeated:
             return
         n = len(same_as)
         self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
-        self._places = np.arange(n)  # of each pass
+        self.lap = n - int(same_as[-1]) - 1 if repeated else 0
+        again = np.arange(n, n + repeated) - self.lap
+        self._places = np.append(np.arange(n), again)  # of each pass
+        self._along = len(self._places)
         if against:
-            self._places = np.append(self._places, self._places[::-1])
-            self.firsts = np.append(firsts, 2 * n - np.append(firsts[1:], n)[::-1])
+            self._places = np.append(self._places, n - 1 - self._places)
+            ends = np.append(firsts[1:], n)[::-1]
+            self.firsts = np.append(firsts, self._along + n - ends)
         passes = len(self._places)
         self.columns = np.arange(passes) + gap * np.repeat(
             np.arange(len(self.firsts)), np.diff(self.firsts, append=passes)
@@ -77,9 +92,15 @@ class ColumnLayout:
 
     def changes_of_passes(self, changes: np.ndarray) -> np.ndarray:
         """Return changes from the places 1, 2, ... before (L, n) as changes of passes."""
-        changes, n = self.of_passes(changes), changes.shape[1]
-        for apart, row in enumerate(changes, 1):  # against the map, they are from the other place
-            row[n + apart :] = row[n : row.shape[0] - apart].copy()
+        changes = self.of_passes(changes)
+        if self.columns is None:
+            return changes
+        n, first = len(self._same_as), self._along
+        for apart, row in enumerate(changes, 1):
+            if self.lap:
+                row[n : n + apart] = row[n + apart]  # over the seam: as behind it
+            # against the map, they are from the other place
+            row[first + apart :] = row[first : row.shape[0] - apart].copy()
         return changes
 
     def width(self, places: int) -> int:
@@ -124,7 +145,7 @@ class ColumnLayout:
 
     def direction_of(self, column: int) -> int:
         """Return 1 of a pass along the map, -1 of one against it."""
-        is_along = self.columns is None or column <= self.columns[len(self._same_as) - 1]
+        is_along = self.columns is None or column <= self.columns[self._along - 1]
         return 1 if is_along else -1
 
     def first_column(self, column: int) -> int:
@@ -133,6 +154,19 @@ class ColumnLayout:
             return 0
         firsts = self.columns[self.firsts]
         return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
+
+    def repeated(self, path: np.ndarray) -> slice:
+        """
+        Return the columns that repeat those a lap before them, where all of a path is there.
+
+        :param path: columns, ascending, (l,).
+        :returns: an empty slice where it is not.
+        """
+        if not self.lap:
+            return slice(0, 0)
+        first = self.first_column(path[0])
+        start, stop = first + len(self._same_as), first + self._along
+        return slice(start, stop) if path[0] >= start else slice(0, 0)
 
     def session_of(self, place: int) -> tuple[int, int]:
         """Return the first place of a place's session, and the first one behind it."""
@@ -151,9 +185,14 @@ class ColumnLayout:
             return np.array([[column - radius, column + radius + 1]])
         positions = self._shared[self.columns]
         own = positions[int(self.pass_before(np.array(column)))]
-        near = self.columns[np.abs(positions - own) <= radius]
+        near = self.columns[self._apart(positions, own) <= radius]
         runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
         return np.array([[run[0], run[-1] + 1] for run in runs])
+
+    def _apart(self, positions: np.ndarray, position: int) -> np.ndarray:
+        """Return how far positions are from one, on a closed route by the shorter arc."""
+        apart = np.abs(positions - position)
+        return np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
 
     def merge_sessions(
         self, belief: Belief, n: int
@@ -176,12 +215,15 @@ class ColumnLayout:
         near, probabilities_near = belief.probabilities(self._width)
         own[near] = probabilities_near
         of_position = np.bincount(self._shared, weights, self._width)
-        sums = np.concatenate([np.zeros(CLOSE + 1), np.cumsum(of_position)])
-        sums = np.concatenate([sums, np.full(CLOSE, sums[-1])])
+        around = np.pad(of_position, CLOSE)
+        if self.lap:  # its first positions are close to its last ones
+            around[:CLOSE] = of_position[self.lap - CLOSE : self.lap]
+            around[self.lap + CLOSE : self.lap + 2 * CLOSE] = of_position[:CLOSE]
+        sums = np.append(0.0, np.cumsum(around))
         of_position = np.minimum(sums[2 * CLOSE + 1 :] - sums[: -2 * CLOSE - 1], 1)
         probabilities = of_position[self._shared]
         best = int(np.argmax(probabilities))
-        at_position = np.abs(self._shared - self._shared[best]) <= CLOSE
+        at_position = self._apart(self._shared, self._shared[best]) <= CLOSE
         column = int(np.argmax(np.where(at_position, own, 0)))
         probabilities[column] = probabilities[best]
         columns = np.flatnonzero(probabilities)

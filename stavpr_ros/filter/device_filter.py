@@ -115,6 +115,13 @@ class DevicePlaceFilter(Filter):
         """See :meth:`grow`."""
         self.grow(-count)
 
+    def move_back(self, places: slice, count: int) -> None:
+        """See :meth:`Filter.move_back`."""
+        self._read()
+        for values, pad in ((self._states.T, self._pad), (self._by_place, 0)):
+            _move_back(values, places, count, pad)
+        _move_back(self._before.transpose(0, 1), places, count, self._pad)
+
     def places_of_states(self) -> np.ndarray:
         """See :meth:`PlaceFilter.places_of_states`; copied from the device."""
         self._read()
@@ -279,6 +286,13 @@ class DevicePlaceFilter(Filter):
         (K, V), (k, v, y) = self._shape, state[:3]
         column = (int(np.flatnonzero(self._top == y)[0]) * K + k) * V + v
         return self._paths[: images + 1, column] // 16
+
+
+def _move_back(values: torch.Tensor, places: slice, count: int, pad: int) -> None:
+    """Add the values of places, (pad + n, ...), to those ``count`` places before."""
+    moved = values[places.start + pad : places.stop + pad]
+    values[places.start + pad - count : places.stop + pad - count] += moved
+    moved.zero_()
 
 
 def _parts(inputs: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, Any]:

@@ -121,6 +121,17 @@ class PlaceFilter(Filter):
             _move_up(origins, count, ALL_ENTERED)
         self._set_by_place(self._by_place[count:].copy())
 
+    def move_back(self, places: slice, count: int) -> None:
+        """See :meth:`Filter.move_back`."""
+        y = np.arange(places.start, places.stop)
+        block, at, block_to, at_to = *divmod(y, BLOCK), *divmod(y - count, BLOCK)
+        self._a[block_to, :, :, at_to] += self._a[block, :, :, at]
+        self._by_place[y - count] += self._by_place[y]
+        self._a[block, :, :, at] = self._by_place[y] = 0
+        self._find_maxima(slice(None))
+        for origins in self._origins:
+            origins[block_to, :, :, at_to] = origins[block, :, :, at]
+
     def _set_by_place(self, by_place: np.ndarray) -> None:
         self._by_place[: len(by_place)], self._by_place[len(by_place) :] = by_place, 0
         self._find_maxima(slice(None))

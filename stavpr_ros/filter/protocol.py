@@ -43,6 +43,14 @@ class Filter(Protocol):
         """
 
     @abstractmethod
+    def move_back(self, places: slice, count: int) -> None:
+        """
+        Move the states of places, at least ``count``, that many places back, also of past images.
+
+        They are added to the states of these places, which lie before ``places``.
+        """
+
+    @abstractmethod
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place now, (room,), float32."""
 

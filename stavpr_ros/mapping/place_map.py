@@ -74,8 +74,9 @@ class PlaceMap:
     :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
     :param session_index: number of each place's session, shape (n,), int32; None without sessions.
     :param camera: of its images; None = unknown.
-    :param same_as: of each place, itself, or the place of an earlier session that shows the same,
-        shape (n,), int32; None = unknown: see :func:`stavpr_ros.recognition.same_places`.
+    :param same_as: of each place, itself, or the place of an earlier session, or of the start of a
+        closed route, that shows the same, shape (n,), int32; None = unknown. By
+        :mod:`stavpr_ros.recognition.same_places`.
     :param threshold: distance below which mode paper matches where its own is not set, above 0; as
         :func:`stavpr_ros.recognition.threshold.suggest_threshold` returns it; None = unknown.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not

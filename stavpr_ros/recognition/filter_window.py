@@ -70,6 +70,7 @@ class FilterWindow(QueryWindow):
         self._posterior = self._of_window = 0.0  # of the latest match, and of the full window
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
+        self._repeated = slice(0, 0)  # columns that the latest path is in, beyond a lap
         self._entered = 0  # number of the image with which the latest path came to the map
 
     @property
@@ -88,6 +89,7 @@ class FilterWindow(QueryWindow):
         self.filter.reset()
         self.change.reset()
         self._at_rest, self._entered, self._recent = None, 0, RecentMean()
+        self._repeated = slice(0, 0)
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -128,6 +130,9 @@ class FilterWindow(QueryWindow):
         :param z: z-normalized distances to the columns, (m,), float32.
         """
         self.buffer.push(z)
+        if self._repeated.stop:
+            self.filter.move_back(self._repeated, self.layout.lap)
+            self._repeated = slice(0, 0)
         weight, ones = 0.0, np.ones(len(self.filter.settings.speeds))
         if not self.filter.count:  # the change of the first image is unknown
             weight = self.change.weight(change)
@@ -236,6 +241,7 @@ class FilterWindow(QueryWindow):
         )
         chosen = self.choice.choose(belief, images)
         place = int(chosen.path[position])
+        self._repeated = self.layout.repeated(chosen.path)
         certain, least = self._probabilities(chosen, images.numbers, position)
         second, probability = self.choice.second_best(chosen, n, place, nms_radius)
         peak = float(chosen.probabilities.max(initial=0.0))

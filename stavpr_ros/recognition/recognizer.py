@@ -427,7 +427,7 @@ class PlaceRecognizer(SequenceRecognizer):
         assert isinstance(self._window, FilterWindow)
         assert isinstance(self._window.filter, PlaceFilter)
         layout, blocks = self._window.layout, self._window.filter.probable_blocks()
-        if self._settings.moves_against:  # the last column may have the first place
+        if self._settings.moves_against or layout.lap:  # the last column may have the first place
             ends = np.minimum(blocks + BLOCK, layout.width(self.places)) - 1
             return np.minimum(layout.names_of(blocks), layout.names_of(ends))
         return layout.pass_before(blocks - 1) + 1
@@ -490,7 +490,8 @@ def _window_of(
 ) -> QueryWindow:
     """Return an empty window for a map."""
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
-    layout = layout_of(place_map, settings.nms_radius, MODEL, settings.moves_against)
+    length = sequence.length if options.place_filter else 0
+    layout = layout_of(place_map, settings.nms_radius, MODEL, settings.moves_against, length)
     if options.place_filter:
         window: FilterWindow
         arguments = sequence, n, MODEL, layout, options.query_znorm

@@ -1,10 +1,16 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Relates places of a session to places of earlier sessions with the same view, by recognition."""
+"""
+Relates places to earlier ones with the same view, by recognition.
+
+A session is related to the sessions before it, and the end of a closed route to its start.
+"""
 
 from dataclasses import replace
 
 import numpy as np
+from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap, select_places
 from stavpr_ros.progress import Progress
 from stavpr_ros.recognition.match import Match
@@ -12,6 +18,7 @@ from stavpr_ros.recognition.recognizer import PlaceRecognizer
 from stavpr_ros.recognition.settings import RecognizerSettings
 
 SURE = 0.9  # probability above which two places are taken to be the same
+AT_END = 60  # last places of a route, which are compared with its first ones
 
 
 class SamePlaces:
@@ -67,6 +74,39 @@ def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
         matched = _recognized(reference, place_map, places)
         is_matched = matched >= 0
         same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
+    return replace(place_map, same_as=same_as.astype(np.int32))
+
+
+def with_seam(place_map: PlaceMap, is_closed: bool = False) -> PlaceMap:
+    """
+    Return the map of a closed route with its end related to its start, another map as it is.
+
+    Its last places are driven, as a query of mode robust, on its first third. The route is closed
+    where one of the last, at most a window from the end, is matched: it was recorded beyond its
+    start, by two windows or so.
+
+    :param is_closed: the route is closed. Where its end is not matched, its last place shows the
+        same as its first.
+    :raises SettingsError: it is stated to be closed, but has several sessions or too few places.
+    """
+    n, same_as = len(place_map), np.arange(len(place_map))
+    third = n // 3
+    if len(place_map.sessions) > 1 or third < SequenceSettings().length:
+        if is_closed:
+            raise SettingsError('a closed route has one session and at least 60 places')
+        return place_map
+    reference = select_places(place_map, np.arange(third))
+    end = np.arange(n - min(third, AT_END), n)
+    matched = _recognized(reference, place_map, end)
+    last = int(np.flatnonzero(matched >= 0)[-1:].sum())
+    is_found = matched[last] >= 0 and len(end) - last <= SequenceSettings().length
+    if not is_found and not is_closed:
+        return place_map
+    # places after a lap
+    count = int(matched[last]) + len(end) - last if is_found else 1
+    same_as[n - count :] = np.arange(count)
+    is_matched = (matched >= 0) & (end >= n - count)
+    same_as[end[is_matched]] = matched[is_matched]
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 

@@ -7,23 +7,39 @@ from dataclasses import replace
 import numpy as np
 from stavpr_ros.filter.columns import ColumnLayout, ONE_SESSION
 from stavpr_ros.filter.model import FilterSettings
+from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 
 
 def layout_of(
-    place_map: PlaceMap, nms_radius: int, model: FilterSettings, against: bool = False
+    place_map: PlaceMap,
+    nms_radius: int,
+    model: FilterSettings,
+    against: bool = False,
+    length: int = 0,
 ) -> ColumnLayout:
-    """Return the layout of a map, for a window of the same model, that may move against it."""
-    index = place_map.session_index
-    if (index is None and not against) or not len(place_map):
-        return ColumnLayout()
-    firsts = ONE_SESSION if index is None else np.flatnonzero(np.diff(index, prepend=-1))
+    """
+    Return the layout of a map, for a window of the same model.
+
+    :param against: the camera may move against the map.
+    :param length: l, of a window that goes on over the seam of a closed route: a route of one
+        session whose last place shows the same as an earlier one.
+    """
+    index, n = place_map.session_index, len(place_map)
     same_as = place_map.same_as
     if same_as is None:
-        same_as = np.arange(len(place_map))
+        same_as = np.arange(n)
+    firsts = ONE_SESSION if index is None else np.flatnonzero(np.diff(index, prepend=-1))
+    repeated = 0
+    if length and len(firsts) == 1 and n:
+        again = n - 1 - 2 * int(same_as[-1])
+        repeated = max(0, min(again, int(length * max(model.speeds))))
+        repeated = repeated if repeated > MAX_LAG and same_as[-1] < n - 1 else 0
+    if (index is None and not against and not repeated) or not n:
+        return ColumnLayout()
     gap = session_gap(nms_radius, model)
-    return ColumnLayout(firsts, same_as.astype(np.int64), gap, against)
+    return ColumnLayout(firsts, same_as.astype(np.int64), gap, against, repeated)
 
 
 def session_gap(nms_radius: int, model: FilterSettings) -> int:
