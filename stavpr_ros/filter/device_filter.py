@@ -116,7 +116,7 @@ class DevicePlaceFilter(Filter):
         self.grow(-count)
 
     def move_back(self, places: slice, count: int) -> None:
-        """See :meth:`Filter.move_back`."""
+        """Move states back: :meth:`Filter.move_back`."""
         self._read()
         for values, pad in ((self._states.T, self._pad), (self._by_place, 0)):
             _move_back(values, places, count, pad)

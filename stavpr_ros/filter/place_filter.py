@@ -122,7 +122,7 @@ class PlaceFilter(Filter):
         self._set_by_place(self._by_place[count:].copy())
 
     def move_back(self, places: slice, count: int) -> None:
-        """See :meth:`Filter.move_back`."""
+        """Move states back: :meth:`Filter.move_back`."""
         y = np.arange(places.start, places.stop)
         block, at, block_to, at_to = *divmod(y, BLOCK), *divmod(y - count, BLOCK)
         self._a[block_to, :, :, at_to] += self._a[block, :, :, at]
