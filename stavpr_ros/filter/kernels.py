@@ -21,6 +21,7 @@ from stavpr_ros.alignment.cpu.simd import (
     bits,
     from_bits,
     LANES,
+    LINE,
     load,
     load_bytes,
     load_splat,
@@ -37,7 +38,6 @@ F, INT = np.float32, np.int32
 PLACES = 2048  # of a part; a multiple of BLOCK
 MIN_EXPONENT, MAX_EXPONENT = -87.0, 80.0  # exponents whose powers are finite float32 numbers
 NEAR_INFINITY = -1e30  # z below it is of a gap
-LINE = 16  # numbers of a cache line
 
 
 @kernel

@@ -14,12 +14,13 @@ from numba.extending import overload
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
-from stavpr_ros.alignment.cpu.simd import LANES, store
+from stavpr_ros.alignment.cpu.simd import LANES, LINE, prefetch, store
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
 
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
+AHEAD = 2048  # numbers of the map that are on their way to the cache
 FEW_IMAGES = 64  # likewise, where the distances of all cells are kept
 
 
@@ -95,6 +96,8 @@ def _float_block_distances(features, queries, x, first, count, d):
     query, sums = queries[x], np.empty(TILE, np.float32)
     for j in range(features.shape[0]):
         for y in range(count):
+            for t in range(0, features.shape[2], LINE):  # processors stop at the end of a page
+                prefetch(features[j, first + y], t + AHEAD)
             for i in range(0, query.shape[0], TILE):
                 _dots(features[j, first + y], query[i : i + TILE], sums)
                 for t in range(TILE):

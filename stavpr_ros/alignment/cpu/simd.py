@@ -28,6 +28,7 @@ def _lanes() -> int:
 
 
 LANES = _lanes()
+LINE = 16  # numbers of a cache line
 PREFETCH = 0, 2, 1  # to read; into the second cache; data
 
 
