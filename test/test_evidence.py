@@ -4,7 +4,12 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.filter.evidence import path_probability, RecentMean, straight_steps
+from stavpr_ros.filter.evidence import (
+    changed_images,
+    path_probability,
+    RecentMean,
+    straight_steps,
+)
 from stavpr_ros.recognition.device_windows import DeviceBuffer
 from stavpr_ros.recognition.window import SequenceBuffer
 import torch
@@ -35,16 +40,17 @@ def test_best_path_elsewhere_equals_plain_loops_on_all_devices(device, n):
     for count, excluded in ((6, [[-3, 12]]), (3, [[2, 9], [20, n + 5]])):
         numbers = np.array([0, 1, 1, 2, 3, 5])[:count]
         steps = straight_steps(numbers, (count - 1) // 2)
-        expected = plain_elsewhere(rows[-count:], steps, excluded)
+        counted = changed_images(numbers)
+        assert counted.tolist() == [True, True, False, True, True, True][:count]
+        expected = plain_elsewhere(rows[-count:][counted], steps[:, counted], excluded)
         for buffer in buffers:
-            assert buffer.best_elsewhere(steps, np.array(excluded)) == pytest.approx(
-                expected, abs=1e-5
-            )
+            found = buffer.best_elsewhere(steps, np.array(excluded), counted)
+            assert found == pytest.approx(expected, abs=1e-5)
 
 
 def test_path_probability_by_hand():
     """Of odds 3, a lead of 1, a drive of recent odds 1/3, and half a window."""
-    x = -3.01 + 0.276 * np.log(3) + 1.309 * np.log(1 + 10) - 1.637 * np.log(3)
+    x = -7.28 + 0.64 * np.log(3) + 2.59 * np.log(1 + 10) - 1.71 * np.log(3)
     assert path_probability(0.75, 2.0, 1.0, 0.25, 10) == pytest.approx(1 / (1 + np.exp(-x)))
     sure = path_probability(1.0, 4.0, 0.0, 0.9, 20)
     assert sure == path_probability(1 - 1e-9, 4.0, -8.0, 0.5, 20) > 0.98

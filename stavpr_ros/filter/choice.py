@@ -27,6 +27,7 @@ from stavpr_ros.filter.checks import (
     unevenness,
 )
 from stavpr_ros.filter.columns import ColumnLayout
+from stavpr_ros.filter.evidence import changed_images
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
 from stavpr_ros.filter.protocol import Filter
@@ -74,7 +75,7 @@ class ChosenPath:
     :param shares: probability of these places and close ones, given the path, (l,).
     :param probability: of the place of the image at the position.
     :param min_probability: below which it is no match: of a camera at rest.
-    :param score: mean of -z along the path.
+    :param score: mean of -z along the path, of images that differ.
     :param places: columns that the image may show, ascending, (m,), and probabilities: theirs,
         after the checks.
     """
@@ -192,7 +193,7 @@ class PathChoice:
         if images.lag_at_rest is not None:
             at_rest = z[numbers == numbers[-1]]
             least = least_at_rest(at_rest, mean, self._filter.settings.weight)
-        compared = z[np.isfinite(z)]
+        compared = z[np.isfinite(z) & changed_images(numbers)]
         score = -float(compared.sum() / len(compared)) if len(compared) else 0.0
         return PathCandidate(placed, masses.sum(axis=1), of_path, factor, least, score)
 

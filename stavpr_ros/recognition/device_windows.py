@@ -59,10 +59,13 @@ class DeviceBuffer(SequenceBuffer):
         entries: np.ndarray = self.memory.take(flat.to(self._device)).cpu().numpy()
         return entries
 
-    def best_elsewhere(self, steps: np.ndarray, excluded: np.ndarray) -> float:
+    def best_elsewhere(
+        self, steps: np.ndarray, excluded: np.ndarray, counted: np.ndarray
+    ) -> float:
         """See :meth:`SequenceBuffer.best_elsewhere`; waits for the device."""
+        rows = torch.from_numpy(self._ring(steps.shape[1])[counted, 0]).to(self._device)
+        steps = steps[:, counted]
         reach, images = int(np.abs(steps).max()), steps.shape[1]
-        rows = torch.from_numpy(self._ring(images)[:, 0]).to(self._device)
         z = self.memory.index_select(0, rows)[:, : self.known]
         z = pad(torch.where(z.isfinite(), z, float(FAR)), (reach, reach), value=float(FAR))
         shifts = torch.from_numpy(steps + reach).to(self._device)[:, :, None]

@@ -12,7 +12,13 @@ from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.filter.choice import ChosenPath, PathChoice, WindowImages
 from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.evidence import APART, path_probability, RecentMean, straight_steps
+from stavpr_ros.filter.evidence import (
+    APART,
+    changed_images,
+    path_probability,
+    RecentMean,
+    straight_steps,
+)
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import NEGLIGIBLE, NO_PLACES
@@ -274,7 +280,7 @@ class FilterWindow(QueryWindow):
             return self._posterior, least
         steps = straight_steps(numbers, position)
         near = self.layout.around(int(chosen.path[position]), APART)
-        elsewhere = self.buffer.best_elsewhere(steps, near)
+        elsewhere = self.buffer.best_elsewhere(steps, near, changed_images(numbers))
         others = chosen.score, elsewhere, self._recent.value, len(numbers)
         return path_probability(self._posterior, *others), path_probability(least, *others)
 

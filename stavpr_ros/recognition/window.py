@@ -137,13 +137,17 @@ class SequenceBuffer:
         entries: np.ndarray = self.memory[self._ring(images), columns]
         return entries
 
-    def best_elsewhere(self, steps: np.ndarray, excluded: np.ndarray) -> float:
+    def best_elsewhere(
+        self, steps: np.ndarray, excluded: np.ndarray, counted: np.ndarray
+    ) -> float:
         """
         Return the largest mean of -z of straight paths of the newest images.
 
         :param steps, excluded: of :func:`stavpr_ros.filter.evidence.best_elsewhere`; l images.
+        :param counted: images that count, (l,), bool.
         """
-        rows = self._ring(steps.shape[1])[:, 0]
+        rows = self._ring(steps.shape[1])[counted, 0]
+        steps = np.ascontiguousarray(steps[:, counted])
         return float(best_elsewhere(self.memory, rows, self.known, steps, excluded))
 
     def _ring(self, images: int | None = None) -> np.ndarray:
