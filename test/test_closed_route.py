@@ -18,6 +18,7 @@ from stavpr_ros.mapping import load_map, merge_maps, save_map, select_places
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.same_places import with_seam
 from test_direction import recognize
+from test_relative_motion import poses_of
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 LAP, MORE = 120, 45  # places of a lap, and those that the map has beyond it
@@ -89,6 +90,25 @@ def test_device_equals_cpu_over_the_seam(closed_map, device):
         if match.accepted:
             assert match.probability == pytest.approx(expected.probability, abs=1e-4)
             np.testing.assert_array_equal(match.path, expected.path)
+
+
+@pytest.mark.parametrize('drift', [0.0, 3.0])
+def test_odometry_is_not_compared_over_the_seam(open_map, drift):
+    """The poses of a map end beside its start: they have drifted."""
+    angles = np.arange(LAP + 60 + 2 * LAP) * 2 * np.pi / LAP
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1) * LAP / (2 * np.pi)
+    places = circle[: len(open_map)] + np.linspace(0, drift, len(open_map))[:, None]
+    place_map = with_seam(replace(open_map, poses=poses_of(places)))
+    query = laps(60, 60 + 2 * LAP, 0.8, 2)
+    matches = recognize(place_map, query, FORWARD, poses=poses_of(circle[60 : 60 + len(query)]))
+    assert all(match.accepted for match in matches[20:])
+
+
+def test_first_stage_compares_the_places_beyond_the_seam(closed_map):
+    query = laps(60, 60 + LAP, 0.8, 2)
+    coarse = recognize(closed_map, query, replace(FORWARD, time_budget_ms=1e-6))
+    exact = recognize(closed_map, query, FORWARD)
+    assert [match.place_index for match in coarse] == [match.place_index for match in exact]
 
 
 def test_states_that_moved_back_have_the_same_past():

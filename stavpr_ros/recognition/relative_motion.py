@@ -81,6 +81,8 @@ class RelativeMotion:
             track, ends = track[::-1], (high - 1 - place, high - 1 - newest)
         trajectory = np.array(self.trajectory)
         length, agreed = len(match.path), 1.0
+        if ends[1] < ends[0]:  # over the seam of a closed route, where the poses have the drift
+            return agreed
         after = length - 1 - position
         for count in {length, min(len(trajectory), length + self._followed)}:
             part = trajectory[-count:]
