@@ -1,0 +1,182 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The heading error of a camera against the mapped pass, by registration of images of one place.
+
+Every column of an image is described by the oriented gradients of its rows above the ground, and
+compared with every column of the image of the place. Where u in -1..1 is the position in the image
+of the place, the scene is shifted by
+
+    shift(u) = h + a u |u| + b |u|
+
+h is the shift of the distant scene: the camera is turned. b is the parallax of a lateral offset:
+the scene beside the path is near. a is an offset along the path. The similarities of the columns
+along each such curve are summed; the sums of successive images are added up with a forgetting
+factor, so that one peak prevails over peaks of repeating structure. exp of the sum, with a normal
+prior of h, a and b, is the posterior.
+"""
+
+from dataclasses import dataclass
+import math
+
+import cv2
+import numpy as np
+from stavpr_ros.checks import require_shape
+
+WIDTH = 192  # pixels of the compared images
+GROUND = 0.62  # the rows below this part of the height are not compared
+ROWS, ORIENTATIONS = 20, 4
+BLOCKS = 16  # of columns
+REACH = WIDTH // 2  # largest shift, pixels
+SMOOTHING, COLUMN_SMOOTHING, CONTRAST_RADIUS = 1.0, 2.0, 12.0  # pixels, deviations
+CONTRAST, CLIP = 0.05, 2.5  # added to the local contrast; largest relative gradient
+EVIDENCE = 60.0  # nats for a mean similarity of 1 over the whole image; images are dependent
+MIN_OVERLAP = 0.4  # of the blocks
+FORGETTING = 0.8  # factor on the sum of the earlier images
+DRIFT, STEP = 1.5, 3  # pixels that the shift changes between two images, deviation and maximum
+PEAK = 5  # pixels from the most probable shift that are one peak
+MIN_RATIO = 9.0  # of the peak of a valid offset to the second peak
+MIN_SIMILARITY = 0.12  # of a valid offset
+FLOOR, INFLATION = 0.5, 2.0  # pixels of a sharp peak; errors of neighboring columns are dependent
+# Deviations of the prior: h in widths; a and b in half widths.
+PRIOR_H, PRIOR_A, PRIOR_B = 0.25, 0.08, 0.15
+A, B = (axis.ravel() for axis in np.meshgrid(
+    np.linspace(-0.1, 0.1, 5), np.linspace(-0.3, 0.3, 13), indexing='ij'
+))  # fmt: skip
+SHIFTS = np.arange(-REACH, REACH + 1)
+
+
+@dataclass(frozen=True)
+class Offset:
+    """
+    How an image is turned and offset against the image of a place.
+
+    :param shift: h as a part of the width of the image, positive: the distant scene is further to
+        the right, the camera is turned to the left (REP-103).
+    :param deviation: of the shift.
+    :param parallax: b / 2, how much further the scene is shifted at both sides of the image, as a
+        part of the width, positive: the camera is to the left of the path.
+    :param ratio: of the probabilities of the peak and of the second peak.
+    :param similarity: mean similarity of the columns of this image alone at the peak; about 0 for
+        a covered camera, or for images of other places.
+    """
+
+    shift: float
+    deviation: float
+    parallax: float
+    ratio: float
+    similarity: float
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether the images determine the shift."""
+        return self.ratio >= MIN_RATIO and self.similarity >= MIN_SIMILARITY
+
+
+def describe_columns(image: np.ndarray) -> np.ndarray:
+    """
+    Describe the columns of an image.
+
+    :param image: RGB, shape (h, w, 3), uint8.
+    :returns: unit vectors, shape (WIDTH, ROWS * ORIENTATIONS), float32.
+    """
+    require_shape('image', image, 'H W 3', 'uint8')
+    height = max(ROWS, round(WIDTH * image.shape[0] / image.shape[1] * GROUND))
+    above = cv2.cvtColor(image[: max(1, round(image.shape[0] * GROUND))], cv2.COLOR_RGB2GRAY)
+    gray = cv2.resize(above, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    gray = cv2.GaussianBlur(np.log1p(32 / 255 * gray.astype(np.float32)), (0, 0), SMOOTHING)
+    dx, dy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
+    # cos(2 (angle - k pi / ORIENTATIONS)), of gradients without a sign
+    square = np.maximum(dx * dx + dy * dy, 1e-12)
+    size = np.sqrt(square)
+    double = (dx * dx - dy * dy) / size, 2 * dx * dy / size
+    angles = 2 * np.pi * np.arange(ORIENTATIONS, dtype=np.float32) / ORIENTATIONS
+    parts = np.maximum(
+        double[0][..., None] * np.cos(angles) + double[1][..., None] * np.sin(angles), 0
+    )
+    parts /= np.sqrt(cv2.GaussianBlur(square, (0, 0), CONTRAST_RADIUS))[..., None] + CONTRAST
+    parts = cv2.GaussianBlur(
+        np.minimum(parts, CLIP), (0, 0), sigmaX=COLUMN_SMOOTHING, sigmaY=height / ROWS / 2
+    )
+    rows = ((np.arange(ROWS) + 0.5) * height / ROWS).astype(int)
+    columns = parts[rows].transpose(1, 0, 2).reshape(WIDTH, -1)
+    columns = columns - columns.mean(axis=0)
+    norms = np.linalg.norm(columns, axis=1, keepdims=True)
+    return columns / np.maximum(norms, 1e-6)
+
+
+class OffsetFilter:
+    """Estimates the offset of each image of a sequence."""
+
+    def __init__(self) -> None:
+        u = ((np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5) * 2
+        beside = (A[:, None] * u * abs(u) + B[:, None] * abs(u)) * WIDTH / 2
+        shifts = np.rint(beside).astype(int)[:, :, None] + SHIFTS
+        self._is_inside = abs(shifts) <= REACH
+        self._index = np.clip(shifts, -REACH, REACH) + REACH
+        self._index += np.arange(BLOCKS)[:, None] * len(SHIFTS)
+        of_model = (A / PRIOR_A) ** 2 + (B / PRIOR_B) ** 2
+        self._prior = -0.5 * (of_model[:, None] + (SHIFTS / (PRIOR_H * WIDTH)) ** 2)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the images."""
+        self._earlier = np.zeros_like(self._prior)
+
+    def update(self, query: np.ndarray, place: np.ndarray) -> Offset:
+        """
+        Return the offset of an image against the image of its place.
+
+        :param query, place: their columns, as :func:`describe_columns` returns them.
+        """
+        # the sum of the earlier images, where the shift has changed: a parabola for the drift
+        padded = np.pad(self._earlier, ((0, 0), (STEP, STEP)), mode='edge')
+        earlier = np.max(
+            [
+                padded[:, STEP + by : STEP + by + len(SHIFTS)] - 0.5 * (by / DRIFT) ** 2
+                for by in range(-STEP, STEP + 1)
+            ],
+            axis=0,
+        )
+        evidence, is_covered = self._evidence(place @ query.T)
+        self._earlier = FORGETTING * earlier + evidence
+        log = np.where(is_covered, self._earlier + self._prior, -np.inf)
+        posterior = np.exp(log - log.max())
+        posterior /= posterior.sum()
+        by_shift = posterior.sum(axis=0)
+        masses = np.convolve(by_shift, np.ones(PEAK), 'same')
+        peak = int(np.argmax(masses))
+        part = slice(max(0, peak - PEAK), peak + PEAK + 1)
+        probability = float(by_shift[part].sum())
+        shift = float(by_shift[part] @ SHIFTS[part]) / probability
+        variance = float(by_shift[part] @ (SHIFTS[part] - shift) ** 2) / probability
+        parallax = float(posterior[:, part].sum(axis=1) @ B) / probability / 2
+        deviation = INFLATION * math.sqrt(variance + FLOOR**2)
+        second = masses[abs(SHIFTS - SHIFTS[peak]) > 2 * PEAK].max()
+        ratio = masses[peak] / max(second, 1e-12)
+        similarity = float(evidence[:, part].max()) / EVIDENCE
+        return Offset(shift / WIDTH, deviation / WIDTH, parallax, float(ratio), similarity)
+
+    def _evidence(self, similarity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the evidence (nats) for each (a, b) and shift, and whether enough blocks overlap.
+
+        :param similarity: of columns of the place and columns of the query, (WIDTH, WIDTH).
+        """
+        padded = np.pad(similarity, ((0, 0), (REACH, REACH)))
+        # row x of the diagonals has the similarities of column x at all shifts
+        stride = padded.strides
+        diagonals = np.lib.stride_tricks.as_strided(
+            padded, (WIDTH, len(SHIFTS)), (stride[0] + stride[1], stride[1]), writeable=False
+        )
+        columns = np.arange(WIDTH)[:, None] + SHIFTS
+        overlaps = ((columns >= 0) & (columns < WIDTH)).reshape(BLOCKS, -1, len(SHIFTS))
+        counts = overlaps.sum(axis=1)
+        sums = diagonals.reshape(BLOCKS, -1, len(SHIFTS)).sum(axis=1)
+        is_covered = counts * 2 >= WIDTH // BLOCKS
+        means = np.where(is_covered, sums / np.maximum(counts, 1), 0)
+        is_used = self._is_inside & is_covered.ravel()[self._index]
+        total = (means.ravel()[self._index] * is_used).sum(axis=1)
+        count = is_used.sum(axis=1)
+        evidence = EVIDENCE / BLOCKS * total * np.sqrt(BLOCKS / np.maximum(count, 1))
+        return evidence, count >= MIN_OVERLAP * BLOCKS

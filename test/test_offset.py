@@ -1,0 +1,106 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Heading errors by registration: signs, subpixel shifts, images that determine none."""
+
+import cv2
+import numpy as np
+import pytest
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import thumbnail_of
+from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
+from stavpr_ros.sources import open_source
+
+WIDTH, HEIGHT, PANORAMA = 192, 144, 400
+
+
+def panorama(seed=0):
+    """Return a wide image of random rectangles, (144, 400, 3)."""
+    rng = np.random.default_rng(seed)
+    image = np.full((HEIGHT, PANORAMA, 3), 128, np.uint8)
+    for _ in range(300):
+        x, y, w, h = rng.integers((0, 0, 4, 4), (PANORAMA, HEIGHT, 40, 60)).tolist()
+        color = tuple(rng.integers(0, 255, 3).tolist())
+        cv2.rectangle(image, (x, y), (x + w, y + h), color, -1)
+    return image
+
+
+def warped(image, shift=0.0, beside=0.0):
+    """Return the middle of a panorama, shifted to the right; pixels, in all and beside."""
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    u = abs(x + 0.5 - WIDTH / 2) / (WIDTH / 2)
+    source = (PANORAMA - WIDTH) / 2 + x - shift - beside * u
+    return cv2.remap(image, source.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+
+
+def offset(query, place) -> Offset:
+    return OffsetFilter().update(describe_columns(query), describe_columns(place))
+
+
+@pytest.mark.parametrize('shift', [-48.0, -7.5, 0.0, 3.3, 60.0])
+def test_shift_is_positive_where_the_scene_is_further_right(shift):
+    image = panorama()
+    result = offset(warped(image, shift), warped(image))
+    assert result.is_valid
+    assert result.shift * WIDTH == pytest.approx(shift, abs=1.0)
+    assert result.deviation * WIDTH < 3
+    assert abs(result.parallax) < 0.02
+
+
+@pytest.mark.parametrize('beside', [-12.0, 12.0])
+def test_near_scene_beside_the_path_is_parallax_not_heading(beside):
+    image = panorama(1)
+    result = offset(warped(image, 5.0, beside), warped(image))
+    assert result.is_valid
+    assert result.shift * WIDTH == pytest.approx(5.0, abs=3)
+    assert result.parallax * WIDTH == pytest.approx(beside, rel=0.4)
+
+
+def test_repeating_structure_is_resolved_by_earlier_images():
+    """A peak of one image alone is wrong; the sum over the images keeps the right one."""
+    column = panorama(4)[:, 100:124]
+    repeated = np.tile(column, (1, 17, 1))[:, :PANORAMA]
+    history, single = OffsetFilter(), OffsetFilter()
+    for seed in range(3):
+        image = panorama(seed)
+        history.update(describe_columns(warped(image, 12)), describe_columns(warped(image)))
+    pair = describe_columns(warped(repeated, 12)), describe_columns(warped(repeated))
+    assert history.update(*pair).shift * WIDTH == pytest.approx(12, abs=3)
+    assert not single.update(*pair).is_valid
+    history.reset()
+    assert not history.update(*pair).is_valid
+
+
+def test_covered_camera_has_no_valid_offset_from_its_first_image():
+    image, estimator = panorama(2), OffsetFilter()
+    rng = np.random.default_rng(0)
+    place = describe_columns(warped(image))
+    for _ in range(5):
+        assert estimator.update(place, place).is_valid
+    noise = rng.normal(20, 3, (HEIGHT, WIDTH, 3)).clip(0, 255).astype(np.uint8)
+    for covered in (noise, np.zeros_like(noise)):
+        assert not estimator.update(describe_columns(covered), place).is_valid
+
+
+def test_image_of_another_type_is_rejected():
+    with pytest.raises(InputError, match=r'image: shape \(4, 4\)'):
+        describe_columns(np.zeros((4, 4)))
+
+
+def test_crops_of_real_images_by_day_and_night(data_folder):
+    """The shift of a crop adds to the shift that the images have; pixels of 1024."""
+    folders = [data_folder / 'walk_by_night' / name for name in ('left_day', 'right_night')]
+    places, queries = ([frame.image for frame in open_source(folder)] for folder in folders)
+    own, cropped, errors = OffsetFilter(), OffsetFilter(), []
+
+    def crop(image, share):
+        width = image.shape[1]
+        first = round(width * (0.13 + share))
+        return describe_columns(thumbnail_of(image[:, first : first + round(width * 0.73)]))
+
+    for place, query in zip(places[:60], queries[:60], strict=True):
+        columns = crop(place, 0)
+        both = own.update(crop(query, 0), columns), cropped.update(crop(query, 0.08), columns)
+        if all(each.is_valid for each in both):
+            errors.append((both[1].shift - both[0].shift + 0.08 / 0.73) * 1024)
+    assert len(errors) >= 20
+    assert np.sqrt(np.mean(np.square(errors))) < 10
