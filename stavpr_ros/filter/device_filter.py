@@ -272,14 +272,6 @@ class DevicePlaceFilter(Filter):
         sums = self._by_place.index_fill(0, torch.from_numpy(excluded).to(self._device), 0)
         return int(sums.argmax()), float(sums.max()) * self._scale
 
-    def mean_z(self, state: np.ndarray) -> float:
-        """See :meth:`Filter.mean_z`."""
-        return self.settings.levels[state[0]]
-
-    def speed(self, state: np.ndarray) -> float:
-        """See :meth:`Filter.speed`."""
-        return self.settings.speeds[state[3]]
-
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
         """See :meth:`PlaceFilter.path`."""
         self._read()

@@ -216,7 +216,7 @@ def _scratch(size):
 
 @parallel_kernel
 def advance(
-    a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, entering, halos, origins, totals,
+    a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, entering, halos, origins,
     by_place, maxima,
 ):  # fmt: skip
     """
@@ -232,14 +232,15 @@ def advance(
     :param entering: probability of each state of a level to come from off the map, (K,).
     :param halos: (parts, K, V, reach), scratch; zeros in the first. Reach is of whole vectors.
     :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written.
-    :param totals: (blocks, K, 3), written: sums before the motion, of the states that moved over
-        the end of the map, and with the image.
     :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
         block, (blocks,); written.
+    :returns: sums before the motion, of the states that moved over the end of the map, and with
+        the image, (3, K).
     """
     _, K, V, _ = a.shape
     reach, halves, parts = halos.shape[3], origins.shape[2], (n + PLACES - 1) // PLACES
     width, size = reach + BLOCK, K * V * BLOCK
+    totals = np.empty(((n + BLOCK - 1) // BLOCK, 3, K))
     states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
     for part in range(1, parts):  # too little work to share
         for row in range(K * V):
@@ -268,7 +269,7 @@ def advance(
                 )
             places[:] = 0
             for k in range(K):
-                totals[at, k, 0], totals[at, k, 1] = _sum_of_lanes(sums, k * LANES), 0
+                totals[at, 0, k], totals[at, 1, k] = _sum_of_lanes(sums, k * LANES), 0
                 total = splat(F(0))
                 for v in range(V):
                     row, step = (k * V + v) * width, steps[v]
@@ -277,7 +278,7 @@ def advance(
                         prefetch(states, line)
                     if first + count == n:
                         ending = mixed[row : row + reach + count]
-                        totals[at, k, 1] += _lost(ending, step, spread)
+                        totals[at, 1, k] += _lost(ending, step, spread)
                     total = total + _move(
                         mixed, row + reach - step, 1 if step > 0 else 0, whole, spread, stay_on,
                         entering[k], likely.reshape(-1), k * BLOCK, states,
@@ -285,5 +286,11 @@ def advance(
                         ((at * K + k) * halves + v // 2) * BLOCK, v % 2, places,
                     )  # fmt: skip
                 store(lanes, 0, total)
-                totals[at, k, 2] = _sum_of_lanes(lanes, 0)
+                totals[at, 2, k] = _sum_of_lanes(lanes, 0)
             maxima[at] = _copy_sums(places, count, by_place, first)
+    sums = np.empty((3, K))
+    for kind, k in np.ndindex(sums.shape):
+        sums[kind, k] = 0
+        for at in range(len(totals)):
+            sums[kind, k] += totals[at, kind, k]
+    return sums

@@ -152,37 +152,31 @@ class PlaceFilter(Filter):
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """See :meth:`Filter.update`."""
-        s, n = self.settings, len(z)
-        slot = self.count % len(self._steps)
-        moved = np.rint(self._speeds * (self.count + 1)) - np.rint(self._speeds * self.count)
-        self._steps[slot] = moved
-        real = max(n - len(self._gaps), 1)
-        states = len(self._levels) * len(self._speeds) * real
+        s, n, slot = self.settings, len(z), self.count % len(self._steps)
+        passed = np.rint(self._speeds * self.count)
+        self._steps[slot] = np.rint(self._speeds * (self.count + 1)) - passed
+        states = len(self._speeds) * max(n - len(self._gaps), 1)  # of a level
+        gaps = self._gaps // BLOCK, slice(None), slice(None), self._gaps % BLOCK
         if not self.count and n:
-            self._a[: -(-n // BLOCK)] = s.start / states
+            self._a[: -(-n // BLOCK)] = s.start / (len(self._levels) * states)
+            self._a[gaps] = 0
             self._off[:] = (1 - s.start) / len(self._levels)
+        if not self.count or n < self._known:
             self._clear_from(n)
-            self._a[self._gaps // BLOCK, :, :, self._gaps % BLOCK] = 0
-        if n < self._known:
-            self._clear_from(n)
-        totals = np.zeros((-(-n // BLOCK), len(self._levels), 3))
         off = self._off @ self._level_changes
-        entering = (off * s.enter / (len(self._speeds) * real)).astype(np.float32)
-        if n:
-            if len(self._gaps) or len(not_near):
-                z = z.copy()
-                z[not_near] = np.maximum(z[not_near], 0)
-                z[self._gaps] = NO_PLACE
-            advance(
-                self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
-                self._level_changes * np.float32(self._scale),
-                s.speed_changes(speed_weights, speed_likelihoods), self._steps[slot],
-                np.float32(s.spread), np.float32(1 - s.leave), entering, self._halos,
-                self._origins[slot], totals, self._by_place, self._maxima,
-            )  # fmt: skip
-        before, lost, on_map = totals.sum(axis=0).T if n else np.zeros((3, len(off)))
+        entering = (off * s.enter / states).astype(np.float32)
+        if len(self._gaps) or len(not_near):
+            z = z.copy()
+            z[not_near] = np.maximum(z[not_near], 0)
+            z[self._gaps] = NO_PLACE
+        before, lost, on_map = advance(
+            self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
+            self._level_changes * np.float32(self._scale),
+            s.speed_changes(speed_weights, speed_likelihoods), self._steps[slot],
+            np.float32(s.spread), np.float32(1 - s.leave), entering, self._halos,
+            self._origins[slot], self._by_place, self._maxima,
+        )  # fmt: skip
         if len(self._gaps):  # likelihoods are 1 there
-            gaps = self._gaps // BLOCK, slice(None), slice(None), self._gaps % BLOCK
             in_gaps = self._a[gaps].sum(axis=(0, 2), dtype=np.float64)
             entered = entering * (len(self._speeds) * len(self._gaps))
             lost = lost + (in_gaps - entered) / (1 - s.leave)
@@ -227,14 +221,6 @@ class PlaceFilter(Filter):
             (self.count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
-
-    def mean_z(self, state: np.ndarray) -> float:
-        """See :meth:`Filter.mean_z`."""
-        return self.settings.levels[state[0]]
-
-    def speed(self, state: np.ndarray) -> float:
-        """See :meth:`Filter.speed`."""
-        return self.settings.speeds[state[3]]
 
 
 def _move_up(values: np.ndarray, count: int, none: int) -> None:
