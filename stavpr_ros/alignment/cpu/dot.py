@@ -14,7 +14,7 @@ from numba.extending import overload
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
-from stavpr_ros.alignment.cpu.simd import LANES, LINE, prefetch, store
+from stavpr_ros.alignment.cpu.simd import LANES, LINE, load, prefetch, splat, store, store_sums
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
 
@@ -52,6 +52,39 @@ def _dots(y, q, sums):
         s5 += q5[t] * value
         s6 += q6[t] * value
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6] = s0, s1, s2, s3, s4, s5, s6
+
+
+@reassociating_kernel
+def _dots_of_two(y, z, q, sums):
+    """
+    Multiply two map strips (d,) by TILE query strips (TILE, d), in 31 of 32 registers.
+
+    The order of the sums is LLVM's in :func:`_dots`: even and odd vectors apart.
+
+    :param sums: (2 LANES,), written: of y, and from LANES on, of z; d is a multiple of 2 LANES.
+    """
+    q0, q1, q2, q3, q4, q5, q6 = q[0], q[1], q[2], q[3], q[4], q[5], q[6]
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = b0 = b1 = b2 = b3 = b4 = b5 = b6 = splat(np.float32(0))
+    e0 = e1 = e2 = e3 = e4 = e5 = e6 = f0 = f1 = f2 = f3 = f4 = f5 = f6 = splat(np.float32(0))
+    for t in range(0, y.shape[0], 2 * LANES):
+        v, w, x = load(y, t), load(z, t), load(q0, t)
+        a0, b0, x = a0 + x * v, b0 + x * w, load(q1, t)
+        a1, b1, x = a1 + x * v, b1 + x * w, load(q2, t)
+        a2, b2, x = a2 + x * v, b2 + x * w, load(q3, t)
+        a3, b3, x = a3 + x * v, b3 + x * w, load(q4, t)
+        a4, b4, x = a4 + x * v, b4 + x * w, load(q5, t)
+        a5, b5, x = a5 + x * v, b5 + x * w, load(q6, t)
+        a6, b6, u = a6 + x * v, b6 + x * w, t + LANES
+        v, w, x = load(y, u), load(z, u), load(q0, u)
+        e0, f0, x = e0 + x * v, f0 + x * w, load(q1, u)
+        e1, f1, x = e1 + x * v, f1 + x * w, load(q2, u)
+        e2, f2, x = e2 + x * v, f2 + x * w, load(q3, u)
+        e3, f3, x = e3 + x * v, f3 + x * w, load(q4, u)
+        e4, f4, x = e4 + x * v, f4 + x * w, load(q5, u)
+        e5, f5, x = e5 + x * v, f5 + x * w, load(q6, u)
+        e6, f6 = e6 + x * v, f6 + x * w
+    store_sums(sums, 0, (a0 + e0, a1 + e1, a2 + e2, a3 + e3, a4 + e4, a5 + e5, a6 + e6))
+    store_sums(sums, LANES, (b0 + f0, b1 + f1, b2 + f2, b3 + f3, b4 + f4, b5 + f5, b6 + f6))
 
 
 @reassociating_kernel
@@ -93,15 +126,23 @@ def _overload_block_distances(features, queries, x, first, count, d):
 
 @kernel
 def _float_block_distances(features, queries, x, first, count, d):
-    query, sums = queries[x], np.empty(TILE, np.float32)
+    query, sums, step = queries[x], np.empty(2 * LANES + TILE, np.float32), 1
+    if LANES == 16 and features.shape[2] % (2 * LANES) == 0:  # with 32 registers
+        step = 2
     for j in range(features.shape[0]):
-        for y in range(count):
-            for t in range(0, features.shape[2], LINE):  # processors stop at the end of a page
-                prefetch(features[j, first + y], t + AHEAD)
+        for y in range(0, count, step):
+            place, other = features[j, first + y], features[j, first + min(y + 1, count - 1)]
+            for t in range(0, step * features.shape[2], LINE):  # processors stop at a page's end
+                prefetch(place, t + AHEAD)
             for i in range(0, query.shape[0], TILE):
-                _dots(features[j, first + y], query[i : i + TILE], sums)
+                if step == 2:
+                    _dots_of_two(place, other, query[i : i + TILE], sums)
+                else:
+                    _dots(place, query[i : i + TILE], sums)
                 for t in range(TILE):
                     d[i + t, j, y] = np.float32(1) - sums[t]
+                    if step == 2 and y + 1 < count:
+                        d[i + t, j, y + 1] = np.float32(1) - sums[LANES + t]
 
 
 @parallel_kernel

@@ -17,7 +17,7 @@ from typing import Any
 
 from llvmlite import binding, ir
 import numba as nb
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic, models, overload, register_model
 
 
@@ -94,6 +94,35 @@ def store(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector), generate
+
+
+@intrinsic
+def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
+    """
+    Write the sums over the lanes of vectors into a flat array, from ``offset``.
+
+    Of a tuple of at most LANES; behind them, the array has room for LANES numbers. Each sum is of
+    halves, as LLVM adds up lanes.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        parts, width = cgutils.unpack_tuple(builder, arguments[2]), LANES
+
+        def half(pair: Any, is_upper: bool) -> Any:
+            taken = [i for i in range(2 * LANES) if (2 * (i % width) >= width) == is_upper]
+            mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), taken)
+            return builder.shuffle_vector(*pair, mask)
+
+        while width > 1:
+            parts += parts[-1:] * (len(parts) % 2)
+            pairs = list(zip(parts[::2], parts[1::2], strict=True))
+            parts = [builder.fadd(half(pair, False), half(pair, True)) for pair in pairs]
+            width //= 2
+        pointer = _pointer(context, builder, signature.args[0], *arguments[:2])
+        builder.store(parts[0], pointer, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vectors), generate
 
 
 def _on_all_lanes(builder: Any, number: Any) -> Any:
