@@ -207,6 +207,11 @@ def _copy_sums(places, count, by_place, first):
 
 
 @kernel
+def _sum_of_blocks(totals):
+    return totals.sum(axis=0)
+
+
+@kernel
 def _scratch(size):
     """Return zeros, (size,), that begin with a cache line."""
     memory = np.zeros(size + LINE, np.float32)
@@ -288,9 +293,4 @@ def advance(
                 store(lanes, 0, total)
                 totals[at, 2, k] = _sum_of_lanes(lanes, 0)
             maxima[at] = _copy_sums(places, count, by_place, first)
-    sums = np.empty((3, K))
-    for kind, k in np.ndindex(sums.shape):
-        sums[kind, k] = 0
-        for at in range(len(totals)):
-            sums[kind, k] += totals[at, kind, k]
-    return sums
+    return _sum_of_blocks(totals)
