@@ -255,13 +255,6 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'map of its rear camera. ~/match names the direction.',
             choices=('forward', 'both'),
         ),
-        NodeParameter(
-            'other_views',
-            False,
-            'Localization in mode robust: compare images rotated by 8 degrees and moved by a '
-            'tenth of their height as well, until one of these views is matched; for a camera '
-            'that is mounted otherwise than that of the map. On the CPU.',
-        ),
     ),
     'Recorded maps': (
         NodeParameter(

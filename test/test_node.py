@@ -13,7 +13,6 @@ from robot import image_message, LENGTH, SECOND
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.pipeline.view_bank import warped
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.ros import output
 from stavpr_ros.ros.messages import nanoseconds
@@ -164,12 +163,3 @@ def test_node_with_an_incompatible_subscriber_logs_it(robot, start):
     requested = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     robot.listen(PlaceMatch, '/stavpr/match', requested)
     robot.until_logged('a subscriber of ~/match receives nothing: it requests another durability')
-
-
-def test_node_with_other_views_reports_the_one_that_matches(robot, start, route):
-    start(other_views=True, min_probability=0.5)
-    assert robot.counts('recognition')['view'] == 'as they are'
-    matches = robot.drive([warped(image, -10, 0) for image in route[:20]])
-    robot.until_logged('images are compared rotated left by 8 degrees')
-    assert robot.counts('recognition')['view'] == 'rotated left by 8 degrees'
-    assert (matches[-1].status, matches[-1].newest_index) == (PlaceMatch.MATCH, 19)

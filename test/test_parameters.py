@@ -68,7 +68,6 @@ def test_default_values_give_default_settings():
 @pytest.mark.parametrize(
     ('values', 'attribute', 'expected'),
     [
-        ({'other_views': True}, 'other_views', True),
         ({'sequence_length': 7}, 'sequence.length', 7),
         ({'min_probability': 0.25}, 'applied_threshold', 0.75),
         ({'max_error': 0.05}, 'applied_threshold', pytest.approx(0.97)),
@@ -103,10 +102,6 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
         ({'min_probability': 1.0}, 'min_probability = 1.0 must be above 0 and below 1'),
         ({'max_error': 0.001}, 'max_error = 0.001: expected 0 = off, or 0.005 to below 1'),
         ({'operation': 'loop_closure', 'max_places': 100}, 'take at least 103'),
-        ({'operation': 'loop_closure', 'other_views': True}, 'other_views with operation loop_cl'),
-        ({'operation': 'mapping', 'other_views': True}, 'take operation localization'),
-        ({'mode': 'paper', 'other_views': True}, 'other_views .* mode paper'),
-        ({'time_budget_ms': 9.0, 'other_views': True}, 'time_budget_ms = 9: .* budget 0'),
         (
             {'operation': 'mapping', 'geometric_check': 'orb', 'thumbnail_width': 0},
             'geometric_check = orb with thumbnail_width = 0',

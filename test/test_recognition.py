@@ -176,25 +176,3 @@ def test_match_has_stamps_of_its_window(small_map, mode):
     match = one.update(small_map.features[:1], 3)
     assert (match.status, match.window_stamps) == (Status.WARMING_UP, (3,))
     assert len(match.window_changes) == (mode == 'robust')
-
-
-def test_another_recognizer_of_a_map_equals_one_made_of_it(small_map):
-    """Also while the first one and its odometry are in use."""
-    settings = RecognizerSettings(mode='robust', sequence=SHORT, nms_radius=5)
-    poses = [np.array([float(i), 0, 0, 0, 0, 0, 1]) for i in range(20)]
-
-    def drive(recognizer, other=None):
-        found = []
-        for i, pose in enumerate(poses):
-            if other is not None:
-                other.update(small_map.features[40 + i // 2 : 41 + i // 2], pose=poses[0])
-            match = recognizer.update(small_map.features[i : i + 1], pose=pose)
-            found.append((match.status, match.place_index, match.probability))
-        return found
-
-    first = PlaceRecognizer(small_map, settings)
-    drive(first)
-    other = first.another(small_map)
-    expected = drive(PlaceRecognizer(small_map, settings))
-    assert expected[-1][:2] == (Status.MATCH, 17)
-    np.testing.assert_equal(drive(other, first), expected)

@@ -304,7 +304,7 @@ def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, ca
         pipeline.snapshot()
     with pytest.raises(SettingsError, match='mapping'):
         pipeline.change(operation='mapping')
-    for name, value in (('precision', 'int8'), ('other_views', True), ('direction', 'both')):
+    for name, value in (('precision', 'int8'), ('direction', 'both')):
         with pytest.raises(SettingsError, match=f'{name} {value}'):
             pipeline.change(settings_of(**{name: value}), loaded=read_map(address, settings_of()))
 

@@ -25,7 +25,6 @@ from stavpr_ros.pipeline.geometric_check import GeometricCheck
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.save_state import SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
-from stavpr_ros.pipeline.view_bank import ViewBank
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
@@ -94,7 +93,7 @@ class Operation(ABC):
         self.settings, self.extractor, self.save_state = settings, extractor, save_state
         self.places: PlaceMap | GrowingMap | None = place_map
         self.reference = place_map  # that images are matched with; None = the recorded route
-        self._recognizer: SequenceRecognizer | ViewBank | None = None
+        self._recognizer: SequenceRecognizer | None = None
         self._start(place_map)
         self._to_bytes: ToBytes | None = None
         if self.extractor is not None:
@@ -121,19 +120,13 @@ class Operation(ABC):
 
     @property
     def recognizer(self) -> SequenceRecognizer | None:
-        """Return the recognizer, of the present view; None without a map."""
-        own = self._recognizer  # once: other threads read this while the worker changes it
-        return own.recognizer if isinstance(own, ViewBank) else own
-
-    @property
-    def view(self) -> str:
-        """Return how images are compared, one of ``VIEWS``; empty without other views."""
-        return self._recognizer.view if isinstance(self._recognizer, ViewBank) else ''
+        """Return the recognizer; None without a map."""
+        return self._recognizer
 
     @property
     def contrast(self) -> float:
         """Deviation of the last image's green channel, of 255; from 32 rows or columns."""
-        image = self._image  # once, as above
+        image = self._image  # once: other threads read this while the worker changes it
         if image is None:
             return math.nan
         step = max(1, min(image.shape[:2]) // 32)
@@ -246,7 +239,7 @@ class Operation(ABC):
         self, stages: dict[str, float], message: Any, row: WindowRow, camera: Camera | None
     ) -> ImageResult:
         assert self.extractor is not None
-        width, bank = self._thumbnail_width(camera), self._recognizer
+        width = self._thumbnail_width(camera)
         with _timed(stages, 'decoding'):
             image = decode_message(message, self.extractor.needed_size(width), self._to_bytes)
             self._image = image
@@ -258,8 +251,7 @@ class Operation(ABC):
             reason = f'the map is full: parameter max_places = {self.settings.max_places}'
             return ImageResult(Status.NOT_READY, reason, image=image, cause='map full')
         with _timed(stages, 'extraction'):
-            images = bank.warped(image) if isinstance(bank, ViewBank) else [image]
-            features = self.extractor.extract(images)
+            features = self.extractor.extract([image])
         with _timed(stages, 'matching'):
             row = row._replace(thumbnail=thumbnail_of(image, width) if width else None)
             result = replace(self._update(features, row), image=image)
@@ -365,11 +357,7 @@ class Localizer(Operation):
         settings = self.settings
         if self.extractor is None or place_map is None:
             return
-        self._recognizer = recognizer = _map_recognizer(
-            settings, self.name, place_map, self.extractor
-        )
-        if settings.other_views and isinstance(recognizer, PlaceRecognizer):
-            self._recognizer = ViewBank(recognizer, place_map)
+        self._recognizer = _map_recognizer(settings, self.name, place_map, self.extractor)
 
     def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
         assert self._recognizer is not None
@@ -501,13 +489,12 @@ def _map_recognizer(
 
 
 def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
-    others = settings.precision, settings.other_views, settings.direction
-    if settings.backend == 'cuda' or others != ('float32', False, 'forward'):
+    others = settings.precision, settings.direction
+    if settings.backend == 'cuda' or others != ('float32', 'forward'):
         raise SettingsError(
-            f'backend {settings.backend}, precision {settings.precision}, other_views '
-            f'{settings.other_views}, direction {settings.direction}: the map of a fleet is '
-            'matched on the CPU in float32; take backend auto or cpu, precision float32, '
-            'other_views false, and direction forward'
+            f'backend {settings.backend}, precision {settings.precision}, direction '
+            f'{settings.direction}: the map of a fleet is matched on the CPU in float32; take '
+            'backend auto or cpu, precision float32, and direction forward'
         )
     assert isinstance(place_map, PartialMap)
     return place_map.recognizer(settings.recognition())

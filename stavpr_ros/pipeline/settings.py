@@ -22,7 +22,6 @@ from stavpr_ros.parameters import BY_NAME, default
 from stavpr_ros.pipeline.maps_folder import maps_folder
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.recognition.loop_closer import least_limit
-from stavpr_ros.recognition.robust import options_of
 from stavpr_ros.recognition.verification import GeometricSettings
 
 OPERATIONS = BY_NAME['operation'].choices
@@ -66,7 +65,6 @@ class PipelineSettings:
     candidates: int = default('candidates')
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     geometric: GeometricSettings | None = None
-    other_views: bool = default('other_views')
     direction: str = default('direction')
 
     def __post_init__(self) -> None:
@@ -106,12 +104,6 @@ class PipelineSettings:
                 f'geometric_check = {self.geometric.method} with thumbnail_width = 0 and '
                 f'operation {operation}: the check compares images with thumbnails'
             )
-        robust = operation == 'localization' and options_of(self.mode).place_filter
-        if self.other_views and (self.time_budget_ms or not robust):
-            raise SettingsError(
-                f'other_views with operation {operation}, mode {self.mode}, time_budget_ms = '
-                f'{self.time_budget_ms:g}: take operation localization, mode robust, budget 0'
-            )
         if self.direction != 'forward' and operation != 'localization':
             raise SettingsError(
                 f'direction = {self.direction} with operation {operation}: a route that grows is '
@@ -135,7 +127,7 @@ class PipelineSettings:
         :raises UnavailableError: ``cuda`` is set and not available.
         """
         backend = str(choose_backend(self.backend))
-        return 'cpu' if operation == 'loop_closure' or self.other_views else backend
+        return 'cpu' if operation == 'loop_closure' else backend
 
     def backend_summary(self, operation: str) -> str:
         """Return one line for the log: the device of each stage, and why."""

@@ -3,7 +3,6 @@
 """Image by image: distances of the newest image, nearest sequence of the window, status."""
 
 from abc import ABC, abstractmethod
-import copy
 from dataclasses import replace
 import math
 import time
@@ -377,20 +376,6 @@ class PlaceRecognizer(SequenceRecognizer):
         if threshold is None and not self._settings.has_probability:
             threshold = self._suggested
         super().set_limits(threshold, min_probability, max_error)
-
-    def another(self, place_map: PlaceMap) -> 'PlaceRecognizer':
-        """
-        Return a recognizer with a window of its own, of the same features in memory.
-
-        :param place_map: of this recognizer: of mode robust, on the CPU, without time budget.
-        """
-        other, window = copy.copy(self), _window_of(place_map, self._settings, 'cpu')
-        assert isinstance(window, FilterWindow)
-        window.change = copy.deepcopy(self._window.change)  # type: ignore[attr-defined]
-        other._window, other._motion = window, copy.deepcopy(self._motion)
-        other._centering = copy.copy(self._centering)
-        other.reset()
-        return other
 
     @property
     def is_standstill(self) -> bool:

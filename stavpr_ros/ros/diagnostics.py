@@ -125,7 +125,6 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             'localized': health.localized,
             'sends_transform': health.sends_transform,
             'camera': health.camera,
-            'view': health.view or None,
             **{_key('edges', source): count for source, count in counts.edges.total.items()},
             f'edges_dropped_{RECENT}s': counts.edges.recent['dropped'],
             'last_edge_reason': counts.edge_reason or None,

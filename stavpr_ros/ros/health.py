@@ -44,7 +44,6 @@ class Health:
     queue: int = 0  # waiting images
     window: int = 0  # images in it
     missing: str = ''  # prerequisite of a match
-    view: str = ''  # how images are compared, with other_views
     odometry_fault: str = ''  # why no odometry can arrive on its topic
     camera: str = 'not needed'  # whether the camera of the edges is known, or why not
     contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown

@@ -364,7 +364,6 @@ class Runtime:
             window=pipeline.operation.window_fill,
             missing=pipeline.operation.missing,
             camera='not needed' if camera is None else camera.state,
-            view=pipeline.operation.view,
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.operation.contrast,
             applied_threshold=pipeline.operation.threshold,
@@ -398,13 +397,11 @@ class Runtime:
             self._pipeline_epoch = item.epoch
             self._reset_window()
         operation, waiting = self.pipeline.operation, time.monotonic() - item.arrival
-        header, places, view = item.message.header, operation.matched_places, operation.view
+        header, places = item.message.header, operation.matched_places
         pose, frames = self._pose_at(nanoseconds(header.stamp))
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
         result = self._match(item.message, pose, camera)
-        if operation.view != view:
-            self._node.get_logger().info(f'images are compared {operation.view}')
         began = time.monotonic()
         if self._navigation is not None:
             self._navigation.publish(header, result, places, pose, frames.odometry)
