@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from pipelines import settings_of
 import pytest
+from stavpr_ros.commands.build_map import _Images
 from stavpr_ros.errors import ImageError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map
@@ -134,10 +135,11 @@ def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes,
     assert pipeline.operation.process(raw(image), 1).image.shape[0] == rows
 
 
-def test_map_of_large_files_has_the_features_that_a_node_computes(image, tmp_path):
+@pytest.mark.parametrize('images', [lambda source: source, lambda source: _Images(source, 1)])
+def test_map_of_large_files_has_the_features_that_a_node_computes(image, images, tmp_path):
     cv2.imwrite(str(tmp_path / 'large.jpg'), image[..., ::-1])
     extractor = FeatureExtractor()
-    place_map = build_map(open_source(tmp_path), extractor, progress=False)
+    place_map = build_map(images(open_source(tmp_path)), extractor, progress=False)
     reduced = decode_file(
         (tmp_path / 'large.jpg').read_bytes(), None, extractor.needed_size(THUMBNAIL_WIDTH)
     )

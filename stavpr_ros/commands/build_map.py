@@ -123,14 +123,14 @@ class _Images:
     """Every N-th image of a source; counts the images that were read."""
 
     def __init__(self, source: 'FolderSource | VideoSource | BagSource', every: int) -> None:
-        self._source, self._every = source, every
+        self.source, self._every = source, every
         self.read = 0
 
     def __len__(self) -> int:
-        return (len(self._source) + self._every - 1) // self._every
+        return (len(self.source) + self._every - 1) // self._every
 
     def __iter__(self) -> Iterator['Frame']:
-        for frame in islice(self._source, 0, None, self._every):
+        for frame in islice(self.source, 0, None, self._every):
             self.read += 1
             yield frame
 

@@ -210,8 +210,9 @@ def _extracted(
         )
     if thumbnail_width is not None:
         require_at_least('thumbnail width', thumbnail_width, 1, 'pixel')
-    if hasattr(frames, 'least'):  # as in the node
-        frames.least = extractor.needed_size(thumbnail_width or 0)
+    source: Any = getattr(frames, 'source', frames)  # of a part of its images
+    if hasattr(source, 'least'):  # as in the node
+        source.least = extractor.needed_size(thumbnail_width or 0)
     total = len(frames) if isinstance(frames, Sized) else None
     places = _places(_with_poses(frames, poses), selector, thumbnail_width, last)
     with (
