@@ -24,7 +24,6 @@ with the mean z of the images at rest: less than 9, as of the first images of a 
 are near, with the weight that the filter does not give to an image of many.
 """
 
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -36,32 +35,6 @@ NEWEST = 0.7  # share of both that the newest images of a window may have
 MIN_PLACES = 3  # of a path whose deviation is meaningful
 SURE_AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
 EXCESS, EXCESS_WEIGHT = 0.04, 30.0  # of right paths at most, and its weight in the odds beyond
-
-
-@dataclass(frozen=True, eq=False)
-class PathCandidate:
-    """
-    A path of the window that may be the right one.
-
-    :param path: place of each image, (l,).
-    :param shares: probability of these places and close ones, given the path, (l,).
-    :param probability: of the path by the filter.
-    :param factor: of its odds, by the checks.
-    :param least: its probability, at least, if the camera is at rest.
-    :param score: mean of -z along the path.
-    """
-
-    path: np.ndarray
-    shares: np.ndarray
-    probability: float
-    factor: float
-    least: float
-    score: float
-
-    @property
-    def weight(self) -> float:
-        """Return the probability after the checks, not normalized."""
-        return self.probability * self.factor
 
 
 @kernel

@@ -14,7 +14,7 @@ In localization, :mod:`stavpr_ros.filter.evidence` makes the probability of the 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import sys
 
 import numpy as np
@@ -23,7 +23,6 @@ from stavpr_ros.filter.checks import (
     least_at_rest,
     NEWEST,
     odds_factor,
-    PathCandidate,
     unevenness,
 )
 from stavpr_ros.filter.columns import ColumnLayout
@@ -69,13 +68,15 @@ class WindowImages:
 @dataclass(frozen=True, eq=False)
 class ChosenPath:
     """
-    The path of a window, and the other places that the image may show.
+    A path of the window, and the other places that the image may show.
 
     :param path: column of each image, (l,), int64.
     :param shares: probability of these places and close ones, given the path, (l,).
-    :param probability: of the place of the image at the position.
+    :param probability: of the path by the filter; of the chosen one, of the place of the image at
+        the position, after the checks.
     :param min_probability: below which it is no match: of a camera at rest.
-    :param score: mean of -z along the path, of images that differ.
+    :param factor: of its odds, by the checks.
+    :param score: mean of -z along the path.
     :param places: columns that the image may show, ascending, (m,), and probabilities: theirs,
         after the checks.
     """
@@ -84,6 +85,7 @@ class ChosenPath:
     shares: np.ndarray
     probability: float
     min_probability: float
+    factor: float
     score: float
     places: np.ndarray
     probabilities: np.ndarray
@@ -137,23 +139,21 @@ class PathChoice:
         :param belief: of the image at the position; it has at least one place.
         """
         places, probabilities, own, best = self._layout.merge_sessions(belief, images.n)
-        candidates: list[PathCandidate] = []
+        candidates: list[ChosenPath] = []
         while len(candidates) < CANDIDATES:
-            candidate = self._candidate(belief, places[best], probabilities[best], images)
+            candidate = self._candidate(belief, places, probabilities, best, images)
             candidates.append(candidate)
             best = _check(places, probabilities, own, best, candidate.factor)
             if candidate.factor >= REFUTED or probabilities[best] < MIN_CANDIDATE:
                 break
-        chosen = max(candidates, key=lambda candidate: candidate.weight)
+        weights = [each.probability * each.factor for each in candidates]
+        chosen = candidates[weights.index(max(weights))]
         on_map = min(float(belief.weights.sum()), 1.0)
-        unchecked = max(on_map - sum(candidate.probability for candidate in candidates), 0.0)
-        total = unchecked + sum(candidate.weight for candidate in candidates)
-        of_path = chosen.weight / max(total + 1 - on_map, sys.float_info.min)
+        unchecked = max(on_map - sum(each.probability for each in candidates), 0.0)
+        total = max(unchecked + sum(weights) + 1 - on_map, sys.float_info.min)
         share = float(chosen.shares[images.position])
-        return ChosenPath(
-            chosen.path, chosen.shares, of_path * share, chosen.least * share, chosen.score,
-            places, probabilities,
-        )  # fmt: skip
+        of_path, least = max(weights) / total * share, chosen.min_probability * share
+        return replace(chosen, probability=of_path, min_probability=least)
 
     def second_best(
         self, chosen: ChosenPath, n: int, place: int, radius: int
@@ -170,12 +170,13 @@ class PathChoice:
         return now, faint * NEGLIGIBLE
 
     def _candidate(
-        self, belief: Belief, place: int, probability: float, images: WindowImages
-    ) -> PathCandidate:
+        self, belief: Belief, places: np.ndarray, probabilities: np.ndarray, best: int,
+        images: WindowImages,
+    ) -> ChosenPath:  # fmt: skip
         """Return the path of the window through a place at the position, and its checks."""
-        low, first, end, high = belief.places.searchsorted(place + AROUND).tolist()
+        low, first, end, high = belief.places.searchsorted(places[best] + AROUND).tolist()
         # of the path: its places are certain within the band
-        of_path = max(float(probability), min(float(belief.weights[low:high].sum()), 1.0))
+        of_path = max(float(probabilities[best]), min(float(belief.weights[low:high].sum()), 1.0))
         state = belief.states[first + belief.weights[first:end].argmax()]
         mean, numbers = self._filter.mean_z(state), images.numbers
         path = self._path(state, images)
@@ -195,7 +196,8 @@ class PathChoice:
             least = least_at_rest(at_rest, mean, self._filter.settings.weight)
         compared = z[np.isfinite(z) & changed_images(numbers)]
         score = -float(compared.sum() / len(compared)) if len(compared) else 0.0
-        return PathCandidate(placed, masses.sum(axis=1), of_path, factor, least, score)
+        shares = masses.sum(axis=1)
+        return ChosenPath(placed, shares, of_path, least, factor, score, places, probabilities)
 
     def _path(self, state: np.ndarray, images: WindowImages) -> np.ndarray:
         """Return the column of each image, (l,); before the image at the position at one speed."""

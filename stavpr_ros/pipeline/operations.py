@@ -222,7 +222,7 @@ class Operation(ABC):
             result = replace(result, session_probabilities=self._session_probabilities())
         if math.isnan(result.threshold):  # none has applied
             result = replace(result, threshold=threshold)
-        return replace(result, stages=stages)
+        return result if result.stages is stages else replace(result, stages=stages)
 
     def _session_probabilities(self) -> tuple[float, ...]:
         """Return the probability of each session of the map, by the newest image."""
@@ -254,7 +254,7 @@ class Operation(ABC):
             features = self.extractor.extract([image])
         with _timed(stages, 'matching'):
             row = row._replace(thumbnail=thumbnail_of(image, width) if width else None)
-            result = replace(self._update(features, row), image=image)
+            result = replace(self._update(features, row), image=image, stages=stages)
         self._window.append(row)
         self._keyframes.accept(row.stamp, row.pose, image)
         if isinstance(self.places, GrowingMap):
@@ -286,7 +286,8 @@ class Operation(ABC):
             is_weighed = self.reference is not None and not math.isnan(result.probability)
             late = tuple(check.checked(each, places, self._query(each), False) for each in late)
             result = check.checked(result, places, self._query(result), is_weighed)
-        return replace(result, late=tuple(each for each in late if each.accepted))
+        late = tuple(each for each in late if each.accepted)
+        return replace(result, late=late) if result.late else result
 
     def _query(self, result: ImageResult) -> np.ndarray | None:
         """Return the thumbnail of the image that a match is of; None = unknown."""
