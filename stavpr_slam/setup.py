@@ -29,7 +29,6 @@ setup(
     ],
     python_requires='>=3.11',
     install_requires=[
-        'gtsam>=4.2',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'scipy>=1.11',

@@ -49,8 +49,6 @@ def allowed(node: str) -> dict[str, set[str]]:
     ],
 )
 def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last):
-    if node == 'pose_graph':
-        pytest.importorskip('gtsam')
     stamps = [(i + 1) * SECOND for i in range(3)]
     image = np.zeros((8, 8, 3), np.uint8)
     images = [ImageRecord.of_image(image, stamp) for stamp in stamps]

@@ -124,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
         '--align',
         action='store_true',
         help='move the poses of each further map into the frame of the first, by the places that '
-        'are recognized on it; requires the package stavpr_slam, and gtsam',
+        'are recognized on it; requires the package stavpr_slam',
     )
     action.add_argument(
         '--different-routes',

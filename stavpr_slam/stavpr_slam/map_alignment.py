@@ -16,7 +16,7 @@ def align(place_map: PlaceMap, reference: PlaceMap) -> PlaceMap:
     """
     Return a map in the frame of another, by the places that are recognized on it.
 
-    :raises StavprError: a map has no poses, too few places are recognized, or no gtsam.
+    :raises StavprError: a map has no poses, or too few places are recognized.
     """
     if place_map.poses is None or reference.poses is None:
         raise InputError('--align: a map has no poses; expected maps recorded with odometry')

@@ -3,13 +3,11 @@
 """``stavpr map merge --align``, found by its entry point."""
 
 import numpy as np
-import pytest
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.mapping import load_map, save_map
 
 
 def test_map_merge_with_align_moves_poses_into_the_first_frame(small_map, tmp_path, map_file):
-    pytest.importorskip('gtsam', reason='the extra slam is not installed')
     shifted = load_map(map_file)
     shifted.poses[:, 1] += 5
     save_map(shifted, tmp_path / 'shifted')

@@ -33,7 +33,7 @@ With --loop: one traverse that passes places again is replayed into the node in 
 loop_closure, which compares it with its own past; 'synthetic' is the synthetic street, twice.
 
 With --slam world: three laps on a closed street with a drifting odometry; the node pose_graph
-corrects it by the loop closures of the node. Requires gtsam and evo (the extra slam).
+corrects it by the loop closures of the node. Requires evo (the extra slam).
 """
 
 EPILOG = """
@@ -327,10 +327,8 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
     from stavpr_lab.demonstration.recordings import Recording, TOPIC
     from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, drive_laps
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_slam.pose_graph.network import load_gtsam
     from stavpr_slam.ros.graph_client import fetch_graph
 
-    load_gtsam()
     _print('1. Three laps of a synthetic street, with a drifting odometry')
     drive = drive_laps(
         arguments.world, arguments.draw, arguments.drift, arguments.carried, arguments.sessions

@@ -13,11 +13,10 @@ A lifecycle node that configures and activates itself. It corrects the odometry 
 (nav_msgs/Path), ~/odometry in the map frame, ~/map_to_odom, ~/edges (visualization_msgs/
 MarkerArray: accepted green, rejected red), /diagnostics. Services: ~/save (stavpr_msgs/SaveMap, a
 file .g2o, .tum or .kitti in the maps folder), ~/reset. The graph is in a process of its own.
-Requires GTSAM: pip install gtsam.
 
 parameters:
 {parameters}
-exit codes: 0 stopped by a signal; 1 an invalid parameter, or GTSAM is not installed
+exit codes: 0 stopped by a signal; 1 an invalid parameter
 """
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closures and odometry become one trajectory: a pose graph, solved with GTSAM."""
+"""Loop closures and odometry become one trajectory: a pose graph."""
 
 from stavpr_slam.pose_graph.alignment import align_maps
 from stavpr_slam.pose_graph.closures import Closure

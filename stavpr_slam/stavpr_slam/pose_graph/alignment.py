@@ -29,7 +29,6 @@ def align_maps(reference: np.ndarray, poses: np.ndarray, pairs: np.ndarray) -> n
     :param pairs: place of the map, place of the other, shape (k, 2), int.
     :returns: shape (4, 4).
     :raises InputError: too few pairs agree.
-    :raises UnavailableError: GTSAM is not installed.
     """
     keyframes = ChainSettings(distance=0.0, max_gap=math.inf, max_speed=math.inf)
     graph = PoseGraph(GraphSettings(keyframes))

@@ -8,9 +8,8 @@ import math
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.closures import ResolvedClosure
+from stavpr_slam.pose_graph.closures import deviations, ResolvedClosure
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.pose_graph.transforms import logarithms
 
 GAIN = 24  # closures more that agree if there is a break, or
 EVIDENCE = 10.0  # so much more evidence
@@ -160,7 +159,7 @@ def _locate(
     moved = [
         pose @ inverse(T[end.query]) for pose, end in zip(at_ends, (last, first), strict=True)
     ]
-    old, new = (_deviations(solved, near, each @ T) for each in moved)
+    old, new = (deviations(solved, near, each @ T) for each in moved)
     at = np.array([each.stamp for each in near])
 
     def probable(stamp: int) -> float:
@@ -170,20 +169,3 @@ def _locate(
 
     stamp = max(evidence, key=probable)
     return Break(int(own[np.searchsorted(stamps, stamp)]), stamp)
-
-
-def _deviations(
-    solved: np.ndarray, closures: Sequence[ResolvedClosure], queries: np.ndarray
-) -> np.ndarray:
-    """Return squared deviations of closures, the queries of which are elsewhere, shape (n,)."""
-    if not closures:
-        return np.zeros(0)
-    X = np.array([(solved[each.place], queries[each.query]) for each in closures])
-    Z, covariance = (
-        np.array([getattr(each, name) for each in closures])
-        for name in ('transform', 'covariance')
-    )
-    off = logarithms(inverse(Z) @ inverse(X[:, 0]) @ X[:, 1])
-    solution = np.linalg.solve(covariance, off[:, :, None])[:, :, 0]
-    result: np.ndarray = (off * solution).sum(axis=1)
-    return result

@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loop closures with a relative pose: the measurements of the graph."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.path_errors import LARGEST_COVARIANCE
+from stavpr_slam.pose_graph.transforms import logarithms
 
 VARIANCES = 1e-10, 1e6  # m^2, rad^2: least and largest that the graph computes with
 
@@ -88,3 +91,20 @@ class ResolvedClosure:
     at: float
     stamp: int
     is_independent: bool
+
+
+def deviations(
+    solved: np.ndarray, closures: Sequence[ResolvedClosure], queries: np.ndarray
+) -> np.ndarray:
+    """Return squared deviations of closures, the queries of which are elsewhere, shape (n,)."""
+    if not closures:
+        return np.zeros(0)
+    X = np.array([(solved[each.place], queries[each.query]) for each in closures])
+    Z, covariance = (
+        np.array([getattr(each, name) for each in closures])
+        for name in ('transform', 'covariance')
+    )
+    off = logarithms(inverse(Z) @ inverse(X[:, 0]) @ X[:, 1])
+    solution = np.linalg.solve(covariance, off[:, :, None])[:, :, 0]
+    result: np.ndarray = (off * solution).sum(axis=1)
+    return result

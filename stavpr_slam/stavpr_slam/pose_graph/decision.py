@@ -11,10 +11,11 @@ successive images at successive places are one event, right or wrong, and count 
 
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.network import Network
 
@@ -30,6 +31,7 @@ MAX_TRIED = 50  # closures that are tried one by one
 DROPPED = 20  # that deviate most and are left out one by one
 STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
 GAP = 15.0  # meters that queries and places of an event are apart at most
+FAR = 1e9  # meters between two sessions
 
 
 def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -38,11 +40,16 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
 
     :param query, place: nodes, (n,).
     """
-    near = np.ones((len(query),) * 2, bool)
-    for nodes in (query, place):
-        at, session = chain.travelled[nodes], chain.session[nodes]
-        near &= (np.abs(at[:, None] - at) <= GAP) & (session[:, None] == session)
-    numbers: np.ndarray = connected_components(near)[1]
+    at = np.stack(
+        [chain.travelled[each] + FAR * chain.session[each] for each in (query, place)], 1
+    )
+    near = (
+        KDTree(at).query_pairs(GAP, np.inf, output_type='ndarray')
+        if len(at)
+        else np.zeros((0, 2), int)
+    )
+    graph = coo_matrix((np.ones(len(near)), near.T), (len(at),) * 2)
+    numbers: np.ndarray = connected_components(graph, directed=False)[1]
     return numbers
 
 
@@ -66,9 +73,9 @@ class Decision:
     scales: np.ndarray
     evidence: float
     rejected: float
-    values: Any
+    values: np.ndarray
     agreeing: np.ndarray
-    corrected: Any
+    corrected: np.ndarray
     strained: int = -1
     chance: float = 0.0
 
@@ -101,7 +108,7 @@ class Decider:
             found.append(own[np.argsort(at[own], kind='stable')[len(own) // 2]])
         return np.array(found, int)
 
-    def _evidence(self, odometry: Any, taken: np.ndarray, values: Any) -> float:
+    def _evidence(self, odometry: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
         network, own = self._network, self.representatives(taken)
         weights = np.zeros(len(taken))
         weights[own] = 1.0
@@ -124,8 +131,8 @@ class Decider:
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
     def _improved(
-        self, odometry: Any, taken: np.ndarray, values: Any, adds: bool
-    ) -> tuple[np.ndarray, Any]:
+        self, odometry: np.ndarray, taken: np.ndarray, values: np.ndarray, adds: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Add and leave out closures, one by one, where that is evidence.
 
@@ -137,7 +144,7 @@ class Decider:
         """
         network, taken = self._network, taken.copy()
 
-        def solved(values: Any) -> tuple[Any, float]:
+        def solved(values: np.ndarray) -> tuple[np.ndarray, float]:
             values, squared, determinant = network.solve(odometry, values, taken * 1.0)
             found = float(self._precise[taken].sum()) + taken.sum() * self._room
             return values, found - determinant - squared / 2
@@ -147,13 +154,15 @@ class Decider:
             rejected, deviating = np.flatnonzero(~taken), np.flatnonzero(taken)
             rejected = rejected[: len(rejected) * (adds and len(rejected) <= MAX_TRIED)]
             rejected = rejected[np.argsort(np.maximum(network.query, network.place)[rejected])]
-            deviating = deviating[np.argsort(-network.residuals(values)[deviating])][:DROPPED]
+            deviating = deviating[np.argsort(-network.residuals(odometry, values)[deviating])][
+                :DROPPED
+            ]
             changed = False
             for number in [*rejected, *deviating]:
                 taken[number] = not taken[number]
                 try:
                     moved, found = solved(values)
-                except RuntimeError:
+                except np.linalg.LinAlgError:
                     found = -math.inf
                 if found > before:
                     values, before, changed = moved, found, True
@@ -176,7 +185,7 @@ class Decider:
         try:
             try:
                 taken, values = network.robust(odometry, start)
-            except RuntimeError:  # of GTSAM: a path that is bent beyond its precision
+            except np.linalg.LinAlgError:
                 if near is None:
                     raise
                 taken, values = network.robust(odometry, near.corrected, AGAIN)
@@ -195,7 +204,7 @@ class Decider:
                     is_better = more.sum() > taken.sum() and found > evidence - CERTAIN
                 if is_better:
                     taken, values, evidence = more, moved, found
-        except RuntimeError:
+        except np.linalg.LinAlgError:
             return Decision(none, scales, 0.0, math.inf, start, none, start)
         joins = network.joined(np.flatnonzero(taken))
         node, squared = network.most_strained(odometry, values)
@@ -234,14 +243,35 @@ class Decider:
 
         return other if gain(other) - max(gain(best), 0.0) > LOOSENED else best
 
-    def estimate(
-        self, decision: Decision, independent: np.ndarray, searches: bool
-    ) -> tuple[np.ndarray, Any, np.ndarray]:
+    def counted(self, taken: np.ndarray, independent: np.ndarray) -> np.ndarray:
         """
-        Estimate the variables at the errors of the odometry that the closures show.
+        Return which of the closures that are taken count in an estimate, shape (n,), bool.
 
         :param independent: closures whose errors do not correlate, shape (n,), bool; of other
             events one closure counts.
+        """
+        if self._measured:
+            return taken
+        counted = taken & independent
+        for number in self.representatives(taken):
+            if not (counted & (self._events == self._events[number])).any():
+                counted[number] = True
+        return counted
+
+    def solved(
+        self, scales: np.ndarray, values: np.ndarray, counted: np.ndarray
+    ) -> tuple[np.ndarray, float, float]:
+        """Estimate the variables with the closures that count, as :meth:`Network.solve`."""
+        odometry = self._network.odometry(scales[self._chain.robot])
+        return self._network.solve(odometry, values, counted * 1.0)
+
+    def estimate(
+        self, decision: Decision, independent: np.ndarray, searches: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        Estimate the variables at the errors of the odometry that the closures show.
+
+        :param independent: as in :meth:`counted`.
         :param searches: leave out closures that are less probable than a place anywhere.
         :returns: the factors on the errors of each robot, the variables, and the closures that
             count, shape (n,), bool.
@@ -252,15 +282,13 @@ class Decider:
             if searches:
                 taken, values = self._improved(odometry, taken, values, False)
             return np.ones_like(decision.scales), values, taken
-        counted = decision.taken & independent
-        for number in self.representatives(decision.taken):
-            if not (counted & (self._events == self._events[number])).any():
-                counted[number] = True
+        counted = self.counted(decision.taken, independent)
 
-        def solved(factor: float) -> tuple[float, float, Any]:
+        def solved(factor: float) -> tuple[float, float, np.ndarray]:
             network = self._network
-            odometry = network.odometry(factor * decision.scales[self._chain.robot])
-            values, squared, determinant = network.solve(odometry, decision.values, counted * 1.0)
+            values, squared, determinant = self.solved(
+                factor * decision.scales, decision.values, counted
+            )
             return network.log_determinant - determinant - squared / 2, factor, values
 
         best, least = solved(1.0), PRECISE / decision.scales.min()

@@ -9,16 +9,17 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks
-from stavpr_slam.pose_graph.closures import Closure, ResolvedClosure
+from stavpr_slam.pose_graph.closures import Closure, deviations, ResolvedClosure
 from stavpr_slam.pose_graph.decision import Decider, Decision, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
-from stavpr_slam.pose_graph.network import load_gtsam, Network
+from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extended, JOINS, Pair, place, session_pairs, weights
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
-GROWN = 1.5  # factor on the number of closures from which scales and breaks are searched anew
+GROWN = 1.1  # factor on the number of closures from which scales and breaks are searched anew
+AGREES = 11.3  # squared deviations of 99 % of right closures in the plane
 MAX_BREAKS = 4  # that are searched
 
 
@@ -52,12 +53,9 @@ class PoseGraph:
 
     Add odometry and closures in any order of arrival, and update now and then. ``counts`` has the
     input that is left out, by its reason.
-
-    :raises UnavailableError: GTSAM is not installed.
     """
 
     def __init__(self, settings: GraphSettings | None = None) -> None:
-        load_gtsam()
         self.settings = settings or GraphSettings()
         self.reset()
 
@@ -71,6 +69,7 @@ class PoseGraph:
         self._searched_at = 0, 0  # closures, and rejected ones, of the last search
         self._changes: dict[int, float] = {}  # of images by their stamps
         self._links: dict[int, int] = {}
+        self._pairs = frozenset[Pair]()  # of sessions that are joined
         self._decision: Decision | None = None
         self._taken = np.zeros(0, bool)
         self._solutions: list[tuple[np.ndarray, np.ndarray, int]] = []
@@ -184,8 +183,7 @@ class PoseGraph:
                 self._update(final)
             else:
                 self.solved = extended(self.chain, self.solved, self._links)
-        except (RuntimeError, np.linalg.LinAlgError, FloatingPointError):
-            # GTSAM raises RuntimeError for a system that it cannot solve
+        except (np.linalg.LinAlgError, FloatingPointError):
             failed = len(self._known) - self._solved_closures
             if not failed:
                 raise
@@ -209,8 +207,33 @@ class PoseGraph:
                 if not self._search_break():
                     break
             self._searched_at = len(self._known), self.rejected
-        else:
+        elif not self._follow():
             self._decide(False)
+
+    def _follow(self) -> bool:
+        """Add new closures to the estimate if all agree with it; return whether they do."""
+        chain, known = self.chain, len(self._taken)
+        new = self._closures[known:]
+        if not self._edges or len(self._links) < len(chain.starts()):
+            return False
+        initial = extended(chain, self.solved, self._links)
+        if any(
+            a != b and (a, b) not in self._pairs for a, b in session_pairs(chain, new).tolist()
+        ):
+            return False
+        if deviations(initial, new, initial).max(initial=0.0) > AGREES:
+            return False
+        numbers = np.concatenate([np.flatnonzero(self._taken), np.arange(known, known + len(new))])
+        used = [self._closures[i] for i in numbers.tolist()]
+        network = Network(chain, initial, used, self._links)
+        decider = Decider(chain, network, initial, self.settings.measured)
+        independent = np.array([each.is_independent for each in used], bool)
+        counted = decider.counted(np.ones(len(used), bool), independent)
+        values, _, _ = decider.solved(self.scales, network.values(initial), counted)
+        self._taken = np.concatenate([self._taken, np.ones(len(new), bool)])
+        self._edges = {int(i): self._closures[i] for i in numbers[counted]}
+        self.solved = network.nodes(values)
+        return True
 
     def _split(self, found: breaks.Break, begins: bool) -> None:
         if begins:
@@ -278,7 +301,7 @@ class PoseGraph:
             if not few:
                 break
             denied |= few
-        self._decision, self._links = decision, placement.links
+        self._decision, self._links, self._pairs = decision, placement.links, placement.pairs
         self._taken = allowed.copy()
         self._taken[allowed] = decision.taken
         self._solutions = []

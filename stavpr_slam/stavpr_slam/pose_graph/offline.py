@@ -23,7 +23,6 @@ def optimize(
     :param odometry: poses, shape (N, 7).
     :returns: the corrected poses (N, 7), NaN where the graph has no odometry, and the graph.
     :raises InputError: other shapes.
-    :raises UnavailableError: GTSAM is not installed.
     """
     require_shape('odometry', odometry, f'{len(stamps)} 7')
     graph = PoseGraph(settings)

@@ -68,12 +68,12 @@ def place(
             waiting[0],
         )
         votes, others = [], []
-        for each, pair in zip(closures, of_pair.tolist(), strict=True):
-            ends = (each.query, each.place), (each.place, each.query)
-            for (own, other), Z in zip(
-                ends, (each.transform, inverse(each.transform)), strict=True
-            ):
-                if session[own] == number and session[other] in known and (*pair,) in joins:
+        for i in np.flatnonzero((of_pair == number).any(axis=1)).tolist():
+            if (*of_pair[i].tolist(),) in joins:
+                Z, own, other = closures[i].transform, closures[i].query, closures[i].place
+                if session[own] != number:
+                    Z, own, other = inverse(Z), other, own
+                if session[other] in known:
                     votes.append(result[other] @ Z @ inverse(T[own]))
                     others.append(other)
         mine, node = session == number, starts[number]

@@ -35,7 +35,6 @@ from stavpr_ros.ros.navigation import tf_message
 from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings
-from stavpr_slam.pose_graph.network import load_gtsam
 from stavpr_slam.ros.correction import LEVER, LimitedCorrection
 from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
 from stavpr_slam.ros.graph_process import GraphProcess, RobotOdometry, Snapshot
@@ -86,7 +85,7 @@ class PoseGraphNode(ManagedNode):
     A lifecycle node. The graph is in a process of its own; callbacks hand over, and publish the
     newest odometry in the map frame.
 
-    :raises StavprError: an invalid parameter, or GTSAM is not installed.
+    :raises StavprError: an invalid parameter.
     """
 
     THREADS = 5
@@ -108,7 +107,6 @@ class PoseGraphNode(ManagedNode):
             raise SettingsError(f'max_correction_speed = {self._speed}: expected 0 or more m/s')
         if len({*self._robots}) < max(len(self._robots), 1):
             raise SettingsError(f'robots = {self._robots}: expected different names, or one ""')
-        load_gtsam()
         gc.freeze()  # collecting what is imported would take .15 s, without any odometry
         keyframes = ChainSettings(given['keyframe_distance'], max_gap=given['max_odometry_gap'])
         self._settings = GraphSettings(keyframes)

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The pose graph in a process of its own, since GTSAM keeps the interpreter lock while it solves.
+The pose graph in a process of its own, so that no odometry waits while it solves.
 
 Nothing here imports ROS. The parent sends the arguments of :meth:`GraphServer.serve`, and the
 child returns a :class:`Snapshot`.
@@ -188,7 +188,7 @@ def run_server(connection: Connection, parent: int, *given: Any) -> None:
     """Serve requests until the parent has ended; in the child."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal, which the parent obeys
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    if sys.platform == 'linux':  # GTSAM may solve for long before the end of the pipe is noticed
+    if sys.platform == 'linux':  # a solution may last long before the end of the pipe is noticed
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL))
     if os.getppid() != parent:
         return

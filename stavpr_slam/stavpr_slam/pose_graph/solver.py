@@ -1,0 +1,430 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Steps of Gauss and Newton on rigid motions: factors, and a sparse Cholesky decomposition by blocks.
+
+A factor is a motion Z measured between two poses; its error is the logarithm of the inverse of Z
+and their motion, and a step is a twist in the axes of the pose. Poses in the plane have the
+three elements of a twist that are in it.
+"""
+
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+from scipy.sparse import coo_matrix, eye_array
+from scipy.sparse.linalg import splu
+from stavpr_ros.compilation import kernel
+
+SMALL = 1e-5  # radians: of a rotation whose series are cut after two terms
+SERIES = 1e-2  # radians: the same of the derivative of the logarithm
+SPARE = 1.25  # times the active factors: a pattern of so many is used again
+
+
+@kernel
+def _between(a, b, result):
+    """Write the inverse of a transform times another."""
+    for i in range(3):
+        result[i, 3] = 0.0
+        for j in range(3):
+            result[i, j] = a[0, i] * b[0, j] + a[1, i] * b[1, j] + a[2, i] * b[2, j]
+            result[i, 3] += a[j, i] * (b[j, 3] - a[j, 3])
+
+
+@kernel
+def _logarithm(T, twist):
+    """Write the logarithm of a transform, rotation first."""
+    x, y, z = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
+    trace = T[0, 0] + T[1, 1] + T[2, 2]
+    w = 1 + trace
+    if trace < 0:  # four times a component of the quaternion that is not small, and the others
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            if T[i, i] >= T[j, j] and T[i, i] >= T[k, k]:
+                own = (x, y, z)[i]
+                x, y, z = T[0, i] + T[i, 0], T[1, i] + T[i, 1], T[2, i] + T[i, 2]
+                whole = 1 + T[i, i] - T[j, j] - T[k, k]
+                x, y, z = (whole, y, z) if i == 0 else (x, whole, z) if i == 1 else (x, y, whole)
+                w = own
+                break
+    length = math.sqrt(x * x + y * y + z * z)
+    if w < 0:
+        x, y, z, w = -x, -y, -z, -w
+    angle = 2 * math.atan2(length, w)
+    factor = angle / length if length > SMALL else 2 / w
+    x, y, z = factor * x, factor * y, factor * z
+    half = angle / 2
+    rest = (1 - half / math.tan(half)) / angle**2 if angle > SMALL else 1 / 12
+    a, b, c = T[0, 3], T[1, 3], T[2, 3]
+    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
+    twist[0], twist[1], twist[2] = x, y, z
+    twist[3] = a - p / 2 + rest * (y * r - z * q)
+    twist[4] = b - q / 2 + rest * (z * p - x * r)
+    twist[5] = c - r / 2 + rest * (x * q - y * p)
+
+
+@kernel
+def _moved(T, twist, result):
+    """Write a transform times the exponential of a twist."""
+    x, y, z = twist[0], twist[1], twist[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    once, twice, third = 1.0, 0.5, 1 / 6
+    if angle > SMALL:
+        once = math.sin(angle) / angle
+        twice = (1 - math.cos(angle)) / angle**2
+        third = (1 - once) / angle**2
+    a, b, c = twist[3], twist[4], twist[5]
+    p, q, r = y * c - z * b, z * a - x * c, x * b - y * a
+    local = (
+        (1 - twice * (y * y + z * z), twice * x * y - once * z, twice * x * z + once * y,
+         a + twice * p + third * (y * r - z * q)),
+        (twice * x * y + once * z, 1 - twice * (x * x + z * z), twice * y * z - once * x,
+         b + twice * q + third * (z * p - x * r)),
+        (twice * x * z - once * y, twice * y * z + once * x, 1 - twice * (x * x + y * y),
+         c + twice * r + third * (x * q - y * p)),
+    )  # fmt: skip
+    for i in range(3):
+        for j in range(4):
+            result[i, j] = T[i, 3] * (j == 3)
+            for k in range(3):
+                result[i, j] += T[i, k] * local[k][j]
+    result[3, :3], result[3, 3] = 0.0, 1.0
+
+
+@kernel
+def _derivative(twist, derivative):
+    """
+    Write the derivative of the logarithm of a transform by a twist behind it, (6, 6).
+
+    It is x / (1 - exp(-x)) of x = ad(twist), whose eigenvalues are 0 and +-i angle, each twice.
+    """
+    x, y, z = twist[0], twist[1], twist[2]
+    ad = np.zeros((6, 6))
+    for a in range(0, 6, 3):
+        for b in range(0, a + 3, 3):
+            u, v, w = twist[a - b], twist[a - b + 1], twist[a - b + 2]
+            ad[a, b + 1], ad[a, b + 2], ad[a + 1, b + 2] = -w, v, -u
+            ad[a + 1, b], ad[a + 2, b], ad[a + 2, b + 1] = w, -v, u
+    angle = math.sqrt(x * x + y * y + z * z)
+    second, fourth = 1 / 12, -1 / 720
+    if angle > SERIES:
+        half = angle / 2
+        even = half / math.tan(half)
+        slope = even / angle - half / 2 / math.sin(half) ** 2
+        fourth = (1 + slope * half - even) / angle**4
+        second = 2 * fourth * angle**2 - slope / angle / 2
+    twice = ad @ ad
+    derivative[:] = np.eye(6) + ad / 2 + second * twice + fourth * (twice @ twice)
+
+
+@kernel
+def linearized(poses, ends, motions, information, at, errors, jacobians, local, squared):
+    """
+    Write the errors of factors, their derivatives by the first pose, and the squared deviations.
+
+    :param ends: first and second pose of each factor, (m, 2); the first is -1 for the origin.
+    :param at: d elements of a twist that are variables.
+    :param jacobians, local: written, (m, d, d): derivatives, and information, of a twist of the
+        second pose. The error is the same as a twist: it is an eigenvector of its derivative.
+    """
+    d = len(at)
+    origin, step, off, twist = np.eye(4), np.eye(4), np.eye(4), np.zeros(6)
+    adjoint, derivative, own = np.zeros((6, 6)), np.zeros((6, 6)), np.empty((d, d))
+    for f in range(len(ends)):
+        i, j = ends[f]
+        _between(origin if i < 0 else poses[i], poses[j], step)
+        _between(motions[f], step, off)
+        _logarithm(off, twist)
+        x, y, z = step[0, 3], step[1, 3], step[2, 3]
+        for a in range(3):
+            u, v, w = step[0, a], step[1, a], step[2, a]
+            adjoint[a, 0] = adjoint[a + 3, 3] = -u
+            adjoint[a, 1] = adjoint[a + 3, 4] = -v
+            adjoint[a, 2] = adjoint[a + 3, 5] = -w
+            adjoint[a + 3, 0] = v * z - w * y
+            adjoint[a + 3, 1] = w * x - u * z
+            adjoint[a + 3, 2] = u * y - v * x
+        _derivative(twist, derivative)
+        squared[f] = 0.0
+        for a in range(d):
+            errors[f, a] = twist[at[a]]
+            for b in range(d):
+                jacobians[f, a, b] = adjoint[at[a], at[b]]
+                own[a, b] = derivative[at[a], at[b]]
+        local[f] = own.T @ information[f] @ own
+        for a in range(d):
+            for b in range(d):
+                squared[f] += information[f, a, b] * errors[f, a] * errors[f, b]
+
+
+@kernel
+def _add(A, scale, B, C, turned):
+    """Add a scaled product of blocks to another one, or its transpose."""
+    d = len(A)
+    for a in range(d):
+        for b in range(d):
+            total = 0.0
+            for c in range(d):
+                total += B[a, c] * C[c, b]
+            if turned:
+                A[b, a] += scale * total
+            else:
+                A[a, b] += scale * total
+
+
+@kernel
+def _assemble(ends, slots, errors, jacobians, information, weights, blocks, gradient):
+    """Write the normal equations; slots: the block of the second pose, the first, and both."""
+    blocks[:], gradient[:] = 0.0, 0.0
+    d = errors.shape[1]
+    one, left, pull = np.eye(d), np.empty((d, d)), np.empty(d)
+    for f in range(len(ends)):
+        w = weights[f]
+        if w == 0.0:
+            continue
+        i, j = ends[f]
+        own, other, both, turned = slots[f]
+        for a in range(d):
+            pull[a] = 0.0
+            for b in range(d):
+                pull[a] -= w * information[f, a, b] * errors[f, b]
+                blocks[own, a, b] += w * information[f, a, b]
+            gradient[j, a] += pull[a]
+        if i >= 0:
+            left[:] = 0.0
+            _add(left, w, information[f], jacobians[f], False)
+            _add(blocks[both], 1.0, left, one, turned == 1)
+            _add(blocks[other], 1.0, jacobians[f].T, left, False)
+            for a in range(d):
+                for b in range(d):
+                    gradient[i, b] += pull[a] * jacobians[f, a, b]
+
+
+@kernel
+def _root(A):
+    """Decompose a block in place; return the logarithm of its determinant, NaN = it has none."""
+    determinant = 0.0
+    for a in range(len(A)):
+        for b in range(a):
+            for c in range(b):
+                A[a, b] -= A[a, c] * A[b, c]
+            A[a, b] /= A[b, b]
+            A[b, a] = 0.0
+        for c in range(a):
+            A[a, a] -= A[a, c] ** 2
+        if not A[a, a] > 0:
+            return np.nan
+        A[a, a] = math.sqrt(A[a, a])
+        determinant += math.log(A[a, a])
+    return determinant
+
+
+@kernel
+def _decompose(starts, rows, blocks):
+    """
+    Decompose the lower half of a matrix, by columns of blocks, in place (left-looking Cholesky).
+
+    :returns: the logarithm of the determinant of the result; NaN = it is not positive definite.
+    """
+    count, d = len(starts) - 1, blocks.shape[1]
+    head, link, first = np.full(count, -1), np.full(count, -1), starts[:-1].copy()
+    where, determinant = np.zeros(count, np.int64), 0.0
+    for j in range(count):
+        for p in range(starts[j], starts[j + 1]):
+            where[rows[p]] = p
+        k = head[j]
+        while k >= 0:  # columns that have a block in this row
+            following = link[k]
+            for p in range(first[k], starts[k + 1]):
+                _add(blocks[where[rows[p]]], -1.0, blocks[p], blocks[first[k]].T, False)
+            _queue(k, starts, rows, head, link, first)
+            k = following
+        determinant += _root(blocks[starts[j]])
+        for p in range(starts[j] + 1, starts[j + 1]):
+            for a in range(d):
+                for b in range(d):
+                    for c in range(b):
+                        blocks[p, a, b] -= blocks[p, a, c] * blocks[starts[j], b, c]
+                    blocks[p, a, b] /= blocks[starts[j], b, b]
+        _queue(j, starts, rows, head, link, first)
+    return determinant
+
+
+@kernel
+def _queue(k, starts, rows, head, link, first):
+    """Note a column for the row of its next block."""
+    first[k] += 1
+    if first[k] < starts[k + 1]:
+        row = rows[first[k]]
+        link[k], head[row] = head[row], k
+
+
+@kernel
+def _substitute(starts, rows, blocks, x):
+    """Solve the decomposed equations in place, x of shape (count, d) in the order of columns."""
+    count, d = x.shape
+    for j in range(count):
+        for a in range(d):
+            for c in range(a):
+                x[j, a] -= blocks[starts[j], a, c] * x[j, c]
+            x[j, a] /= blocks[starts[j], a, a]
+        for p in range(starts[j] + 1, starts[j + 1]):
+            for a in range(d):
+                for c in range(d):
+                    x[rows[p], a] -= blocks[p, a, c] * x[j, c]
+    for j in range(count - 1, -1, -1):
+        for p in range(starts[j] + 1, starts[j + 1]):
+            for c in range(d):
+                for a in range(d):
+                    x[j, c] -= blocks[p, a, c] * x[rows[p], a]
+        for a in range(d - 1, -1, -1):
+            for c in range(a + 1, d):
+                x[j, a] -= blocks[starts[j], c, a] * x[j, c]
+            x[j, a] /= blocks[starts[j], a, a]
+
+
+@kernel
+def _solved(
+    poses, ends, errors, jacobians, information, weights, at, order, slots, starts, rows, result
+):
+    """Write the poses after a step, and return the logarithm of the determinant."""
+    d = len(at)
+    blocks, gradient = np.empty((len(rows), d, d)), np.empty((len(poses), d))
+    _assemble(ends, slots, errors, jacobians, information, weights, blocks, gradient)
+    determinant = _decompose(starts, rows, blocks)
+    if np.isnan(determinant):
+        return determinant
+    x, twist = gradient[order], np.zeros(6)
+    _substitute(starts, rows, blocks, x)
+    for k in range(len(order)):
+        for a in range(d):
+            twist[at[a]] = x[k, a]
+        _moved(poses[order[k]], twist, result[order[k]])
+    return determinant
+
+
+@kernel
+def _filled(first, below, starts):
+    """
+    Return the rows of the blocks of a decomposition, by columns, and write where each one begins.
+
+    :param first, below: rows below the diagonal of each column of the matrix, likewise.
+    """
+    count = len(first) - 1
+    rows, used = np.empty(4 * (len(below) + count), np.int64), 0
+    seen, head, link = np.full(count, -1), np.full(count, -1), np.full(count, -1)
+    for j in range(count):
+        while used + count > len(rows):
+            rows = np.append(rows, np.empty_like(rows))
+        starts[j] = used
+        rows[used], seen[j] = j, j
+        used += 1
+        child = -2  # the column itself, then those whose first row below the diagonal it is
+        while child != -1:
+            begin, end = (
+                (first[j], first[j + 1]) if child < 0 else (starts[child], starts[child + 1])
+            )
+            for p in range(begin, end):
+                row = below[p] if child < 0 else rows[p]
+                if row > j and seen[row] != j:
+                    rows[used], seen[row] = row, j
+                    used += 1
+            child = head[j] if child < 0 else link[child]
+        rows[starts[j] : used].sort()
+        starts[j + 1] = used
+        if used > starts[j] + 1:
+            parent = rows[starts[j] + 1]
+            link[j], head[parent] = head[parent], j
+    return rows[:used]
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """
+    Where the decomposition has blocks, for some of the factors.
+
+    :param order: the poses in the order of elimination, (V,).
+    :param starts, rows: blocks of each column, the diagonal first, as in a CSC matrix.
+    :param slots: blocks of each factor: second pose, first pose, both, and whether turned, (m, 4).
+    """
+
+    active: np.ndarray
+    order: np.ndarray
+    starts: np.ndarray
+    rows: np.ndarray
+    slots: np.ndarray
+
+    @classmethod
+    def of(cls, ends: np.ndarray, count: int, active: np.ndarray) -> 'Pattern':
+        """Order by minimum degree, as SuperLU does."""
+        i, j = ends[active & (ends[:, 0] >= 0)].T
+        graph = coo_matrix((np.full(len(i), -1.0), (i, j)), (count, count))
+        graph = graph + graph.T
+        graph = (graph + eye_array(count) * (1 - graph.sum(axis=0).min())).tocsc()
+        options = {'SymmetricMode': True}
+        place = splu(graph, 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, options=options).perm_c
+        starts = np.zeros(count + 1, np.int64)
+        first, second = place[i], place[j]
+        column, row = np.minimum(first, second), np.maximum(first, second)
+        by_column = np.argsort(column, kind='stable')
+        rows = _filled(
+            np.searchsorted(column[by_column], np.arange(count + 1)), row[by_column], starts
+        )
+        keys = np.repeat(np.arange(count), np.diff(starts)) * count + rows
+        first, second = place[ends[:, 0]], place[ends[:, 1]]
+        column, row = np.minimum(first, second), np.maximum(first, second)
+        both = np.searchsorted(keys, column * count + row)
+        slots = np.stack([starts[second], starts[first], both, first > second], axis=1)
+        return cls(active, np.argsort(place), starts, rows, slots.astype(np.int64))
+
+
+@dataclass(eq=False)
+class Solver:
+    """
+    Solves for poses by factors.
+
+    :param ends, motions: as in :func:`linearized`, (m, 2) and (m, 4, 4).
+    :param at: as in :func:`linearized`.
+    """
+
+    ends: np.ndarray
+    motions: np.ndarray
+    at: np.ndarray
+    _patterns: list[Pattern] = field(default_factory=list)
+
+    def squared(self, poses: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """Return the squared deviations of all factors, (m,), and keep their derivatives."""
+        count, d = len(self.ends), len(self.at)
+        self._errors, self._local = np.empty((count, d)), np.empty((count, d, d))
+        self._jacobians = np.empty((count, d, d))
+        result = np.empty(count)
+        linearized(
+            poses, self.ends, self.motions, information, self.at, self._errors, self._jacobians,
+            self._local, result,
+        )  # fmt: skip
+        return result
+
+    def step(self, poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+        """
+        Return the poses after a step from those that were linearized at last.
+
+        :param weights: of the factors, (m,).
+        :returns: and the logarithm of the determinant of the square root of the information.
+        :raises LinAlgError: the poses have no unique solution.
+        """
+        used, result = self._pattern(weights > 0, len(poses)), np.empty_like(poses)
+        determinant = _solved(
+            poses, self.ends, self._errors, self._jacobians, self._local, weights, self.at,
+            used.order, used.slots, used.starts, used.rows, result,
+        )  # fmt: skip
+        if not math.isfinite(determinant) or not np.isfinite(result).all():
+            raise np.linalg.LinAlgError('the pose graph has no unique solution')
+        return result, determinant
+
+    def _pattern(self, active: np.ndarray, count: int) -> Pattern:
+        most = SPARE * active.sum()
+        for each in self._patterns:
+            if not (active & ~each.active).any() and each.active.sum() <= most:
+                return each
+        self._patterns = [Pattern.of(self.ends, count, active), *self._patterns[:3]]
+        return self._patterns[0]

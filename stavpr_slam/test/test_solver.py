@@ -1,0 +1,93 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of the pose graph's solver, beside a dense solution whose derivatives are differences."""
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from stavpr_ros.mapping.transforms import inverse
+from stavpr_slam.pose_graph.solver import Solver
+from stavpr_slam.pose_graph.transforms import exponentials, logarithms
+
+PLANAR, SPATIAL = np.array([3, 4, 2]), np.arange(6)
+N = 12
+
+
+def random_motions(rng, count, at, turn):
+    twists = np.zeros((count, 6))
+    twists[:, at] = rng.normal(0, 1, (count, len(at)))
+    twists[:, :3] *= turn
+    twists[:, 3:] *= 5
+    return exponentials(twists)
+
+
+def graph_of(at, turn):
+    """Return ends, motions, information and poses: the first one is tied to the origin."""
+    rng = np.random.default_rng(len(at))
+    chain = np.stack([np.arange(-1, N - 1), np.arange(N)], axis=1)
+    ends = np.concatenate([chain, [[0, 7], [9, 2], [11, 3], [5, 11]]])
+    motions = random_motions(rng, len(ends), at, turn)
+    root = rng.normal(0, 1, (len(ends), len(at), len(at)))
+    information = root @ root.transpose(0, 2, 1) + np.eye(len(at))
+    return ends, motions, information, random_motions(rng, N, at, turn)
+
+
+def errors_of(ends, motions, poses):
+    first = np.where(ends[:, 0, None, None] < 0, np.eye(4), poses[ends[:, 0]])
+    return logarithms(inverse(motions) @ inverse(first) @ poses[ends[:, 1]])
+
+
+def moved(poses, x, at):
+    twists = np.zeros((N, 6))
+    twists[:, at] = x.reshape(N, -1)
+    return poses @ exponentials(twists)
+
+
+@pytest.mark.parametrize('at', [PLANAR, SPATIAL])
+@pytest.mark.parametrize('turn', [1e-4, 0.1, 0.8])
+def test_step_is_that_of_gauss_and_newton(at, turn):
+    """Also where errors turn far: closures that are false."""
+    ends, motions, information, poses = graph_of(at, turn)
+    weights = np.ones(len(ends))
+    weights[-2:] = 0.3, 0.0
+    solver = Solver(ends, motions, at)
+    squared = solver.squared(poses, information)
+    errors = errors_of(ends, motions, poses)[:, at]
+    np.testing.assert_allclose(
+        squared, np.einsum('ni,nij,nj->n', errors, information, errors), rtol=1e-6, atol=1e-9
+    )
+    size, h = N * len(at), 1e-6
+    J = np.empty((errors.size, size))
+    for k in range(size):
+        ahead, behind = (
+            errors_of(ends, motions, moved(poses, sign * h * np.eye(size)[k], at))[:, at]
+            for sign in (1, -1)
+        )
+        J[:, k] = ((ahead - behind) / (2 * h)).ravel()
+    W = block_diag(*(weights[:, None, None] * information))
+    expected = moved(poses, -np.linalg.solve(J.T @ W @ J, J.T @ W @ errors.ravel()), at)
+    result, determinant = solver.step(poses, weights)
+    np.testing.assert_allclose(result, expected, atol=1e-4)
+    assert determinant == pytest.approx(np.linalg.slogdet(J.T @ W @ J)[1] / 2, abs=1e-5)
+
+
+def test_pattern_of_more_factors_is_used_again():
+    ends, motions, information, poses = graph_of(SPATIAL, 0.1)
+    solver, weights = Solver(ends, motions, SPATIAL), np.ones(len(ends))
+    solver.squared(poses, information)
+    solver.step(poses, weights)
+    weights[-1] = 0
+    again, _ = solver.step(poses, weights)
+    fresh = Solver(ends, motions, SPATIAL)
+    fresh.squared(poses, information)
+    np.testing.assert_allclose(again, fresh.step(poses, weights)[0], atol=1e-9)
+    assert (len(solver._patterns), len(fresh._patterns)) == (1, 1)
+
+
+def test_pose_without_factors_has_no_solution():
+    ends, motions, information, poses = graph_of(PLANAR, 0.1)
+    solver, weights = Solver(ends, motions, PLANAR), np.ones(len(ends))
+    weights[(ends == N - 1).any(axis=1)] = 0.0
+    solver.squared(poses, information)
+    with pytest.raises(np.linalg.LinAlgError, match='no unique solution'):
+        solver.step(poses, weights)
