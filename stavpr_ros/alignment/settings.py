@@ -41,6 +41,11 @@ class SpatialSettings:
                 f'strategy {self.strategy!r} has no vertical alignment: take adaptive or vanilla'
             )
 
+    @property
+    def aligns_strips(self) -> bool:
+        """Whether strips are aligned as they are, by DTW."""
+        return self.strategy in ('adaptive', 'vanilla') and not self.vertical
+
     def band(self, W: int) -> int:
         """Return the half width of the allowed band, xi or W; refuse xi > W."""
         if self.xi is None:

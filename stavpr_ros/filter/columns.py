@@ -80,6 +80,8 @@ class ColumnLayout:
         self._same_as = same_as
         self._shared = np.arange(self._width)  # column where the position's probability is summed
         self._shared[self.columns] = self.columns[same_as[self._places]]
+        self._by_position = self.columns[np.argsort(self._shared[self.columns], kind='stable')]
+        self._positions = self._shared[self._by_position]
         self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
 
     def passes(self, places: int) -> int:
@@ -183,15 +185,23 @@ class ColumnLayout:
         """Return the columns of positions near a column's, as first ones and ends, (m, 2)."""
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
-        positions = self._shared[self.columns]
-        own = positions[int(self.pass_before(np.array(column)))]
-        near = self.columns[self._apart(positions, own) <= radius]
+        own = self._shared[self.columns[int(self.pass_before(np.array(column)))]]
+        near = self._columns_near(np.array([own]), radius)
         runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
         return np.array([[run[0], run[-1] + 1] for run in runs])
 
-    def _apart(self, positions: np.ndarray, position: int) -> np.ndarray:
-        """Return how far positions are from one, on a closed route by the shorter arc."""
-        apart = np.abs(positions - position)
+    def _columns_near(self, positions: np.ndarray, radius: int) -> np.ndarray:
+        """Return the columns of positions near any of those, ascending."""
+        if self.lap:
+            positions = np.concatenate([positions - self.lap, positions, positions + self.lap])
+        firsts = np.searchsorted(self._positions, positions - radius)
+        ends = np.searchsorted(self._positions, positions + radius, 'right')
+        parts = [self._by_position[low:end] for low, end in zip(firsts, ends, strict=True)]
+        return np.unique(np.concatenate(parts))
+
+    def _apart(self, positions: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """Return how far positions are from others, on a closed route by the shorter arc."""
+        apart = np.abs(positions - others)
         return np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
 
     def merge_sessions(
@@ -210,22 +220,16 @@ class ColumnLayout:
             places, probabilities = belief.probabilities(n)
             own_states = np.ones(len(places), bool)
             return places, probabilities, own_states, int(np.argmax(probabilities))
-        weights, own = np.zeros(self._width), np.zeros(self._width)
-        weights[belief.places] = belief.weights
+        positions = self._shared[belief.places]
+        columns = self._columns_near(np.unique(positions), CLOSE)
+        shared, own = self._shared[columns], np.zeros(len(columns))
         near, probabilities_near = belief.probabilities(self._width)
-        own[near] = probabilities_near
-        of_position = np.bincount(self._shared, weights, self._width)
-        around = np.pad(of_position, CLOSE)
-        if self.lap:  # its first positions are close to its last ones
-            around[:CLOSE] = of_position[self.lap - CLOSE : self.lap]
-            around[self.lap + CLOSE : self.lap + 2 * CLOSE] = of_position[:CLOSE]
-        sums = np.append(0.0, np.cumsum(around))
-        of_position = np.minimum(sums[2 * CLOSE + 1 :] - sums[: -2 * CLOSE - 1], 1)
-        probabilities = of_position[self._shared]
+        is_place, at = np.isin(near, columns), np.searchsorted(columns, near)
+        own[at[is_place]] = probabilities_near[is_place]
+        is_close = self._apart(shared[:, None], positions) <= CLOSE
+        probabilities = np.minimum(is_close @ belief.weights, 1)
         best = int(np.argmax(probabilities))
-        at_position = self._apart(self._shared, self._shared[best]) <= CLOSE
-        column = int(np.argmax(np.where(at_position, own, 0)))
-        probabilities[column] = probabilities[best]
-        columns = np.flatnonzero(probabilities)
-        index = int(np.searchsorted(columns, column))
-        return columns, probabilities[columns], own[columns] > 0, index
+        at_position = self._apart(shared, shared[best]) <= CLOSE
+        index = int(np.argmax(np.where(at_position, own, 0)))
+        probabilities[index] = probabilities[best]
+        return columns, probabilities, own > 0, index

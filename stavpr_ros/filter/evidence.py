@@ -42,7 +42,7 @@ MIN_RECENT = 0.04  # a drive that comes to the map late is recognized there
 FIRST, LAST = 8, 108  # windows that count as the mean .5 at first, and that the mean goes back
 FAR = np.float32(1)  # z beside the map, and of places that are not compared
 INF = np.float32(np.inf)
-CHUNK = 1024  # places whose sums stay in the cache
+CHUNK = 128  # places whose sums are computed together
 
 
 class RecentMean:
@@ -111,6 +111,9 @@ def best_elsewhere(
     flat, least = memory.reshape(-1), infinite
     for start in range(0, n, CHUNK):
         count = min(CHUNK, n - start)
+        newest = rows[-1] * memory.shape[1] + start
+        if not (flat[newest : newest + count] < INF).any():
+            continue
         for v in range(len(steps)):
             sums[:count], sums[count:] = 0, INF
             for i in range(images):

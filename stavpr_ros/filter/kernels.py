@@ -219,6 +219,15 @@ def _scratch(size):
     return memory[first : first + size]
 
 
+@kernel
+def _copy_halo(states, part, rows, reach, halos):
+    """Copy the last columns before a part."""
+    for row in range(rows):
+        before = ((part * PLACES // BLOCK - 1) * rows + row + 1) * BLOCK - reach
+        for x in range(0, reach, LANES):
+            store(halos, (part * rows + row) * reach + x, load(states, before + x))
+
+
 @parallel_kernel
 def advance(
     a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, entering, halos, origins,
@@ -229,7 +238,8 @@ def advance(
 
     :param a: states, (blocks, K, V, BLOCK), read and written; 0 from place n on.
     :param n: places, at least 1.
-    :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level.
+    :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level;
+        blocks without states, whose places are all excluded by +inf, are skipped.
     :param levels, speeds: see :func:`_mix`.
     :param steps: places that each speed moves on, (V,).
     :param spread: probability of one place more, and of one less, never back.
@@ -238,7 +248,7 @@ def advance(
     :param halos: (parts, K, V, reach), scratch; zeros in the first. Reach is of whole vectors.
     :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written.
     :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
-        block, (blocks,); written.
+        block, (blocks,); read and written.
     :returns: sums before the motion, of the states that moved over the end of the map, and with
         the image, (3, K).
     """
@@ -248,10 +258,7 @@ def advance(
     totals = np.empty(((n + BLOCK - 1) // BLOCK, 3, K))
     states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
     for part in range(1, parts):  # too little work to share
-        for row in range(K * V):
-            before = ((part * PLACES // BLOCK - 1) * K * V + row + 1) * BLOCK - reach
-            for x in range(0, reach, LANES):
-                store(flat_halos, (part * K * V + row) * reach + x, load(states, before + x))
+        _copy_halo(states, part, K * V, reach, flat_halos)
     for part in nb.prange(parts):
         mixed, places = _scratch(K * V * width), _scratch(BLOCK)
         likely, b = _scratch(K * BLOCK).reshape(K, BLOCK), _scratch((V + 1) * LANES)
@@ -261,6 +268,10 @@ def advance(
             first = part * PLACES + block * BLOCK
             count, at = min(BLOCK, n - first), first // BLOCK
             whole = (count + LANES - 1) // LANES * LANES
+            is_empty = weight != 0 and maxima[at] == 0 and first + count < n
+            if is_empty and not (z[first : first + count] < np.inf).any():
+                totals[at] = 0
+                continue
             _likelihoods(z, first, count, weight, mu, likely)
             for own in range(2):  # the columns before the block, and its own
                 source, pitch, from_, mixed_at, columns = states, BLOCK, at * size, reach, whole

@@ -159,6 +159,7 @@ class PlaceFilter(Filter):
         gaps = self._gaps // BLOCK, slice(None), slice(None), self._gaps % BLOCK
         if not self.count and n:
             self._a[: -(-n // BLOCK)] = s.start / (len(self._levels) * states)
+            self._maxima[:] = s.start
             self._a[gaps] = 0
             self._off[:] = (1 - s.start) / len(self._levels)
         if not self.count or n < self._known:

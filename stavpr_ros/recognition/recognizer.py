@@ -20,9 +20,11 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.prepare.blocks import blocks
+from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
+from stavpr_ros.prepare.several_sessions import SeveralSessions
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import (
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 
 EARLY = 0.95  # minimum probability of a match by the newest images alone
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
+MANY = 2  # places of a position, in the mean: more are not all compared
 TIMED = 3  # images, to compare the time of one with the time budget
 
 
@@ -364,6 +367,12 @@ class PlaceRecognizer(SequenceRecognizer):
                     "the first stage is of backend 'cpu'; take that, or 0"
                 )
             self._keep_time_budget(prepared.features, features[:1])
+        same_as, matcher = place_map.same_as, self._matcher
+        is_many = same_as is not None and len(same_as) > MANY * len(np.unique(same_as))
+        is_filtered = isinstance(self._window, FilterWindow) and settings.spatial.aligns_strips
+        if same_as is not None and is_many and is_filtered and isinstance(matcher, CpuMatcher):
+            arguments = self._window.layout.runs, same_as, self.place_probabilities
+            self._matcher = SeveralSessions(matcher, *arguments)
 
     def set_limits(
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
@@ -388,7 +397,6 @@ class PlaceRecognizer(SequenceRecognizer):
         budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
         text = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
         if exact > budget:
-            from stavpr_ros.prepare.cpu_matcher import CpuMatcher
             from stavpr_ros.prepare.first_stage import FirstStage
 
             assert isinstance(self._matcher, CpuMatcher)

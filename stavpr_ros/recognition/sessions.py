@@ -54,9 +54,13 @@ def in_places(match: WindowMatch, layout: ColumnLayout, nms_radius: int) -> Wind
         return match
 
     def sequences() -> WindowSequences:
-        return in_columns._replace(places=layout.names_of(in_columns.places))
+        costs, columns, probabilities = in_columns
+        if probabilities is not None:
+            probabilities = probabilities[possible]
+        return WindowSequences(costs[possible], layout.names_of(columns[possible]), probabilities)
 
     in_columns = match.sequences()
+    possible = np.isfinite(in_columns.costs)
     columns = np.array([match.nearest.first, match.nearest.last, match.nearest.middle])
     first, last, middle = layout.names_of(columns).tolist()
     best = Candidate(middle, match.nearest.distance)

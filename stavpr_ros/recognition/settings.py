@@ -90,8 +90,7 @@ class RecognizerSettings:
                 f'direction = both is of mode robust: in mode {self.mode}, sequences of the map '
                 'are along it; take forward'
             )
-        with_dtw = self.spatial.strategy in ('adaptive', 'vanilla') and not self.spatial.vertical
-        if self.time_budget_ms and not (self.has_probability and with_dtw):
+        if self.time_budget_ms and not (self.has_probability and self.spatial.aligns_strips):
             raise SettingsError(
                 f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
                 'strategy adaptive or vanilla, without vertical alignment; take 0'
