@@ -239,6 +239,7 @@ class FeatureExtractor:
         :returns: local features of shape (W, len(images), d).
         :raises ImageError: the features are not finite.
         """
+        images = [np.ascontiguousarray(image) for image in images]  # views as well
         strips, cells = self._cut(self._backbone.feature_maps(images))
         if not np.isfinite(strips).all():
             raise ImageError(
