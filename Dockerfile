@@ -20,6 +20,7 @@ COPY package.xml src/stavpr_ros/
 COPY stavpr_msgs/package.xml src/stavpr_ros/stavpr_msgs/
 COPY stavpr_fleet/package.xml src/stavpr_ros/stavpr_fleet/
 COPY stavpr_slam/package.xml src/stavpr_ros/stavpr_slam/
+COPY stavpr_nav/package.xml src/stavpr_ros/stavpr_nav/
 COPY requirements/robot.txt src/stavpr_ros/requirements/
 
 # Versions are those of the distribution, which changes them for security fixes only.

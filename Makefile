@@ -25,11 +25,11 @@ SETUP = $(PYTHON) -E tools/setup_venv.py
 RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
 LEARNED = $(filter learned hybrid efficientnet_lite1,$(FEATURES))
-TESTS := test stavpr_fleet/test stavpr_slam/test stavpr_lab/test
+TESTS := test stavpr_fleet/test stavpr_slam/test stavpr_nav/test stavpr_lab/test
 PYTEST = pytest -n 2 --dist loadfile $(TESTS)
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN)
 # Package and least percentage of its lines and branches that the tests reach.
-COVERAGE := stavpr_ros:95 stavpr_fleet:93 stavpr_slam:88 stavpr_lab:91
+COVERAGE := stavpr_ros:95 stavpr_fleet:93 stavpr_slam:88 stavpr_nav:88 stavpr_lab:91
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 

@@ -24,7 +24,7 @@ from setuptools import find_packages, setup
 
 MANIFEST = ElementTree.parse('package.xml')
 NAME = 'stavpr_ros'
-SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
 WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(sys.argv)
 
 # Commands of other packages run here as well, if these are installed.
@@ -38,7 +38,7 @@ MESSAGES = 'share/ament_index/resource_index/packages/stavpr_msgs'
 NO_MESSAGES = """
 stavpr_ros needs stavpr_msgs, a package in its folder, where colcon does not search. In the folder
 of the workspace, make links beside it, then build again:
-  ln -s stavpr_ros/stavpr_{msgs,fleet,slam,lab} src/
+  ln -s stavpr_ros/stavpr_{msgs,fleet,slam,nav,lab} src/
 """
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']

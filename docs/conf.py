@@ -8,7 +8,7 @@ import sys
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ('.', 'stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+PACKAGES = ('.', 'stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
 sys.path[:0] = [str(ROOT / folder) for folder in PACKAGES]
 
 project = 'stavpr_ros'

@@ -14,9 +14,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / 'stavpr_ros'
-PACKAGES = ('stavpr_msgs', 'stavpr_ros', 'stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+PACKAGES = ('stavpr_msgs', 'stavpr_ros', 'stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
 """Each may import those before it, except as in BESIDE."""
-BESIDE = {'stavpr_fleet', 'stavpr_slam'}
+BESIDE = {'stavpr_fleet', 'stavpr_slam', 'stavpr_nav'}
 """Packages that do not import each other."""
 FOLDERS = {name: ROOT / name / name for name in PACKAGES[2:]} | {'stavpr_ros': PACKAGE}
 TESTS = {name: ROOT / name / 'test' for name in PACKAGES[2:]} | {'stavpr_ros': ROOT / 'test'}

@@ -23,7 +23,7 @@ from stavpr_ros import plugins
 from stavpr_ros.commands import COMMANDS, stavpr
 
 ROOT = Path(__file__).resolve().parents[1]
-SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
 PACKAGES = {'stavpr_ros': ROOT} | {name: ROOT / name for name in SIBLINGS}
 FOLDERS = [*PACKAGES.values(), ROOT / 'stavpr_msgs']
 EXTRAS = ('onnx', 'hdf5', 'heif', 'faiss', 'fleet', 'ray', 'slam', 'torch', 'video')
@@ -183,7 +183,7 @@ def colcon_arguments(folder: Path) -> list[str]:
 
 
 def test_build_by_colcon_without_messages_names_the_links(sources, tmp_path):
-    links = r'ln -s stavpr_ros/stavpr_{msgs,fleet,slam,lab} src/'
+    links = r'ln -s stavpr_ros/stavpr_{msgs,fleet,slam,nav,lab} src/'
     with pytest.raises(AssertionError, match=links):
         run_setup(sources, *colcon_arguments(tmp_path), prefix='/opt/ros/jazzy')
     assert not list(tmp_path.iterdir())

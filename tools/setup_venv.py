@@ -46,6 +46,7 @@ SOURCES = {
     ),
     'stavpr_fleet': ('stavpr_fleet',),
     'stavpr_slam': ('stavpr_slam',),
+    'stavpr_nav': ('stavpr_nav',),
     'stavpr_lab': ('stavpr_lab',),
 }  # fmt: skip
 

@@ -51,7 +51,7 @@ REPLACEMENTS = WORDS | SPELLINGS
 # Vague words, where terms of the field are exact: path, state, block, except, or a repeated noun.
 VAGUE = re.compile(r'\b(ways?|some|holds?|held|stands?|sees?|seen|th(at|ose) of)\b', re.IGNORECASE)
 MAX_VAGUE, SLACK = 207, 20  # MAX_VAGUE only falls
-INNER = ('stavpr_fleet', 'stavpr_slam', 'stavpr_lab')
+INNER = ('stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
 PACKAGES = ('stavpr_ros', 'stavpr_msgs', *(f'{name}/{name}' for name in INNER))
 AVOIDED = re.compile('|'.join([rf'(?<![^\W_])(?:{"|".join(WORDS)})(?![^\W_])', *SPELLINGS]))
 

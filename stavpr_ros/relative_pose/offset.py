@@ -68,9 +68,14 @@ class Offset:
     similarity: float
 
     @property
+    def is_similar(self) -> bool:
+        """Whether the image is similar to the image of the place."""
+        return self.similarity >= MIN_SIMILARITY
+
+    @property
     def is_valid(self) -> bool:
         """Whether the images determine the shift."""
-        return self.ratio >= MIN_RATIO and self.similarity >= MIN_SIMILARITY
+        return self.is_similar and self.ratio >= MIN_RATIO
 
 
 def describe_columns(image: np.ndarray) -> np.ndarray:

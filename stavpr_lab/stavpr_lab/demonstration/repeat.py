@@ -1,0 +1,290 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Teach and repeat in a simulator: a robot with differential drive on the synthetic street.
+
+The image is rendered where the robot is; recognition, offset and control law get nothing but the
+images. Wheels slip, images arrive late, and single images are lost. Poses are x, y (meters) and
+heading (radians, to the left). ``python3 -m stavpr_lab.demonstration.repeat FOLDER`` drives laps
+by day, at dusk and in the rain, and writes a table and a plot from above.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+import math
+from pathlib import Path
+import sys
+
+import numpy as np
+from stavpr_lab.demonstration.street.laps import RingWorld
+from stavpr_lab.demonstration.street.rendering import render
+from stavpr_lab.demonstration.street.street import CELL
+from stavpr_lab.demonstration.street.surfaces import noise
+from stavpr_lab.demonstration.street.traverses import (
+    AFTERNOON,
+    Conditions,
+    EPOCH,
+    GOOD_LIGHT,
+    LANE,
+    LENGTH,
+    RAINY_DUSK,
+    Traverse,
+)
+from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
+from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
+from stavpr_ros.sources.frame import Frame
+
+RATE, SPEED = 5.0, 2.5  # images per second; m/s of the taught run
+STEP = 0.05  # seconds of the simulation, and of the control
+LATENCY, LOST = (
+    0.15,
+    0.05,
+)  # seconds until an image is processed; share of the images that are lost
+SLIP, SLIP_TURN = 0.05, 0.05  # deviations of the wheels' slip, shares; constant over seconds
+BIAS = 0.01  # rad/m that the robot pulls to the left
+CONVERGENCE = 20.0  # meters at the start that are not counted
+BRAKING, LAG = 5.0, 0.15  # m/s^2; time constant of the drive, seconds
+CONDITIONS = {
+    'day': replace(GOOD_LIGHT, traffic=5),
+    'dusk': replace(RAINY_DUSK, lane=LANE, rain=0.0, fog=0.002, traffic=3),
+    'rain': replace(AFTERNOON, lane=LANE, rain=0.4, fog=0.004, clouds=1.0, sun=0.0, traffic=4),
+}
+
+
+class View(Traverse):
+    """The street as a camera at any pose shows it."""
+
+    def __init__(self, world: RingWorld, conditions: Conditions) -> None:
+        super().__init__(world, np.zeros(1), np.zeros(1, bool), conditions)
+        self._line = world.center_line[:-1]
+
+    def image(self, pose: np.ndarray, number: int) -> np.ndarray:
+        """Render the image at a pose, RGB; cars drive and the camera shakes by its number."""
+        along, across = self.on_street(pose)
+        yaw = self._line[int(along / CELL), 2] - pose[2]
+        shake = math.radians(self._conditions.shake) * math.sin(number * 2.4)
+        self.along = np.full(number + 1, along)
+        traffic = np.concatenate([self._parked[0], self._driving(number)])
+        return render(
+            self._streets[0], along, across, shake, math.remainder(yaw, 2 * math.pi), self._light,
+            traffic, number * 7919 + self._conditions.traffic, *self._size,
+        )  # fmt: skip
+
+    def on_street(self, pose: np.ndarray) -> tuple[float, float]:
+        """Return meters along the street, and to the right of its center line."""
+        away = pose[:2] - self._line[:, :2]
+        cell = int(np.argmin(np.einsum('ij,ij->i', away, away)))
+        for _ in range(2):  # the nearest start of a cell may be of the next one
+            x, y, heading = self._line[cell]
+            ahead = (pose[0] - x) * math.cos(heading) + (pose[1] - y) * math.sin(heading)
+            if ahead >= 0:
+                break
+            cell = (cell - 1) % len(self._line)
+        across = (pose[0] - x) * math.sin(heading) - (pose[1] - y) * math.cos(heading)
+        return cell * CELL + min(max(ahead, 0.0), CELL * 0.999), across
+
+
+@dataclass(frozen=True, eq=False)
+class Taught:
+    """
+    A taught route.
+
+    :param poses: at the places, shape (n, 3).
+    """
+
+    world: RingWorld
+    place_map: PlaceMap
+    run: TaughtRun
+    poses: np.ndarray
+
+    def error(self, pose: np.ndarray) -> tuple[float, float]:
+        """Return how far left of the path a pose is, meters, and its heading error, radians."""
+        away = pose[:2] - self.poses[:, :2]
+        place = int(np.argmin(np.einsum('ij,ij->i', away, away)))
+        heading = self.poses[place, 2]
+        left = away[place] @ [-math.sin(heading), math.cos(heading)]
+        return float(left), math.remainder(pose[2] - heading, 2 * math.pi)
+
+
+def teach(world: RingWorld, begin: float = 0.0, length: float = LENGTH) -> Taught:
+    """Drive along a part of the street by day, and record images and velocities."""
+    along = begin + np.arange(0, length, SPEED / RATE)
+    line, cells = world.center_line, np.arange(len(world.center_line)) * CELL
+    across = LANE + 0.5 * (np.array([noise(each / 17.0, 0.0, 1) for each in along]) - 0.5)
+    x, y, heading = (np.interp(along, cells, column) for column in line.T)
+    x, y = x + across * np.sin(heading), y - across * np.cos(heading)
+    heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    poses = np.column_stack([x, y, heading])
+    times = np.arange(len(along)) / RATE
+    view = View(world, GOOD_LIGHT)
+    frames = (
+        Frame(view.image(pose, k), EPOCH + round(times[k] * 1e9), '')
+        for k, pose in enumerate(poses)
+    )
+    speeds = np.hypot(np.gradient(x), np.gradient(y)) * RATE
+    run = TaughtRun(times, speeds, np.gradient(heading) * RATE)
+    place_map = build_map(frames, FeatureExtractor(), progress=False)
+    return Taught(world, place_map, run, poses)
+
+
+class Robot:
+    """A robot with differential drive, whose wheels slip."""
+
+    def __init__(self, pose: np.ndarray, dice: np.random.Generator) -> None:
+        self.pose, self._dice = pose.copy(), dice
+        self.speed = self.turn = 0.0
+        self._slip = np.zeros(2)
+
+    def move(self, speed: float, turn: float) -> None:
+        """Move for one step of the simulation."""
+        share = 1 - math.exp(-STEP / LAG)
+        self.speed = max(self.speed + share * (speed - self.speed), self.speed - BRAKING * STEP)
+        self.turn += share * (turn - self.turn)
+        keep = math.exp(-STEP / 2.0)  # the slip changes over 2 s
+        fresh = self._dice.normal(size=2) * (SLIP, SLIP_TURN) * math.sqrt(1 - keep**2)
+        self._slip = keep * self._slip + fresh
+        speed = self.speed * (1 + self._slip[0])
+        turn = self.turn * (1 + self._slip[1]) + BIAS * speed
+        middle = self.pose[2] + turn * STEP / 2
+        self.pose += STEP * np.array([speed * math.cos(middle), speed * math.sin(middle), turn])
+
+
+class Autopilot:
+    """The software on the robot: it gets images, and returns velocities."""
+
+    def __init__(self, taught: Taught, settings: FollowerSettings | None = None) -> None:
+        settings = settings or FollowerSettings(max_speed=SPEED, max_acceleration=2.0)
+        self.follower = RouteFollower(taught.run, settings)
+        self._map, self._offset = taught.place_map, OffsetFilter()
+        self._extractor = self._map.extractor()
+        self._recognizer = PlaceRecognizer(self._map, RecognizerSettings())
+        self.observation: Observation | None = None
+
+    def see(self, image: np.ndarray, stamp: float) -> Observation:
+        """Return what an image shows."""
+        features = self._extractor.extract([image])
+        match = self._recognizer.update(features, EPOCH + round((stamp + 1e5) * 1e9))
+        place, probability, offset = match.newest_index, match.probability, None
+        if place < 0:
+            place, probability = self.follower.expected_place(), math.nan
+        if place >= 0:
+            thumbnail = self._map.thumbnail(place)
+            assert thumbnail is not None
+            offset = self._offset.update(describe_columns(image), describe_columns(thumbnail))
+        else:
+            self._offset.reset()
+        return Observation(stamp, place, probability, offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """
+    A drive of the robot, by steps of the simulation.
+
+    :param times: seconds, shape (n,).
+    :param poses: shape (n, 3); errors: meters to the left of the path and radians, shape (n, 2).
+    :param speeds: m/s, shape (n,).
+    :param reasons: why the robot did not move, n texts.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    errors: np.ndarray
+    speeds: np.ndarray
+    reasons: list[str]
+
+    def within(self, meters: float, after: float = CONVERGENCE) -> float:
+        """Return the share of the way within some meters of the path, after the first meters."""
+        driven = np.cumsum(self.speeds) * STEP
+        part = driven > after
+        weights = self.speeds[part]
+        return float((weights * (abs(self.errors[part, 0]) <= meters)).sum() / weights.sum())
+
+
+def repeat(
+    taught: Taught, conditions: Conditions, seconds: float, begin: int = 0,
+    left: float = 1.0, turned: float = math.radians(10), seed: int = 0,
+    change: Callable[[np.ndarray, float], np.ndarray] = lambda image, time: image,
+    world: RingWorld | None = None,
+) -> Drive:  # fmt: skip
+    """
+    Repeat a taught route in the simulator.
+
+    :param begin: place at which the robot starts, ``left`` meters and ``turned`` radians off; the
+        operator states it.
+    :param change: returns the image that the camera delivers at a time.
+    :param world: another one than the taught one.
+    """
+    dice = np.random.default_rng(seed)
+    view = View(world or taught.world, conditions)
+    pose = taught.poses[begin] + [0, 0, turned]
+    heading = taught.poses[begin, 2]
+    pose[:2] += left * np.array([-math.sin(heading), math.cos(heading)])
+    robot, pilot = Robot(pose, dice), Autopilot(taught)
+    pilot.follower.start(begin)
+    waiting: deque[tuple[float, Observation]] = deque()
+    rows, reasons = [], []
+    for k in range(round(seconds / STEP)):
+        time = k * STEP
+        if k % round(1 / RATE / STEP) == 0 and dice.random() >= LOST:
+            image = change(view.image(robot.pose, k), time)
+            waiting.append((time + LATENCY, pilot.see(image, time)))
+        while waiting and waiting[0][0] <= time:
+            pilot.follower.observe(waiting.popleft()[1], time)
+        command = pilot.follower.command(time)
+        robot.move(command.speed, command.turn)
+        rows.append((time, *robot.pose, *taught.error(robot.pose), robot.speed))
+        reasons.append(command.reason)
+        if command.reason == 'end of the route' and robot.speed < 0.01:
+            break
+    table = np.array(rows)
+    return Drive(table[:, 0], table[:, 1:4], table[:, 4:6], table[:, 6], reasons)
+
+
+def plot(taught: Taught, drives: dict[str, Drive], path: Path) -> None:
+    """Draw the drives from above, and their error over the way."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5), layout='constrained')
+    above, over = figure.subplots(1, 2)
+    above.plot(*taught.poses[:, :2].T, color='0.7', linewidth=4, label='taught')
+    for name, drive in drives.items():
+        above.plot(*drive.poses[:, :2].T, linewidth=1, label=name)
+        over.plot(np.cumsum(drive.speeds) * STEP, drive.errors[:, 0], linewidth=1, label=name)
+    above.set(xlabel='x (m)', ylabel='y (m)', aspect='equal')
+    over.set(xlabel='driven (m)', ylabel='left of the taught path (m)', ylim=(-2, 2))
+    for each in (-0.5, 0.5):
+        over.axhline(each, color='0.7', linewidth=0.8)
+    above.legend()
+    figure.savefig(path, dpi=100)
+
+
+def main(folder: Path, length: float) -> None:
+    """Drive a lap in each condition, and write a table and a plot."""
+    taught, drives = teach(RingWorld(), 0.0, length), {}
+    lines = [
+        '| lap | driven | time | standing | within .5 m | within 1 m | largest error | RMS |',
+        '|---|---|---|---|---|---|---|---|',
+    ]
+    for name, conditions in CONDITIONS.items():
+        drives[name] = drive = repeat(taught, conditions, 2 * length / SPEED + 60, begin=10)
+        driven = np.cumsum(drive.speeds) * STEP
+        error = drive.errors[driven > CONVERGENCE, 0]
+        lines.append(
+            f'| {name} | {driven[-1]:.0f} m | {drive.times[-1]:.0f} s '
+            f'| {(drive.speeds < 0.02).sum() * STEP:.0f} s | {drive.within(0.5):.1%} '
+            f'| {drive.within(1.0):.1%} | {abs(error).max(initial=0):.2f} m '
+            f'| {np.sqrt(np.mean(error**2)):.2f} m |'
+        )
+        print(lines[-1], flush=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / 'repeat.md').write_text('\n'.join(lines) + '\n')
+    plot(taught, drives, folder / 'repeat.png')
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else LENGTH)

@@ -1,0 +1,65 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Teach and repeat in the simulator: a short lap, a covered camera, another route."""
+
+import math
+
+import numpy as np
+import pytest
+from stavpr_lab.demonstration.repeat import (
+    CONDITIONS,
+    plot,
+    repeat,
+    STEP,
+    teach,
+    View,
+)
+from stavpr_lab.demonstration.street.laps import RingWorld
+from stavpr_lab.demonstration.street.street import CELL
+
+COVERED = 18.0  # seconds
+
+
+@pytest.fixture(scope='module')
+def taught():
+    return teach(RingWorld(7), 0.0, 60.0)
+
+
+def cover(image, time):
+    """Cover the camera after some seconds; noise is left."""
+    dark = np.random.default_rng(round(time * 10)).normal(15, 3, image.shape)
+    return image if time < COVERED else dark.clip(0, 255).astype(np.uint8)
+
+
+def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(taught, tmp_path):
+    drive = repeat(taught, CONDITIONS['dusk'], COVERED + 3, begin=10, change=cover)
+    assert drive.errors[0] == pytest.approx((1.0, math.radians(10)), abs=0.05)
+    driven = np.cumsum(drive.speeds) * STEP
+    assert driven[-1] > 25
+    assert drive.within(0.5) >= 0.95
+    assert drive.within(1.0, after=15.0) == 1.0
+    covered = drive.times >= COVERED
+    assert drive.speeds[covered][0] > 1
+    assert drive.speeds[covered & (drive.times > COVERED + 1)].max() < 0.05
+    assert drive.reasons[-1] == 'not localized on the route'
+    plot(taught, {'dusk': drive}, tmp_path / 'repeat.png')
+    assert (tmp_path / 'repeat.png').stat().st_size > 10_000
+
+
+def test_robot_on_another_route_does_not_move(taught):
+    drive = repeat(taught, CONDITIONS['day'], 4.0, begin=10, world=RingWorld(11))
+    assert drive.speeds.max() == 0
+
+
+def test_view_at_a_pose_of_the_street(taught):
+    view, line = View(taught.world, CONDITIONS['day']), taught.world.center_line
+    for along in (0.3, 123.4, 599.6):
+        cell = int(along / CELL)
+        x, y, heading = line[cell]
+        ahead, right = along - cell * CELL, 1.3
+        pose = np.array([
+            x + ahead * math.cos(heading) + right * math.sin(heading),
+            y + ahead * math.sin(heading) - right * math.cos(heading),
+            heading,
+        ])  # fmt: skip
+        assert view.on_street(pose) == pytest.approx((along, right), abs=1e-6)

@@ -1,0 +1,262 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The control law: velocities of the taught run by place, corrected by the offset of the camera.
+
+At the place of the newest image the robot repeats the taught velocities v and w, at a share c of
+the speed that falls with the probability of the place, and steers against the offset of the image:
+
+    v' = c v        w' = c w - gain v' (shift + weight parallax)
+
+shift is the heading error and parallax the lateral offset, in parts of the image's width (see
+``stavpr_ros.relative_pose.offset``). Both errors converge, without a calibrated camera, as the
+bearing-only law of Krajnik et al. (Navigation without localisation, 2018) does, whose one shift of
+all features is the sum of the two.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.relative_pose.offset import Offset
+
+UNCERTAIN, CERTAIN = 0.5, 0.9  # probabilities of the slowest and of the full speed
+SLOWEST = 0.3  # share of the taught speed
+WITHOUT_OFFSET = 0.5  # share of the speed while the offset is not valid
+MAX_STEER = 0.2  # widths of the image
+BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
+BRIDGE_TIME, BRIDGE_SHARE = 6.0, 0.5  # seconds of the taught run without a match; share of speed
+STUCK_TIME, STUCK_PLACES = 2.0, 4  # of the taught run, in which the place has to change
+FIRST = 3  # successive confirmed images, from which on the robot moves
+HISTORY = 200  # latest commands, to know how far the robot is since an image was taken
+
+
+@dataclass(frozen=True)
+class FollowerSettings:
+    """
+    Settings of the control law.
+
+    :param gain: radians of a turn per meter, for an offset of one width of the image.
+    :param parallax_weight: of the parallax over the shift.
+    :param max_speed, max_turn: m/s, rad/s.
+    :param max_acceleration, max_turn_acceleration: m/s^2, rad/s^2; a stop is not limited.
+    :param max_age: seconds without an image after which the robot stops.
+    :param max_delay: seconds since the newest image was taken, after which it stops.
+    :param max_unconfirmed: seconds without an image of the route after which it stops.
+    :raises SettingsError: a number that is not above 0.
+    """
+
+    gain: float = 0.9
+    parallax_weight: float = 5.0
+    max_speed: float = 1.0
+    max_turn: float = 0.5
+    max_acceleration: float = 0.5
+    max_turn_acceleration: float = 1.0
+    max_age: float = 0.5
+    max_delay: float = 1.0
+    max_unconfirmed: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (value > 0 and math.isfinite(value)):
+                raise SettingsError(f'{name} = {value} must be a number above 0')
+
+
+@dataclass(frozen=True, eq=False)
+class TaughtRun:
+    """
+    The velocities of the taught run at the n places of the map.
+
+    :param times: seconds, increasing, shape (n,).
+    :param speeds, turns: m/s and rad/s, positive to the left, shape (n,).
+    :param is_closed: the last place is followed by the first.
+    :raises InputError: other shapes, numbers that are not finite, times that do not increase.
+    """
+
+    times: np.ndarray
+    speeds: np.ndarray
+    turns: np.ndarray
+    is_closed: bool = False
+
+    def __post_init__(self) -> None:
+        columns = (self.times, self.speeds, self.turns)
+        n = len(self.times)
+        if n < 2 or any(column.shape != (n,) for column in columns):
+            shapes = ', '.join(str(column.shape) for column in columns)
+            raise InputError(f'times, speeds and turns have shapes {shapes}: expected (n,), n > 1')
+        if not np.isfinite(columns).all() or (np.diff(self.times) <= 0).any():
+            raise InputError('times, speeds and turns must be finite, times must increase')
+
+    @property
+    def period(self) -> float:
+        """Return the seconds of a lap, or until the end of the route."""
+        times = self.times
+        return float(times[-1] - times[0] + (times[-1] - times[-2]) * self.is_closed)
+
+    def at(self, place: int, later: float) -> tuple[float, float, bool]:
+        """Return speed and turn some seconds after a place, and whether it is the end."""
+        time = float(self.times[place]) + later
+        if self.is_closed:
+            time = (time - self.times[0]) % self.period + self.times[0]
+        is_end = not self.is_closed and time >= self.times[-1]
+        speed, turn = (np.interp(time, self.times, each) for each in (self.speeds, self.turns))
+        return float(speed), float(turn), is_end
+
+
+@dataclass(frozen=True)
+class Observation:
+    """
+    What an image showed.
+
+    :param stamp: when it was taken, seconds.
+    :param place: that the image shows; -1 = unknown.
+    :param probability: of the place; NaN = without a match, it is the expected place.
+    :param offset: of the image against the place; None = unknown.
+    """
+
+    stamp: float
+    place: int
+    probability: float
+    offset: Offset | None
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the image is of the route: its sequence is matched, and it is similar."""
+        if self.place < 0 or self.offset is None:
+            return False
+        return self.offset.is_similar and (
+            not math.isnan(self.probability) or self.offset.similarity >= BRIDGE_SIMILARITY
+        )
+
+
+@dataclass(frozen=True)
+class Command:
+    """
+    Velocities of the robot.
+
+    :param speed, turn: m/s, and rad/s to the left.
+    :param reason: why the robot does not move; empty while it does.
+    """
+
+    speed: float
+    turn: float
+    reason: str = ''
+
+
+class RouteFollower:
+    """
+    Follows a taught route; all times are seconds of one clock.
+
+    :param taught: the velocities to repeat.
+    """
+
+    def __init__(self, taught: TaughtRun, settings: FollowerSettings | None = None) -> None:
+        self._taught, self._settings = taught, settings or FollowerSettings()
+        self._stuck = max(STUCK_TIME, STUCK_PLACES * float(np.median(np.diff(taught.times))))
+        self._newest: Observation | None = None  # of the confirmed images
+        self._received = self._confirmed = -math.inf
+        self._changed = 0.0  # what was repeated when the place last changed
+        self._stamp = -math.inf
+        self._successive = 0
+        self._last, self._time = Command(0.0, 0.0), -math.inf
+        # seconds of the taught run that were repeated, by the time of the commands
+        self._repeated: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], HISTORY)
+        self._anchor: tuple[int, float] | None = (
+            None  # the last match; what was repeated until then
+        )
+
+    def start(self, place: int) -> None:
+        """State at which place the robot stands; otherwise it moves from its first match on."""
+        self._anchor = place, self._repeated[-1][1]
+        self._changed = self._repeated[-1][1]
+
+    def expected_place(self) -> int:
+        """Return the place of an image soon after the last match; -1 = unknown."""
+        if self._anchor is None:
+            return -1
+        place, before = self._anchor
+        done, times = self._repeated[-1][1] - before, self._taught.times
+        if done > BRIDGE_TIME:
+            return -1
+        time = times[place] + done
+        if self._taught.is_closed and time > times[-1]:
+            time -= self._taught.period
+        return min(int(np.searchsorted(times, time)), len(times) - 1)
+
+    def observe(self, observation: Observation, now: float) -> None:
+        """Take the result of an image."""
+        self._received, self._stamp = now, observation.stamp
+        if observation.is_confirmed:
+            if self._newest is None or observation.place != self._newest.place:
+                self._changed = self._repeated[-1][1]
+            self._newest, self._confirmed = observation, now
+            self._successive += 1
+            if not math.isnan(observation.probability):
+                done = self._repeated[-1][1] - self._since(observation.stamp)
+                self._anchor = observation.place, done
+        elif now - self._confirmed > self._settings.max_unconfirmed:
+            self._successive = 0
+
+    def command(self, now: float) -> Command:
+        """Return the velocities for now; to be called at a steady rate, above 10 Hz."""
+        step = min(now - self._time, 1.0) if math.isfinite(self._time) else 0.0
+        self._time = now
+        self._last = self._limited(self._wanted(now), step)
+        return self._last
+
+    def _stop_reason(self, now: float) -> str:
+        """Return why the robot must not move; empty = it may."""
+        settings = self._settings
+        if now - self._received > settings.max_age or now - self._stamp > settings.max_delay:
+            return 'no new image'
+        if now - self._confirmed > settings.max_unconfirmed:
+            self._successive = 0
+            return 'not localized on the route'
+        if self._confirmed < self._received:
+            return 'the newest image is not of the route'
+        if self._repeated[-1][1] - self._changed > self._stuck:
+            return 'the place does not change'
+        return 'waiting for more images of the route' if self._successive < FIRST else ''
+
+    def _wanted(self, now: float) -> Command:
+        """Return the velocities without limits of the acceleration."""
+        settings, newest = self._settings, self._newest
+        if reason := self._stop_reason(now):
+            return Command(0.0, 0.0, reason)
+        assert newest is not None
+        offset = newest.offset
+        assert offset is not None
+        speed, turn, is_end = self._taught.at(newest.place, self._since(newest.stamp))
+        if is_end:
+            return Command(0.0, 0.0, 'end of the route')
+        share = (newest.probability - UNCERTAIN) / (CERTAIN - UNCERTAIN)
+        share = BRIDGE_SHARE if math.isnan(share) else min(max(share, SLOWEST), 1.0)
+        share *= 1 if offset.is_valid else WITHOUT_OFFSET
+        share = min(share, settings.max_speed / max(abs(speed), 1e-9))
+        speed, turn = share * speed, share * turn
+        if offset.is_valid:
+            steer = offset.shift + settings.parallax_weight * offset.parallax
+            turn -= settings.gain * abs(speed) * min(max(steer, -MAX_STEER), MAX_STEER)
+        return Command(speed, turn)
+
+    def _since(self, stamp: float) -> float:
+        """Return the seconds of the taught run that were repeated since a time."""
+        before = next((done for at, done in reversed(self._repeated) if at <= stamp), 0.0)
+        return self._repeated[-1][1] - before
+
+    def _limited(self, wanted: Command, step: float) -> Command:
+        """Limit velocities and accelerations, but no stop; count what is repeated."""
+        settings, newest = self._settings, self._newest
+        if wanted.reason or newest is None:
+            return wanted
+        faster = settings.max_acceleration * step
+        speed = min(max(wanted.speed, self._last.speed - faster), self._last.speed + faster)
+        turning = settings.max_turn_acceleration * step
+        turn = min(max(wanted.turn, self._last.turn - turning), self._last.turn + turning)
+        turn = min(max(turn, -settings.max_turn), settings.max_turn)
+        taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
+        done = speed / taught * step if abs(taught) > 1e-3 else step
+        self._repeated.append((self._time, self._repeated[-1][1] + done))
+        return Command(speed, turn)
