@@ -33,8 +33,8 @@ COVERAGE := stavpr_ros:95 stavpr_fleet:93 stavpr_slam:88 stavpr_nav:88 stavpr_la
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo animation days evaluate test test-long test-arm coverage crash-test lint docs bench bench-quick accuracy \
-	protocol off-map pose-graphs shell clean distclean development
+.PHONY: help setup build demo animation days repeat evaluate test test-long test-arm coverage crash-test lint docs bench bench-quick \
+	accuracy protocol off-map pose-graphs shell clean distclean development
 
 help: ## list the targets (the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
@@ -70,6 +70,10 @@ demo: build ## run the node on the synthetic street, or on your images (MAP= QUE
 
 animation: demo ## write the animation of the README, docs/demo.webp
 	@$(RUN) python -m stavpr_lab.demonstration.animation demo_output docs/demo.webp
+
+repeat: override EXTRAS += slam
+repeat: build ## teach and repeat in a simulator, benchmarks/results/repeat.md
+	@$(RUN) python -m stavpr_lab.demonstration.repeat benchmarks/results
 
 days: build ## update a map by 30 days on the synthetic street, benchmarks/results/days.md
 	@$(RUN) python -m stavpr_lab.demonstration.days 31 benchmarks/results/days

@@ -72,6 +72,7 @@ entry_points = {'console_scripts': [f'stavpr = {NAME}.commands.stavpr:main']}
 for sibling in SIBLINGS if WHEEL else ():
     packages += find_packages(sibling, include=[sibling, f'{sibling}.*'])
     configuration = ConfigParser()
+    configuration['options.entry_points'] = {}
     configuration.read(f'{sibling}/setup.cfg')
     for group, lines in configuration['options.entry_points'].items():
         entry_points.setdefault(group, []).extend(lines.split('\n'))

@@ -44,6 +44,7 @@ setup(
         'hdf5': ['h5py>=3.10'],
         'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'slam': ['evo>=1.31', 'stavpr_slam'],
+        'nav': ['stavpr_nav'],
         'torch': ['torch>=2.10'],
     },
     zip_safe=False,

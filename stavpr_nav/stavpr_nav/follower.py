@@ -96,7 +96,7 @@ class TaughtRun:
         return float(times[-1] - times[0] + (times[-1] - times[-2]) * self.is_closed)
 
     def at(self, place: int, later: float) -> tuple[float, float, bool]:
-        """Return speed and turn some seconds after a place, and whether it is the end."""
+        """Return speed and turn a time (s) after a place, and whether it is the end."""
         time = float(self.times[place]) + later
         if self.is_closed:
             time = (time - self.times[0]) % self.period + self.times[0]
@@ -168,7 +168,7 @@ class RouteFollower:
         )
 
     def start(self, place: int) -> None:
-        """State at which place the robot stands; otherwise it moves from its first match on."""
+        """Set the place of a robot at rest; otherwise it moves after its first match."""
         self._anchor = place, self._repeated[-1][1]
         self._changed = self._repeated[-1][1]
 

@@ -164,7 +164,7 @@ class Autopilot:
         self._recognizer = PlaceRecognizer(self._map, RecognizerSettings())
         self.observation: Observation | None = None
 
-    def see(self, image: np.ndarray, stamp: float) -> Observation:
+    def process(self, image: np.ndarray, stamp: float) -> Observation:
         """Return what an image shows."""
         features = self._extractor.extract([image])
         match = self._recognizer.update(features, EPOCH + round((stamp + 1e5) * 1e9))
@@ -198,7 +198,7 @@ class Drive:
     reasons: list[str]
 
     def within(self, meters: float, after: float = CONVERGENCE) -> float:
-        """Return the share of the way within some meters of the path, after the first meters."""
+        """Return the share of the distance within a bound of the path, after a start."""
         driven = np.cumsum(self.speeds) * STEP
         part = driven > after
         weights = self.speeds[part]
@@ -232,7 +232,7 @@ def repeat(
         time = k * STEP
         if k % round(1 / RATE / STEP) == 0 and dice.random() >= LOST:
             image = change(view.image(robot.pose, k), time)
-            waiting.append((time + LATENCY, pilot.see(image, time)))
+            waiting.append((time + LATENCY, pilot.process(image, time)))
         while waiting and waiting[0][0] <= time:
             pilot.follower.observe(waiting.popleft()[1], time)
         command = pilot.follower.command(time)
@@ -246,7 +246,7 @@ def repeat(
 
 
 def plot(taught: Taught, drives: dict[str, Drive], path: Path) -> None:
-    """Draw the drives from above, and their error over the way."""
+    """Draw the drives from above, and their error over the distance."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5), layout='constrained')
