@@ -258,6 +258,13 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
     ),
     'Recorded maps': (
         NodeParameter(
+            'update_map',
+            False,
+            'Localization: what drives show that are certain where they are becomes part of the '
+            'map, as by `stavpr map update`: in its file, by ~/save_map without a path, and on '
+            'deactivation or shutdown. Of max_places images at most.',
+        ),
+        NodeParameter(
             'maps_folder',
             '',
             'Folder of the maps that services name; map_path, save_path and model_path must also '

@@ -388,20 +388,17 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _update(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.mapping.versions import current_version, save_version
     from stavpr_ros.output_file import FileVersion
-    from stavpr_ros.prepare.prepared_map import statistics_of_map
-    from stavpr_ros.recognition.upkeep import update_map, UpkeepSettings
+    from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
 
     settings = UpkeepSettings(arguments.max_places, arguments.max_age)
     opened, place_map = FileVersion.of(arguments.map), _verified(arguments.map)
-    before, name = current_version(arguments.map), Path(arguments.drive).stem[:40]
+    name = Path(arguments.drive).stem[:40]
     with _drive(arguments, place_map) as drive:
-        updated, version = update_map(place_map, drive, name, before, settings)
-        statistics = statistics_of_map(updated)
-        version = save_version(arguments.map, opened, updated, before, version, statistics)
+        version = update_file(arguments.map, opened, place_map, drive, settings, name)
     say('\n'.join(version.changes))
-    say(f'{arguments.map}: {len(updated)} places, id {version.map_id}, was {before.map_id}')
+    places = len(version.use)
+    say(f'{arguments.map}: {places} places, id {version.map_id}, was {place_map.map_id}')
 
 
 @contextmanager
@@ -418,9 +415,7 @@ def _drive(arguments: argparse.Namespace, place_map: 'PlaceMap') -> 'Iterator[Pl
     from stavpr_ros.sources import open_source
 
     if is_map(arguments.drive):
-        drive = load_map(arguments.drive)
-        drive.features.require_same_settings(place_map.settings, 'the map')
-        yield drive
+        yield load_map(arguments.drive)
         return
     folder, extractor = history_of(arguments.map), place_map.extractor()
     folder.mkdir(exist_ok=True)

@@ -105,6 +105,10 @@ class Operation(ABC):
         self._window: deque[WindowRow] = deque(maxlen=settings.sequence.length)
         self._image: np.ndarray | None = None  # the last one
 
+    def take_drives(self) -> list[PlaceMap]:
+        """Return the drives since the start or the last call, which may update the map."""
+        return []
+
     @abstractmethod
     def _start(self, place_map: PlaceMap | None) -> None:
         """Make the places and their recognizer: all that may fail or takes long."""
@@ -350,19 +354,54 @@ class Operation(ABC):
 
 
 class Localizer(Operation):
-    """Recognizes the places of a map; without one, it waits for it."""
+    """
+    Recognizes the places of a map; without one, it waits for it.
+
+    With ``update_map``, it records its drives, each from one reset to the next.
+    """
 
     name = 'localization'
 
     def _start(self, place_map: PlaceMap | None) -> None:
         settings = self.settings
+        self._drives: list[GrowingMap] = []
         if self.extractor is None or place_map is None:
             return
+        if settings.update_map and os.path.isfile(self.save_state.path):
+            self._begin_drive()
         self._recognizer = _map_recognizer(settings, self.name, place_map, self.extractor)
 
     def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
         assert self._recognizer is not None
-        return ImageResult.of_match(self._recognizer.update(features, row.stamp, row.pose))
+        jpeg = row.jpeg if self._drives else b''
+        result = ImageResult.of_match(self._recognizer.update(features, row.stamp, row.pose))
+        if self._drives and sum(map(len, self._drives)) < self.settings.max_places:
+            self._drives[-1].add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
+        return result
+
+    def _thumbnail_width(self, camera: Camera | None) -> int:
+        return (
+            super()._thumbnail_width(camera) or bool(self._drives) * self.settings.thumbnail_width
+        )
+
+    def _begin_drive(self) -> None:
+        assert self.extractor is not None
+        limit, settings = self.settings.max_places, self.extractor.settings
+        self._drives.append(GrowingMap(settings, self.extractor.projection, limit))
+
+    def reset(self) -> None:
+        """Empty the window; another drive begins."""
+        super().reset()
+        if self._drives and len(self._drives[-1]):
+            self._begin_drive()
+
+    def take_drives(self) -> list[PlaceMap]:
+        """Return the recorded drives, and begin another one."""
+        drives = [each.snapshot() for each in self._drives if len(each)]
+        if self._drives:
+            self._drives = []
+            self._begin_drive()
+        return drives
 
 
 class Mapper(Operation):

@@ -5,17 +5,20 @@
 from collections.abc import Callable
 from logging import Logger
 from pathlib import Path
+import time
 from typing import Any
 
-from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
-from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.errors import InputError, JournalError, OutputTakenError, StavprError
+from stavpr_ros.mapping import load_map, PlaceMap, save_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
-from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
+from stavpr_ros.output_file import FileVersion, Force, MAP, numbered, require_replaceable
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.same_places import with_last_related
+from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
+from stavpr_ros.units import SECOND
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
@@ -35,11 +38,35 @@ def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: For
     return len(snapshot.places)
 
 
+def update_own_map(pipeline: Pipeline, on_worker: OnWorker, log: 'Logger | Any') -> int:
+    """
+    Let the drives of localization update the file of its map (docs/upkeep.md), on this thread.
+
+    :returns: places of the last version; 0 = there is none, the log has the reasons.
+    :raises StavprError: a file that cannot be read or written; it stays as it is.
+    """
+    state, places = pipeline.save_state, 0
+    for drive in on_worker(pipeline.operation.take_drives):
+        name = time.strftime(
+            'drive %Y-%m-%d %H:%M:%S', time.gmtime(int(drive.stamps[0]) // SECOND)
+        )
+        opened, place_map = FileVersion.of(state.path), load_map(state.path)
+        try:
+            version = update_file(state.path, opened, place_map, drive, UpkeepSettings(), name)
+        except InputError as error:
+            log.warning(f'{name} does not update {state.path}: {error}')
+            continue
+        state.own(state.path)
+        places = len(version.use)
+        log.info(f'{name} updates {state.path}, {places} places: {"; ".join(version.changes)}')
+    return places
+
+
 def save_recorded_map(
     pipeline: Pipeline, on_worker: OnWorker, path: str, log: 'Logger | Any'
 ) -> bool:
     """
-    Write unsaved places to ``path``; log errors.
+    Write unsaved places to ``path``, or update the map of localization; log errors.
 
     A file of another map is not overwritten, a numbered name beside it is used.
 
@@ -47,6 +74,7 @@ def save_recorded_map(
     :returns: whether nothing failed.
     """
     try:
+        update_own_map(pipeline, on_worker, log)
         unsaved = on_worker(lambda: pipeline.unsaved)  # includes the image being processed
         if unsaved and path:
             log.info(f'writing the map to {path}')

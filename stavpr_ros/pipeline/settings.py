@@ -66,6 +66,7 @@ class PipelineSettings:
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     geometric: GeometricSettings | None = None
     direction: str = default('direction')
+    update_map: bool = default('update_map')
 
     def __post_init__(self) -> None:
         settings_class(self.features)  # rejects an unknown kind

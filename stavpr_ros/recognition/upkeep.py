@@ -19,13 +19,16 @@ place is the place of an earlier session that shows the same, or itself.
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import merge_maps, PlaceMap
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.mapping.versions import Version
+from stavpr_ros.mapping.versions import current_version, save_version, Version
+from stavpr_ros.output_file import FileVersion
+from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.recognizer import PlaceRecognizer
 from stavpr_ros.recognition.same_places import SamePlaces
@@ -118,6 +121,27 @@ def update_map(
         use=tuple(np.round(use[kept], 3).tolist()),
         missed=tuple(missed[kept].tolist()),
     )
+
+
+def update_file(
+    path: str | Path,
+    opened: FileVersion | None,
+    place_map: PlaceMap,
+    drive: PlaceMap,
+    settings: UpkeepSettings,
+    name: str,
+) -> Version:
+    """
+    Let a drive update the map of a file, and return its new version.
+
+    :param opened: the file when it was read; place_map: its content.
+    :raises InputError: the drive is not certain where it is, or has other features.
+    :raises OutputError: the version cannot be written; the map stays as it is.
+    """
+    drive.features.require_same_settings(place_map.settings, 'the map')
+    before = current_version(path)
+    updated, version = update_map(place_map, drive, name, before, settings)
+    return save_version(path, opened, updated, before, version, statistics_of_map(updated))
 
 
 def _with_ids(ids: tuple[str, ...]) -> tuple[str, ...]:

@@ -150,6 +150,12 @@ class Runtime:
         )
 
     @property
+    def updates_map(self) -> bool:
+        """Whether the drives of this operation update its map."""
+        settings = self.settings
+        return settings.pipeline.update_map and settings.operation == 'localization'
+
+    @property
     def _journaled(self) -> Path:
         """Return the file whose name the journal of recorded places has."""
         return Path(self.settings.save_path or self.settings.maps_path / RECORDED)

@@ -13,7 +13,7 @@ from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.pipeline.saving import write_map
+from stavpr_ros.pipeline.saving import update_own_map, write_map
 from stavpr_ros.recognition import Status
 from stavpr_ros.ros.messages import candidates_message, match_message, matched_pose_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
@@ -104,6 +104,13 @@ class Services:
         return f'{response.map.places} places from {path}'
 
     def _save_map(self, runtime: Runtime, request: Any, response: Any) -> str:
+        if runtime.updates_map and not request.path:
+            log = self._logger
+            response.places = update_own_map(runtime.pipeline, runtime.worker.run, log)
+            path = runtime.pipeline.save_state.path
+            if not response.places:
+                raise StavprError(f'{path} stays as it is: the log has the reasons')
+            return f'{response.places} places to {path}, which load_map reads'
         if request.path:
             path = inside(runtime.settings.maps_path, request.path)
         elif (
