@@ -113,11 +113,13 @@ def test_package_and_parameters_import_lightly():
     assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())
 
 
+@pytest.mark.usefixtures('kernels')
 def test_mapping_and_localization_with_gradient_load_no_torch(tmp_path):
     """
     Nor what reads other inputs; a folder of images to a map, and the map to a match.
 
-    Where torch is not installed and a driver of CUDA is, as on a Jetson; the memory stays small.
+    Where torch is not installed and a driver of CUDA is, as on a Jetson; the memory stays
+    small, once the kernels are compiled.
     """
     rng = np.random.default_rng(0)
     for i, image in enumerate(rng.integers(0, 256, (40, 48, 64, 3), np.uint8)):
@@ -153,7 +155,7 @@ unused = {{'torch', 'pandas', 'onnxruntime', 'av', 'h5py', 'faiss', 'ray', 'gtsa
 assert not unused & sys.modules.keys()
 status = open('/proc/self/status').read()
 peak = int(status.partition('VmHWM:')[2].split()[0])
-assert peak < 450_000, f'{{peak}} kB'
+assert peak < 300_000, f'{{peak}} kB'
 print('\\n', match.status.name, *loaded)
 """
     done = subprocess.run(
