@@ -158,9 +158,8 @@ peak = int(status.partition('VmHWM:')[2].split()[0])
 assert peak < 300_000, f'{{peak}} kB'
 print('\\n', match.status.name, *loaded)
 """
-    done = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, '-c', code]  # elsewhere: of the installed package, as the kernels
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     status, *loaded = done.stdout.splitlines()[-1].split()
     assert status in ('MATCH', 'NO_MATCH')
