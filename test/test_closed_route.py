@@ -166,6 +166,10 @@ def test_commands_find_the_seam_or_state_it(tmp_path, capsys):
     assert PlaceRecognizer(kept, FORWARD)._window.layout.lap == len(images) + more - 1 - shown
     several = merge_maps([kept, kept], 'ab')
     assert PlaceRecognizer(several, FORWARD)._window.layout.lap == 0
+    # a session of several, whose places are related to themselves or their neighbors
+    own = np.arange(len(kept), dtype=np.int32)
+    for same_as in (own, np.minimum(own, len(kept) - 2)):
+        assert replace(kept, same_as=same_as).seam is None
     save_map(select_places(replace(kept, same_as=None), np.arange(len(images))), lap, force=True)
     assert map_command.main(['close', str(lap), str(closed)]) == 0
     assert load_map(closed).same_as[-1] == 0

@@ -84,7 +84,7 @@ class PlaceMapOf:
     """What the layout reads of a map."""
 
     def __init__(self, session_index):
-        self.session_index, self.same_as = session_index, None
+        self.session_index, self.same_as, self.seam = session_index, None, None
 
     def __len__(self):
         return len(self.session_index)

@@ -275,8 +275,8 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
     megabytes = Path(output).stat().st_size / 1e6
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
     say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
-    if place_map.same_as is not None:
-        say(f'the route is closed: its last place shows place {place_map.same_as[-1]}')
+    if place_map.seam is not None:
+        say(f'the route is closed: its last place shows place {place_map.seam}')
     if place_map.threshold is not None:
         say(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
 

@@ -251,8 +251,8 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         positions = place_map.poses[~np.isnan(place_map.poses[:, 0]), :3]
         length = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
         rows['poses'] = f'a route of {length:.0f} m'
-    if len(place_map.sessions) < 2 and place_map.same_as is not None:
-        rows['route'] = f'closed: its last place shows place {place_map.same_as[-1]}'
+    if place_map.seam is not None:
+        rows['route'] = f'closed: its last place shows place {place_map.seam}'
     lines = [f'{name:<11}{value}' for name, value in rows.items()]
     for number, session in enumerate(place_map.sessions):
         assert place_map.session_index is not None
@@ -346,8 +346,7 @@ def _close(arguments: argparse.Namespace) -> None:
     from stavpr_ros.recognition.same_places import with_seam
 
     place_map = with_seam(_verified(arguments.map), is_closed=True)
-    assert place_map.same_as is not None
-    say(f'the last place shows place {place_map.same_as[-1]}')
+    say(f'the last place shows place {place_map.seam}')
     _write(place_map, arguments)
 
 

@@ -164,6 +164,14 @@ class PlaceMap:
             session.id if session is not None else '',
         )
 
+    @property
+    def seam(self) -> int | None:
+        """Return the place that the last one of a closed route shows, None of another map."""
+        if self.same_as is None or len(self.sessions) > 1 or not len(self):
+            return None
+        place = int(self.same_as[-1])
+        return place if 2 * place < len(self) - 1 else None
+
     def session(self, place: int) -> Session | None:
         """Return the session that a place is of, None without sessions."""
         return None if self.session_index is None else self.sessions[self.session_index[place]]

@@ -23,19 +23,17 @@ def layout_of(
     Return the layout of a map, for a window of the same model.
 
     :param against: the camera may move against the map.
-    :param length: l, of a window that goes on over the seam of a closed route: a route of one
-        session whose last place shows the same as an earlier one.
+    :param length: l, of a window that goes on over the seam of a closed route.
     """
     index, n = place_map.session_index, len(place_map)
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(n)
     firsts = ONE_SESSION if index is None else np.flatnonzero(np.diff(index, prepend=-1))
-    repeated = 0
-    if length and len(firsts) == 1 and n:
-        again = n - 1 - 2 * int(same_as[-1])
-        repeated = max(0, min(again, int(length * max(model.speeds))))
-        repeated = repeated if repeated > MAX_LAG and same_as[-1] < n - 1 else 0
+    repeated, seam = 0, place_map.seam
+    if length and seam is not None:
+        repeated = min(n - 1 - 2 * seam, int(length * max(model.speeds)))
+        repeated = repeated if repeated > MAX_LAG else 0
     if (index is None and not against and not repeated) or not n:
         return ColumnLayout()
     gap = session_gap(nms_radius, model)
