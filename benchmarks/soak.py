@@ -10,7 +10,7 @@ import argparse
 import array
 from collections import Counter
 from collections.abc import Callable, Iterator
-from itertools import cycle, islice
+from itertools import count, cycle, islice
 import json
 import os
 from pathlib import Path
@@ -134,6 +134,8 @@ def publish(
         began = time.monotonic()
         each_minute()
         node.create_timer(60.0, each_minute)
+        if getattr(arguments, 'changes', False):
+            node.create_timer(1.0, changes(node, names[0]))
         if after is not None:
             seconds, call = after
 
@@ -163,6 +165,27 @@ def publish(
         return [one.figures(total, PlaceMatch.DROPPED) for one in nodes], rate
 
 
+def changes(node: Any, name: str) -> Callable[[], None]:
+    """Return what changes a parameter of a node, and every 20th time resets it."""
+    from rcl_interfaces.msg import Parameter
+    from rcl_interfaces.srv import SetParameters
+    from std_srvs.srv import Trigger
+
+    set_parameters = node.create_client(SetParameters, f'/{name}/set_parameters')
+    reset = node.create_client(Trigger, f'/{name}/reset')
+    numbers = count()
+
+    def change() -> None:
+        number = next(numbers)
+        parameter = Parameter(name='max_error')
+        parameter.value.type, parameter.value.double_value = 3, (0.05, 0.1)[number % 2]
+        set_parameters.call_async(SetParameters.Request(parameters=[parameter]))
+        if number % 20 == 0:
+            reset.call_async(Trigger.Request())
+
+    return change
+
+
 def about(load: float) -> dict[str, Any]:
     """Return machine and versions of a run."""
     machine = {'load_before': load, 'cpu': cpu_model(), 'cores': os.cpu_count()}
@@ -177,6 +200,8 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=300)
     parser.add_argument('--rate', type=float, default=30, help='images per second (%(default)s)')
     parser.add_argument('--map', help=f'instead of one of {PLACES} synthetic places')
+    text = 'change a parameter each second, and reset the node every 20 seconds'
+    parser.add_argument('--changes', action='store_true', help=text)
     text = 'of the node, besides map_path; may be repeated'
     repeated: dict[str, Any] = {'action': 'append', 'default': []}
     parser.add_argument('--parameter', metavar='NAME:=VALUE', help=text, **repeated)

@@ -62,7 +62,7 @@ def test_decode_compressed_of_too_large_image_is_rejected_first(monkeypatch):
         decode_compressed(data)
     assert caught.value.kind == 'too large'
     # from here on Pillow refuses by itself
-    monkeypatch.setattr(files.Image, 'MAX_IMAGE_PIXELS', 5000)
+    monkeypatch.setattr(Image, 'MAX_IMAGE_PIXELS', 5000)
     with pytest.raises(ImageError, match='expected at most 10000') as caught:
         decode_compressed(data)
     assert caught.value.kind == 'too large'

@@ -8,6 +8,8 @@ from stavpr_ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.signals import run_until_signal
 from stavpr_ros.threads import wait_passively
 
+BLAS = 'scipy.linalg.cython_blas'  # numba imports it where SciPy is installed
+
 HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
 
 A lifecycle node that configures and activates itself. It recognizes the places of the images on
@@ -49,7 +51,17 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _run(args: list[str] | None) -> int:
+    _import_numba()
     from stavpr_ros.ros.node import PlaceRecognitionNode
     from stavpr_ros.ros.process import run_node
 
     return run_node(PlaceRecognitionNode, args, BY_NAME)
+
+
+def _import_numba() -> None:
+    """Import numba without SciPy's linear algebra (14 MB) for matrix products in kernels."""
+    if BLAS not in sys.modules:
+        sys.modules[BLAS] = None  # type: ignore[assignment]  # it cannot be imported
+        import numba.np.arraymath  # noqa: F401
+
+        del sys.modules[BLAS]

@@ -5,13 +5,15 @@
 from collections.abc import Callable
 from io import BytesIO
 import re
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import cv2
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import frame
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 MAX_PIXELS = frame.MAX_PIXELS
 
@@ -160,7 +162,7 @@ def decode_file(
     return np.asarray(cv2.cvtColor(reduce(image, least), code))
 
 
-def _unpack(flat: np.ndarray, flag: int, header: Image.Image) -> np.ndarray | None:
+def _unpack(flat: np.ndarray, flag: int, header: 'Image.Image') -> np.ndarray | None:
     """Return gray or BGR, uint8 or uint16, as stored; None = it cannot be decoded."""
     if header.format != 'HEIF' and (header.format, header.mode) not in WIDE_TIFF:
         try:
@@ -169,6 +171,8 @@ def _unpack(flat: np.ndarray, flag: int, header: Image.Image) -> np.ndarray | No
             image = None
         if image is not None or header.format != 'TIFF':
             return image
+    from PIL import Image, ImageOps
+
     try:
         with Image.open(BytesIO(flat.data), formats=[str(header.format)]) as file:
             upright = ImageOps.exif_transpose(file)
@@ -201,7 +205,7 @@ def _damaged(size: int) -> ImageError:
     )
 
 
-def checked_header(flat: np.ndarray, max_pixels: int) -> tuple[Image.Image, int]:
+def checked_header(flat: np.ndarray, max_pixels: int) -> tuple['Image.Image', int]:
     """
     Check what a file claims, which OpenCV allocates before it reads.
 
@@ -209,6 +213,8 @@ def checked_header(flat: np.ndarray, max_pixels: int) -> tuple[Image.Image, int]
     :returns: the header, closed, and the orientation by EXIF, 1 to 8.
     :raises ImageError: see :func:`decode_file`.
     """
+    from PIL import Image, UnidentifiedImageError  # not in a node of raw images
+
     formats: tuple[str, ...] = COMPRESSED_FORMATS
     kind = 'damaged'
     if HEIF.match(flat[:12].tobytes()):
@@ -249,7 +255,7 @@ def checked_header(flat: np.ndarray, max_pixels: int) -> tuple[Image.Image, int]
     return header, turn
 
 
-def _turn_of(header: Image.Image, flat: np.ndarray) -> int:
+def _turn_of(header: 'Image.Image', flat: np.ndarray) -> int:
     """Return the orientation by EXIF, 1 to 8; decoders turn TIFF and HEIC themselves."""
     late = header.format == 'PNG' and b'eXIf' in flat.tobytes()  # it may be behind the pixels
     if header.format in ('TIFF', 'HEIF') or not ('exif' in header.info or late):
@@ -261,7 +267,7 @@ def _turn_of(header: Image.Image, flat: np.ndarray) -> int:
     return turn if turn in range(2, 9) else 1
 
 
-def _part_of_tiff(header: Image.Image) -> tuple[int, int]:
+def _part_of_tiff(header: 'Image.Image') -> tuple[int, int]:
     """Return width and height of the strips or tiles that a TIFF claims, (0, 0) = none."""
     tags = getattr(header, 'tag_v2', {})
     if TIFF_TILE[0] in tags:
