@@ -3,3 +3,4 @@
 """Units of time."""
 
 SECOND = 1_000_000_000  # nanoseconds
+DATED = 250_000_000 * SECOND  # stamps below count from the start of a video or a simulation

@@ -3,6 +3,7 @@
 """Parameter update_map: drives of a node in localization become part of the file of its map."""
 
 from pathlib import Path
+import re
 
 import pytest
 from stavpr_msgs.srv import SaveMap
@@ -34,6 +35,7 @@ def test_drives_update_the_file_by_save_map_and_at_the_end(robot, start, path):
     assert 'which load_map reads' in response.message
     learned = current_version(path)
     assert learned.map_id == load_map(path).map_id
+    assert re.fullmatch(r'drive 20\d\d-.*', learned.drive)  # its stamps are not dated
     assert 'stays as it is' in robot.refuses(SaveMap, 'save_map')  # nothing was driven since
     robot.drive(ROUTE)
     assert robot.transition('deactivate')

@@ -14,15 +14,13 @@ from stavpr_ros import plugins
 from stavpr_ros.commands.program import make_parser, run_program, say
 from stavpr_ros.errors import MapFileError, printable, SettingsError, SourceError, UnavailableError
 from stavpr_ros.output_file import MAP, PNG, require_replaceable
-from stavpr_ros.units import SECOND
+from stavpr_ros.units import DATED, SECOND
 
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
 
 # Tools of other packages, and the packages that provide them.
 TOOLS = {'align': 'stavpr_slam', 'colmap': 'stavpr_slam', 'plot': 'stavpr_lab'}
-
-DATED = 250_000_000 * SECOND  # stamps below count from the start of a video or a simulation
 
 EPILOG = """
 examples:

@@ -18,7 +18,7 @@ from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.same_places import with_last_related
 from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
-from stavpr_ros.units import SECOND
+from stavpr_ros.units import DATED, SECOND
 
 OnWorker = Callable[[Callable[[], Any]], Any]
 
@@ -47,9 +47,9 @@ def update_own_map(pipeline: Pipeline, on_worker: OnWorker, log: 'Logger | Any')
     """
     state, places = pipeline.save_state, 0
     for drive in on_worker(pipeline.operation.take_drives):
-        name = time.strftime(
-            'drive %Y-%m-%d %H:%M:%S', time.gmtime(int(drive.stamps[0]) // SECOND)
-        )
+        start = int(drive.stamps[0])  # the drive of a simulation is named by the present time
+        seconds = start / SECOND if start >= DATED else time.time()
+        name = time.strftime('drive %Y-%m-%d %H:%M:%S', time.gmtime(seconds))
         opened, place_map = FileVersion.of(state.path), load_map(state.path)
         try:
             version = update_file(state.path, opened, place_map, drive, UpkeepSettings(), name)
