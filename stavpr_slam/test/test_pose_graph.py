@@ -123,7 +123,6 @@ def test_optimize_carried_robot_cuts_at_the_image():
     truth, odometry, closures = carried_drive()
     found, graph = solve(truth, closures, odometry)
     assert graph.splits == 1
-    assert 4 < graph.widest_break < 20  # images 134 to 136 of 2 m have no closure
     assert error(found, truth) < 1.5  # one image on the wrong side would be 2 m
 
 

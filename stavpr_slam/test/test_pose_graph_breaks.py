@@ -30,7 +30,6 @@ def test_merge_session_restores_the_chain():
         chain.split(node, (node + 1) * SECOND)
     assert chain.splits == [20, 40]
     assert np.bincount(chain.session).tolist() == [20, 20, 60]
-    np.testing.assert_array_equal(np.bincount(chain.rejoined(40)), [20, 80])
     chain.merge_session(20)
     assert np.bincount(chain.session).tolist() == [40, 60]
     assert (chain.splits, chain.sessions) == ([40], 2)

@@ -61,16 +61,16 @@ def find(
             continue
         Z = np.array([each.transform for each in rows])
         moved = solved[place[own]] @ Z @ inverse(solved[query[own]])
-        points = solved[query[own], :3, 3]
-        at = np.einsum('nij,mj->nmi', moved[:, :3, :3], points) + moved[:, None, :3, 3]
+        points = solved[query[own], :3, 3].T
+        at = moved[:, :3, :3] @ points + moved[:, :3, 3:]
         wide = [np.linalg.eigvalsh(each.covariance[3:, 3:])[-1] ** 0.5 for each in rows]
-        away = np.linalg.norm(at - np.einsum('nni->ni', at)[None], axis=2)
-        agree = away < NEAR * (1 + np.maximum.outer(wide, wide))
+        away = np.linalg.norm(at - np.einsum('nin->in', at), axis=1)
+        agree = (away < NEAR * (1 + np.maximum.outer(wide, wide))).astype(np.float32)
 
         def most(among: np.ndarray, agree: np.ndarray = agree) -> np.ndarray:
             """Return the rejected closures among some that agree with most of them."""
-            counts = np.where(among, (agree & among).sum(axis=1), 0)
-            return agree[np.argmax(counts)] & among
+            result: np.ndarray = (agree[np.argmax(agree @ among * among)] > 0) & among
+            return result
 
         for node in np.unique(query[own])[:: SUPPORT // 4].tolist():
             # a closure across the break: its place is not behind, or of another session

@@ -349,19 +349,6 @@ class PoseGraph:
         return len(self.chain.splits)
 
     @property
-    def widest_break(self) -> float:
-        """Return the longest distance without accepted closures around a break, m; 0 = none."""
-        chain, widest = self.chain, 0.0
-        queries = np.array([edge.query for edge in self.edges if edge.accepted], int)
-        for node in chain.splits:
-            own = queries[chain.recording[queries] == chain.recording[node]]
-            behind = own >= node
-            at = chain.travelled[own]
-            if behind.any() and not behind.all():
-                widest = max(widest, float(at[behind].min() - at[~behind].max()))
-        return widest
-
-    @property
     def pending(self) -> int:
         """Return the number of closures that wait for their odometry."""
         return len(self._pending)

@@ -279,15 +279,11 @@ class KeyframeChain:
         :param node: its first keyframe.
         :param stamp: of its first odometry, ns, after the keyframe before.
         """
-        self.session[:] = self.parted(node)
+        later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
+        self.session[later] = self.sessions
         self._cuts[node] = stamp, int(self.previous[node])
         self.previous[node] = -1
         self.sessions += 1
-
-    def parted(self, node: int) -> np.ndarray:
-        """Return the sessions of the nodes as they would be after a split at a node, (N,)."""
-        later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
-        return np.where(later, self.sessions, self.session)
 
     @property
     def splits(self) -> Sequence[int]:
@@ -297,12 +293,7 @@ class KeyframeChain:
     def merge_session(self, node: int) -> None:
         """Let a session that began by a split at a node be part of the one before again."""
         ended = self.session[node]
-        self.session[:] = self.rejoined(node)
+        self.session[self.session == ended] = self.session[self._cuts[node][1]]
         self.session[self.session > ended] -= 1
         self.sessions -= 1
         _, self.previous[node] = self._cuts.pop(node)
-
-    def rejoined(self, node: int) -> np.ndarray:
-        """Return the sessions of the nodes as they would be without a split, (N,)."""
-        before = self.session[self._cuts[node][1]]
-        return np.where(self.session == self.session[node], before, self.session)

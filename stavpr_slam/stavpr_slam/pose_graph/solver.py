@@ -18,7 +18,8 @@ from stavpr_ros.compilation import kernel
 
 SMALL = 1e-5  # radians: of a rotation whose series are cut after two terms
 SERIES = 1e-2  # radians: the same of the derivative of the logarithm
-SPARE = 1.25  # times the active factors: a pattern of so many is used again
+SPARE = 1.5  # times the active factors: a pattern of so many is used again
+PATTERNS = 16  # that are kept
 
 
 @kernel
@@ -96,25 +97,29 @@ def _derivative(twist, derivative):
     """
     Write the derivative of the logarithm of a transform by a twist behind it, (6, 6).
 
-    It is x / (1 - exp(-x)) of x = ad(twist), whose eigenvalues are 0 and +-i angle, each twice.
+    It is x / (1 - exp(-x)) of x = ad(twist): 1 + x / 2 + a x^2 + b x^4, since the eigenvalues of x
+    are 0 and +-i angle, each twice. The upper right block, which is 0, is not written.
     """
-    x, y, z = twist[0], twist[1], twist[2]
-    ad = np.zeros((6, 6))
-    for a in range(0, 6, 3):
-        for b in range(0, a + 3, 3):
-            u, v, w = twist[a - b], twist[a - b + 1], twist[a - b + 2]
-            ad[a, b + 1], ad[a, b + 2], ad[a + 1, b + 2] = -w, v, -u
-            ad[a + 1, b], ad[a + 2, b], ad[a + 2, b + 1] = w, -v, u
-    angle = math.sqrt(x * x + y * y + z * z)
-    second, fourth = 1 / 12, -1 / 720
-    if angle > SERIES:
-        half = angle / 2
+    w, v = twist[:3], twist[3:]
+    square, both = w[0] ** 2 + w[1] ** 2 + w[2] ** 2, v[0] * w[0] + v[1] * w[1] + v[2] * w[2]
+    second, fourth = 1 / 12 + square / 720, -1 / 720
+    if square > SERIES**2:
+        half = math.sqrt(square) / 2
         even = half / math.tan(half)
-        slope = even / angle - half / 2 / math.sin(half) ** 2
-        fourth = (1 + slope * half - even) / angle**4
-        second = 2 * fourth * angle**2 - slope / angle / 2
-    twice = ad @ ad
-    derivative[:] = np.eye(6) + ad / 2 + second * twice + fourth * (twice @ twice)
+        second = (1 - even) / square
+        fourth = (1 - even / 2 - (half / math.sin(half)) ** 2 / 2) / square**2
+    for a in range(3):
+        for b in range(3):
+            one = w[a] * w[b] - square * (a == b)
+            mixed = v[a] * w[b] + w[a] * v[b] - 2 * both * (a == b)
+            derivative[a, b] = second * one + (a == b)
+            derivative[a + 3, b] = second * mixed - 2 * fourth * both * one
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        for row, half_turn in ((0, w[c] / 2), (3, v[c] / 2)):
+            derivative[row + b, a] += half_turn
+            derivative[row + a, b] -= half_turn
+    derivative[3:, 3:] = derivative[:3, :3]
 
 
 @kernel
@@ -129,7 +134,8 @@ def linearized(poses, ends, motions, information, at, errors, jacobians, local, 
     """
     d = len(at)
     origin, step, off, twist = np.eye(4), np.eye(4), np.eye(4), np.zeros(6)
-    adjoint, derivative, own = np.zeros((6, 6)), np.zeros((6, 6)), np.empty((d, d))
+    adjoint, derivative = np.zeros((6, 6)), np.zeros((6, 6))
+    own, left = np.empty((d, d)), np.empty((d, d))
     for f in range(len(ends)):
         i, j = ends[f]
         _between(origin if i < 0 else poses[i], poses[j], step)
@@ -151,7 +157,9 @@ def linearized(poses, ends, motions, information, at, errors, jacobians, local, 
             for b in range(d):
                 jacobians[f, a, b] = adjoint[at[a], at[b]]
                 own[a, b] = derivative[at[a], at[b]]
-        local[f] = own.T @ information[f] @ own
+        left[:], local[f] = 0.0, 0.0
+        _add(left, 1.0, information[f], own, False)
+        _add(local[f], 1.0, own.T, left, False)
         for a in range(d):
             for b in range(d):
                 squared[f] += information[f, a, b] * errors[f, a] * errors[f, b]
@@ -426,5 +434,5 @@ class Solver:
         for each in self._patterns:
             if not (active & ~each.active).any() and each.active.sum() <= most:
                 return each
-        self._patterns = [Pattern.of(self.ends, count, active), *self._patterns[:3]]
+        self._patterns = [Pattern.of(self.ends, count, active), *self._patterns[: PATTERNS - 1]]
         return self._patterns[0]

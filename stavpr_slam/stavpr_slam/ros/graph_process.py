@@ -162,7 +162,6 @@ class GraphServer:
                 f'{robot} {reason}'.strip() for robot, reason in self._breaks[-3:]
             ),
             'breaks_by_closures': graph.splits,
-            'widest_break_m': f'{graph.widest_break:.1f}',
             'accepted_closures': graph.accepted,
             'rejected_closures': graph.rejected,
             'waiting_closures': graph.pending,
