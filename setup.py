@@ -31,7 +31,7 @@ WHEEL = not {'bdist_wheel', 'dist_info', 'editable_wheel', 'sdist'}.isdisjoint(s
 EXECUTABLES = (
     'node', 'build_map', 'map', 'replay', 'record', 'warm',
     'weights', 'monitor', 'demo', 'evaluate', 'experiments', 'export_model', 'pose_graph',
-    'optimize_graph', 'bridge', 'build_descriptor_map',
+    'optimize_graph', 'bridge', 'build_descriptor_map', 'teach', 'repeat',
 )  # fmt: skip
 BY_COLCON = not {'--build-base', '--build-directory'}.isdisjoint(sys.argv)
 MESSAGES = 'share/ament_index/resource_index/packages/stavpr_msgs'

@@ -22,6 +22,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/launch', ['launch/teach.launch.py', 'launch/repeat.launch.py']),
+        (f'lib/{NAME}', ['scripts/teach', 'scripts/repeat']),
     ],
     python_requires='>=3.11',
     install_requires=['numpy>=1.26', 'stavpr_ros'],

@@ -35,21 +35,26 @@ PUBLIC = (
     'stavpr_lab.evaluation.metrics',
 )  # fmt: skip
 
+PARTS = {'.srv': ['/request', '/response'], '.action': ['/goal', '/result', '/feedback']}
+
 
 def messages() -> Iterator[str]:
-    """Yield every field and constant of the messages and services, without comments."""
-    for path in sorted((ROOT / 'stavpr_msgs').glob('???/*.???')):
-        part = '/request' if path.suffix == '.srv' else ''
+    """Yield every field and constant of the interfaces, without comments."""
+    paths = (ROOT / 'stavpr_msgs').glob('*/*.*')
+    for path in sorted(each for each in paths if each.suffix[1:] == each.parent.name):
+        parts = iter(PARTS.get(path.suffix, ['']))
+        part = next(parts)
         for line in path.read_text(encoding='utf-8').splitlines():
             text = ' '.join(line.partition('#')[0].split())
             if text == '---':
-                part = '/response'
+                part = next(parts)
             elif text:
                 yield f'stavpr_msgs/{path.parent.name}/{path.stem}{part}: {text}'
 
 
 def parameters() -> Iterator[str]:
     """Yield the parameters of the nodes."""
+    from stavpr_nav.parameters import REPEAT, TEACH
     from stavpr_ros.parameters import PARAMETERS
     from stavpr_slam.commands.bridge import _class, TARGETS
     from stavpr_slam.ros import graph_node
@@ -57,7 +62,7 @@ def parameters() -> Iterator[str]:
     for row in PARAMETERS:
         limits = ', '.join(filter(None, [row.range, ' | '.join(row.choices), row.when]))
         yield f'node {row.name}: {type(row.default).__name__} = {row.default!r} ({limits})'
-    tables = {'pose_graph': graph_node.PARAMETERS}
+    tables = {'pose_graph': graph_node.PARAMETERS, 'teach': TEACH, 'repeat': REPEAT}
     tables |= {f'bridge {target}': _class(target).PARAMETERS for target in TARGETS}
     for program, table in tables.items():
         for name, (default, _) in table.items():

@@ -16,6 +16,7 @@ all features is the sum of the two.
 
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 import numpy as np
@@ -71,14 +72,15 @@ class TaughtRun:
 
     :param times: seconds, increasing, shape (n,).
     :param speeds, turns: m/s and rad/s, positive to the left, shape (n,).
-    :param is_closed: the last place is followed by the first.
+    :param seam: the place that the last one of a closed route shows, which goes on from there;
+        None = the route ends at its last place.
     :raises InputError: other shapes, numbers that are not finite, times that do not increase.
     """
 
     times: np.ndarray
     speeds: np.ndarray
     turns: np.ndarray
-    is_closed: bool = False
+    seam: int | None = None
 
     def __post_init__(self) -> None:
         columns = (self.times, self.speeds, self.turns)
@@ -88,19 +90,27 @@ class TaughtRun:
             raise InputError(f'times, speeds and turns have shapes {shapes}: expected (n,), n > 1')
         if not np.isfinite(columns).all() or (np.diff(self.times) <= 0).any():
             raise InputError('times, speeds and turns must be finite, times must increase')
+        if self.seam is not None and not 0 <= self.seam < n - 1:
+            raise InputError(f'seam = {self.seam}: expected a place before the last of {n}')
 
-    @property
-    def period(self) -> float:
-        """Return the seconds of a lap, or until the end of the route."""
-        times = self.times
-        return float(times[-1] - times[0] + (times[-1] - times[-2]) * self.is_closed)
+    @cached_property
+    def distances(self) -> np.ndarray:
+        """Return the meters from the first place to each, shape (n,)."""
+        steps = abs(self.speeds[:-1] + self.speeds[1:]) / 2 * np.diff(self.times)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def on_lap(self, time: float) -> float:
+        """Return a time after the last place of a closed route as one of the next lap."""
+        last = float(self.times[-1])
+        if self.seam is None or time <= last:
+            return time
+        first = float(self.times[self.seam])
+        return first + (time - last) % (last - first)
 
     def at(self, place: int, later: float) -> tuple[float, float, bool]:
         """Return speed and turn a time (s) after a place, and whether it is the end."""
-        time = float(self.times[place]) + later
-        if self.is_closed:
-            time = (time - self.times[0]) % self.period + self.times[0]
-        is_end = not self.is_closed and time >= self.times[-1]
+        time = self.on_lap(float(self.times[place]) + later)
+        is_end = self.seam is None and time >= self.times[-1]
         speed, turn = (np.interp(time, self.times, each) for each in (self.speeds, self.turns))
         return float(speed), float(turn), is_end
 
@@ -163,9 +173,9 @@ class RouteFollower:
         self._last, self._time = Command(0.0, 0.0), -math.inf
         # seconds of the taught run that were repeated, by the time of the commands
         self._repeated: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], HISTORY)
-        self._anchor: tuple[int, float] | None = (
-            None  # the last match; what was repeated until then
-        )
+        # the last match, and what was repeated until then
+        self._anchor: tuple[int, float] | None = None
+        self.end: int | None = None  # a place before the last at which the route ends
 
     def start(self, place: int) -> None:
         """Set the place of a robot at rest; otherwise it moves after its first match."""
@@ -180,9 +190,7 @@ class RouteFollower:
         done, times = self._repeated[-1][1] - before, self._taught.times
         if done > BRIDGE_TIME:
             return -1
-        time = times[place] + done
-        if self._taught.is_closed and time > times[-1]:
-            time -= self._taught.period
+        time = self._taught.on_lap(float(times[place]) + done)
         return min(int(np.searchsorted(times, time)), len(times) - 1)
 
     def observe(self, observation: Observation, now: float) -> None:
@@ -198,6 +206,11 @@ class RouteFollower:
                 self._anchor = observation.place, done
         elif now - self._confirmed > self._settings.max_unconfirmed:
             self._successive = 0
+
+    def halt(self, now: float, reason: str) -> Command:
+        """Halt for now; the robot accelerates from rest afterwards."""
+        self._time, self._last = now, Command(0.0, 0.0, reason)
+        return self._last
 
     def command(self, now: float) -> Command:
         """Return the velocities for now; to be called at a steady rate, above 10 Hz."""
@@ -228,8 +241,9 @@ class RouteFollower:
         assert newest is not None
         offset = newest.offset
         assert offset is not None
-        speed, turn, is_end = self._taught.at(newest.place, self._since(newest.stamp))
-        if is_end:
+        since, times = self._since(newest.stamp), self._taught.times
+        speed, turn, is_end = self._taught.at(newest.place, since)
+        if is_end or (self.end is not None and times[newest.place] + since >= times[self.end]):
             return Command(0.0, 0.0, 'end of the route')
         share = (newest.probability - UNCERTAIN) / (CERTAIN - UNCERTAIN)
         share = BRIDGE_SHARE if math.isnan(share) else min(max(share, SLOWEST), 1.0)

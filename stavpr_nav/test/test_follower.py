@@ -145,12 +145,12 @@ def test_expected_place_follows_the_last_match():
 
 
 def test_route_ends_at_its_last_place_unless_it_is_closed():
-    runs = [Run(run=taught(20, is_closed=closed)) for closed in (False, True)]
+    runs = [Run(run=taught(20, seam=seam)) for seam in (None, 0)]
     commands = [run.drive(14)[-1] for run in runs]
     assert commands[0].reason == 'end of the route'
     assert commands[0].speed == 0
     assert commands[1].speed == pytest.approx(0.8)
-    assert runs[1].run.period == pytest.approx(10.0)
+    assert runs[1].run.on_lap(10.0) == pytest.approx(0.5)
 
 
 def test_invalid_numbers_are_rejected():

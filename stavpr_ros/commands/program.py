@@ -5,6 +5,7 @@
 import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import difflib
+from importlib import import_module
 import math
 import os
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 
 from stavpr_ros.errors import printable, SettingsError, StavprError
 from stavpr_ros.parameters import BY_NAME
-from stavpr_ros.signals import interrupted, obey_signals
+from stavpr_ros.signals import interrupted, obey_signals, run_until_signal
 from stavpr_ros.threads import wait_passively
 
 DONE, FAILED, BAD_USAGE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
@@ -156,3 +157,31 @@ def run_program(
             raise
         say(f'{name}: {interruption()}', sys.stderr)
         return INTERRUPTED
+
+
+def run_node_program(text: str, module: str, node: str, args: list[str] | None) -> int:
+    """
+    Run a node until it is stopped, or print its help.
+
+    :param text: the help, with ``{parameters}``.
+    :param module: imported then; it has the class of the node, and ``PARAMETERS`` with default
+        and sentence by name.
+    :returns: the exit code.
+    """
+    arguments = sys.argv[1:] if args is None else args
+    wait_passively()
+
+    def run() -> int:
+        content = import_module(module)
+        if arguments[:1] in (['-h'], ['--help']):
+            rows = (
+                f'  {name} (default {default!r})\n      {sentence}\n'
+                for name, (default, sentence) in content.PARAMETERS.items()
+            )
+            print(text.format(parameters=''.join(rows)))
+            return DONE
+        from stavpr_ros.ros.process import run_node
+
+        return run_node(getattr(content, node), args, content.PARAMETERS)
+
+    return run_until_signal(run)

@@ -24,6 +24,8 @@ PACKAGES = {
     'pose_graph': 'stavpr_slam',
     'optimize_graph': 'stavpr_slam',
     'bridge': 'stavpr_slam',
+    'teach': 'stavpr_nav',
+    'repeat': 'stavpr_nav',
 }
 """Packages of the commands that are not in this one, for the message where one is missing."""
 

@@ -4,7 +4,7 @@
 
 import sys
 
-from stavpr_ros.signals import run_until_signal
+from stavpr_ros.commands.program import run_node_program
 
 HELP = """usage: pose_graph [--ros-args -p NAME:=VALUE ... -r odom:=TOPIC]
 
@@ -22,24 +22,7 @@ exit codes: 0 stopped by a signal; 1 an invalid parameter
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is stopped."""
-    arguments = sys.argv[1:] if args is None else args
-    if arguments[:1] in (['-h'], ['--help']):
-        from stavpr_slam.ros.graph_node import PARAMETERS
-
-        rows = (
-            f'  {name} (default {default!r})\n      {sentence}\n'
-            for name, (default, sentence) in PARAMETERS.items()
-        )
-        print(HELP.format(parameters=''.join(rows)))
-        return 0
-    return run_until_signal(lambda: _run(args))
-
-
-def _run(args: list[str] | None) -> int:
-    from stavpr_ros.ros.process import run_node
-    from stavpr_slam.ros.graph_node import PARAMETERS, PoseGraphNode
-
-    return run_node(PoseGraphNode, args, PARAMETERS)
+    return run_node_program(HELP, 'stavpr_slam.ros.graph_node', 'PoseGraphNode', args)
 
 
 if __name__ == '__main__':

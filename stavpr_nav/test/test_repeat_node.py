@@ -1,0 +1,294 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes teach and repeat over ROS: goals, offsets, velocities, bad input, the end."""
+
+import math
+from pathlib import Path
+import time
+from xml.etree import ElementTree
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+from processes import Process, TIMEOUT
+import pytest
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image
+from stavpr_msgs.action import Repeat
+from stavpr_msgs.msg import Offset, PlaceMatch
+from stavpr_nav.ros.repeat_node import RepeatNode
+from stavpr_nav.ros.teach_node import TeachNode
+from stavpr_nav.taught_run import read_velocities
+from stavpr_ros.errors import InputError, OutputError, SettingsError
+from stavpr_ros.mapping import load_map
+from stavpr_ros.ros.messages import image_message
+from std_msgs.msg import Bool, Header
+
+POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
+PERIOD = 0.1  # seconds between two images
+FAST = {'max_acceleration': 100.0, 'max_speed': 2.0}
+
+
+def overrides(**values):
+    return {'parameter_overrides': [Parameter(name, value=each) for name, each in values.items()]}
+
+
+class Rover:
+    """A camera, a recognition node that is right, a dead-man switch, and wheels."""
+
+    def __init__(self, context, images, map_id, kind=Twist):
+        self.node = rclpy.create_node('rover', context=context)
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(self.node)
+        publisher, subscribe = self.node.create_publisher, self.node.create_subscription
+        self.image = publisher(Image, 'image', qos_profile_sensor_data)
+        self.match = publisher(PlaceMatch, 'stavpr/match', 10)
+        self.camera = publisher(CameraInfo, 'camera_info', 10)
+        self.deadman = publisher(Bool, 'deadman', 10)
+        self.commands, self.offsets, self.feedback = [], [], []
+        subscribe(kind, 'cmd_vel', self.commands.append, 10)
+        subscribe(Offset, 'repeat/offset', self.offsets.append, 10)
+        self.client = ActionClient(self.node, Repeat, 'repeat')
+        self.images, self.map_id = images, map_id
+        self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
+        self.node.create_timer(PERIOD, self.look)
+
+    def look(self):
+        """Publish what the camera shows, the match, and the switch."""
+        header = Header(stamp=self.node.get_clock().now().to_msg())
+        image = image_message(header, self.images[int(self.place)])
+        if self.damaged:
+            image.encoding = 'nonsense'
+        matched = self.status == PlaceMatch.MATCH
+        match = PlaceMatch(header=header, status=self.status, map_id=self.map_id)
+        match.newest_index, match.probability = int(self.place) if matched else -1, 0.99
+        self.deadman.publish(Bool(data=self.pressed))
+        self.match.publish(match)
+        self.image.publish(image)
+        self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
+        if self.commands and hasattr(self.commands[-1], 'linear'):
+            step = self.commands[-1].linear.x * PERIOD
+            self.place = min(self.place + step, len(self.images) - 1)
+
+    def until(self, done):
+        end = time.monotonic() + TIMEOUT
+        while not done():
+            assert time.monotonic() < end, (self.place, self.commands[-3:])
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def result_of(self, future):
+        self.until(future.done)
+        return future.result()
+
+    def send(self, **goal):
+        """Send a goal; return its handle."""
+        self.until(self.client.server_is_ready)
+        return self.result_of(self.client.send_goal_async(
+            Repeat.Goal(**goal), lambda message: self.feedback.append(message.feedback)
+        ))  # fmt: skip
+
+    def drives(self):
+        return bool(self.commands) and self.commands[-1].linear.x > 0
+
+    def rests(self):
+        return bool(self.commands) and self.commands[-1].linear.x == 0
+
+
+@pytest.fixture
+def rover(request, context, route, map_file):
+    rover = Rover(context, route, load_map(map_file).map_id, getattr(request, 'param', Twist))
+    yield rover
+    rover.executor.shutdown()
+    rover.node.destroy_node()
+
+
+@pytest.fixture
+def repeat(context, rover, map_file):
+    """Make a node that is spun with the rover; it ends with the test."""
+    made = []
+
+    def make(**parameters):
+        node = RepeatNode(context=context, **overrides(map_path=map_file, **FAST | parameters))
+        made.append(node)
+        rover.executor.add_node(node)
+        return node
+
+    yield make
+    for node in made:
+        if not node.is_ending:
+            node.destroy_node()
+
+
+def test_goal_is_reached_with_feedback_and_velocities_stop(rover, repeat):
+    repeat()
+    handle = rover.send(place_index=9, start_index=3)
+    assert handle.accepted
+    answer = rover.result_of(handle.get_result_async())
+    result = answer.result
+    assert (result.code, result.place_index, result.message) == (Repeat.Result.REACHED, 9, '')
+    assert result.distance == pytest.approx(6, abs=1.5)
+    assert rover.rests()
+    driving = [one for one in rover.feedback if one.speed > 0]
+    assert driving
+    assert driving[0].distance_to_go <= 6
+    assert max(one.probability for one in driving) == pytest.approx(0.99)
+    rover.commands.clear()
+    images = len(rover.offsets)
+    rover.until(lambda: len(rover.offsets) > images + 5)  # without a goal: offsets alone
+    assert not rover.commands
+    offset = rover.offsets[-1]
+    assert (offset.place_index, offset.place_id) == (int(rover.place), f'place {int(rover.place)}')
+    assert offset.is_valid
+    assert offset.heading == pytest.approx(math.atan(offset.shift * 2), abs=1e-6)
+    assert abs(offset.heading) < 0.02
+
+
+def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rover, repeat):
+    node = repeat(give_up_after=0.0)
+    handle = rover.send(start_index=3, place_id='place 50')
+    rover.until(rover.drives)
+    busy = rover.send()
+    assert not busy.accepted  # there is a goal
+    for name, value in (
+        ('pressed', False),
+        ('damaged', True),
+        ('map_id', 'other'),
+        ('status', PlaceMatch.INVALID_IMAGE),
+    ):
+        right = getattr(rover, name)
+        rover.until(rover.drives)
+        setattr(rover, name, value)
+        rover.until(rover.rests)
+        setattr(rover, name, right)
+    rover.until(rover.drives)
+    assert node.counts['invalid images'] > 0
+    assert node.counts['matches on another map'] > 0
+    canceled = rover.result_of(handle.cancel_goal_async())
+    assert len(canceled.goals_canceling) == 1
+    answer = rover.result_of(handle.get_result_async())
+    assert answer.result.code == Repeat.Result.CANCELED
+    assert rover.rests()
+
+
+def test_node_that_ends_stops_the_robot(rover, repeat):
+    node = repeat()
+    rover.send(start_index=3)
+    rover.until(rover.drives)
+    rover.executor.remove_node(node)
+    node.destroy_node()
+    rover.until(rover.rests)
+
+
+def test_goals_that_are_not_on_the_route_are_rejected(rover, repeat):
+    repeat()
+    for goal in ({'place_index': 60}, {'place_id': 'nowhere'}, {'laps': 2}):
+        assert not rover.send(**goal).accepted
+
+
+@pytest.mark.parametrize('rover', [TwistStamped], indirect=True)
+def test_lost_robot_gives_up_and_velocities_may_be_stamped(rover, repeat):
+    repeat(give_up_after=0.5, stamped=True, base_frame='base')
+    rover.status = PlaceMatch.NO_MATCH
+    handle = rover.send()
+    answer = rover.result_of(handle.get_result_async())
+    assert answer.result.code == Repeat.Result.LOST
+    assert answer.result.place_index == -1
+    rover.until(lambda: rover.commands)
+    assert rover.commands[-1].header.frame_id == 'base'
+
+
+@pytest.mark.parametrize('name', ['repeat', 'teach'])
+def test_security_policy_allows_what_the_nodes_use(context, repeat, tmp_path, name):
+    if name == 'repeat':
+        node = repeat()
+    else:
+        node = TeachNode(context=context, **overrides(run_path=str(tmp_path / 'run.csv')))
+    published = node.get_publisher_names_and_types_by_node(name, '/')
+    subscribed = node.get_subscriber_names_and_types_by_node(name, '/')
+    replied = node.get_service_names_and_types_by_node(name, '/')
+    used = {
+        right: {topic for topic, _ in names if '/_action/' not in topic}
+        for right, names in (('publish', published), ('subscribe', subscribed), ('reply', replied))
+    }
+    allowed = {}
+    for enclave in ElementTree.parse(POLICY).iter('enclave'):
+        if enclave.get('path') == f'/stavpr/{name}':
+            for group in enclave.find('profiles/profile'):
+                (right,) = group.attrib
+                names = {entry.text.replace('~', f'/{name}') for entry in group}
+                allowed[right] = names
+    assert allowed.pop('execute', {'/repeat'}) == {'/repeat'}
+    optional = {'/clock', '/image/compressed', '/cmd_vel'}
+    assert {r: n - optional for r, n in allowed.items()} == {
+        r: n - optional for r, n in used.items()
+    }
+    if name == 'teach':
+        node.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'message'),
+    [
+        ({'gain': 0.0}, 'gain = 0.0 must be a number above 0'),
+        ({'give_up_after': -1.0}, 'give_up_after = -1.0'),
+        ({'image_transport': 'theora'}, "image_transport = 'theora'"),
+        ({'run_path': '/none.csv'}, 'cannot be read as a taught run'),
+    ],
+)
+def test_invalid_parameters_are_rejected(context, map_file, parameters, message):
+    with pytest.raises((SettingsError, InputError), match=message):
+        RepeatNode(context=context, **overrides(map_path=map_file, **parameters))
+
+
+@pytest.mark.parametrize('source', ['odom', 'cmd_vel', 'cmd_vel_stamped'])
+def test_velocities_are_recorded(context, tmp_path, source):
+    path = tmp_path / 'run.csv'
+    node = TeachNode(context=context, **overrides(run_path=str(path), source=source))
+    sender = rclpy.create_node('wheels', context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    kind, topic = {
+        'odom': (Odometry, 'odom'),
+        'cmd_vel': (Twist, 'cmd_vel'),
+        'cmd_vel_stamped': (TwistStamped, 'cmd_vel'),
+    }[source]
+    message = kind()
+    twist = getattr(message, 'twist', message)
+    twist = getattr(twist, 'twist', twist)
+    twist.linear.x, twist.angular.z = 0.5, -0.25
+    publisher = sender.create_publisher(kind, topic, 10)
+    end, stamp = time.monotonic() + TIMEOUT, 0
+    while len(path.read_text().splitlines()) < 5:
+        assert time.monotonic() < end
+        stamp += 1
+        if hasattr(message, 'header'):
+            message.header.stamp.sec = 100 + stamp
+        publisher.publish(message)
+        executor.spin_once(timeout_sec=0.05)
+    with pytest.raises(OutputError, match='File exists'):
+        TeachNode(context=context, **overrides(run_path=str(path)))
+    executor.shutdown()
+    node.destroy_node()
+    sender.destroy_node()
+    velocities = read_velocities(path)
+    np.testing.assert_allclose(velocities[:, 1:], [[0.5, -0.25]] * len(velocities))
+
+
+def test_executables_start_and_end(map_file, tmp_path):
+    run = tmp_path / 'run.csv'
+    teach = Process(tmp_path / 'teach', 'teach', '--ros-args', '-p', f'run_path:={run}')
+    repeat = Process(tmp_path / 'repeat', 'repeat', '--ros-args', '-p', f'map_path:={map_file}')
+    try:
+        end = time.monotonic() + TIMEOUT
+        while 'waiting for a goal' not in repeat.output() or 'recording' not in teach.output():
+            assert time.monotonic() < end
+            time.sleep(0.1)
+        assert (repeat.stop(), teach.stop()) == (0, 0)
+    finally:
+        repeat.end()
+        teach.end()
+    assert run.read_text() == 'stamp,speed,turn\n'
