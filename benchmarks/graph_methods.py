@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 import json
 import multiprocessing
 import os
@@ -49,7 +49,7 @@ SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
 NEARBY = np.diag([3.0] * 3 + [np.radians(20)] * 3) ** 2  # of KITTI's closures
 RIGHT = {'kitti': 10.0, 'world': 6.0}  # meters between the images of a right closure
 KITTI = ('00', '05', '06', '08', '09')
-GROUPS = (1, 10, 50, 900)  # closures between two updates
+GROUPS = (1, 3, 10, 50, 100, 900)  # closures between two updates
 DRIVES = {  # of a world: factor on the errors of the odometry, and what is special
     'large drift': (1.0, {}), 'small drift': (0.06, {}),
     'sessions': (1.0, {'sessions': 2}), 'carried': (1.0, {'carried': True}),
@@ -163,22 +163,26 @@ def driven(drive: Drive, group: int) -> dict[str, Any]:
         graph.update()
         times.append((time.process_time() - began) * 1e3)
         if number % 10 == 9 or group >= 50:
-            above = max(above, _error(drive, graph, at) - _error(drive, None, at))
+            after, before = _errors(drive, graph)
+            above = max(above, after - before)
     for stamp, pose in zip(drive.stamps[at:].tolist(), drive.odometry[at:], strict=True):
         graph.add_odometry(stamp, pose)
     graph.update(final=True)
-    count = len(drive.stamps)
+    found = np.array([graph.at(t) for t in drive.stamps.tolist()])
+    odometry, error = drive.error(drive.odometry), drive.error(found)
     return {'kind': drive.kind, 'drive': drive.name, 'group': group,
-            'odometry': _error(drive, None, count), 'error': _error(drive, graph, count),
-            'above': above, 'ms': np.percentile(times, [50, 90]).tolist()}  # fmt: skip
+            'odometry': round(odometry, 2), 'error': round(error, 2), 'above': round(above, 2),
+            'ms': np.percentile(times, [50, 90]).round().tolist()}  # fmt: skip
 
 
-def _error(drive: Drive, graph: PoseGraph | None, count: int) -> float:
-    poses = drive.odometry[:count]
-    if graph is not None:
-        poses = np.array([graph.at(t) for t in drive.stamps[:count].tolist()])
-    truth = planar_poses(drive.truth[:count])
-    return float(trajectory_errors(drive.stamps[:count], poses, truth)[0])
+def _errors(drive: Drive, graph: PoseGraph) -> list[float]:
+    """Return the errors of the path so far and of its odometry at the keyframes, m."""
+    stamps = graph.chain.stamps
+    truth = planar_poses(drive.truth[np.searchsorted(drive.stamps, stamps)])
+    return [
+        float(trajectory_errors(stamps, to_poses(each), truth)[0])
+        for each in (graph.solved, graph.chain.transforms)
+    ]
 
 
 def plain(drive: Drive, kernel: Any = None, gnc: bool = False) -> np.ndarray:
@@ -287,14 +291,10 @@ def main() -> None:
     parser.add_argument('--drives', action='store_true', help='KITTI in groups alone')
     options = parser.parse_args()
     if options.drives:
-        rows = [
-            driven(kitti(name, alpha), group)
-            for name in KITTI
-            for alpha in ('0.00', '0.30')
-            for group in GROUPS
-        ]
-        for row in rows:
-            print({k: np.round(v, 2) if k not in {'kind', 'drive'} else v for k, v in row.items()})
+        rows = []
+        for name, alpha, group in product(KITTI, ('0.00', '0.30'), GROUPS):
+            rows.append(driven(kitti(name, alpha), group))
+            print(rows[-1], flush=True)
         text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
         (RESULTS / 'graph_drives.json').write_text(text + '\n')
         return

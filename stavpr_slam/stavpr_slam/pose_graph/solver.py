@@ -16,6 +16,7 @@ from scipy.sparse import coo_matrix, eye_array
 from scipy.sparse.linalg import splu
 from stavpr_ros.compilation import kernel
 
+TINY = 1e-12  # twice the sine of an angle
 SMALL = 1e-5  # radians: of a rotation whose series are cut after two terms
 SERIES = 1e-2  # radians: the same of the derivative of the logarithm
 SPARE = 1.5  # times the active factors: a pattern of so many is used again
@@ -36,23 +37,11 @@ def _between(a, b, result):
 def _logarithm(T, twist):
     """Write the logarithm of a transform, rotation first."""
     x, y, z = T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]
-    trace = T[0, 0] + T[1, 1] + T[2, 2]
-    w = 1 + trace
-    if trace < 0:  # four times a component of the quaternion that is not small, and the others
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            if T[i, i] >= T[j, j] and T[i, i] >= T[k, k]:
-                own = (x, y, z)[i]
-                x, y, z = T[0, i] + T[i, 0], T[1, i] + T[i, 1], T[2, i] + T[i, 2]
-                whole = 1 + T[i, i] - T[j, j] - T[k, k]
-                x, y, z = (whole, y, z) if i == 0 else (x, whole, z) if i == 1 else (x, y, whole)
-                w = own
-                break
-    length = math.sqrt(x * x + y * y + z * z)
-    if w < 0:
-        x, y, z, w = -x, -y, -z, -w
-    angle = 2 * math.atan2(length, w)
-    factor = angle / length if length > SMALL else 2 / w
+    length, trace = math.sqrt(x * x + y * y + z * z), T[0, 0] + T[1, 1] + T[2, 2]
+    angle = math.atan2(length, trace - 1)
+    if length < TINY and trace < 0:  # half a turn, about an axis that is not known
+        z = length = 1.0
+    factor = angle / length if length > TINY else 0.5
     x, y, z = factor * x, factor * y, factor * z
     half = angle / 2
     rest = (1 - half / math.tan(half)) / angle**2 if angle > SMALL else 1 / 12
