@@ -29,13 +29,12 @@ CAMERA = Camera(*SIZE, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), '', (), tuple(CAM
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """A recognized pair: when it was known, its images, and the changes of its window."""
+    """A recognized pair: when it was known, and its images."""
 
     known: int
     query: int
     place: int
     pair: MatchedPair
-    changes: tuple[tuple[int, float], ...]
     is_late: bool
 
 
@@ -92,10 +91,8 @@ def recognize(
             window = each.match
             query = image_of[window.window_stamps[window.position]]
             place = image_of[pair.source.place(each.place_index).stamp]
-            changes = tuple(zip(window.window_stamps, window.window_changes, strict=True))
-            changes = () if window.is_late else changes
             pair = replace(pair, source=route)
-            pairs.append(Matched(i, query, place, pair, changes, window.is_late))
+            pairs.append(Matched(i, query, place, pair, window.is_late))
     return pairs
 
 
@@ -130,7 +127,7 @@ def with_edges(
         pose = (edge.pose, edge.covariance) if edge.has_pose else (IDENTITY, APPEARANCE)
         closure = None
         if edge.source is not Source.REFUTED:
-            closure = Closure(*stamps, *pose, edge.independent, changes=each.changes)
+            closure = Closure(*stamps, *pose, edge.independent)
         closures.append(
             Found(each.known, each.query, each.place, each.pair, edge, closure, took, each.is_late)
         )

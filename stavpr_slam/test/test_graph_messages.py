@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of the pose graph: closures to measurements, paths and edges to messages."""
 
-import math
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
@@ -10,7 +9,7 @@ import numpy as np
 from processes import SECOND
 import pytest
 from rclpy.serialization import deserialize_message
-from stavpr_msgs.msg import AlignedPlaces, LoopClosure
+from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
@@ -47,18 +46,6 @@ def test_closure_of_appearance_is_edge_of_meters_only_on_request():
     assert found is not None
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(3)
     assert not found.is_independent
-
-
-def test_closure_of_message_has_changes_of_the_images():
-    message = LoopClosure(query_index=3, place_index=1)
-    message.query_stamp, message.place_stamp = time_message(3 * SECOND), time_message(SECOND)
-    message.pairs = [
-        AlignedPlaces(query_stamp=time_message(stamp * SECOND), query_change=change)
-        for stamp, change in ((2, math.nan), (3, 0.25), (4, 0.5))
-    ]
-    found = closure_of(message, appearance=True)
-    assert found is not None
-    assert found.changes == ((3 * SECOND, 0.25), (4 * SECOND, 0.5))
 
 
 def test_closure_of_map_has_pose_of_place():

@@ -17,13 +17,6 @@ def chain_of(poses: np.ndarray) -> KeyframeChain:
     return chain
 
 
-def test_add_odometry_that_stands_is_noted_at_the_next_keyframe():
-    poses = planar_poses(np.array([[x, 0.0, 0.0] for x in (0, 2, 4, 4.01, 4.02, 6, 8)]))
-    chain = chain_of(poses)
-    assert len(chain) == 5
-    assert chain.stood.tolist() == [[0, 0], [0, 0], [0, 0], [2 * SECOND, 4 * SECOND], [0, 0]]
-
-
 def test_merge_session_restores_the_chain():
     chain = chain_of(planar_poses(circle(1)))
     for node in (20, 40):

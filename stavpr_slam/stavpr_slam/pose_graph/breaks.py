@@ -2,23 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where closures prove that the odometry missed a motion: the robot was carried."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-import math
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.closures import deviations, ResolvedClosure
+from stavpr_slam.pose_graph.closures import ResolvedClosure
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 GAIN = 24  # closures more that agree if there is a break, or
 EVIDENCE = 10.0  # so much more evidence
 SUPPORT, DISTANCE = 32, 40.0  # closures on each side of a break, and meters that they are along
 NEAR = 2.0  # meters, and deviations of two closures, that agreeing ones are apart
-STOPPED = math.log(10)  # evidence of a stop: elsewhere, one image in ten is of a stop
-PAUSE = 4.0  # times the usual time between keyframes: the robot was carried then
-CLEAR = 4.0  # a closure belongs to the side that it deviates from so many times less
-WRONG_SIDE = 0.1  # cost of a closure on the wrong side of a break, in logarithms of a change
+PAUSE = 1.5  # times the usual time between keyframes: the robot was carried then
 GAP = 15.0  # meters before and behind the closures at a break where it may be
 
 
@@ -40,14 +36,12 @@ def find(
     solved: np.ndarray,
     taken: np.ndarray,
     closures: Sequence[ResolvedClosure],
-    changes: Mapping[int, float],
 ) -> Break | None:
     """
     Return the break that lets most rejected closures agree; None = none.
 
     :param solved: transforms of all nodes by the robust solution, (N, 4, 4).
     :param taken: whether each closure agrees with it, shape (n,).
-    :param changes: see :func:`_locate`.
     """
     query, place = (
         np.array([getattr(each, end) for each in closures], int) for end in ('query', 'place')
@@ -81,13 +75,12 @@ def find(
                 before = np.flatnonzero(taken & here & (query < query[best].min()))
                 if not len(before):
                     before = own[most(query[own] < query[best].min())]
-    return _between(chain, closures, before, best, solved, changes)
+    return _between(chain, closures, before, best)
 
 
 def strained(
-    chain: KeyframeChain, solved: np.ndarray, taken: np.ndarray,
-    closures: Sequence[ResolvedClosure], node: int, changes: Mapping[int, float],
-) -> Break | None:  # fmt: skip
+    chain: KeyframeChain, taken: np.ndarray, closures: Sequence[ResolvedClosure], node: int
+) -> Break | None:
     """
     Return the break between the closures beside a node that the solution bends the odometry at.
 
@@ -96,76 +89,25 @@ def strained(
     query = np.array([each.query for each in closures], int)
     own = taken & (chain.session[query] == chain.session[node])
     before, behind = np.flatnonzero(own & (query < node)), np.flatnonzero(own & (query >= node))
-    return _between(chain, closures, before, behind, solved, changes)
+    return _between(chain, closures, before, behind)
 
 
 def _between(
     chain: KeyframeChain, closures: Sequence[ResolvedClosure], before: np.ndarray,
-    behind: np.ndarray, solved: np.ndarray, changes: Mapping[int, float],
+    behind: np.ndarray,
 ) -> Break | None:  # fmt: skip
+    """Return the break at the longest pause between closures, else in the middle."""
     query = np.array([each.query for each in closures], int)
     for side in (before, behind):
         if len(side) < SUPPORT or np.ptp(chain.travelled[query[side]]) < DISTANCE:
             return None
-    ends = before[np.argmax(query[before])], behind[np.argmin(query[behind])]
-    return _locate(chain, solved, closures, (int(ends[0]), int(ends[1])), changes)
-
-
-def _locate(
-    chain: KeyframeChain,
-    solved: np.ndarray,
-    closures: Sequence[ResolvedClosure],
-    ends: tuple[int, int],
-    changes: Mapping[int, float],
-) -> Break:
-    """
-    Return the break between closures: at a pause, else where it is most probable.
-
-    There, the images change much, the odometry stops, as a robot that is carried does not drive,
-    and few closures are on the wrong side. Changes are known in windows of closures only. Windows
-    at the break have images of both sides, so that some closures are on the wrong side. Without
-    any evidence, the break is in the middle.
-    """
-    last, first = (closures[i] for i in ends)
-    session = chain.session[first.query]
-    nodes = np.arange(last.query + 1, first.query + 1)
-    nodes = nodes[chain.session[nodes] == session]
+    last, first = query[before].max(), query[behind].min()
+    at, number = chain.travelled, np.arange(len(chain))
+    own = (chain.session == chain.session[first]) & (chain.previous >= 0)
+    nodes = np.flatnonzero(own & (at >= at[last] - GAP) & (at <= at[first] + GAP))
     pauses = chain.stamps[nodes] - chain.stamps[chain.previous[nodes]]
-    if len(nodes) and pauses.max() > PAUSE * np.median(pauses):
-        node = int(nodes[np.argmax(pauses)])
-        return Break(node, int(chain.stamps[node]))
-    low, high = last.at - GAP, first.at + GAP
-    own = np.flatnonzero((chain.session == session) & (chain.travelled >= low))
-    own = own[chain.travelled[own] <= high]
-    stamps = chain.stamps[own]
-    changed = {t: c for t, c in changes.items() if stamps[0] < t <= stamps[-1] and c > 0}
-    usual = float(np.median(list(changed.values()))) if changed else 1.0
-    evidence = dict.fromkeys(changed, 0.0)
-    least = np.median(np.diff(stamps)) / 2 if len(own) > 1 else math.inf
-    for time, middle in chain.stood[own[1:]].tolist():
-        if time >= least:
-            during = [t for t in changed if 0 < t - middle + time / 2 <= time] or [middle]
-            evidence |= dict.fromkeys(during, STOPPED)
-    if not evidence:
-        node = int(nodes[len(nodes) // 2]) if len(nodes) else first.query
-        return Break(node, int(chain.stamps[node]))
-    near = [
-        each
-        for each in closures
-        if stamps[0] <= each.stamp <= stamps[-1] and chain.session[each.query] == session
-    ]
-    T = chain.transforms
-    at_ends = [solved[each.place] @ each.transform for each in (last, first)]
-    moved = [
-        pose @ inverse(T[end.query]) for pose, end in zip(at_ends, (last, first), strict=True)
-    ]
-    old, new = (deviations(solved, near, each @ T) for each in moved)
-    at = np.array([each.stamp for each in near])
-
-    def probable(stamp: int) -> float:
-        wrong = np.where(at >= stamp, CLEAR * old < new, CLEAR * new < old).sum()
-        change = math.log(changed.get(stamp, usual) / usual)
-        return change + evidence[stamp] - WRONG_SIDE * float(wrong)
-
-    stamp = max(evidence, key=probable)
-    return Break(int(own[np.searchsorted(stamps, stamp)]), stamp)
+    node = nodes[np.argmax(pauses)]
+    if pauses.max() <= PAUSE * np.median(pauses):
+        nodes = np.flatnonzero(own & (number > last) & (number <= first))
+        node = nodes[len(nodes) // 2]
+    return Break(int(node), int(chain.stamps[[node, chain.previous[node]]].mean()))

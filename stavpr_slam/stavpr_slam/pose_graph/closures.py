@@ -26,8 +26,6 @@ class Closure:
     :param is_independent: its error does not correlate with that of the edge before.
     :param map_id: of the map that the place is in, whose pose there is ``place_pose``, shape (7,);
         empty = the place is on the same drive.
-    :param changes: stamps (ns) of the images of the window, the newest last, and how much each
-        differs from the image before it; more than usual where the robot was carried.
     :param query_robot, place_robot: whose odometry the stamps are of.
     """
 
@@ -38,7 +36,6 @@ class Closure:
     is_independent: bool = True
     map_id: str = ''
     place_pose: np.ndarray | None = None
-    changes: tuple[tuple[int, float], ...] = ()
     query_robot: str = ''
     place_robot: str = ''
 
@@ -77,8 +74,6 @@ class ResolvedClosure:
     A closure between two nodes of the graph.
 
     :param query, place: nodes.
-    :param stamp: of the images that the closure is evidence of, ns: recognition follows the newest
-        images of a window more than those before its middle, the query.
     :param transform: of the query's node in the place's, shape (4, 4).
     :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
     :param at: distance travelled at the query, m.
@@ -89,7 +84,6 @@ class ResolvedClosure:
     transform: np.ndarray
     covariance: np.ndarray
     at: float
-    stamp: int
     is_independent: bool
 
 

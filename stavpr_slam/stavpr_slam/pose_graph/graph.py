@@ -3,7 +3,7 @@
 """The pose graph: odometry and loop closures in, a corrected trajectory out."""
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -67,7 +67,6 @@ class PoseGraph:
         self._closures: list[ResolvedClosure] = []  # of them
         self._solved_closures = 0  # of them, in the last solution
         self._searched_at = 0, 0  # closures, and rejected ones, of the last search
-        self._changes: dict[int, float] = {}  # of images by their stamps
         self._links: dict[int, int] = {}
         self._pairs = frozenset[Pair]()  # of sessions that are joined
         self._decision: Decision | None = None
@@ -112,12 +111,10 @@ class PoseGraph:
         :raises InputError: it is not finite; it is counted and left out.
         """
         try:
-            closure = closure.checked()
+            self._pending.append(closure.checked())
         except InputError:
             self.counts['invalid'] += 1
             raise
-        self._changes |= closure.changes
-        self._pending.append(replace(closure, changes=closure.changes[-1:]))
         if len(self._pending) > MAX_PENDING:
             self._resolve()
         if len(self._pending) > MAX_PENDING:
@@ -149,14 +146,13 @@ class PoseGraph:
             return None
         (i, to_query), (j, to_place) = query, place
         measured = matrices(closure.pose)
-        newest = closure.changes[0][0] if closure.changes else closure.query_stamp
         # the frame of the pose moves with the query: its covariance in these axes changes by
         # the short motion between image and keyframe, which is left out
         return ResolvedClosure(
             i, j, to_place @ measured @ inverse(to_query),
             body_covariance(closure.covariance, measured),
             float(self.chain.travelled[i] + np.linalg.norm(to_query[:3, 3])),
-            (closure.query_stamp + newest) // 2, closure.is_independent,
+            closure.is_independent,
         )  # fmt: skip
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
@@ -254,10 +250,9 @@ class PoseGraph:
         for number, (solved, agreeing, node) in enumerate(self._solutions):
             if any(np.array_equal(agreeing, other) for _, other, _ in self._solutions[:number]):
                 continue
-            given = self.chain, solved, agreeing, self._closures
-            candidates = [breaks.find(*given, self._changes)]
+            candidates = [breaks.find(self.chain, solved, agreeing, self._closures)]
             if node >= 0:
-                candidates.append(breaks.strained(*given, node, self._changes))
+                candidates.append(breaks.strained(self.chain, agreeing, self._closures, node))
             for each in candidates:
                 if each and all(abs(each.node - other.node) > breaks.GAP for other in found):
                     found.append(each)

@@ -14,8 +14,6 @@ from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
 from stavpr_slam.pose_graph.track import OdometryTrack
 
-STILL = 0.05  # meters that a robot moves at most while it is stopped
-
 
 @dataclass(frozen=True)
 class ChainSettings:
@@ -40,28 +38,16 @@ class OdometryRecording:
     Odometry without a break, of one robot.
 
     :param stamps, nodes: of its keyframes, ns.
-    :param tail, still: stamp and pose of the newest odometry, and of the one that later ones have
-        not moved from.
-    :param stood: longest time that it stood since the last keyframe, and its middle, ns.
+    :param tail: stamp and pose of the newest odometry.
     :param spread: covariance of the odometry at the last keyframe as in its message, (6, 6).
     """
 
     robot: str
     track: OdometryTrack
     tail: tuple[int, np.ndarray]
-    still: tuple[int, np.ndarray]
     spread: np.ndarray | None
     stamps: list[int] = field(default_factory=list)
     nodes: list[int] = field(default_factory=list)
-    stood: tuple[int, int] = (0, 0)
-
-    def note_standing(self, stamp: int, pose: np.ndarray) -> None:
-        """Update ``stood``."""
-        since, at = self.still
-        if np.linalg.norm(pose[:3] - at[:3]) > STILL:
-            self.still = stamp, pose
-        elif stamp - since > self.stood[0]:
-            self.stood = stamp - since, (stamp + since) // 2
 
 
 class KeyframeChain:
@@ -70,9 +56,8 @@ class KeyframeChain:
 
     Arrays of N nodes: ``stamps`` (ns), ``transforms`` in the odometry of its session, or in the
     map, (N, 4, 4), ``travelled`` (m), ``session`` (negative = fixed), ``recording`` (the session
-    before splits), ``previous`` (the node before in its session, -1 = none), ``stood`` (how long
-    the odometry stood before the node, and the middle of that time, (N, 2), ns), ``robot`` (number
-    in ``robots``), and for :mod:`path_errors` ``origin`` (3,) and ``spread`` (6, 6).
+    before splits), ``previous`` (the node before in its session, -1 = none), ``robot`` (number in
+    ``robots``), and for :mod:`path_errors` ``origin`` (3,) and ``spread`` (6, 6).
     """
 
     FIXED = -1
@@ -82,7 +67,7 @@ class KeyframeChain:
         self._nodes = np.zeros(1024, [
             ('stamps', np.int64), ('transforms', np.float64, (4, 4)), ('travelled', np.float64),
             ('session', np.int32), ('recording', np.int32), ('previous', np.int64),
-            ('stood', np.int64, 2), ('origin', np.float64, 3), ('spread', np.float64, (6, 6)),
+            ('origin', np.float64, 3), ('spread', np.float64, (6, 6)),
             ('robot', np.int32),
         ])  # fmt: skip
         self._count = 0
@@ -128,7 +113,7 @@ class KeyframeChain:
             if current is not None:
                 self.breaks.append(cause)
             track = OdometryTrack(self._settings.distance, self._settings.angle)
-            current = OdometryRecording(robot, track, (stamp, pose), (stamp, pose), covariance)
+            current = OdometryRecording(robot, track, (stamp, pose), covariance)
             self._current[robot] = current
             if robot not in self.robots:
                 self.robots.append(robot)
@@ -145,7 +130,6 @@ class KeyframeChain:
         turned = (np.trace(step[:3, :3]) - 1) / 2 < np.cos(self._settings.angle)
         is_keyframe = bool(turned or not near)
         current.tail = stamp, pose
-        current.note_standing(stamp, pose)
         current.track.add(stamp, pose, is_keyframe)
         if is_keyframe:
             self._append(current, stamp, pose, node, covariance)
@@ -172,7 +156,7 @@ class KeyframeChain:
         transform = matrices(pose)
         node = self._extend(stamp, transform, self.sessions - 1, len(self._recordings) - 1)
         row, before = self._nodes[node], self._nodes[previous]
-        row['previous'], row['stood'], row['origin'] = previous, current.stood, pose[:3]
+        row['previous'], row['origin'] = previous, pose[:3]
         row['robot'] = self.robots.index(current.robot)
         if previous >= 0:
             for name in ('session', 'recording', 'origin'):
@@ -186,7 +170,7 @@ class KeyframeChain:
             if given is not None:
                 grown = LEAST * grown + given
             row['spread'] = before['spread'] + grown
-        current.spread, current.stood = covariance, (0, 0)
+        current.spread = covariance
         current.stamps.append(stamp)
         current.nodes.append(node)
 

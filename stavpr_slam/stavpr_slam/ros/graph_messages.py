@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of the pose graph: loop closures in; paths, poses and markers out."""
 
-import math
 import struct
 from typing import Any
 
@@ -31,15 +30,9 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     if relative.source in (RelativePose.REFUTED, RelativePose.DROPPED):
         return None
     on_map = message.query_index < 0 and message.has_poses
-    # a late closure has the window, and so the changes, of the closure published before it
     known: dict[str, Any] = {
         'map_id': (message.map_id or 'map') if on_map else '',
         'place_pose': pose_array(message.place_pose) if on_map else None,
-        'changes': tuple(
-            (nanoseconds(pair.query_stamp), pair.query_change)
-            for pair in message.pairs
-            if math.isfinite(pair.query_change) and not message.is_late
-        ),
     }
     if message.has_relative_pose and relative.source != RelativePose.NONE:
         covariance = np.array(relative.pose.covariance).reshape(6, 6)
