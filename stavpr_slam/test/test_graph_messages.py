@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of the pose graph: closures to measurements, paths and edges to messages."""
 
-
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 import numpy as np

@@ -41,7 +41,7 @@ def align_maps(reference: np.ndarray, poses: np.ndarray, pairs: np.ndarray) -> n
         )  # fmt: skip
     graph.update()
     chosen = [(edge.query, edge.place) for edge in graph.edges if edge.accepted]
-    if not graph.used:
+    if not len(graph.used):
         raise InputError(
             f'{len(chosen)} of {len(pairs)} recognized places agree on a transform: expected maps '
             'with a common stretch; leave --align out to keep both frames'

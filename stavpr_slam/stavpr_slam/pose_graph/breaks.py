@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where closures prove that the odometry missed a motion: the robot was carried."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.closures import ResolvedClosure
+from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 GAIN = 24  # closures more that agree if there is a break, or
@@ -32,10 +31,7 @@ class Break:
 
 
 def find(
-    chain: KeyframeChain,
-    solved: np.ndarray,
-    taken: np.ndarray,
-    closures: Sequence[ResolvedClosure],
+    chain: KeyframeChain, solved: np.ndarray, taken: np.ndarray, closures: ClosureArrays
 ) -> Break | None:
     """
     Return the break that lets most rejected closures agree; None = none.
@@ -43,21 +39,17 @@ def find(
     :param solved: transforms of all nodes by the robust solution, (N, 4, 4).
     :param taken: whether each closure agrees with it, shape (n,).
     """
-    query, place = (
-        np.array([getattr(each, end) for each in closures], int) for end in ('query', 'place')
-    )
+    query, place = closures.query, closures.place
     best, before = np.zeros(0, int), np.zeros(0, int)
     for session in np.unique(chain.session[query]).tolist():
         here = chain.session[query] == session
         own = np.flatnonzero(~taken & here)
-        rows = [closures[i] for i in own.tolist()]
         if len(own) < SUPPORT:
             continue
-        Z = np.array([each.transform for each in rows])
-        moved = solved[place[own]] @ Z @ inverse(solved[query[own]])
+        moved = solved[place[own]] @ closures.transform[own] @ inverse(solved[query[own]])
         points = solved[query[own], :3, 3].T
         at = moved[:, :3, :3] @ points + moved[:, :3, 3:]
-        wide = [np.linalg.eigvalsh(each.covariance[3:, 3:])[-1] ** 0.5 for each in rows]
+        wide = np.linalg.eigvalsh(closures.covariance[own, 3:, 3:])[:, -1] ** 0.5
         away = np.linalg.norm(at - np.einsum('nin->in', at), axis=1)
         agree = (away < NEAR * (1 + np.maximum.outer(wide, wide))).astype(np.float32)
 
@@ -75,29 +67,22 @@ def find(
                 before = np.flatnonzero(taken & here & (query < query[best].min()))
                 if not len(before):
                     before = own[most(query[own] < query[best].min())]
-    return _between(chain, closures, before, best)
+    return _between(chain, query, before, best)
 
 
 def strained(
-    chain: KeyframeChain, taken: np.ndarray, closures: Sequence[ResolvedClosure], node: int
+    chain: KeyframeChain, taken: np.ndarray, query: np.ndarray, node: int
 ) -> Break | None:
-    """
-    Return the break between the closures beside a node that the solution bends the odometry at.
-
-    Parameters as of :func:`find`.
-    """
-    query = np.array([each.query for each in closures], int)
+    """Return the break between the closures beside a node that the solution bends strongly at."""
     own = taken & (chain.session[query] == chain.session[node])
     before, behind = np.flatnonzero(own & (query < node)), np.flatnonzero(own & (query >= node))
-    return _between(chain, closures, before, behind)
+    return _between(chain, query, before, behind)
 
 
 def _between(
-    chain: KeyframeChain, closures: Sequence[ResolvedClosure], before: np.ndarray,
-    behind: np.ndarray,
-) -> Break | None:  # fmt: skip
+    chain: KeyframeChain, query: np.ndarray, before: np.ndarray, behind: np.ndarray
+) -> Break | None:
     """Return the break at the longest pause between closures, else in the middle."""
-    query = np.array([each.query for each in closures], int)
     for side in (before, behind):
         if len(side) < SUPPORT or np.ptp(chain.travelled[query[side]]) < DISTANCE:
             return None

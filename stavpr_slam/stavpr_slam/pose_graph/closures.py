@@ -4,6 +4,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -68,37 +69,24 @@ class Closure:
         return replace(self, pose=pose, covariance=covariance, place_pose=place)
 
 
-@dataclass(frozen=True, eq=False)
-class ResolvedClosure:
-    """
-    A closure between two nodes of the graph.
-
-    :param query, place: nodes.
-    :param transform: of the query's node in the place's, shape (4, 4).
-    :param covariance: in the axes of the query's node, rotation first, shape (6, 6).
-    :param at: distance travelled at the query, m.
-    """
-
-    query: int
-    place: int
-    transform: np.ndarray
-    covariance: np.ndarray
-    at: float
-    is_independent: bool
+# A closure between two nodes: the transform of the query's node in the place's, its covariance in
+# the axes of the query's node, rotation first, and whether its error is independent.
+BETWEEN_NODES = np.dtype([
+    ('query', np.int64), ('place', np.int64), ('transform', np.float64, (4, 4)),
+    ('covariance', np.float64, (6, 6)), ('is_independent', np.bool_),
+])  # fmt: skip
+ClosureArrays = Any  # np.recarray of this type
 
 
-def deviations(
-    solved: np.ndarray, closures: Sequence[ResolvedClosure], queries: np.ndarray
-) -> np.ndarray:
-    """Return squared deviations of closures, the queries of which are elsewhere, shape (n,)."""
-    if not closures:
-        return np.zeros(0)
-    X = np.array([(solved[each.place], queries[each.query]) for each in closures])
-    Z, covariance = (
-        np.array([getattr(each, name) for each in closures])
-        for name in ('transform', 'covariance')
-    )
-    off = logarithms(inverse(Z) @ inverse(X[:, 0]) @ X[:, 1])
-    solution = np.linalg.solve(covariance, off[:, :, None])[:, :, 0]
+def between_nodes(rows: Sequence[Any]) -> ClosureArrays:
+    """Return closures as arrays, the fields of :data:`BETWEEN_NODES`."""
+    return np.array(rows, BETWEEN_NODES).view(np.recarray)
+
+
+def deviations(solved: np.ndarray, closures: ClosureArrays) -> np.ndarray:
+    """Return the squared deviations of closures, shape (n,)."""
+    measured = inverse(closures.transform) @ inverse(solved[closures.place])
+    off = logarithms(measured @ solved[closures.query])
+    solution = np.linalg.solve(closures.covariance, off[:, :, None])[:, :, 0]
     result: np.ndarray = (off * solution).sum(axis=1)
     return result

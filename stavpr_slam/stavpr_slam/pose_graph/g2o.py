@@ -38,7 +38,7 @@ def g2o_text(graph: PoseGraph) -> str:
     motions = inverse(T[before]) @ T[nodes]
     for row in zip(before.tolist(), nodes.tolist(), motions, covariances, strict=True):
         lines.append(_edge_text(*row))
-    for edge in graph.used.values():
+    for edge in graph.used:
         lines.append(_edge_text(edge.place, edge.query, edge.transform, edge.covariance))
     return '\n'.join(lines) + '\n'
 

@@ -4,12 +4,13 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks
-from stavpr_slam.pose_graph.closures import Closure, deviations, ResolvedClosure
+from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays, deviations
 from stavpr_slam.pose_graph.decision import Decider, Decision, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.network import Network
@@ -64,7 +65,7 @@ class PoseGraph:
         self.chain = KeyframeChain(self.settings.keyframes, self.settings.noise)
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
-        self._closures: list[ResolvedClosure] = []  # of them
+        self._closures: ClosureArrays = between_nodes([])  # of them
         self._solved_closures = 0  # of them, in the last solution
         self._searched_at = 0, 0  # closures, and rejected ones, of the last search
         self._links: dict[int, int] = {}
@@ -72,7 +73,7 @@ class PoseGraph:
         self._decision: Decision | None = None
         self._taken = np.zeros(0, bool)
         self._solutions: list[tuple[np.ndarray, np.ndarray, int]] = []
-        self._edges: dict[int, ResolvedClosure] = {}
+        self._counted = np.zeros(0, int)  # numbers of the edges of the solution
         self.scales = np.zeros(0)
         self.solved = np.zeros((0, 4, 4))
         self.counts: Counter[str] = Counter()
@@ -123,12 +124,12 @@ class PoseGraph:
 
     def _resolve(self) -> None:
         """Find the nodes of the closures that wait."""
-        waiting = []
+        waiting, found = [], []
         for closure in self._pending:
             resolved = self._resolved(closure)
             if resolved is not None:
                 self._known.append(closure)
-                self._closures.append(resolved)
+                found.append(resolved)
                 continue
             ahead = self.chain.is_ahead
             if ahead(closure.query_stamp, closure.query_robot) or (
@@ -138,8 +139,10 @@ class PoseGraph:
             else:
                 self.counts['unknown stamp'] += 1
         self._pending = waiting
+        both = np.concatenate([self._closures, between_nodes(found)])
+        self._closures = both.view(np.recarray)
 
-    def _resolved(self, closure: Closure) -> ResolvedClosure | None:
+    def _resolved(self, closure: Closure) -> tuple[Any, ...] | None:
         query = self.chain.find(closure.query_stamp, closure.query_robot)
         place = self._place(closure)
         if query is None or place is None or query[0] == place[0]:
@@ -148,11 +151,9 @@ class PoseGraph:
         measured = matrices(closure.pose)
         # the frame of the pose moves with the query: its covariance in these axes changes by
         # the short motion between image and keyframe, which is left out
-        return ResolvedClosure(
+        return (
             i, j, to_place @ measured @ inverse(to_query),
-            body_covariance(closure.covariance, measured),
-            float(self.chain.travelled[i] + np.linalg.norm(to_query[:3, 3])),
-            closure.is_independent,
+            body_covariance(closure.covariance, measured), closure.is_independent,
         )  # fmt: skip
 
     def _place(self, closure: Closure) -> tuple[int, np.ndarray] | None:
@@ -184,7 +185,8 @@ class PoseGraph:
             if not failed:
                 raise
             self.counts['failed'] += failed
-            del self._known[self._solved_closures :], self._closures[self._solved_closures :]
+            del self._known[self._solved_closures :]
+            self._closures = self._closures[: self._solved_closures]
             self._update(final)
         self._solved_closures = len(self._known)
         return self.solved
@@ -210,24 +212,23 @@ class PoseGraph:
         """Add new closures to the estimate if all agree with it; return whether they do."""
         chain, known = self.chain, len(self._taken)
         new = self._closures[known:]
-        if not self._edges or len(self._links) < len(chain.starts()):
+        if not len(self._counted) or len(self._links) < len(chain.starts()):
             return False
         initial = extended(chain, self.solved, self._links)
         if any(
             a != b and (a, b) not in self._pairs for a, b in session_pairs(chain, new).tolist()
         ):
             return False
-        if deviations(initial, new, initial).max(initial=0.0) > AGREES:
+        if deviations(initial, new).max(initial=0.0) > AGREES:
             return False
         numbers = np.concatenate([np.flatnonzero(self._taken), np.arange(known, known + len(new))])
-        used = [self._closures[i] for i in numbers.tolist()]
+        used = self._closures[numbers]
         network = Network(chain, initial, used, self._links)
         decider = Decider(chain, network, initial, self.settings.measured)
-        independent = np.array([each.is_independent for each in used], bool)
-        counted = decider.counted(np.ones(len(used), bool), independent)
+        counted = decider.counted(np.ones(len(used), bool), used.is_independent)
         values, _, _ = decider.solved(self.scales, network.values(initial), counted)
         self._taken = np.concatenate([self._taken, np.ones(len(new), bool)])
-        self._edges = {int(i): self._closures[i] for i in numbers[counted]}
+        self._counted = numbers[counted]
         self.solved = network.nodes(values)
         return True
 
@@ -236,11 +237,10 @@ class PoseGraph:
             self.chain.split(found.node, found.stamp)
         else:
             self.chain.merge_session(found.node)
-        again = [self._resolved(closure) for closure in self._known]
-        self._closures = [
-            before if now is None else now
-            for before, now in zip(self._closures, again, strict=True)
-        ]
+        for number, closure in enumerate(self._known):
+            resolved = self._resolved(closure)
+            if resolved is not None:
+                self._closures[number] = resolved
 
     def _search_break(self) -> bool:
         """Begin a session where closures prove that the robot was carried."""
@@ -252,7 +252,9 @@ class PoseGraph:
                 continue
             candidates = [breaks.find(self.chain, solved, agreeing, self._closures)]
             if node >= 0:
-                candidates.append(breaks.strained(self.chain, agreeing, self._closures, node))
+                candidates.append(
+                    breaks.strained(self.chain, agreeing, self._closures.query, node)
+                )
             for each in candidates:
                 if each and all(abs(each.node - other.node) > breaks.GAP for other in found):
                     found.append(each)
@@ -283,15 +285,15 @@ class PoseGraph:
             allowed = np.array(
                 [a == b or (a, b) in placement.pairs for a, b in of_pair.tolist()], bool
             )
-            used = [self._closures[i] for i in np.flatnonzero(allowed)]
+            used = self._closures[allowed]
             network = Network(chain, placement.initial, used, placement.links)
             decider = Decider(chain, network, placement.initial, self.settings.measured)
             if searches or self._decision is None:
                 decision = decider.decide(len(chain.robots))
             else:
                 decision = decider.at(self._decision.scales)
-            taken = [each for each, right in zip(used, decision.taken, strict=True) if right]
-            joined = weights(session_pairs(chain, taken), taken)
+            taken = used[decision.taken]
+            joined = weights(session_pairs(chain, taken), taken.query)
             few = {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
             if not few:
                 break
@@ -305,12 +307,11 @@ class PoseGraph:
             agreeing[allowed] = each.agreeing
             self._solutions.append((network.nodes(each.corrected), agreeing, each.strained))
         self.scales, values = decision.scales, decision.values
-        self._edges = {}
+        self._counted = np.zeros(0, int)
         if decision.taken.any():
-            independent = np.array([each.is_independent for each in used], bool)
-            self.scales, values, counted = decider.estimate(decision, independent, searches)
-            numbers = np.flatnonzero(allowed)[counted]
-            self._edges = {int(i): self._closures[i] for i in numbers}
+            found = decider.estimate(decision, used.is_independent, searches)
+            self.scales, values, counted = found
+            self._counted = np.flatnonzero(allowed)[counted]
         self.solved = network.nodes(values)
 
     # results
@@ -318,10 +319,8 @@ class PoseGraph:
     @property
     def edges(self) -> list[GraphEdge]:
         """Return all closures between nodes."""
-        return [
-            GraphEdge(each.query, each.place, bool(taken))
-            for each, taken in zip(self._closures, self._taken, strict=False)
-        ]
+        ends = self._closures.query, self._closures.place, self._taken
+        return [GraphEdge(*row) for row in zip(*(each.tolist() for each in ends), strict=False)]
 
     @property
     def accepted(self) -> int:
@@ -334,9 +333,9 @@ class PoseGraph:
         return len(self._taken) - self.accepted
 
     @property
-    def used(self) -> dict[int, ResolvedClosure]:
-        """Return the edges of the solution by their numbers."""
-        return self._edges
+    def used(self) -> ClosureArrays:
+        """Return the edges of the solution, see :func:`between_nodes`."""
+        return self._closures[self._counted]
 
     @property
     def splits(self) -> int:

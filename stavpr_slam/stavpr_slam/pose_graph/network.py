@@ -7,12 +7,12 @@ Few nodes are variables: a run of the odometry between two of them is one factor
 nodes inside a run follow from its ends. Drives in a plane have poses in the plane.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.closures import ResolvedClosure
+from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 from stavpr_slam.pose_graph.runs import Runs
 from stavpr_slam.pose_graph.solver import Solver
@@ -44,12 +44,11 @@ class Network:
         self,
         chain: KeyframeChain,
         initial: np.ndarray,
-        closures: Sequence[ResolvedClosure],
+        closures: ClosureArrays,
         links: Mapping[int, int],
     ) -> None:
         self._chain, self._links = chain, links
-        self.query = np.array([each.query for each in closures], int)
-        self.place = np.array([each.place for each in closures], int)
+        self.query, self.place = closures.query, closures.place
         ends = {*self.query.tolist(), *self.place.tolist(), *links.values()}
         self._runs = Runs.of(chain, ends)
         variables = np.flatnonzero(self._runs.variable)
@@ -60,8 +59,7 @@ class Network:
         loose = np.array([LOOSE_ANGLE] * 3 + [LOOSE_POSITION] * 3)[at] ** -2.0
         self.loose_determinant = float(np.log(loose).sum() / 2)
         self.limit = float(chi2.ppf(INLIER, self.freedom))
-        covariance = np.array([each.covariance for each in closures]).reshape(-1, 6, 6)
-        self.information = np.linalg.inv(covariance[:, at[:, None], at])
+        self.information = np.linalg.inv(closures.covariance[:, at[:, None], at])
 
         # a factor for each variable: the odometry before it, a loose link, or an anchor
         before = self._runs.before[variables]
@@ -77,11 +75,10 @@ class Network:
         )
         number = np.full(len(chain) + 1, -1)
         number[variables] = np.arange(len(variables))
-        measured = np.array([each.transform for each in closures]).reshape(-1, 4, 4)
         starts = np.concatenate([np.where(self._inside, before, link), self.place])
         self._solver = Solver(
             number[np.stack([starts, np.concatenate([variables, self.query])], axis=1)],
-            np.concatenate([motions, measured]), at,
+            np.concatenate([motions, closures.transform]), at,
         )  # fmt: skip
         self._variables = variables
         self._covariance = self._runs.covariance[variables[self._inside]][:, at[:, None], at]

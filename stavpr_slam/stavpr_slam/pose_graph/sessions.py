@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sessions of a pose graph: which ones closures join, and where each one is in the map."""
 
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph.closures import ResolvedClosure
+from stavpr_slam.pose_graph.closures import ClosureArrays
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 JOINS = 8  # closures that join two sessions
@@ -31,24 +32,18 @@ class Placement:
     pairs: frozenset[Pair]
 
 
-def session_pairs(chain: KeyframeChain, closures: Sequence[ResolvedClosure]) -> np.ndarray:
+def session_pairs(chain: KeyframeChain, closures: ClosureArrays) -> np.ndarray:
     """Return the sessions of the ends of closures, the lower number first, shape (n, 2)."""
-    ends = np.array([(each.query, each.place) for each in closures], int).reshape(-1, 2)
-    return np.sort(chain.session[ends], axis=1)
+    return np.sort(chain.session[np.stack([closures.query, closures.place], axis=1)], axis=1)
 
 
-def weights(pairs: np.ndarray, closures: Sequence[ResolvedClosure]) -> dict[Pair, int]:
+def weights(pairs: np.ndarray, queries: np.ndarray) -> dict[Pair, int]:
     """Return at how many queries closures join two sessions."""
-    queries: dict[Pair, set[int]] = {}
-    for (a, b), each in zip(pairs.tolist(), closures, strict=True):
-        if a != b:
-            queries.setdefault((a, b), set()).add(each.query)
-    return {pair: len(own) for pair, own in queries.items()}
+    own = np.unique(np.column_stack([pairs, queries])[pairs[:, 0] != pairs[:, 1]], axis=0)
+    return dict(Counter((a, b) for a, b, _ in own.tolist()))
 
 
-def place(
-    chain: KeyframeChain, closures: Sequence[ResolvedClosure], denied: Collection[Pair]
-) -> Placement:
+def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair]) -> Placement:
     """
     Place the sessions, each where closures vote for.
 
@@ -57,9 +52,8 @@ def place(
     T, session = chain.transforms, chain.session
     result, links = T.copy(), {}
     of_pair = session_pairs(chain, closures)
-    joins = {
-        pair for pair, w in weights(of_pair, closures).items() if w >= JOINS and pair not in denied
-    }
+    joined = weights(of_pair, closures.query).items()
+    joins = {pair for pair, weight in joined if weight >= JOINS and pair not in denied}
     starts = {int(session[node]): int(node) for node in chain.starts()}
     waiting, known = list(starts), {KeyframeChain.FIXED}
     while waiting:
@@ -70,7 +64,8 @@ def place(
         votes, others = [], []
         for i in np.flatnonzero((of_pair == number).any(axis=1)).tolist():
             if (*of_pair[i].tolist(),) in joins:
-                Z, own, other = closures[i].transform, closures[i].query, closures[i].place
+                Z = closures.transform[i]
+                own, other = int(closures.query[i]), int(closures.place[i])
                 if session[own] != number:
                     Z, own, other = inverse(Z), other, own
                 if session[other] in known:
