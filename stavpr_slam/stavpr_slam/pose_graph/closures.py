@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.path_errors import LARGEST_COVARIANCE
-from stavpr_slam.pose_graph.transforms import logarithms
 
 VARIANCES = 1e-10, 1e6  # m^2, rad^2: least and largest that the graph computes with
 
@@ -81,12 +79,3 @@ ClosureArrays = Any  # np.recarray of this type
 def between_nodes(rows: Sequence[Any]) -> ClosureArrays:
     """Return closures as arrays, the fields of :data:`BETWEEN_NODES`."""
     return np.array(rows, BETWEEN_NODES).view(np.recarray)
-
-
-def deviations(solved: np.ndarray, closures: ClosureArrays) -> np.ndarray:
-    """Return the squared deviations of closures, shape (n,)."""
-    measured = inverse(closures.transform) @ inverse(solved[closures.place])
-    off = logarithms(measured @ solved[closures.query])
-    solution = np.linalg.solve(closures.covariance, off[:, :, None])[:, :, 0]
-    result: np.ndarray = (off * solution).sum(axis=1)
-    return result

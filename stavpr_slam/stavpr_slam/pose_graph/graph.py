@@ -10,7 +10,7 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks
-from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays, deviations
+from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
 from stavpr_slam.pose_graph.decision import Decider, Decision, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.network import Network
@@ -20,7 +20,6 @@ from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
 GROWN = 1.1  # factor on the number of closures from which scales and breaks are searched anew
-AGREES = 11.3  # squared deviations of 99 % of right closures in the plane
 MAX_BREAKS = 4  # that are searched
 
 
@@ -211,23 +210,24 @@ class PoseGraph:
     def _follow(self) -> bool:
         """Add new closures to the estimate if all agree with it; return whether they do."""
         chain, known = self.chain, len(self._taken)
-        new = self._closures[known:]
         if not len(self._counted) or len(self._links) < len(chain.starts()):
             return False
+        pairs = session_pairs(chain, self._closures[known:]).tolist()
+        if any(a != b and (a, b) not in self._pairs for a, b in pairs):
+            return False
         initial = extended(chain, self.solved, self._links)
-        if any(
-            a != b and (a, b) not in self._pairs for a, b in session_pairs(chain, new).tolist()
-        ):
-            return False
-        if deviations(initial, new).max(initial=0.0) > AGREES:
-            return False
-        numbers = np.concatenate([np.flatnonzero(self._taken), np.arange(known, known + len(new))])
+        number = np.arange(len(self._closures))
+        numbers = np.concatenate([np.flatnonzero(self._taken), number[known:]])
         used = self._closures[numbers]
         network = Network(chain, initial, used, self._links)
+        odometry = network.odometry(self.scales[chain.robot])
+        residuals = network.residuals(odometry, network.values(initial))
+        if (residuals[self.accepted :] > network.limit).any():
+            return False
         decider = Decider(chain, network, initial, self.settings.measured)
         counted = decider.counted(np.ones(len(used), bool), used.is_independent)
         values, _, _ = decider.solved(self.scales, network.values(initial), counted)
-        self._taken = np.concatenate([self._taken, np.ones(len(new), bool)])
+        self._taken = np.append(self._taken, number[known:] >= known)
         self._counted = numbers[counted]
         self.solved = network.nodes(values)
         return True
