@@ -75,8 +75,9 @@ repeat: override EXTRAS += slam
 repeat: build ## teach and repeat in a simulator, benchmarks/results/repeat.md
 	@$(RUN) python -m stavpr_lab.demonstration.repeat benchmarks/results
 
-days: build ## update a map by 30 days on the synthetic street, benchmarks/results/days.md
+days: build ## update a map by 30 synthetic days, and by real sessions, benchmarks/results/days.md
 	@$(RUN) python -m stavpr_lab.demonstration.days 31 benchmarks/results/days
+	@$(RUN) python benchmarks/sessions.py
 
 evaluate: override EXTRAS += evaluation
 evaluate: build ## report the matches of QUERY= on MAP=; metrics with TRUTH= (ARGS=)

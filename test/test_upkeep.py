@@ -86,7 +86,7 @@ def test_drive_like_the_map_changes_the_use_of_its_places_only(first):
     assert place_map.ids == tuple(map(str, range(200)))  # so that they stay
     assert version.use[100] > version.use[5] == 0.9
     assert set(version.missed) == {0}
-    assert version.changes == ('matched 100% of 160 images, certain of 100%',)
+    assert version.changes == ('certain of 100% of 160 images',)
 
 
 def test_stretch_that_looks_otherwise_becomes_an_experience(first, rebuilt):

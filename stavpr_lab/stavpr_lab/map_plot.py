@@ -28,6 +28,9 @@ def plot_map(place_map: PlaceMap, path: Path) -> None:
             _draw_thumbnails(bottom, place_map, 4)
         else:
             _draw_thumbnails(left, place_map, 2)
+        if len(place_map.sessions) > 1:
+            upper, right = right.subfigures(2, 1, height_ratios=(1, 2.4))
+            _draw_sessions(upper.subplots(), place_map)
         _draw_matrix(right, right.subplots(), place_map)
 
 
@@ -59,6 +62,21 @@ def _draw_route(axes: Axes, place_map: PlaceMap) -> None:
     axes.set(xlabel='x in m; circle: first place, numbers: places', ylabel='y in m')
     if place_map.sessions:
         axes.legend(loc='best')
+
+
+def _draw_sessions(axes: Axes, place_map: PlaceMap) -> None:
+    """Draw which places of earlier sessions each session shows, and its own ones."""
+    axes.set_title('places by session; gray: of an earlier session', fontsize=10.5, loc='left')
+    runs = _runs(place_map)
+    for row, (_, places) in enumerate(runs):
+        shown = places if place_map.same_as is None else place_map.same_as[places]
+        axes.plot(places, np.full(len(places), row), '|', ms=9, color=f'C{row % 10}')
+        earlier = shown[shown != places]
+        axes.plot(earlier, np.full(len(earlier), row), '|', ms=9, color=QUIET)
+    names = [f'{name}, {len(places)} places' for name, places in runs]
+    axes.set_yticks(range(len(runs)), names, fontsize=8)
+    axes.set_xlabel('place')
+    axes.invert_yaxis()
 
 
 def _draw_thumbnails(figure: SubFigure, place_map: PlaceMap, columns: int) -> None:

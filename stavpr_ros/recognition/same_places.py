@@ -28,23 +28,25 @@ class SamePlaces:
     The middle image of a full window has the matched place, its others the places of the path
     until they are the middle themselves.
 
+    ``middles`` has the places of the middle images only, (N,).
+
     :param count: of the images.
     """
 
     def __init__(self, count: int) -> None:
-        self._matched, self._near = (np.full(count, -1) for _ in range(2))
+        self.middles, self._near = (np.full(count, -1) for _ in range(2))
 
     def add(self, match: Match, image: int, length: int) -> None:
         """Take the match of the window that ends with an image; only a full one counts."""
         if match.accepted and len(match.window_stamps) == length:
             window = image - length + 1 + match.path[:, 0]
             self._near[window] = match.path[:, 1]
-            self._matched[window[(len(window) - 1) // 2]] = match.place_index
+            self.middles[window[(len(window) - 1) // 2]] = match.place_index
 
     @property
     def places(self) -> np.ndarray:
         """Return the place of each image, (N,)."""
-        return np.where(self._matched >= 0, self._matched, self._near)
+        return np.where(self.middles >= 0, self.middles, self._near)
 
 
 def with_last_related(place_map: PlaceMap) -> PlaceMap:

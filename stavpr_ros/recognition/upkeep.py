@@ -104,7 +104,7 @@ def update_map(
     grown = _with_stretches(place_map, drive, name, stretches)
     use = np.concatenate([use, np.ones(len(grown) - n)])
     missed = np.concatenate([missed, np.zeros(len(grown) - n, np.int64)])
-    is_kept = ~_long(missed >= settings.max_age, _runs(grown))
+    is_kept = ~_long((missed >= settings.max_age) & _is_replaced(grown), _runs(grown))
     if removed := int((~is_kept).sum()):
         changes.append(f'removed {removed} places not recognized by {settings.max_age} drives')
     limit = settings.max_places or round(1.5 * (version.base_places or n))
@@ -112,8 +112,8 @@ def update_map(
     if removed := int((is_kept & ~fits).sum()):
         changes.append(f'removed {removed} places that helped least, above {limit} places')
     kept = np.flatnonzero(fits)
-    matched = f'matched {driven.is_matched.mean():.0%} of {len(drive)} images'
-    changes.insert(0, f'{matched}, certain of {len(driven.certain) / len(drive):.0%}')
+    certain = (driven.of_windows >= 0).mean()
+    changes.insert(0, f'certain of {certain:.0%} of {len(drive)} images')
     return keep_places(grown, kept), replace(
         version,
         drive=name,
@@ -154,12 +154,14 @@ class _Driven:
     """
     A drive on the map.
 
-    :param places: that its images are certain of, (N,); -1 = none.
-    :param is_matched: whether they are matched, certain or not, (N,).
+    :param places: that its images, in the middle of a window, are certain of, (N,); -1 = none.
+    :param of_windows: that images are certain of in any part of a window, (N,); -1 = none.
+    :param is_matched: whether the middle ones are matched, certain or not, (N,).
     :param driven: number of images in motion up to each, (N,).
     """
 
     places: np.ndarray
+    of_windows: np.ndarray
     is_matched: np.ndarray
     driven: np.ndarray
     recognizer: PlaceRecognizer
@@ -186,7 +188,8 @@ def _drive(place_map: PlaceMap, drive: PlaceMap) -> _Driven:
         if match.probability > least:
             certain.add(match, i, settings.sequence.length)
         moves[i] = not recognizer.is_standstill
-    return _Driven(certain.places, matched.places >= 0, np.cumsum(moves), recognizer)
+    is_matched, driven = matched.middles >= 0, np.cumsum(moves)
+    return _Driven(certain.middles, certain.places, is_matched, driven, recognizer)
 
 
 def _require_certain(
@@ -206,7 +209,7 @@ def _require_certain(
     runs = _runs(place_map)
     for a, b in pairwise(certain):
         p, q = roots[places[a]], roots[places[b]]
-        allowed = FASTEST * (driven.driven[b] - driven.driven[a]) + SLACK
+        allowed = FASTEST * (b - a) + SLACK
         if runs[p] == runs[q] and not -SLACK <= q - p <= allowed:
             raise InputError(
                 f'images {a} and {b} are certain of places {p} and {q}, which they cannot both '
@@ -214,7 +217,7 @@ def _require_certain(
             )
     if not (len(place_map.thumbnails) and len(drive.thumbnails)):
         return
-    verifier, score = PlaceVerifier(GeometricSettings('orb')), 0
+    verifier, score, decided = PlaceVerifier(GeometricSettings('orb')), 0, 0
     for image in certain[np.linspace(0, len(certain) - 1, PROBES).astype(int)].tolist():
         query, place = drive.thumbnail(image), int(places[image])
         if query is None:
@@ -222,7 +225,8 @@ def _require_certain(
         other = (place + max(FAR, len(place_map) // 2)) % len(place_map)
         right, wrong = (verifier.inliers(query, place_map, each) or 0 for each in (place, other))
         score += int(right > wrong) - int(right < wrong)
-    if score < 0:
+        decided += int(right != wrong)
+    if score < -2 * decided**0.5:
         raise InputError(
             'the thumbnails of the certain images fit other places better; the map stays as it is'
         )
@@ -243,20 +247,19 @@ def _used(
     use = use * DECAY if len(use) == n else np.full(n, DECAY)
     missed = missed if len(missed) == n else np.zeros(n, np.int64)
     helped, passed = np.zeros(n, bool), np.zeros(n, bool)
-    certain, places = driven.certain, driven.places
+    places, certain = driven.of_windows, np.flatnonzero(driven.of_windows >= 0)
     for a, b in pairwise(certain):
         p, q = places[a], places[b]
         if runs[p] == runs[q] and 0 <= q - p <= FASTEST * (b - a) + SLACK and b - a <= SLACK:
             helped[p : q + 1] = True
         p, q = roots[p], roots[q]
-        if runs[p] == runs[q] and (b - a < MIN_HARD or 0.8 <= (q - p) / (b - a) <= 1.25):
+        if runs[p] == runs[q] and b - a < MIN_HARD:
             passed[p : q + 1] = True
     helped[places[certain]] = True
     fits = np.zeros(n, bool)  # a place of the same session beside it was recognized
     for run in np.unique(runs):
         own = np.flatnonzero(runs == run)
-        near = np.convolve(helped[own], np.ones(2 * NEAR + 1), 'full')[NEAR : NEAR + len(own)]
-        fits[own] = near > 0.5
+        fits[own] = _is_near(helped[own], NEAR)
     missed = np.where(helped, 0, missed + (passed[roots] & fits))
     return use + helped, missed
 
@@ -276,7 +279,7 @@ def _stretches(
         is_same = bool(runs[p] == runs[q]) and _is_same_road(
             driven, drive, roots, (a, b), line, runs == runs[p]
         )
-        of_gap = np.rint(line[inside]).astype(np.int64) if is_same else np.full(len(inside), -1)
+        of_gap = np.rint(line[inside]).astype(np.int64) if is_same else driven.of_windows[inside]
         margin = max(MARGIN, -(-(MIN_SESSION - len(inside)) // 2))
         before = certain[(certain <= a) & (certain > a - margin) & moves[certain]]
         after = certain[(certain >= b) & (certain < b + margin) & moves[certain]]
@@ -394,6 +397,23 @@ def _long(is_missed: np.ndarray, runs: np.ndarray) -> np.ndarray:
     begins = (np.diff(is_missed, prepend=False) != 0) | (np.diff(runs, prepend=runs[0]) != 0)
     part = np.cumsum(begins)
     return is_missed & (np.bincount(part)[part] >= MIN_MISSED)
+
+
+def _is_near(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Return which places are within some places of one that a mask has, (n,)."""
+    near = np.convolve(mask, np.ones(2 * reach + 1), 'full')[reach : reach + len(mask)]
+    return np.asarray(near > 0.5)
+
+
+def _is_replaced(grown: PlaceMap) -> np.ndarray:
+    """Return which places other sessions show, and a window of places on both sides, (n,)."""
+    runs, is_replaced = _runs(grown), np.zeros(len(grown), bool)
+    roots = np.arange(len(grown)) if grown.same_as is None else grown.same_as
+    for run in np.unique(runs):
+        own, is_other = np.flatnonzero(runs == run), np.zeros(len(grown), bool)
+        is_other[roots[runs != run]] = True
+        is_replaced[own] = ~_is_near(~_is_near(is_other, SLACK)[roots[own]], MIN_HARD)
+    return is_replaced
 
 
 def _within(grown: PlaceMap, use: np.ndarray, is_kept: np.ndarray, limit: int) -> np.ndarray:
