@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from stavpr_ros.filter.evidence import (
     changed_images,
+    own_evidence,
     path_probability,
-    RecentMean,
+    RecentWindows,
     straight_steps,
 )
 from stavpr_ros.recognition.device_windows import DeviceBuffer
@@ -49,20 +50,29 @@ def test_best_path_elsewhere_equals_plain_loops_on_all_devices(device, n):
 
 
 def test_path_probability_by_hand():
-    """Of odds 3, a lead of 1, a drive of recent odds 1/3, and half a window."""
-    x = -7.28 + 0.64 * np.log(3) + 2.59 * np.log(1 + 10) - 1.71 * np.log(3)
-    assert path_probability(0.75, 2.0, 1.0, 0.25, 10) == pytest.approx(1 / (1 + np.exp(-x)))
-    sure = path_probability(1.0, 4.0, 0.0, 0.9, 20)
-    assert sure == path_probability(1 - 1e-9, 4.0, -8.0, 0.5, 20) > 0.98
-    assert path_probability(0.0, 4.0, 0.0, 0.9, 20) == 0
-    assert path_probability(0.5, -1.0, 0.0, 0.5, 20) == path_probability(0.5, 1.0, 2.0, 0.5, 20)
+    """Of odds 3, a lead of 1, and half a window; of a drive that rarely matched."""
+    own = own_evidence(0.75, 2.0, 1.0, 10)
+    assert own == pytest.approx(-6.91 + 0.62 * np.log(3) + 2.56 * np.log(11))
+    expected = 1 / (1 + np.exp(-own + 3.65 * np.log(3)))
+    assert path_probability(own, 0.25) == pytest.approx(expected)
+    assert path_probability(own, 0.5) == path_probability(own, 0.9) > expected
+    sure = own_evidence(1.0, 4.0, 0.0, 20)
+    assert sure == own_evidence(1 - 1e-9, 4.0, -8.0, 20) > 4
+    assert own_evidence(0.5, -1.0, 0.0, 20) == own_evidence(0.5, 1.0, 2.0, 20)
+    assert path_probability(own_evidence(0.0, 4.0, 0.0, 20), 0.9) == 0
 
 
-def test_recent_mean_starts_even_and_forgets():
-    recent = RecentMean()
+def test_recent_windows_start_even_forget_and_trust_sure_ones_soon():
+    recent = RecentWindows()
     for _ in range(4):
         recent.add(1.0)
-    assert recent.value == pytest.approx((8 * 0.5 + 4) / 12)
+    assert recent.share == pytest.approx((8 * 0.5 + 4) / 12)
     for _ in range(600):
-        recent.add(0.0)
-    assert recent.value < 0.01
+        recent.add(-np.inf)
+    assert recent.share < 0.01
+    for _ in range(15):
+        recent.add(4.0)
+    assert recent.share > 0.5
+    for _ in range(30):
+        recent.add(1.0)  # likely, not sure
+    assert 0.3 < recent.share < 0.5

@@ -12,18 +12,22 @@ depend on it:
   (:func:`best_elsewhere`): how much nearer it is than its look-alikes, in this window and light.
   Of a camera at rest, one image counts;
 - the number l of images that are matched: a window, or the newest images alone;
-- r, the **recent** mean of p over the windows of the drive, from .5 on: whether this drive is on
-  the map at all.
+- r, the **recent** windows of the drive: whether this drive is on the map at all.
 
 The probability is 1 / (1 + exp(-x)) with::
 
-    x = -7.28 + 0.64 ln(p / (1 - p)) + 2.59 ln(1 + l d) + 1.71 min(0, ln(r / (1 - r)))
+    x = own + 3.65 min(0, ln(r / (1 - r)))
+    own = -6.91 + 0.62 ln(p / (1 - p)) + 2.56 ln(1 + l d)
 
-by logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
+r is the share of the windows before that are likely matches by themselves, own > -0.5, or, if that
+is larger, the share of the latest ones that are sure by themselves, own > 3.5: of a drive that
+comes to the map late. The mean of p would tell less: by night p is low on right paths, too.
+
+By logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
 windows of drives, half of them with detours, and on the first images of drives. Each of six
 routes, floors that look alike, and unrelated routes have the same weight. The log odds y of this
-regression are recalibrated on routes left out, x = 2 (y - 0.85): of what it declared 0.9 with
-``gradient``, 0.97 was right, and detours are matched at 0.7 and below.
+regression are recalibrated on routes left out, x = 2 (y - 0.75), with 1.25 times the factor of r:
+of what it declared 0.9 with ``gradient``, 0.97 was right, and detours are matched at 0.7 and below.
 benchmarks/results/evidence.md names the data, and has the results on data sets left out, other
 quantities, and what half and double of each factor does.
 """
@@ -34,45 +38,61 @@ import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
 
-CONSTANT, POSTERIOR, LEAD, RECENT = -7.28, 0.64, 2.59, 1.71
+CONSTANT, POSTERIOR, LEAD, RECENT = -6.91, 0.62, 2.56, 3.65
+LIKELY, SURE = -0.5, 3.5  # own evidence of windows that are counted
 APART = 20  # places: paths nearer than that to the path are not elsewhere
 SPEEDS = np.array([1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0])  # of straight paths
 CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do not grow
 MIN_RECENT = 0.04  # a drive that comes to the map late is recognized there
-FIRST, LAST = 8, 108  # windows that count as the mean .5 at first, and that the mean goes back
+FIRST = 8  # windows that count as the share .5 at first
+LAST, LATEST = 100, 20  # windows that the shares of likely and of sure ones go back
 FAR = np.float32(1)  # z beside the map, and of places that are not compared
 INF = np.float32(np.inf)
 CHUNK = 128  # places whose sums are computed together
 
 
-class RecentMean:
-    """The mean probability p of a drive's windows, ``value``: .5 at first."""
+class RecentWindows:
+    """The share r of a drive's windows that are matches by themselves: .5 at first."""
 
     def __init__(self) -> None:
-        self.value, self._count = 0.5, FIRST
+        self._likely = self._sure = 0.5
+        self._count = FIRST
 
-    def add(self, probability: float) -> None:
-        """Count another window."""
+    @property
+    def share(self) -> float:
+        """Return r."""
+        return max(self._likely, self._sure)
+
+    def add(self, own: float) -> None:
+        """Count another window by its own evidence."""
         self._count = min(self._count + 1, LAST)
-        self.value += (probability - self.value) / self._count
+        self._likely += ((own > LIKELY) - self._likely) / self._count
+        self._sure += ((own > SURE) - self._sure) / min(self._count, LATEST)
 
 
-def path_probability(
-    posterior: float, score: float, elsewhere: float, recent: float, images: int
-) -> float:
+def own_evidence(posterior: float, score: float, elsewhere: float, images: int) -> float:
     """
-    Return the probability of a path.
+    Return the evidence of a path by its window alone; -inf if it is impossible.
 
     :param posterior: p, by the filter and the checks.
     :param score: m, mean of -z along the path.
     :param elsewhere: m', of :func:`best_elsewhere`.
-    :param recent: r, of the windows before.
     :param images: l.
     """
+    if posterior <= 0:
+        return -math.inf
     lead = max(score - max(elsewhere, 0.0), 0.0)
-    x = CONSTANT + POSTERIOR * _log_odds(posterior, CERTAIN) + LEAD * math.log1p(images * lead)
-    x += RECENT * min(_log_odds(recent, MIN_RECENT), 0.0)
-    return 1 / (1 + math.exp(-x)) if posterior > 0 else 0.0
+    return CONSTANT + POSTERIOR * _log_odds(posterior, CERTAIN) + LEAD * math.log1p(images * lead)
+
+
+def path_probability(own: float, recent: float) -> float:
+    """
+    Return the probability of a path.
+
+    :param own: of :func:`own_evidence`.
+    :param recent: r, of the windows before.
+    """
+    return 1 / (1 + math.exp(-own - RECENT * min(_log_odds(recent, MIN_RECENT), 0.0)))
 
 
 def changed_images(numbers: np.ndarray) -> np.ndarray:

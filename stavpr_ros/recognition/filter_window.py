@@ -5,6 +5,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+import math
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.evidence import (
     APART,
     changed_images,
+    own_evidence,
     path_probability,
-    RecentMean,
+    RecentWindows,
     straight_steps,
 )
 from stavpr_ros.filter.model import FilterSettings, MODEL
@@ -72,8 +74,8 @@ class FilterWindow(QueryWindow):
         self.filter: Filter = self.filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(layout.passes(places), settings, length)
         self.choice = PathChoice(self.filter, self.change, layout, width)
-        self._recent = RecentMean()
-        self._posterior = self._of_window = 0.0  # of the latest match, and of the full window
+        self._recent = RecentWindows()
+        self._own = self._of_window = -math.inf  # evidence of the latest match, and of the window
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._repeated = slice(0, 0)  # columns that the latest path is in, beyond a lap
@@ -94,7 +96,7 @@ class FilterWindow(QueryWindow):
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._at_rest, self._entered, self._recent = None, 0, RecentMean()
+        self._at_rest, self._entered, self._recent = None, 0, RecentWindows()
         self._repeated = slice(0, 0)
 
     def grow(self, places: int) -> None:
@@ -170,7 +172,7 @@ class FilterWindow(QueryWindow):
         match = self._at_rest
         if match is None:
             match = self._match_image(len(self.images), middle, nms_radius)
-            self._of_window = self._posterior
+            self._of_window = self._own
         self._recent.add(self._of_window)
         self._at_rest = match if self._rests(middle) else None
         return in_places(match, self.layout, nms_radius)
@@ -229,7 +231,7 @@ class FilterWindow(QueryWindow):
         n, first = self.buffer.known, self.buffer.first
         if not n:
             return WindowMatch()
-        self._posterior = 0.0
+        self._own = -math.inf
         rows = list(self.images)[len(self.images) - count :]
         belief = self.filter.belief(n, rows[-1].number - rows[position].number)
         if not len(belief.places):
@@ -275,14 +277,17 @@ class FilterWindow(QueryWindow):
         self, chosen: ChosenPath, numbers: np.ndarray, position: int
     ) -> tuple[float, float]:
         """Return the probability of a path, and the one below which it is no match."""
-        self._posterior, least = chosen.probability, chosen.min_probability
+        posterior, least = chosen.probability, chosen.min_probability
         if self._to_oldest:
-            return self._posterior, least
+            return posterior, least
         steps = straight_steps(numbers, position)
         near = self.layout.around(int(chosen.path[position]), APART)
         elsewhere = self.buffer.best_elsewhere(steps, near, changed_images(numbers))
-        others = chosen.score, elsewhere, self._recent.value, len(numbers)
-        return path_probability(self._posterior, *others), path_probability(least, *others)
+        lead = chosen.score, elsewhere, len(numbers)
+        self._own, recent = own_evidence(posterior, *lead), self._recent.share
+        return path_probability(self._own, recent), path_probability(
+            own_evidence(least, *lead), recent
+        )
 
     def _sequences(
         self, n: int, first: int, chosen: ChosenPath | None = None, share: float = 1.0
