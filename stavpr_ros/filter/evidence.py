@@ -21,7 +21,7 @@ The probability is 1 / (1 + exp(-x)) with::
 
 r is the share of the windows before that are likely matches by themselves, own > -0.5, or, if that
 is larger, the share of the latest ones that are sure by themselves, own > 3.5: of a drive that
-comes to the map late. The mean of p would tell less: by night p is low on right paths, too.
+comes to the map late. The mean of p separates less: by night p is low on right paths, too.
 
 By logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
 windows of drives, half of them with detours, and on the first images of drives. Each of six
