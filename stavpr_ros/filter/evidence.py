@@ -27,9 +27,9 @@ By logistic regression on features ``gradient`` and ``efficientnet_lite1`` toget
 windows of drives, half of them with detours, and on the first images of drives. Each of six
 routes, floors that look alike, and unrelated routes have the same weight. The log odds y of this
 regression are recalibrated on routes left out, x = 2 (y - 0.75), with 1.25 times the factor of r:
-of what it declared 0.9 with ``gradient``, 0.97 was right, and detours are matched at 0.7 and below.
-benchmarks/results/evidence.md names the data, and has the results on data sets left out, other
-quantities, and what half and double of each factor does.
+of what it declared 0.9 with ``gradient``, 0.97 was right, and detours are matched at 0.7 and
+below. benchmarks/results/evidence.md names the data, and has the results on data sets left out,
+other quantities, and what half and double of each factor does.
 """
 
 import math
