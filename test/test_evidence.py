@@ -52,7 +52,7 @@ def test_best_path_elsewhere_equals_plain_loops_on_all_devices(device, n):
 def test_path_probability_by_hand():
     """Of odds 3, a lead of 1, and half a window; of a drive that rarely matched."""
     own = own_evidence(0.75, 2.0, 1.0, 10)
-    assert own == pytest.approx(-6.91 + 0.62 * np.log(3) + 2.56 * np.log(11))
+    assert own == pytest.approx(-7.01 + 0.62 * np.log(3) + 2.56 * np.log(11))
     expected = 1 / (1 + np.exp(-own + 3.65 * np.log(3)))
     assert path_probability(own, 0.25) == pytest.approx(expected)
     assert path_probability(own, 0.5) == path_probability(own, 0.9) > expected

@@ -17,16 +17,16 @@ depend on it:
 The probability is 1 / (1 + exp(-x)) with::
 
     x = own + 3.65 min(0, ln(r / (1 - r)))
-    own = -6.91 + 0.62 ln(p / (1 - p)) + 2.56 ln(1 + l d)
+    own = -7.01 + 0.62 ln(p / (1 - p)) + 2.56 ln(1 + l d)
 
-r is the share of the windows before that are likely matches by themselves, own > -0.5, or, if that
-is larger, the share of the latest ones that are sure by themselves, own > 3.5: of a drive that
+r is the share of the windows before that are likely matches by themselves, own > -0.6, or, if that
+is larger, the share of the latest ones that are sure by themselves, own > 3.4: of a drive that
 comes to the map late. The mean of p separates less: by night p is low on right paths, too.
 
 By logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
 windows of drives, half of them with detours, and on the first images of drives. Each of six
 routes, floors that look alike, and unrelated routes have the same weight. The log odds y of this
-regression are recalibrated on routes left out, x = 2 (y - 0.75), with 1.25 times the factor of r:
+regression are recalibrated on routes left out, x = 2 (y - 0.8), with 1.25 times the factor of r:
 of what it declared 0.9 with ``gradient``, 0.97 was right, and detours are matched at 0.7 and
 below. benchmarks/results/evidence.md names the data, and has the results on data sets left out,
 other quantities, and what half and double of each factor does.
@@ -38,12 +38,12 @@ import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
 
-CONSTANT, POSTERIOR, LEAD, RECENT = -6.91, 0.62, 2.56, 3.65
-LIKELY, SURE = -0.5, 3.5  # own evidence of windows that are counted
+CONSTANT, POSTERIOR, LEAD, RECENT = -7.01, 0.62, 2.56, 3.65
+LIKELY, SURE = -0.6, 3.4  # own evidence of windows that are counted
 APART = 20  # places: paths nearer than that to the path are not elsewhere
 SPEEDS = np.array([1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0])  # of straight paths
 CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do not grow
-MIN_RECENT = 0.04  # a drive that comes to the map late is recognized there
+MIN_RECENT = 0.2  # a drive that comes to the map late is recognized there
 FIRST = 8  # windows that count as the share .5 at first
 LAST, LATEST = 100, 20  # windows that the shares of likely and of sure ones go back
 FAR = np.float32(1)  # z beside the map, and of places that are not compared

@@ -19,7 +19,7 @@ from stavpr_ros.mapping.error_risks import ErrorRisks
 
 # error rates, descending, and the least probability of matches that keep them
 ERRORS = np.array([0.1, 0.05, 0.02, 0.01, 0.005])
-PROBABILITIES = np.array([0.005, 0.01, 0.51, 0.972, 0.9985])
+PROBABILITIES = np.array([0.005, 0.01, 0.5, 0.969, 0.9985])
 
 
 def least_probability(max_error: float, risks: ErrorRisks | None = None) -> float:
