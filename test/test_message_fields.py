@@ -112,7 +112,7 @@ class Drive:
             return 0.2
         if 'not confirmed' in match.reason:
             return 0.0
-        return 0.05 if len(match.path) in range(1, LENGTH) else 1 - PROBABILITY
+        return 0.03 if len(match.path) in range(1, LENGTH) else 1 - PROBABILITY
 
 
 def is_close(a: float, b: float, error: float = 1e-6) -> bool:
@@ -631,7 +631,7 @@ def test_drives_show_what_the_fields_distinguish(drives):
     """Or a check would hold for want of messages."""
     robust, paper, mapping, loop, _, _, early, back = drives
     assert {match.status for drive in drives for match in drive.matches} == set(range(8))
-    assert {0.2, 0.05} == {round(match.threshold, 6) for match in early.matches}
+    assert {0.2, 0.03} == {round(match.threshold, 6) for match in early.matches}
     assert 0.0 in {match.threshold for match in loop.matches}
     assert any(matched(match) for match in back.matches)
     for drive in (robust, paper):
