@@ -47,6 +47,7 @@ help: ## list the targets (the default)
 	@echo '  TRUTH=identity, TRUTH=FILE demo, evaluate: ground truth, for metrics (default: none)'
 	@echo '  FEATURES=learned           demo: features hybrid, of the extra learned (default: gradient)'
 	@echo '  LOOP=PATH                  demo: your sequence with loops, or synthetic for the street'
+	@echo '  REPEAT=street              demo: a robot repeats a taught route in a simulator'
 	@echo '  SLAM=world                 demo: three laps, odometry corrected by a pose graph'
 	@echo '  ARGS="..."                 options for the program of the target (test: pytest)'
 
@@ -56,7 +57,7 @@ setup: ## create .venv with the pinned Python packages and the ROS 2 Jazzy wheel
 build: ## setup, then build the packages with colcon
 	@$(SETUP) build $(OPTIONS) $(EXTRAS)
 
-ifdef SLAM
+ifneq ($(SLAM)$(REPEAT),)
 demo: override EXTRAS += slam
 endif
 ifneq ($(LEARNED),)
@@ -64,9 +65,13 @@ demo: override EXTRAS += learned
 endif
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
 	@$(if $(LEARNED),$(RUN) $(LAB)/weights efficientnet_lite1)
+ifdef REPEAT
+	@$(RUN) python -m stavpr_lab.demonstration.repeat demo_output/repeat --length 150 --laps 1
+else
 	@$(RUN) $(LAB)/demo $(if $(FEATURES),--features $(FEATURES:learned=hybrid)) $(if $(MAP),--map "$$MAP") $(if $(QUERY),--query "$$QUERY") \
 		$(if $(LOOP),--loop "$$LOOP") $(if $(SLAM),--slam "$$SLAM") \
 		$(if $(TRUTH),--truth "$$TRUTH") $(ARGS)
+endif
 
 animation: demo ## write the animation of the README, docs/demo.webp
 	@$(RUN) python -m stavpr_lab.demonstration.animation demo_output docs/demo.webp

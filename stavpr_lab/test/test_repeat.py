@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from stavpr_lab.demonstration.repeat import (
+    animate,
     CONDITIONS,
     plot,
     repeat,
@@ -32,7 +33,13 @@ def cover(image, time):
 
 
 def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(taught, tmp_path):
-    drive = repeat(taught, CONDITIONS['dusk'], COVERED + 3, begin=10, change=cover)
+    images = []
+
+    def change(image, time):
+        images.append(image)
+        return cover(image, time)
+
+    drive = repeat(taught, CONDITIONS['dusk'], COVERED + 3, begin=10, change=change)
     assert drive.errors[0] == pytest.approx((1.0, math.radians(10)), abs=0.05)
     driven = np.cumsum(drive.speeds) * STEP
     assert driven[-1] > 25
@@ -44,6 +51,23 @@ def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(taught, tmp_pa
     assert drive.reasons[-1] == 'not localized on the route'
     plot(taught, {'dusk': drive}, tmp_path / 'repeat.png')
     assert (tmp_path / 'repeat.png').stat().st_size > 10_000
+    animate(taught, drive, images[:15], tmp_path / 'repeat.webp')
+    assert (tmp_path / 'repeat.webp').stat().st_size > 10_000
+
+
+def test_robot_stops_within_a_second_where_the_camera_shows_another_route(taught):
+    other = View(RingWorld(11), CONDITIONS['day'])
+    line, shown = other._line, []
+
+    def change(image, time):
+        if time < 12:
+            return image
+        shown.append(other.image(line[round(0.5 / CELL) * len(shown)], len(shown)))
+        return shown[-1]
+
+    drive = repeat(taught, CONDITIONS['day'], 14.0, begin=10, change=change)
+    assert drive.speeds[drive.times < 12][-1] > 2
+    assert drive.speeds[drive.times >= 13].max() < 0.05
 
 
 def test_robot_on_another_route_does_not_move(taught):

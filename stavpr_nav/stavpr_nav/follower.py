@@ -6,12 +6,13 @@ The control law: velocities of the taught run by place, corrected by the offset 
 At the place of the newest image the robot repeats the taught velocities v and w, at a share c of
 the speed that falls with the probability of the place, and steers against the offset of the image:
 
-    v' = c v        w' = c w - gain v' (shift + weight parallax)
+    v' = c v        w' = c w - gain v' (e + 1 / D integral e ds)        e = shift + weight parallax
 
 shift is the heading error and parallax the lateral offset, in parts of the image's width (see
 ``stavpr_ros.relative_pose.offset``). Both errors converge, without a calibrated camera, as the
 bearing-only law of Krajnik et al. (Navigation without localisation, 2018) does, whose one shift of
-all features is the sum of the two.
+all features is the sum of the two. The integral over the path takes out a constant pull to one
+side, of unequal wheels or a camera that does not look straight ahead.
 """
 
 from collections import deque
@@ -27,9 +28,11 @@ UNCERTAIN, CERTAIN = 0.5, 0.9  # probabilities of the slowest and of the full sp
 SLOWEST = 0.3  # share of the taught speed
 WITHOUT_OFFSET = 0.5  # share of the speed while the offset is not valid
 MAX_STEER = 0.2  # widths of the image
+INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image
 BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
 BRIDGE_TIME, BRIDGE_SHARE = 6.0, 0.5  # seconds of the taught run without a match; share of speed
 STUCK_TIME, STUCK_PLACES = 2.0, 4  # of the taught run, in which the place has to change
+FALL, MEMORY = 0.3, 10  # share of the recent similarity that is dissimilar; images of its mean
 FIRST = 3  # successive confirmed images, from which on the robot moves
 HISTORY = 200  # latest commands, to know how far the robot is since an image was taken
 
@@ -170,6 +173,8 @@ class RouteFollower:
         self._changed = 0.0  # what was repeated when the place last changed
         self._stamp = -math.inf
         self._successive = 0
+        self._integral = self._steer = 0.0
+        self._similarity = 0.0  # mean of the latest matched images
         self._last, self._time = Command(0.0, 0.0), -math.inf
         # seconds of the taught run that were repeated, by the time of the commands
         self._repeated: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], HISTORY)
@@ -196,7 +201,7 @@ class RouteFollower:
     def observe(self, observation: Observation, now: float) -> None:
         """Take the result of an image."""
         self._received, self._stamp = now, observation.stamp
-        if observation.is_confirmed:
+        if observation.is_confirmed and not self._falls(observation):
             if self._newest is None or observation.place != self._newest.place:
                 self._changed = self._repeated[-1][1]
             self._newest, self._confirmed = observation, now
@@ -206,6 +211,14 @@ class RouteFollower:
                 self._anchor = observation.place, done
         elif now - self._confirmed > self._settings.max_unconfirmed:
             self._successive = 0
+
+    def _falls(self, observation: Observation) -> bool:
+        """Whether the filter still matches, by its memory, an image unlike its place."""
+        if math.isnan(observation.probability) or observation.offset is None:
+            return False
+        similarity, before = observation.offset.similarity, self._similarity
+        self._similarity += (similarity - before) / MEMORY if before else similarity
+        return similarity < FALL * before
 
     def halt(self, now: float, reason: str) -> Command:
         """Halt for now; the robot accelerates from rest afterwards."""
@@ -250,9 +263,11 @@ class RouteFollower:
         share *= 1 if offset.is_valid else WITHOUT_OFFSET
         share = min(share, settings.max_speed / max(abs(speed), 1e-9))
         speed, turn = share * speed, share * turn
+        self._steer = 0.0
         if offset.is_valid:
             steer = offset.shift + settings.parallax_weight * offset.parallax
-            turn -= settings.gain * abs(speed) * min(max(steer, -MAX_STEER), MAX_STEER)
+            self._steer = min(max(steer, -MAX_STEER), MAX_STEER)
+        turn -= settings.gain * abs(speed) * (self._steer + self._integral)
         return Command(speed, turn)
 
     def _since(self, stamp: float) -> float:
@@ -273,4 +288,6 @@ class RouteFollower:
         taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
         done = speed / taught * step if abs(taught) > 1e-3 else step
         self._repeated.append((self._time, self._repeated[-1][1] + done))
+        integral = self._integral + self._steer * abs(speed) * step / INTEGRAL
+        self._integral = min(max(integral, -MAX_INTEGRAL), MAX_INTEGRAL)
         return Command(speed, turn)

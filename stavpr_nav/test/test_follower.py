@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from stavpr_nav import follower
 from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.relative_pose.offset import Offset
@@ -52,6 +53,13 @@ def test_taught_velocities_are_repeated_from_third_image_on():
     assert commands[-1].reason == ''
 
 
+@pytest.fixture
+def proportional(monkeypatch):
+    """Leave out the integral of the law."""
+    monkeypatch.setattr(follower, 'INTEGRAL', 1e9)
+
+
+@pytest.mark.usefixtures('proportional')
 @pytest.mark.parametrize('offset', [(0.1, 0.0), (-0.1, 0.0), (0.0, 0.02), (0.0, -0.02)])
 def test_robot_turned_or_offset_to_the_left_steers_to_the_right(offset):
     shift, parallax = offset
@@ -60,6 +68,7 @@ def test_robot_turned_or_offset_to_the_left_steers_to_the_right(offset):
     assert command.turn == pytest.approx(expected)
 
 
+@pytest.mark.usefixtures('proportional')
 def test_correction_is_bounded():
     turns = [Run().drive(2, Offset(shift, 0.01, 0, 1e6, 0.6))[-1].turn for shift in (0.25, 0.45)]
     assert turns[0] == turns[1] == pytest.approx(0.1 - FAST.gain * 0.8 * 0.2)
@@ -160,3 +169,30 @@ def test_invalid_numbers_are_rejected():
         TaughtRun(np.arange(3.0), np.ones(2), np.ones(3))
     with pytest.raises(InputError, match='times must increase'):
         TaughtRun(np.zeros(3), np.ones(3), np.ones(3))
+
+
+def test_integral_takes_out_a_constant_pull():
+    """A robot that turns by itself: the shift is what its heading has become."""
+    robot, heading, pull = RouteFollower(taught(2000), FAST), 0.0, 0.02
+    headings = []
+    for k in range(4000):
+        time = k * STEP
+        offset = Offset(heading, 0.01, 0.0, 1e6, 0.6)
+        if k % 4 == 0:
+            robot.observe(Observation(time, int(time * 2), 1.0, offset), time)
+        command = robot.command(time)
+        heading += (command.turn - 0.1 * command.speed / 0.8 + pull * command.speed) * STEP
+        headings.append(heading)
+    assert max(headings) > 0.01
+    assert abs(headings[-1]) < 1e-3
+
+
+def test_matched_image_much_less_similar_than_before_stops_at_once():
+    run = Run()
+    run.drive(3)
+    other = Offset(0.0, 0.01, 0.0, 1e6, 0.17)
+    assert run.drive(STEP, other)[-1].reason == 'the newest image is not of the route'
+    other = Offset(0.0, 0.01, 0.0, 1e6, 0.3)
+    run = Run()
+    run.drive(3)
+    assert run.drive(3, other)[-1].speed == pytest.approx(0.8)

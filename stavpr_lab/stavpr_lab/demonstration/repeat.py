@@ -4,17 +4,19 @@
 Teach and repeat in a simulator: a robot with differential drive on the synthetic street.
 
 The image is rendered where the robot is; recognition, offset and control law get nothing but the
-images. Wheels slip, images arrive late, and single images are lost. Poses are x, y (meters) and
-heading (radians, to the left). ``python3 -m stavpr_lab.demonstration.repeat FOLDER`` drives laps
-by day, at dusk and in the rain, and writes a table and a plot from above.
+images. Wheels slip and pull to one side, images arrive late, and single images are lost. Poses are
+x, y (meters) and heading (radians, to the left). ``python3 -m stavpr_lab.demonstration.repeat
+FOLDER`` drives ten laps by day, at dusk and in the rain, and the stops, and writes a table and a
+plot from above; ``--length 150 --laps 1`` drives one shorter lap, and writes its animation too.
 """
 
+import argparse
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-import sys
+from typing import NamedTuple
 
 import numpy as np
 from stavpr_lab.demonstration.street.laps import RingWorld
@@ -37,15 +39,12 @@ from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
+from tqdm import tqdm
 
 RATE, SPEED = 5.0, 2.5  # images per second; m/s of the taught run
 STEP = 0.05  # seconds of the simulation, and of the control
-LATENCY, LOST = (
-    0.15,
-    0.05,
-)  # seconds until an image is processed; share of the images that are lost
+LATENCY, LOST = 0.15, 0.05  # seconds until an image is processed; share of images that are lost
 SLIP, SLIP_TURN = 0.05, 0.05  # deviations of the wheels' slip, shares; constant over seconds
-BIAS = 0.01  # rad/m that the robot pulls to the left
 CONVERGENCE = 20.0  # meters at the start that are not counted
 BRAKING, LAG = 5.0, 0.15  # m/s^2; time constant of the drive, seconds
 CONDITIONS = {
@@ -53,6 +52,24 @@ CONDITIONS = {
     'dusk': replace(RAINY_DUSK, lane=LANE, rain=0.0, fog=0.002, traffic=3),
     'rain': replace(AFTERNOON, lane=LANE, rain=0.4, fog=0.004, clouds=1.0, sun=0.0, traffic=4),
 }
+
+
+class Lap(NamedTuple):
+    """Light, pull to the left (rad/m), and where the robot starts (meters left of the path)."""
+
+    light: str
+    pull: float
+    left: float
+
+
+LAPS = [
+    Lap('day', 0.01, 1), Lap('dusk', 0.01, -1), Lap('rain', 0.01, 1), Lap('day', -0.01, -1),
+    Lap('dusk', -0.01, 1), Lap('rain', -0.01, -1), Lap('day', 0.02, 1), Lap('dusk', 0.0, -1),
+    Lap('rain', 0.0, 1), Lap('day', 0.0, -1),
+]  # fmt: skip
+TURNED = math.radians(10)  # at the start, away from the path
+CHANGED = 15.0  # seconds until the image changes in the drives that have to stop
+EVERY, MILLISECONDS, QUALITY = 5, 150, 40  # images per drawn one; time of each; of WebP
 
 
 class View(Traverse):
@@ -132,10 +149,14 @@ def teach(world: RingWorld, begin: float = 0.0, length: float = LENGTH) -> Taugh
 
 
 class Robot:
-    """A robot with differential drive, whose wheels slip."""
+    """
+    A robot with differential drive, whose wheels slip.
 
-    def __init__(self, pose: np.ndarray, dice: np.random.Generator) -> None:
-        self.pose, self._dice = pose.copy(), dice
+    :param pull: rad/m that it turns to the left by itself.
+    """
+
+    def __init__(self, pose: np.ndarray, dice: np.random.Generator, pull: float = 0.0) -> None:
+        self.pose, self._dice, self._pull = pose.copy(), dice, pull
         self.speed = self.turn = 0.0
         self._slip = np.zeros(2)
 
@@ -148,7 +169,7 @@ class Robot:
         fresh = self._dice.normal(size=2) * (SLIP, SLIP_TURN) * math.sqrt(1 - keep**2)
         self._slip = keep * self._slip + fresh
         speed = self.speed * (1 + self._slip[0])
-        turn = self.turn * (1 + self._slip[1]) + BIAS * speed
+        turn = self.turn * (1 + self._slip[1]) + self._pull * speed
         middle = self.pose[2] + turn * STEP / 2
         self.pose += STEP * np.array([speed * math.cos(middle), speed * math.sin(middle), turn])
 
@@ -207,7 +228,7 @@ class Drive:
 
 def repeat(
     taught: Taught, conditions: Conditions, seconds: float, begin: int = 0,
-    left: float = 1.0, turned: float = math.radians(10), seed: int = 0,
+    left: float = 1.0, turned: float = TURNED, seed: int = 0, pull: float = 0.01,
     change: Callable[[np.ndarray, float], np.ndarray] = lambda image, time: image,
     world: RingWorld | None = None,
 ) -> Drive:  # fmt: skip
@@ -216,6 +237,7 @@ def repeat(
 
     :param begin: place at which the robot starts, ``left`` meters and ``turned`` radians off; the
         operator states it.
+    :param pull: rad/m that the robot turns to the left by itself.
     :param change: returns the image that the camera delivers at a time.
     :param world: another one than the taught one.
     """
@@ -224,7 +246,7 @@ def repeat(
     pose = taught.poses[begin] + [0, 0, turned]
     heading = taught.poses[begin, 2]
     pose[:2] += left * np.array([-math.sin(heading), math.cos(heading)])
-    robot, pilot = Robot(pose, dice), Autopilot(taught)
+    robot, pilot = Robot(pose, dice, pull), Autopilot(taught)
     pilot.follower.start(begin)
     waiting: deque[tuple[float, Observation]] = deque()
     rows, reasons = [], []
@@ -263,28 +285,120 @@ def plot(taught: Taught, drives: dict[str, Drive], path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
-def main(folder: Path, length: float) -> None:
-    """Drive a lap in each condition, and write a table and a plot."""
+def animate(taught: Taught, drive: Drive, images: list[np.ndarray], path: Path) -> None:
+    """Write the images of a drive beside the path from above, as WebP."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from PIL import Image
+
+    frames = []
+    for number in range(0, len(images), EVERY):
+        step = min(len(drive.times) - 1, number * len(drive.times) // len(images))
+        figure = Figure(figsize=(7, 2.6), layout='constrained')
+        camera, above = figure.subplots(1, 2)
+        camera.imshow(images[number])
+        camera.set_axis_off()
+        camera.set_title(drive.reasons[step] or f'{drive.speeds[step]:.1f} m/s', fontsize=9)
+        above.plot(*taught.poses[:, :2].T, color='0.7', linewidth=4)
+        above.plot(*drive.poses[: step + 1, :2].T, linewidth=1)
+        above.plot(*drive.poses[step, :2], 'o')
+        above.set(aspect='equal')
+        above.set_title(f'{drive.errors[step, 0]:+.2f} m left of the path', fontsize=9)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+    frames[0].save(
+        path, save_all=True, append_images=frames[1:], duration=MILLISECONDS, loop=0,
+        quality=QUALITY,
+    )  # fmt: skip
+
+
+def stops(taught: Taught, seconds: float = CHANGED + 5) -> dict[str, float]:
+    """Return the seconds until the robot is at rest, after the camera shows something else."""
+    other = View(RingWorld(11), GOOD_LIGHT)
+    dice = np.random.default_rng(0)
+    shown: list[np.ndarray] = []
+
+    def cover(image: np.ndarray) -> np.ndarray:
+        return dice.normal(15, 3, image.shape).clip(0, 255).astype(np.uint8)
+
+    def replace_route(_: np.ndarray) -> np.ndarray:
+        x, y, heading = other._line[round(SPEED / RATE / CELL * len(shown))]
+        shown.append(other.image(np.array([x, y - LANE, heading]), len(shown)))
+        return shown[-1]
+
+    def freeze(image: np.ndarray) -> np.ndarray:
+        shown.append(image)
+        return shown[0]
+
+    changes: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        'is covered': cover,
+        'shows another route': replace_route,
+        'repeats one image': freeze,
+    }
+    result = {}
+    for name, change in changes.items():
+        shown.clear()
+
+        def changed(
+            image: np.ndarray,
+            time: float,
+            change: Callable[[np.ndarray], np.ndarray] = change,
+        ) -> np.ndarray:
+            return change(image) if time >= CHANGED else image
+
+        drive = repeat(taught, GOOD_LIGHT, seconds, begin=10, change=changed)
+        is_later = drive.times >= CHANGED
+        at_rest = np.flatnonzero(is_later & (drive.speeds < 0.05))
+        result[name] = float(drive.times[at_rest[0]] - CHANGED) if len(at_rest) else math.inf
+    return result
+
+
+def main() -> None:
+    """Drive the laps and the stops, and write tables, a plot and an animation."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('folder', type=Path)
+    parser.add_argument('--length', type=float, default=LENGTH, help='of a lap, meters')
+    parser.add_argument('--laps', type=int, default=len(LAPS))
+    arguments = parser.parse_args()
+    length, folder = arguments.length, arguments.folder
     taught, drives = teach(RingWorld(), 0.0, length), {}
+    images: list[np.ndarray] = []
     lines = [
-        '| lap | driven | time | standing | within .5 m | within 1 m | largest error | RMS |',
-        '|---|---|---|---|---|---|---|---|',
+        '| lap | pull, rad/m | driven | time | at rest | within 0.5 m | within 1 m | largest '
+        '| mean | RMS |',
+        '|---|---|---|---|---|---|---|---|---|---|',
     ]
-    for name, conditions in CONDITIONS.items():
-        drives[name] = drive = repeat(taught, conditions, 2 * length / SPEED + 60, begin=10)
+    for seed, lap in enumerate(tqdm(LAPS[: arguments.laps], unit='lap')):
+
+        def keep(image: np.ndarray, _: float) -> np.ndarray:
+            if arguments.laps == 1:
+                images.append(image)
+            return image
+
+        drive = repeat(
+            taught, CONDITIONS[lap.light], 2 * length / SPEED + 60, 10, lap.left,
+            math.copysign(TURNED, lap.left), seed, lap.pull, keep,
+        )  # fmt: skip
+        drives[f'{seed + 1}: {lap.light}, {lap.pull:+.2f}'] = drive
         driven = np.cumsum(drive.speeds) * STEP
         error = drive.errors[driven > CONVERGENCE, 0]
         lines.append(
-            f'| {name} | {driven[-1]:.0f} m | {drive.times[-1]:.0f} s '
+            f'| {lap.light} | {lap.pull:+.2f} | {driven[-1]:.0f} m | {drive.times[-1]:.0f} s '
             f'| {(drive.speeds < 0.02).sum() * STEP:.0f} s | {drive.within(0.5):.1%} '
             f'| {drive.within(1.0):.1%} | {abs(error).max(initial=0):.2f} m '
-            f'| {np.sqrt(np.mean(error**2)):.2f} m |'
+            f'| {error.mean():+.2f} m | {np.sqrt(np.mean(error**2)):.2f} m |'
         )
-        print(lines[-1], flush=True)
+        tqdm.write(lines[-1])
+    lines += ['', '| the camera, at 2.5 m/s | at rest after |', '|---|---|']
+    lines += [f'| {name} | {seconds:.1f} s |' for name, seconds in stops(taught).items()]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / 'repeat.md').write_text('\n'.join(lines) + '\n')
+    (folder / 'repeat_table.md').write_text('\n'.join(lines) + '\n')
+    print('\n'.join(lines))
     plot(taught, drives, folder / 'repeat.png')
+    if images:
+        animate(taught, drive, images, folder / 'repeat.webp')
 
 
 if __name__ == '__main__':
-    main(Path(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else LENGTH)
+    main()
