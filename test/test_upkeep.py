@@ -167,8 +167,10 @@ def test_map_stays_within_its_budget_and_keeps_what_helps(first, rebuilt, around
     ids=['another route', 'mirrored', 'wrong start', 'short'],
 )
 def test_drive_that_may_be_wrong_teaches_nothing(first, images, reason):
-    with pytest.raises(InputError, match=reason):
-        updated(first, built(images, 1))
+    split = keep_places(first, np.r_[0:98, 103:200])  # of two sessions
+    for place_map in (first, split):
+        with pytest.raises(InputError, match=reason):
+            updated(place_map, built(images, 1))
 
 
 def test_drive_whose_thumbnails_fit_other_places_teaches_nothing():

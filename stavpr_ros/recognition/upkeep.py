@@ -20,10 +20,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+import re
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import merge_maps, PlaceMap
+from stavpr_ros.mapping import merge_maps, PlaceMap, Session
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.mapping.versions import current_version, save_version, Version
@@ -206,11 +207,11 @@ def _require_certain(
             f'{len(certain)} of {len(drive)} images are certain where they are: expected '
             f'{MIN_SESSION}, and {MIN_CERTAIN:.0%} of those in motion; the map stays as it is'
         )
-    runs = _runs(place_map)
+    drives = _drives(place_map)
     for a, b in pairwise(certain):
         p, q = roots[places[a]], roots[places[b]]
         allowed = FASTEST * (b - a) + SLACK
-        if runs[p] == runs[q] and not -SLACK <= q - p <= allowed:
+        if drives[p] == drives[q] and not -SLACK <= q - p <= allowed:
             raise InputError(
                 f'images {a} and {b} are certain of places {p} and {q}, which they cannot both '
                 'be right about; the map stays as it is'
@@ -236,6 +237,21 @@ def _runs(place_map: PlaceMap) -> np.ndarray:
     """Return the session of each place, (n,)."""
     index = place_map.session_index
     return np.zeros(len(place_map), np.int32) if index is None else index
+
+
+def _drives(place_map: PlaceMap) -> np.ndarray:
+    """
+    Return a number of the drive of each place, (n,), the same in all parts of a split session.
+
+    :func:`keep_places` numbers their ids; the start tells them from other drives, whose ids may
+    be numbered as well.
+    """
+    runs = _runs(place_map)
+    keys = []
+    for session in place_map.sessions or (Session('first'),):
+        base = re.sub(r'-\d+$', '', session.id)
+        keys.append((base if session.start or base == 'first' else session.id, session.start))
+    return np.array([keys.index(key) for key in keys])[runs]
 
 
 def _used(
