@@ -36,6 +36,7 @@ def generate_launch_description() -> LaunchDescription:
         package='stavpr_nav',
         executable='repeat',
         name='repeat',
+        namespace=LaunchConfiguration('namespace'),
         output='screen',
         remappings=[
             ('image', LaunchConfiguration('image')),

@@ -29,6 +29,7 @@ def generate_launch_description() -> LaunchDescription:
         package='stavpr_nav',
         executable='teach',
         name='teach',
+        namespace=LaunchConfiguration('namespace'),
         output='screen',
         remappings=[('odom', LaunchConfiguration('odom'))],
         parameters=[{each.name: LaunchConfiguration(each.name) for each in own}],

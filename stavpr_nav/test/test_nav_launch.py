@@ -34,6 +34,7 @@ def test_launch_file_starts_both_nodes_with_their_arguments(monkeypatch, name):
     (node,) = launch.nodes
     assert Path(executable(node.executable)).parent.name == node.package == 'stavpr_nav'
     assert {topic: words(to) for topic, to in node.remappings} == remappings
+    assert words(node.namespace) == '${namespace}'
     (values,) = node.parameters
     assert set(values) == own
     for key, value in values.items():
