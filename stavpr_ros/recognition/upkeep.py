@@ -243,8 +243,8 @@ def _drives(place_map: PlaceMap) -> np.ndarray:
     """
     Return a number of the drive of each place, (n,), the same in all parts of a split session.
 
-    :func:`keep_places` numbers their ids; the start tells them from other drives, whose ids may
-    be numbered as well.
+    :func:`keep_places` numbers their ids; they have one start, and other drives, whose ids may be
+    numbered as well, have another.
     """
     runs = _runs(place_map)
     keys = []
