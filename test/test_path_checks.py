@@ -79,7 +79,7 @@ def test_where_the_most_probable_path_is_refuted_the_next_one_is_matched(monkeyp
     route[:, 140:220] = route[:, 40:120]
     query = features_of(route[:, 40:120], 0.2, 1)
     recognizer = PlaceRecognizer(
-        map_of(features_of(route, 0.05)), RecognizerSettings(mode='robust', min_probability=1e-5)
+        map_of(features_of(route, 0.05)), RecognizerSettings(mode='robust', min_probability=1e-9)
     )
 
     def refuted_first(path, z, part):
