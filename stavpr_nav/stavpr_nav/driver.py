@@ -20,7 +20,6 @@ class Outcome(enum.IntEnum):
     REACHED = 0
     CANCELED = 1
     LOST = 2
-    STOPPED = 3
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class Driver:
             self.end(Outcome.REACHED, now)
         if self.outcome is not None:
             return self.command
-        if self._needs_deadman and now - self._pressed > DEADMAN_AGE:
+        if self._needs_deadman and not 0 <= now - self._pressed <= DEADMAN_AGE:
             self.command, self._alive = self._follower.halt(now, PAUSED), now
         else:
             self.command = self._follower.command(now)

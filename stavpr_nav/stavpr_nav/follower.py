@@ -235,7 +235,8 @@ class RouteFollower:
     def _stop_reason(self, now: float) -> str:
         """Return why the robot must not move; empty = it may."""
         settings = self._settings
-        if now - self._received > settings.max_age or now - self._stamp > settings.max_delay:
+        is_new = 0 <= now - self._received <= settings.max_age  # or the clock was set back
+        if not is_new or now - self._stamp > settings.max_delay:
             return 'no new image'
         if now - self._confirmed > settings.max_unconfirmed:
             self._successive = 0

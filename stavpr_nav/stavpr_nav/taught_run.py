@@ -6,7 +6,7 @@ The velocities of the taught run at the places of its map.
 They come from the poses of the map, or from a recorded file: CSV with the columns stamp (seconds,
 of the clock that stamps the images), speed (m/s) and turn (rad/s, to the left). Both are
 integrated between two places, so that a robot that repeats them drives the same distance and turns
-by the same angle. Time in which the robot stood is left out.
+by the same angle. Time in which the robot was at rest is left out.
 """
 
 import csv
@@ -20,7 +20,7 @@ from stavpr_ros.units import SECOND
 
 COLUMNS = ['stamp', 'speed', 'turn']
 STILL_SPEED, STILL_TURN = 0.02, 0.02  # m/s and rad/s; below both, the robot is at rest
-STANDING = 1e-3  # seconds between two places that are left of a time in which the robot stood
+STANDING = 1e-3  # seconds between two places that are left of a time at rest
 MAX_GAP = 1.0  # seconds without a velocity that are bridged
 MARGIN = 2.0  # seconds before the first and after the last velocity in which places may be
 
@@ -78,7 +78,7 @@ def taught_run(place_map: PlaceMap, velocities: np.ndarray | None = None) -> Tau
         raise InputError('the robot is at rest in the whole taught run')
     seconds = np.maximum(moving, STANDING)
     speeds, turns = moved / seconds, turned / seconds
-    # where the robot stood, the velocities are the next ones
+    # where the robot was at rest, the velocities are the next ones
     following = np.where(moving > STANDING, np.arange(len(moving)), len(moving))
     following = np.minimum.accumulate(following[::-1])[::-1]
     following[following == len(moving)] = np.flatnonzero(moving > STANDING)[-1]

@@ -81,6 +81,8 @@ def test_robot_stands_without_dead_man_switch_and_goes_on_slowly():
     stopped = [c.reason for c in drive.go(2, pressed=False)].index(PAUSED) * STEP
     assert stopped <= DEADMAN_AGE + STEP
     assert drive.time > began
+    drive.driver.press(drive.time + 9)
+    assert drive.driver.step(drive.time).reason == PAUSED  # the clock was set back
     drive.driver.press(drive.time)
     drive.driver.release()
     assert drive.driver.step(drive.time).reason == PAUSED

@@ -196,3 +196,9 @@ def test_matched_image_much_less_similar_than_before_stops_at_once():
     run = Run()
     run.drive(3)
     assert run.drive(3, other)[-1].speed == pytest.approx(0.8)
+
+
+def test_clock_that_is_set_back_stops_the_robot_until_the_next_image():
+    run = Run()
+    run.drive(3)
+    assert run.follower.command(run.time - 2).reason == 'no new image'

@@ -167,6 +167,13 @@ def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rove
     rover.until(rover.drives)
     assert node.counts['invalid images'] > 0
     assert node.counts['matches on another map'] > 0
+    (rejected,) = node.set_parameters([Parameter('max_speed', value=9.0)])
+    assert not rejected.successful
+    place_columns, node._columns = node._columns, None  # any error of one image
+    rover.until(rover.rests)
+    node._columns = place_columns
+    rover.until(rover.drives)
+    assert node.counts['failed images'] > 0
     canceled = rover.result_of(handle.cancel_goal_async())
     assert len(canceled.goals_canceling) == 1
     answer = rover.result_of(handle.get_result_async())

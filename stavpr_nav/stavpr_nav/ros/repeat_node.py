@@ -8,15 +8,17 @@ from dataclasses import fields
 from functools import lru_cache
 import math
 import threading
+import traceback
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from stavpr_msgs.action import Repeat
@@ -26,17 +28,19 @@ from stavpr_nav.driver import Driver, Goal, Outcome
 from stavpr_nav.follower import Command, FollowerSettings, Observation
 from stavpr_nav.parameters import REPEAT
 from stavpr_nav.taught_run import read_velocities, taught_run
-from stavpr_ros.errors import ImageError, InputError, SettingsError
+from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.mapping import open_map
 from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
 from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.messages import camera_of, nanoseconds
+from stavpr_ros.ros.rclpy_workarounds import log_failure
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Bool
 
 PARAMETERS = REPEAT
+READ_ONLY = ParameterDescriptor(read_only=True)
 PERIOD, FEEDBACK = 0.05, 4  # s of the control; its steps of one feedback
 REMEMBERED = 20  # images and matches that wait for each other
 SHOWN = (  # SKIPPED: the robot is at rest, or the rate is limited; the place is the expected one
@@ -60,7 +64,7 @@ class RepeatNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('repeat', **options)
         values = {
-            name: self.declare_parameter(name, default).value
+            name: self.declare_parameter(name, default, READ_ONLY).value
             for name, (default, _) in PARAMETERS.items()
         }
         self._settings = FollowerSettings(
@@ -96,10 +100,13 @@ class RepeatNode(Node):
         images: tuple[Any, str] = (Image, 'image')
         if transport == 'compressed':
             images = CompressedImage, 'image/compressed'
-        self.create_subscription(*images, self._on_image, qos_profile_sensor_data)
+        best_effort = qos_profile_sensor_data  # receives from reliable publishers as well
+        self.create_subscription(*images, self._on_image, best_effort)
         self.create_subscription(PlaceMatch, values['match_topic'], self._on_match, 10)
-        self.create_subscription(CameraInfo, 'camera_info', self._on_camera, 10)
-        self.create_subscription(Bool, 'deadman', self._on_deadman, QoSProfile(depth=1))
+        self.create_subscription(
+            CameraInfo, 'camera_info', self._on_camera, qos_profile_sensor_data
+        )
+        self.create_subscription(Bool, 'deadman', self._on_deadman, best_effort)
         self._worker = threading.Thread(target=self._work, daemon=True, name='offset')
         self._worker.start()
         self._server = ActionServer(
@@ -121,7 +128,7 @@ class RepeatNode(Node):
             self.is_ending = True
             self._lock.notify()
             if self._driver is not None:
-                self._driver.end(Outcome.STOPPED, self._now())
+                self._driver = None
                 self._publish(Command(0.0, 0.0))
         self._worker.join()
         self._server.destroy()
@@ -178,11 +185,15 @@ class RepeatNode(Node):
                 (image, match), self._next = self._next, None
             try:
                 observation = self._observation(image, match)
-            except ImageError as error:
+            except StavprError as error:
                 self.counts['invalid images'] += 1
                 self.get_logger().warning(
                     f'an image is not used: {error}', throttle_duration_sec=10.0
                 )
+                continue
+            except Exception:  # the robot stops, and the next image may be good
+                self.counts['failed images'] += 1
+                log_failure(traceback.format_exc())
                 continue
             self.counts['processed'] += 1
             with self._lock:
@@ -193,8 +204,9 @@ class RepeatNode(Node):
         """Return what an image shows; publish its offset where the place is known."""
         place, probability, offset = match.newest_index, match.probability, None
         if match.status != PlaceMatch.MATCH:
-            driver = self._driver
-            place, probability = driver.expected_place() if driver else -1, math.nan
+            with self._lock:
+                place = self._driver.expected_place() if self._driver else -1
+            probability = math.nan
         if 0 <= place < len(self._map):
             columns = describe_columns(decode_message(image))
             offset = self._filter.update(columns, self._columns(place))

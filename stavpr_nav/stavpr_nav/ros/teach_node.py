@@ -8,6 +8,7 @@ from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from stavpr_nav.parameters import TEACH
@@ -17,6 +18,7 @@ from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.units import SECOND
 
 PARAMETERS = TEACH
+READ_ONLY = ParameterDescriptor(read_only=True)
 SOURCES: dict[str, tuple[str, Any]] = {
     'odom': ('odom', Odometry),
     'cmd_vel': ('cmd_vel', Twist),
@@ -34,7 +36,7 @@ class TeachNode(Node):
     def __init__(self, **options: Any) -> None:
         super().__init__('teach', **options)
         values = {
-            name: self.declare_parameter(name, default).value
+            name: self.declare_parameter(name, default, READ_ONLY).value
             for name, (default, _) in PARAMETERS.items()
         }
         path, source = Path(values['run_path']), values['source']
