@@ -40,12 +40,12 @@ def test_best_path_elsewhere_equals_plain_loops_on_all_devices(device, n):
         buffers[1].push(torch.from_numpy(row).to(device))
     for count, excluded in ((6, [[-3, 12]]), (3, [[2, 9], [20, n + 5]])):
         numbers = np.array([0, 1, 1, 2, 3, 5])[:count]
-        steps = straight_steps(numbers, (count - 1) // 2)
-        counted = changed_images(numbers)
+        position, counted = (count - 1) // 2, changed_images(numbers)
+        steps = straight_steps(numbers, position)
         assert counted.tolist() == [True, True, False, True, True, True][:count]
         expected = plain_elsewhere(rows[-count:][counted], steps[:, counted], excluded)
         for buffer in buffers:
-            found = buffer.best_elsewhere(steps, np.array(excluded), counted)
+            found = buffer.best_elsewhere(numbers, position, np.array(excluded))
             assert found == pytest.approx(expected, abs=1e-5)
 
 

@@ -30,7 +30,7 @@ from stavpr_ros.filter.evidence import changed_images
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
 from stavpr_ros.filter.protocol import Filter
-from stavpr_ros.filter.refine import BAND, image_times, OFFSETS, refined
+from stavpr_ros.filter.refine import BAND, columns_near, image_times, refined
 
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
@@ -180,7 +180,7 @@ class PathChoice:
         state = belief.states[first + belief.weights[first:end].argmax()]
         mean, numbers = self._filter.mean_z(state), images.numbers
         path = self._path(state, images)
-        z = images.z(np.minimum(np.maximum(path[:, None] + OFFSETS, 0), images.n - 1))
+        z = images.z(columns_near(path, images.n))
         path, placed, z, masses = refined(
             z, path, images.weights * mean, images.numbers, images.stamps,
             self._place_times[: images.n], min(mean, NEAR_LEVEL) / mean,

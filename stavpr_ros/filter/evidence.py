@@ -48,6 +48,7 @@ FIRST = 8  # windows that count as the share .5 at first
 LAST, LATEST = 100, 20  # windows that the shares of likely and of sure ones go back
 FAR = np.float32(1)  # z beside the map, and of places that are not compared
 INF = np.float32(np.inf)
+ZERO = np.float32(0)
 CHUNK = 128  # places whose sums are computed together
 
 
@@ -95,63 +96,77 @@ def path_probability(own: float, recent: float) -> float:
     return 1 / (1 + math.exp(-own - RECENT * min(_log_odds(recent, MIN_RECENT), 0.0)))
 
 
+@kernel
 def changed_images(numbers: np.ndarray) -> np.ndarray:
     """
     Return which images differ from the one before, (l,), bool; the first one counts.
 
     :param numbers: of the images, (l,); equal ones are of a camera at rest.
     """
-    changed: np.ndarray = np.diff(numbers, prepend=numbers[0] - 1) != 0
+    changed = np.ones(len(numbers), np.bool_)
+    changed[1:] = numbers[1:] != numbers[:-1]
     return changed
 
 
+@kernel
 def straight_steps(numbers: np.ndarray, position: int) -> np.ndarray:
     """
     Return the steps of straight paths from the place of an image, (V, l), int64.
 
     :param numbers: of the images, (l,); equal ones are of a camera at rest.
     """
-    steps: np.ndarray = np.rint(SPEEDS[:, None] * (numbers - numbers[position])).astype(np.int64)
+    steps = np.empty((len(SPEEDS), len(numbers)), np.int64)
+    for v in range(len(SPEEDS)):
+        for i in range(len(numbers)):
+            steps[v, i] = np.rint(SPEEDS[v] * (numbers[i] - numbers[position]))
     return steps
 
 
 @kernel
 def best_elsewhere(
-    memory: np.ndarray, rows: np.ndarray, n: int, steps: np.ndarray, excluded: np.ndarray
-) -> float:
+    memory: np.ndarray, rows: np.ndarray, n: int, numbers: np.ndarray, position: int,
+    excluded: np.ndarray,
+) -> float:  # fmt: skip
     """
     Return the largest mean of -z of straight paths, -inf where there is none.
 
     :param memory: distances z, (L, n or more), float32.
     :param rows: of the images in memory, (l,).
-    :param steps: of :func:`straight_steps`.
+    :param numbers, position: of :func:`straight_steps`; images that do not differ from the one
+        before do not count.
     :param excluded: first ones and ends of the places whose paths do not count, (m, 2).
     """
-    sums, images, infinite, far = np.empty(CHUNK, np.float32), len(rows), splat(INF), splat(FAR)
-    flat, least = memory.reshape(-1), infinite
+    counted = np.flatnonzero(changed_images(numbers))
+    rows, images = rows[counted], len(counted)
+    steps = straight_steps(numbers, position)[:, counted]
+    before, behind = -min(steps.min(), 0), max(steps.max(), 0)
+    width = before + CHUNK + behind
+    near = np.empty((images, width), np.float32)  # z of the images around a chunk, finite
+    flat, sums, least = near.reshape(-1), np.empty(CHUNK, np.float32), splat(INF)
     for start in range(0, n, CHUNK):
-        count = min(CHUNK, n - start)
-        newest = rows[-1] * memory.shape[1] + start
-        if not (flat[newest : newest + count] < INF).any():
+        if not (memory[rows[-1], start : min(start + CHUNK, n)] < INF).any():
             continue
-        for v in range(len(steps)):
-            sums[:count], sums[count:] = 0, INF
-            for i in range(images):
-                shift = start + steps[v, i]
-                row = rows[i] * memory.shape[1] + shift
-                low = min(max(-shift, 0), count)
-                high = max(min(n - shift, count), low)
-                whole = low + (high - low) // LANES * LANES
-                for x in range(low, whole, LANES):
-                    z = load(flat, row + x)
-                    near = select(z < infinite, z, far)
-                    store(sums, x, load(sums, x) + near)
-                for x in range(whole, high):
-                    sums[x] += flat[row + x] if flat[row + x] < INF else FAR
-                sums[:low] += FAR
-                sums[high:count] += FAR
+        first, end = max(start - before, 0), min(start + CHUNK + behind, n)
+        for i in range(images):
+            row, own = memory[rows[i], first:end], near[i]
+            own[: first - start + before] = own[end - start + before :] = FAR
+            own = own[first - start + before : end - start + before]
+            for y in range(len(row)):
+                own[y] = row[y] if row[y] < INF else FAR
+        for v in range(len(SPEEDS)):
+            for x in range(0, CHUNK, 4 * LANES):  # four sums at a time: each waits for itself
+                a, b, c, d = splat(ZERO), splat(ZERO), splat(ZERO), splat(ZERO)
+                for i in range(images):
+                    at = i * width + before + steps[v, i] + x
+                    a, b = a + load(flat, at), b + load(flat, at + LANES)
+                    c, d = c + load(flat, at + 2 * LANES), d + load(flat, at + 3 * LANES)
+                store(sums, x, a)
+                store(sums, x + LANES, b)
+                store(sums, x + 2 * LANES, c)
+                store(sums, x + 3 * LANES, d)
+            sums[n - start :] = INF
             for first, end in excluded:
-                sums[min(max(first - start, 0), count) : min(max(end - start, 0), count)] = INF
+                sums[max(first - start, 0) : max(end - start, 0)] = INF
             for x in range(0, CHUNK, LANES):
                 least = select(load(sums, x) < least, load(sums, x), least)
     store(sums, 0, least)

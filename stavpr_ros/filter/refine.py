@@ -55,6 +55,16 @@ def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 @kernel
+def columns_near(path: np.ndarray, n: int) -> np.ndarray:
+    """Return the columns at each offset from a path (l,), none beyond the n columns, (l, S)."""
+    columns = np.empty((len(path), len(OFFSETS)), np.int64)
+    for i in range(len(path)):
+        for s in range(len(OFFSETS)):
+            columns[i, s] = min(max(path[i] + OFFSETS[s], 0), n - 1)
+    return columns
+
+
+@kernel
 def refine(z, path, exponents, images, times, place_times, evidence):
     """
     Return where the camera was beside a path, by all images of the window.

@@ -13,7 +13,7 @@ from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.device_filter import DevicePlaceFilter
-from stavpr_ros.filter.evidence import FAR
+from stavpr_ros.filter.evidence import changed_images, FAR, straight_steps
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
@@ -55,16 +55,15 @@ class DeviceBuffer(SequenceBuffer):
 
     def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
         """See :meth:`SequenceBuffer.at`; copied from the device."""
-        flat = torch.from_numpy(self._ring(images) * self.memory.shape[1] + columns)
+        flat = torch.from_numpy(self._ring(images)[:, None] * self.memory.shape[1] + columns)
         entries: np.ndarray = self.memory.take(flat.to(self._device)).cpu().numpy()
         return entries
 
-    def best_elsewhere(
-        self, steps: np.ndarray, excluded: np.ndarray, counted: np.ndarray
-    ) -> float:
+    def best_elsewhere(self, numbers: np.ndarray, position: int, excluded: np.ndarray) -> float:
         """See :meth:`SequenceBuffer.best_elsewhere`; waits for the device."""
-        rows = torch.from_numpy(self._ring(steps.shape[1])[counted, 0]).to(self._device)
-        steps = steps[:, counted]
+        counted = changed_images(numbers)
+        rows = torch.from_numpy(self._ring(len(numbers))[counted]).to(self._device)
+        steps = straight_steps(numbers, position)[:, counted]
         reach, images = int(np.abs(steps).max()), steps.shape[1]
         z = self.memory.index_select(0, rows)[:, : self.known]
         z = pad(torch.where(z.isfinite(), z, float(FAR)), (reach, reach), value=float(FAR))

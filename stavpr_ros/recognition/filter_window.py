@@ -15,11 +15,9 @@ from stavpr_ros.filter.choice import ChosenPath, PathChoice, WindowImages
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.evidence import (
     APART,
-    changed_images,
     own_evidence,
     path_probability,
     RecentWindows,
-    straight_steps,
 )
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.motion import ImageChange
@@ -29,7 +27,7 @@ from stavpr_ros.filter.place_means import PlaceMeans
 from stavpr_ros.filter.protocol import Filter
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.sessions import in_places
-from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer, WindowImage
+from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
 
 MIN_IMAGES = 2  # of a match
 ON_MAP = 0.5  # probability above which the newest images can have a match
@@ -84,12 +82,12 @@ class FilterWindow(QueryWindow):
     @property
     def changes(self) -> tuple[float, ...]:
         """Change of each image from the one before, oldest first."""
-        return tuple(image.change for image in self.images)
+        return tuple(self.images['change'].tolist())
 
     @property
     def is_standstill(self) -> bool:
         """Whether the newest image equals the one before, up to noise."""
-        return self.change.is_standstill(self.images[-1].change)
+        return self.change.is_standstill(float(self.images['change'][-1]))
 
     def reset(self) -> None:
         """Drop all images."""
@@ -158,7 +156,7 @@ class FilterWindow(QueryWindow):
             by_pass = self.layout.to_passes(self.filter.places_of_states()[: len(z)])
             if self.change.is_dark_stretch(by_pass):
                 self.filter.update(z, 0.0, ones, ones)
-        self.images.append(WindowImage(stamp, change, weight, self.filter.count - 1))
+        self._append(stamp, change, weight, self.filter.count - 1)
         if self._at_rest is not None:
             self._at_rest = _shifted(self._at_rest) if self._rests(self._middle) else None
 
@@ -179,7 +177,8 @@ class FilterWindow(QueryWindow):
 
     def _rests(self, position: int) -> bool:
         """Whether the camera has not moved since an image; of a full window in localization."""
-        is_equal = self.images[position].number == self.images[-1].number
+        numbers = self.images['number']
+        is_equal = bool(numbers[position] == numbers[-1])
         return is_equal and self.buffer.full and not self._to_oldest
 
     def match_newest(self, nms_radius: int) -> WindowMatch:
@@ -204,7 +203,7 @@ class FilterWindow(QueryWindow):
             return 0
         if not self.buffer.full:
             return len(self.images)
-        numbers = np.array([image.number for image in self.images])
+        numbers = self.images['number']
         lag = min(len(self.images) - 1 - self._middle, int(numbers[-1]))
         path = self.filter.path(belief.states[np.argmax(belief.weights)], lag)
         on_map = int(np.count_nonzero(path >= 0))
@@ -216,8 +215,8 @@ class FilterWindow(QueryWindow):
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
-        self.images[self._middle].is_matched = is_matched
-        if self.images[0].is_matched or not is_matched:
+        self.images['is_matched'][self._middle] = is_matched
+        if self.images['is_matched'][0] or not is_matched:
             return WindowMatch()
         return self._match_image(len(self.images), 0, nms_radius)
 
@@ -232,15 +231,18 @@ class FilterWindow(QueryWindow):
         if not n:
             return WindowMatch()
         self._own = -math.inf
-        rows = list(self.images)[len(self.images) - count :]
-        belief = self.filter.belief(n, rows[-1].number - rows[position].number)
+        rows = self.images[len(self.images) - count :]
+        numbers, weights, stamps = (
+            np.ascontiguousarray(rows[name]) for name in ('number', 'weight', 'stamp')
+        )
+        belief = self.filter.belief(n, int(numbers[-1] - numbers[position]))
         if not len(belief.places):
             return self._off_map(count)
         rests = self._rests(len(self.images) - count + position)
         images = WindowImages(
-            numbers=np.array([row.number for row in rows]),
-            weights=np.array([row.weight for row in rows]),
-            stamps=np.array([row.stamp for row in rows]),
+            numbers,
+            weights,
+            stamps,
             z=lambda columns: self.buffer.at(columns, len(columns)),
             n=n,
             position=position,
@@ -250,7 +252,7 @@ class FilterWindow(QueryWindow):
         chosen = self.choice.choose(belief, images)
         place = int(chosen.path[position])
         self._repeated = self.layout.repeated(chosen.path)
-        certain, least = self._probabilities(chosen, images.numbers, position)
+        certain, least = self._probabilities(chosen, numbers, position)
         second, probability = self.choice.second_best(chosen, n, place, nms_radius)
         peak = float(chosen.probabilities.max(initial=0.0))
         share = certain / peak if peak > certain else 1.0  # none is above the match
@@ -280,9 +282,8 @@ class FilterWindow(QueryWindow):
         posterior, least = chosen.probability, chosen.min_probability
         if self._to_oldest:
             return posterior, least
-        steps = straight_steps(numbers, position)
         near = self.layout.around(int(chosen.path[position]), APART)
-        elsewhere = self.buffer.best_elsewhere(steps, near, changed_images(numbers))
+        elsewhere = self.buffer.best_elsewhere(numbers, position, near)
         lead = chosen.score, elsewhere, len(numbers)
         self._own, recent = own_evidence(posterior, *lead), self._recent.share
         return path_probability(self._own, recent), path_probability(

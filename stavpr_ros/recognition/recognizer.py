@@ -293,7 +293,7 @@ class SequenceRecognizer(ABC):
             verdict.probability,
             verdict.limits.probability,
             match.path_ratios(position),
-            window_stamps=tuple(image.stamp for image in window.images)[-images:],
+            window_stamps=tuple(window.images['stamp'][-images:].tolist()),
             window_changes=window.changes[-images:],
             is_oldest=is_oldest,
             direction=match.direction,

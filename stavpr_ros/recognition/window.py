@@ -9,9 +9,7 @@ A recognizer has one window, which is all that is reset between two queries besi
 """
 
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,23 +22,15 @@ from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition.match import WindowMatch
 
 
-@dataclass
-class WindowImage:
-    """
-    An image of the window.
-
-    :param stamp: ns; 0 = unknown.
-    :param change: from the image before; mode robust.
-    :param weight: exponent alpha of its likelihood; mode robust.
-    :param number: of the filter's last update; images of a camera at rest share one.
-    :param is_matched: it had a match as the middle image.
-    """
-
-    stamp: int = 0
-    change: float = 0.0
-    weight: float = 0.0
-    number: int = 0
-    is_matched: bool = False
+# An image of the window:
+# stamp       ns; 0 = unknown
+# change      from the image before; mode robust
+# weight      exponent alpha of its likelihood; mode robust
+# number      of the filter's last update; images of a camera at rest share one
+# is_matched  it had a match as the middle image
+WINDOW_IMAGE = np.dtype(
+    [('stamp', 'i8'), ('change', 'f8'), ('weight', 'f8'), ('number', 'i8'), ('is_matched', '?')]
+)
 
 
 class SequenceBuffer:
@@ -69,6 +59,7 @@ class SequenceBuffer:
         self.length, self.k, self._copies = int(length), k, copies
         self._row_width = row_width
         self.first = 0  # index of the first place that is not evicted
+        self._order = np.tile(np.arange(self.length), 2)
         self.known = 0  # places with an entry in any row of the window; all others are +inf
         self._count = 0
         self._allocate(places)
@@ -134,26 +125,23 @@ class SequenceBuffer:
 
         :param images: their number; None = all in the window.
         """
-        entries: np.ndarray = self.memory[self._ring(images), columns]
+        entries: np.ndarray = self.memory[self._ring(images)[:, None], columns]
         return entries
 
-    def best_elsewhere(
-        self, steps: np.ndarray, excluded: np.ndarray, counted: np.ndarray
-    ) -> float:
+    def best_elsewhere(self, numbers: np.ndarray, position: int, excluded: np.ndarray) -> float:
         """
         Return the largest mean of -z of straight paths of the newest images.
 
-        :param steps, excluded: of :func:`stavpr_ros.filter.evidence.best_elsewhere`; l images.
-        :param counted: images that count, (l,), bool.
+        :param numbers, position, excluded: of
+            :func:`stavpr_ros.filter.evidence.best_elsewhere`.
         """
-        rows = self._ring(steps.shape[1])[counted, 0]
-        steps = np.ascontiguousarray(steps[:, counted])
-        return float(best_elsewhere(self.memory, rows, self.known, steps, excluded))
+        rows = self._ring(len(numbers))
+        return float(best_elsewhere(self.memory, rows, self.known, numbers, position, excluded))
 
     def _ring(self, images: int | None = None) -> np.ndarray:
-        """Return the rows of one copy of the newest images, oldest first, (images, 1)."""
-        newest = self._count + np.arange(-(images or len(self)), 0)[:, None]
-        rows: np.ndarray = newest % self.length
+        """Return the rows of one copy of the newest images, oldest first, (images,)."""
+        end = self.oldest + self.length
+        rows: np.ndarray = self._order[end - (images or len(self)) : end]
         return rows
 
     def clear(self) -> None:
@@ -185,7 +173,7 @@ class QueryWindow(ABC):
     :param normalizes: z-normalize the distances of each image.
     :param around: see :func:`stavpr_ros.prepare.normalization.z_normalized`.
 
-    ``images`` are those in the window, oldest first.
+    ``images`` are those in the window, oldest first, (m,), ``WINDOW_IMAGE``.
     """
 
     def __init__(
@@ -196,7 +184,7 @@ class QueryWindow(ABC):
         around: int = 0,
     ) -> None:
         self.buffer, self.layout = buffer, layout
-        self.images: deque[WindowImage] = deque(maxlen=buffer.length)
+        self.images = np.empty(0, WINDOW_IMAGE)
         self._normalizes, self._around = normalizes, around
 
     @property
@@ -218,7 +206,13 @@ class QueryWindow(ABC):
         :param stamp: ns; 0 = unknown.
         """
         self.buffer.push(self._as_columns(row))
-        self.images.append(WindowImage(stamp))
+        self._append(stamp)
+
+    def _append(
+        self, stamp: int, change: float = 0.0, weight: float = 0.0, number: int = 0
+    ) -> None:
+        newest = np.array([(stamp, change, weight, number, False)], WINDOW_IMAGE)
+        self.images = np.concatenate([self.images, newest])[-self.buffer.length :]
 
     def _as_columns(self, row: Any) -> Any:
         """Return distances to the places, normalized, as a row of the buffer."""
@@ -263,7 +257,7 @@ class QueryWindow(ABC):
     def reset(self) -> None:
         """Drop all images."""
         self.buffer.clear()
-        self.images.clear()
+        self.images = self.images[:0]
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
