@@ -21,7 +21,6 @@ from stavpr_ros.memory import aligned_empty
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition.match import WindowMatch
 
-
 # An image of the window:
 # stamp       ns; 0 = unknown
 # change      from the image before; mode robust
