@@ -28,6 +28,7 @@ import numpy as np
 from results import environment, RESULTS
 from slam import render
 from slam_pairs import recognized, SharedViews, with_edges
+from stavpr_lab.demonstration import false_places
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import drive_laps
 from stavpr_ros.mapping.transforms import matrices, to_poses
@@ -35,7 +36,6 @@ from stavpr_slam.pose_graph import (
     breaks,
     Closure,
     decision,
-    false_places,
     network,
     OdometryNoise,
     optimize,

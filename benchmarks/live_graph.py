@@ -21,6 +21,7 @@ from pose_graph import COVARIANCE, DELAY, LAP, STEP
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from results import commit, cpu_model
+from stavpr_lab.demonstration.simulated_odometry import drifted
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
@@ -28,7 +29,6 @@ from stavpr_ros.ros.messages import pose_message, time_message
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_messages import pose_array
-from stavpr_slam.simulated_odometry import drifted
 
 PERIOD = 0.02  # seconds between two odometries while all is solved
 

@@ -11,11 +11,11 @@ import time
 
 import numpy as np
 from results import commit, cpu_model
+from stavpr_lab.demonstration.simulated_odometry import drifted
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure, PoseGraph
 from stavpr_slam.pose_graph.transforms import planar_poses
-from stavpr_slam.simulated_odometry import drifted
 
 LAP, STEP = 1000, 2.0  # keyframes, and meters between them
 DELAY = 10  # keyframes until a closure is known

@@ -24,13 +24,13 @@ from results import environment, RESULTS, write_lines
 from scipy.spatial.transform import Rotation
 from slam_page import markdown, NEAR
 from slam_pairs import CAMERA, Found, measured, recognized, SharedViews, with_edges
+from stavpr_lab.demonstration.false_places import FalsePlaces
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import CARRIED, drive_laps, LapDrive
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_slam.pose_graph import Closure, optimize, PoseGraph
-from stavpr_slam.pose_graph.false_places import FalsePlaces
 from stavpr_slam.pose_graph.transforms import planar_poses
 from tqdm import tqdm
 

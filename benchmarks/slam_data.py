@@ -19,6 +19,7 @@ import numpy as np
 from results import environment, RESULTS, table, write_json
 from slam import ate, DRIFTS
 from slam_pairs import measured, recognize, with_edges
+from stavpr_lab.demonstration.simulated_odometry import drifted
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
 from stavpr_lab.demonstration.street.traverses import LENGTH
@@ -28,7 +29,6 @@ from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.sources import open_source
 from stavpr_slam.pose_graph import optimize
 from stavpr_slam.pose_graph.transforms import planar_poses
-from stavpr_slam.simulated_odometry import drifted
 from tqdm import tqdm
 
 HALLWAY_LENGTH = 40.0  # meters of a lap; laps of Gardens Point get the length of the street

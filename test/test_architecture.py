@@ -20,7 +20,7 @@ BESIDE = {'stavpr_fleet', 'stavpr_slam', 'stavpr_nav'}
 """Packages that do not import each other."""
 FOLDERS = {name: ROOT / name / name for name in PACKAGES[2:]} | {'stavpr_ros': PACKAGE}
 TESTS = {name: ROOT / name / 'test' for name in PACKAGES[2:]} | {'stavpr_ros': ROOT / 'test'}
-NEED_SLAM = {f'demonstration/{name}.py' for name in ('slam', 'repeat', 'street/laps')}
+NEED_SLAM = {'demonstration/slam.py'}
 """Modules of stavpr_lab that need stavpr_slam, imported within functions only."""
 ROS = {'rclpy', 'ament_index_python', 'stavpr_msgs', 'rcl_interfaces', 'builtin_interfaces'}
 ROS |= {

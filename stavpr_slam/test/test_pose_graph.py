@@ -13,8 +13,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import align_maps, Closure, optimize, PoseGraph
 from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.files import save_graph
-from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
-from stavpr_slam.simulated_odometry import drifted
+from stavpr_slam.pose_graph.transforms import body_covariance, exponentials, planar_poses
 
 SECOND = 10**9
 LAP = 100  # images of 2 m
@@ -29,9 +28,25 @@ def circle(laps: int = 2) -> np.ndarray:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2])
 
 
-def odometry_of(truth: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
-    noticed = np.ones(len(truth), bool) if moved is None else moved
-    return planar_poses(drifted(truth, noticed, np.random.default_rng(1), 1.0))
+def odometry_of(
+    truth: np.ndarray, moved: np.ndarray | None = None, drift: float = 1.0, seed: int = 12
+) -> np.ndarray:
+    """
+    Return an odometry with errors of the scale and of the heading, poses (N, 7).
+
+    :param moved: whether it noticed the motion before each image, shape (N,).
+    """
+    dice, T = np.random.default_rng(seed), matrices(planar_poses(truth))
+    steps = inverse(T[:-1]) @ T[1:]
+    steps[:, :3, 3] *= 1 + drift * (0.02 * dice.normal(size=(len(steps), 1)) - 0.01)
+    errors, length = np.zeros((len(steps), 6)), np.linalg.norm(steps[:, :3, 3], axis=1)
+    errors[:, 2] = np.radians(0.5) * np.sqrt(length) * dice.normal(size=len(steps))
+    errors[:, 2] += np.radians(0.02) * length
+    steps = steps @ exponentials(drift * errors)
+    poses = [np.eye(4)]
+    for number, step in enumerate(steps, 1):
+        poses.append(poses[-1] @ step if moved is None or moved[number] else poses[-1])
+    return to_poses(np.array(poses))
 
 
 def closure(truth, query, place, claimed=None, stamps=None, independent=None) -> Closure:

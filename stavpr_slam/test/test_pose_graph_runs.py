@@ -9,7 +9,6 @@ from stavpr_slam.pose_graph import optimize, PoseGraph, runs
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise, path_errors
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
-from stavpr_slam.simulated_odometry import drifted
 from test_pose_graph import circle, closure, LAP, odometry_of, SECOND
 
 NOISE = OdometryNoise(0.05, 0.012)
@@ -86,10 +85,8 @@ def test_optimize_with_runs_agrees_with_all_keyframes(monkeypatch):
 
 def test_update_splits_runs_where_edges_arrive():
     truth = circle(3)
-    dice = np.random.default_rng(4)
-    odometry = planar_poses(drifted(truth, np.ones(len(truth), bool), dice, 0.3))
     graph, closures = PoseGraph(), []
-    for i, pose in enumerate(odometry):
+    for i, pose in enumerate(odometry_of(truth, drift=0.3, seed=4)):
         graph.add_odometry((i + 1) * SECOND, pose)
         if i >= LAP:
             closures.append(closure(truth, i, i - LAP, independent=i % 7 == 0))

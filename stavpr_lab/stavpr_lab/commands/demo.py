@@ -323,11 +323,11 @@ def _loop_closure(arguments: argparse.Namespace, folder: Path) -> None:
 def _slam(arguments: argparse.Namespace, folder: Path) -> None:
     """Correct the odometry of three laps by loop closures."""
     from stavpr_lab.demonstration import slam
+    from stavpr_lab.demonstration.graph_client import fetch_graph
     from stavpr_lab.demonstration.live import executable, run_live
     from stavpr_lab.demonstration.recordings import Recording, TOPIC
     from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, drive_laps
     from stavpr_ros.commands.feature_options import make_extractor
-    from stavpr_slam.ros.graph_client import fetch_graph
 
     _print('1. Three laps of a synthetic street, with a drifting odometry')
     drive = drive_laps(
@@ -343,7 +343,7 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
     others = {}
     if arguments.false_closures:
         topic = 'false_closures/loop_closure'
-        relay = [sys.executable, '-m', 'stavpr_slam.ros.false_closures']
+        relay = [sys.executable, '-m', 'stavpr_lab.demonstration.false_closures']
         relay += ['--share', str(arguments.false_closures), '--seed', str(arguments.world)]
         others['false_closures'] = relay + ['--coherent'] * arguments.coherent
     graph = {'maps_folder': folder.absolute(), 'loop_closure_topics': [topic]}

@@ -12,6 +12,7 @@ from functools import cached_property
 from math import pi
 
 import numpy as np
+from stavpr_lab.demonstration.simulated_odometry import drifted, relative_poses
 from stavpr_lab.demonstration.street.rendering import EYE, FOCAL, HORIZON
 from stavpr_lab.demonstration.street.street import CELL, Street, VIEW
 from stavpr_lab.demonstration.street.traverses import (
@@ -32,7 +33,6 @@ from stavpr_lab.demonstration.street.traverses import (
     World,
 )
 from stavpr_ros.sources.frame import Frame
-from stavpr_slam.simulated_odometry import drifted, relative_poses
 
 DUSK = replace(RAINY_DUSK, lane=LANE, traffic=3)
 AGAIN = 330  # images of lap 2, and of lap 3

@@ -8,10 +8,10 @@ import sys
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from stavpr_lab.demonstration.false_places import FalsePlaces
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.ros.process import own_arguments, ros_node, spin_until
-from stavpr_slam.pose_graph.false_places import FalsePlaces
 
 
 class FalseClosures(Node):
