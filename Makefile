@@ -119,8 +119,10 @@ docs: development ## build the documentation into docs/_build; warnings are erro
 	@$(RUN) sphinx-build -E -W --keep-going -q -b html docs docs/_build
 
 bench bench-quick: override EXTRAS += bench
+bench: override EXTRAS += faiss evaluation
 bench: build ## measure speed and memory beside lower bounds and peers (ARGS=)
 	@$(RUN) python benchmarks/cost.py
+	@$(RUN) python benchmarks/peer_cost.py
 	@$(RUN) python benchmarks/matching.py $(ARGS)
 
 bench-quick: build ## the same for up to 20,000 places, in two to three minutes (ARGS=)
