@@ -7,7 +7,21 @@ import numpy as np
 import pytest
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import thumbnail_of
-from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
+from stavpr_ros.relative_pose import offset as module
+from stavpr_ros.relative_pose.offset import (
+    A,
+    B,
+    BLOCKS,
+    describe_columns,
+    DRIFT,
+    EVIDENCE,
+    MIN_OVERLAP,
+    Offset,
+    OffsetFilter,
+    REACH,
+    SHIFTS,
+    STEP,
+)
 from stavpr_ros.sources import open_source
 
 WIDTH, HEIGHT, PANORAMA = 192, 144, 400
@@ -34,6 +48,47 @@ def warped(image, shift=0.0, beside=0.0):
 
 def offset(query, place) -> Offset:
     return OffsetFilter().update(describe_columns(query), describe_columns(place))
+
+
+def plain_evidence(query, place):
+    """Return the evidence, and whether enough blocks overlap, (models, shifts), from the text."""
+    means = np.full((BLOCKS, len(SHIFTS)), np.nan)
+    for block, columns in enumerate(np.split(np.arange(WIDTH), BLOCKS)):
+        for k, shift in enumerate(SHIFTS):
+            pairs = [(x, x + shift) for x in columns if 0 <= x + shift < WIDTH]
+            if 2 * len(pairs) >= len(columns):
+                products = [place[x].astype(float) @ query[y].astype(float) for x, y in pairs]
+                means[block, k] = np.mean(products)
+    evidence, is_enough = np.zeros((2, len(A), len(SHIFTS)))
+    centers = (np.arange(BLOCKS) + 0.5) / BLOCKS * 2 - 1
+    for model, (a, b) in enumerate(zip(A, B, strict=True)):
+        beside = np.rint((a * centers * abs(centers) + b * abs(centers)) * WIDTH / 2).astype(int)
+        for k, shift in enumerate(SHIFTS):
+            shifted = shift + beside
+            is_near = abs(shifted) <= REACH
+            used = means[np.flatnonzero(is_near), shifted[is_near] + REACH]
+            used = used[~np.isnan(used)]
+            if len(used):
+                evidence[model, k] = EVIDENCE * used.sum() / np.sqrt(BLOCKS * len(used))
+            is_enough[model, k] = len(used) >= MIN_OVERLAP * BLOCKS
+    return evidence, is_enough
+
+
+def plain_drifted(earlier):
+    padded = np.pad(earlier, ((0, 0), (STEP, STEP)), mode='edge')
+    steps = range(-STEP, STEP + 1)
+    parts = [padded[:, STEP + by :][:, : len(SHIFTS)] - 0.5 * (by / DRIFT) ** 2 for by in steps]
+    return np.max(parts, axis=0)
+
+
+def test_kernels_equal_plain_sums():
+    image = panorama(3)
+    query, place = describe_columns(warped(image, 9, 4)), describe_columns(warped(image))
+    evidence, is_enough = module._evidence(query, place, OffsetFilter()._beside)
+    expected, enough = plain_evidence(query, place)
+    np.testing.assert_allclose(evidence, expected, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(is_enough, enough)
+    np.testing.assert_array_equal(module._drifted(evidence), plain_drifted(evidence))
 
 
 @pytest.mark.parametrize('shift', [-48.0, -7.5, 0.0, 3.3, 60.0])

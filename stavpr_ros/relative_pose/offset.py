@@ -22,6 +22,7 @@ import math
 import cv2
 import numpy as np
 from stavpr_ros.checks import require_shape
+from stavpr_ros.compilation import kernel, reassociating_kernel
 
 WIDTH = 192  # pixels of the compared images
 GROUND = 0.62  # the rows below this part of the height are not compared
@@ -116,10 +117,7 @@ class OffsetFilter:
     def __init__(self) -> None:
         u = ((np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5) * 2
         beside = (A[:, None] * u * abs(u) + B[:, None] * abs(u)) * WIDTH / 2
-        shifts = np.rint(beside).astype(int)[:, :, None] + SHIFTS
-        self._is_inside = abs(shifts) <= REACH
-        self._index = np.clip(shifts, -REACH, REACH) + REACH
-        self._index += np.arange(BLOCKS)[:, None] * len(SHIFTS)
+        self._beside = np.rint(beside).astype(np.int64)
         of_model = (A / PRIOR_A) ** 2 + (B / PRIOR_B) ** 2
         self._prior = -0.5 * (of_model[:, None] + (SHIFTS / (PRIOR_H * WIDTH)) ** 2)
         self.reset()
@@ -134,17 +132,8 @@ class OffsetFilter:
 
         :param query, place: their columns, as :func:`describe_columns` returns them.
         """
-        # the sum of the earlier images, where the shift has changed: a parabola for the drift
-        padded = np.pad(self._earlier, ((0, 0), (STEP, STEP)), mode='edge')
-        earlier = np.max(
-            [
-                padded[:, STEP + by : STEP + by + len(SHIFTS)] - 0.5 * (by / DRIFT) ** 2
-                for by in range(-STEP, STEP + 1)
-            ],
-            axis=0,
-        )
-        evidence, is_covered = self._evidence(place @ query.T)
-        self._earlier = FORGETTING * earlier + evidence
+        evidence, is_covered = _evidence(query, place, self._beside)
+        self._earlier = FORGETTING * _drifted(self._earlier) + evidence
         log = np.where(is_covered, self._earlier + self._prior, -np.inf)
         posterior = np.exp(log - log.max())
         posterior /= posterior.sum()
@@ -162,26 +151,61 @@ class OffsetFilter:
         similarity = float(evidence[:, part].max()) / EVIDENCE
         return Offset(shift / WIDTH, deviation / WIDTH, parallax, float(ratio), similarity)
 
-    def _evidence(self, similarity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the evidence (nats) for each (a, b) and shift, and whether enough blocks overlap.
 
-        :param similarity: of columns of the place and columns of the query, (WIDTH, WIDTH).
-        """
-        padded = np.pad(similarity, ((0, 0), (REACH, REACH)))
-        # row x of the diagonals has the similarities of column x at all shifts
-        stride = padded.strides
-        diagonals = np.lib.stride_tricks.as_strided(
-            padded, (WIDTH, len(SHIFTS)), (stride[0] + stride[1], stride[1]), writeable=False
-        )
-        columns = np.arange(WIDTH)[:, None] + SHIFTS
-        overlaps = ((columns >= 0) & (columns < WIDTH)).reshape(BLOCKS, -1, len(SHIFTS))
-        counts = overlaps.sum(axis=1)
-        sums = diagonals.reshape(BLOCKS, -1, len(SHIFTS)).sum(axis=1)
-        is_covered = counts * 2 >= WIDTH // BLOCKS
-        means = np.where(is_covered, sums / np.maximum(counts, 1), 0)
-        is_used = self._is_inside & is_covered.ravel()[self._index]
-        total = (means.ravel()[self._index] * is_used).sum(axis=1)
-        count = is_used.sum(axis=1)
-        evidence = EVIDENCE / BLOCKS * total * np.sqrt(BLOCKS / np.maximum(count, 1))
-        return evidence, count >= MIN_OVERLAP * BLOCKS
+# ------------------------------------------------ kernels
+
+
+@reassociating_kernel
+def _dot(x: np.ndarray, y: np.ndarray) -> np.float32:
+    total = np.float32(0)
+    for i in range(len(x)):
+        total += x[i] * y[i]
+    return total
+
+
+@kernel
+def _evidence(
+    query: np.ndarray, place: np.ndarray, beside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the evidence (nats) for each (a, b) and shift, and whether enough blocks overlap.
+
+    :param query, place: their columns, (WIDTH, d), float32.
+    :param beside: shift of each block of columns beside h, pixels, (models, BLOCKS).
+    """
+    size, shifts, models = WIDTH // BLOCKS, 2 * REACH + 1, len(beside)
+    means, is_covered = np.zeros((BLOCKS, shifts)), np.zeros((BLOCKS, shifts), np.bool_)
+    for block in range(BLOCKS):
+        for k in range(shifts):
+            total, count = 0.0, 0
+            first = max(block * size, REACH - k)
+            last = min((block + 1) * size, WIDTH + REACH - k)
+            for x in range(first, last):
+                total += _dot(place[x], query[x + k - REACH])
+            if 2 * (last - first) >= size:
+                means[block, k], is_covered[block, k] = total / (last - first), True
+    evidence, is_enough = np.zeros((models, shifts)), np.zeros((models, shifts), np.bool_)
+    for model in range(models):
+        for k in range(shifts):
+            total, count = 0.0, 0
+            for block in range(BLOCKS):
+                shift = k + beside[model, block]
+                if 0 <= shift < shifts and is_covered[block, shift]:
+                    total += means[block, shift]
+                    count += 1
+            evidence[model, k] = EVIDENCE / BLOCKS * total * np.sqrt(BLOCKS / max(count, 1))
+            is_enough[model, k] = count >= MIN_OVERLAP * BLOCKS
+    return evidence, is_enough
+
+
+@kernel
+def _drifted(earlier: np.ndarray) -> np.ndarray:
+    """Return the sum of the earlier images where the shift has changed: a parabola for it."""
+    result = earlier.copy()
+    last = earlier.shape[1] - 1
+    for model in range(len(earlier)):
+        for k in range(last + 1):
+            for by in range(-STEP, STEP + 1):
+                value = earlier[model, min(max(k + by, 0), last)] - 0.5 * (by / DRIFT) ** 2
+                result[model, k] = max(result[model, k], value)
+    return result
