@@ -84,6 +84,22 @@ def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
     assert {match.direction for match in both if match.accepted} == {1, -1}
 
 
+@pytest.mark.parametrize('camera', ['front', 'rear'])
+@pytest.mark.parametrize('against', [False, True])
+def test_map_of_two_cameras_names_the_one_that_saw_the_place(camera, against):
+    """A drive with two cameras is searched as a whole, in both directions."""
+    maps = map_of(view(0, 0.6)), map_of(view(5, 0.6))
+    cameras = ('front', 0.0), ('rear', np.pi)
+    place_map = merge_maps(maps, ['front', 'rear'], cameras)
+    is_rear = camera == 'rear'
+    query = features_of(route_strips(5 if is_rear else 0, N), 0.8, 9)
+    for match in recognize(place_map, query[::-1] if against else query)[LENGTH:]:
+        assert match.accepted
+        session = place_map.session(match.place_index)
+        assert (session.camera, session.yaw) == cameras[is_rear]
+        assert match.direction == (-1 if against else 1)
+
+
 def test_changes_of_passes_are_to_the_passes_before():
     changes = np.array([[0.0, 1, 2, 3], [0, 0, 12, 13]])
     layout = ColumnLayout(same_as=np.arange(4), gap=3, against=True)

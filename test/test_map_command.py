@@ -4,6 +4,7 @@
 
 from contextlib import suppress
 from dataclasses import replace
+import math
 import os
 import sys
 
@@ -216,6 +217,21 @@ def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive, c
     assert np.array_equal(days.features[24:].strips, drive.features.strips)
     assert merge_maps([days, night], ['', '']).session(70).id == 'night'
     assert main(['sessions', 'both.stavpr', 'x', '--keep', 'dusk']) == 1
+
+
+def test_maps_of_several_cameras_are_one(folder, capsys):
+    merge = ['merge', 'both.stavpr', 'day.stavpr', 'night.stavpr', '--different-routes']
+    for text in ('front:x', ':90', 'front:inf', 'x' * 65):
+        assert main([*merge, '--cameras', text, 'rear']) == 2
+        assert 'expected NAME or NAME:DEGREES' in capsys.readouterr().err
+    assert main([*merge, '--cameras', 'front', 'rear:540']) == 0
+    front, rear = load_map('both.stavpr').sessions
+    assert (front.camera, front.yaw, rear.camera) == ('front', None, 'rear')
+    assert abs(rear.yaw) == pytest.approx(math.pi)
+    assert main(['info', 'both.stavpr']) == 0
+    shown = capsys.readouterr().out
+    assert 'camera front: 24 places' in shown
+    assert '180 degrees: 24 places' in shown
 
 
 def test_recording_behind_a_map_with_sessions_is_another_session(drive):

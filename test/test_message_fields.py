@@ -138,6 +138,8 @@ def matched(m: PlaceMatch) -> bool:
 # Of each field: its sentence in the .msg, and what is true of it on a drive.
 Checks = dict[str, tuple[str, Callable[[Any, Drive], bool]]]
 
+CAMERAS = {'': ('', 0.0), 'day': ('front', 0.1), 'night': ('rear', math.pi)}  # name, yaw
+
 # fmt: off
 PLACE_MATCH: Checks = {
     'header': ("header of the image, copied: frame_id is the camera's",
@@ -148,6 +150,8 @@ PLACE_MATCH: Checks = {
         lambda m, d: m.map_id == d.map_id),
     'session': ('session of the map that the place is of; empty = unknown',
         lambda m, d: m.session == (d.session(m.place_index) if matched(m) else '')),
+    'camera': ('camera of that session; empty = unknown',
+        lambda m, d: m.camera == (CAMERAS[d.session(m.place_index)][0] if matched(m) else '')),
     'status': ('',
         lambda m, d: matched(m) <= (m.newest_index >= 0) and (m.status == 7) ==
         bool(d.operation == 'mapping' and nanoseconds(m.header.stamp) in d.x)),
@@ -198,6 +202,10 @@ PLACE_MATCH: Checks = {
         'both), 0 = no sequence',
         lambda m, d: m.direction in ((0,) if not m.path else (1,) if not d.is_back else
         (-1,) if matched(m) else (1, -1))),
+    'relative_yaw': ("of the robot in its pose at place_index, rad to the left: yaw of the map's "
+        "camera less the own one's; 0 = not stated by the map",
+        lambda m, d: is_close(m.relative_yaw, CAMERAS[d.session(m.place_index)][1] if matched(m)
+        else 0)),
     'path': ('its warping path, from the oldest image to the newest',
         lambda m, d: not m.path or (sorted({pair.query_index for pair in m.path}) ==
         list(range(len(d.window(m)))) and (np.diff([(p.query_index, m.direction * p.place_index)
@@ -498,7 +506,11 @@ def drives(robot, small_map, tmp_path_factory):
     """Return a drive of each operation and mode, and one of images that are not matched."""
     path = str(tmp_path_factory.mktemp('map') / 'route.stavpr')
     index = np.repeat(np.array([0, 1], np.int32), LAP)
-    sessions = Session('day'), Session('night')
+    sessions = tuple(
+        Session(session, camera=name, yaw=yaw)
+        for session, (name, yaw) in CAMERAS.items()
+        if session
+    )
     save_map(replace(small_map, sessions=sessions, session_index=index), path)
     on_map = {'path': path, 'places': load_map(path)}
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The transform from map to odometry, and the initial pose."""
 
+from dataclasses import replace
 import math
 from pathlib import Path
 import re
@@ -17,10 +18,12 @@ import pytest
 from rclpy.qos import qos_profile_services_default
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
-from stavpr_ros.ros.messages import pose_message
+from stavpr_ros.recognition.match import Match
+from stavpr_ros.ros.messages import matched_pose_message, pose_message
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
 from test_visualization import header, Publishers
 
@@ -39,6 +42,21 @@ def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
     )
     found = matrices(map_to_odometry(place, odometry)) @ matrices(odometry)
     np.testing.assert_allclose(found, matrices(place), atol=1e-12)
+
+
+def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
+    poses = np.tile(posed(0, 0, 30), (len(small_map), 1))
+    poses[:, 0] = np.arange(len(poses))
+    places = replace(small_map, poses=poses)
+    path = np.column_stack([np.arange(4), np.arange(10, 6, -1)])
+    sequence = SequenceMatch(10, 7, 9, 0.1, -1, math.nan)
+    match = Match(Status.MATCH, sequence=sequence, path=path)
+    result = replace(ImageResult.of_match(match), relative_yaw=math.pi)
+    message = matched_pose_message(header(0), result, places, 'map')
+    o = message.pose.pose.orientation
+    assert message.pose.pose.position.x == 7
+    assert abs(np.array([o.x, o.y, o.z, o.w]) @ posed(0, 0, 210)[3:]) == pytest.approx(1)
+    assert message.pose.covariance[35] == 0.01
 
 
 def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():

@@ -13,6 +13,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map, thumbnail_of
 from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.relative_pose import landmarks
 from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
@@ -67,6 +68,11 @@ def scene(camera, query, seed=0):
     return MatchedPair(object(), PLACE, image, *driven(), 0, poses, thumbnails)
 
 
+def turned_mount(mount, yaw):
+    """Return the mounting (7,) of a camera that is turned with its base."""
+    return to_poses(matrices(pose(0, yaw=yaw)) @ matrices(np.array(mount)))
+
+
 def driven(ahead=0.0, speed=1.0, middle=5):
     """
     Return poses of the window, the middle's position, and distances to the places.
@@ -94,6 +100,26 @@ def test_edge_of_images_is_the_pose_between_the_bases(camera):
     error = np.concatenate([edge.pose[:3] - query[:3], turn.as_rotvec()])
     assert error @ np.linalg.solve(edge.covariance, error) < 12.6  # 95 % of 6 dimensions
     assert np.linalg.eigvalsh(edge.covariance).min() > 0
+
+
+@pytest.mark.parametrize('speed', [1.0, -1.0])
+def test_edge_of_a_rear_camera_is_turned(speed):
+    """It sees from behind, on the way back, what the front camera of the map saw."""
+    pair = replace(plain_pair(*driven(0.4, speed), direction=int(speed)), relative_yaw=math.pi)
+    for method, source in (('auto', Source.ALIGNED), ('none', Source.NONE)):
+        edge = EdgeEstimator(method).estimate(pair, None, None)
+        assert edge.source is source
+        assert abs(edge.pose[3:] @ pose(0, yaw=math.pi)[3:]) == pytest.approx(1)
+        np.testing.assert_allclose(
+            edge.pose[:3], [0.4 * SPACING * (source is Source.ALIGNED), 0, 0], atol=0.06
+        )
+    # by keypoints, with the mountings of both cameras
+    pair = scene(CAMERA, pose(0.4, -0.7))
+    rear = replace(CAMERA, mount=tuple(turned_mount(CAMERA.mount, math.pi)))
+    edge = EdgeEstimator().estimate(pair, rear, CAMERA)
+    assert edge.source is Source.PNP
+    np.testing.assert_allclose(edge.pose[:3], [0.4, -0.7, 0], atol=0.12)
+    assert abs(edge.pose[3:] @ pose(0, yaw=math.pi)[3:]) == pytest.approx(1, abs=1e-4)
 
 
 @pytest.mark.parametrize('method', ['auto', 'pnp'])
@@ -279,3 +305,23 @@ def test_map_file_holds_the_camera(small_map, tmp_path):
     assert load_map(tmp_path / 'b.stavpr').camera is None
     assert merge_maps([with_camera] * 2, ['a', 'b']).camera == camera
     assert merge_maps([with_camera, small_map], ['a', 'b']).camera is None
+
+
+def test_map_file_holds_several_cameras(small_map, tmp_path):
+    n, rear = len(small_map), replace(CAMERA, mount=tuple(turned_mount(CAMERA.mount, math.pi)))
+    assert rear.yaw == pytest.approx(math.pi)
+    maps = replace(small_map, camera=CAMERA), replace(small_map, camera=rear)
+    merged = merge_maps(maps, ['front', 'rear'], [('front', 0.1), ('rear', None)])
+    save_map(merged, tmp_path / 'a.stavpr')
+    found = load_map(tmp_path / 'a.stavpr')
+    assert found.sessions == merged.sessions
+    assert [(each.camera, each.yaw) for each in found.sessions] == [
+        ('front', 0.1), ('rear', pytest.approx(math.pi)),
+    ]  # fmt: skip
+    assert (found.camera_of(n - 1), found.camera_of(n)) == (CAMERA, rear)
+    assert with_same_places(found).same_as.tolist() == list(range(2 * n))  # they look elsewhere
+    alike = merge_maps(maps, ['front', 'rear'])
+    assert alike.camera_of(n) == rear
+    assert with_same_places(alike).same_as[n:].tolist() == list(range(n))
+    with pytest.raises(InputError, match='1 cameras of 2 maps'):
+        merge_maps(maps, ['front', 'rear'], [('front', 0.0)])

@@ -267,7 +267,7 @@ def _written_index(index: MapIndex) -> dict[str, Any]:
         'version': VERSION,
         'places': index.places,
         'firsts': index.firsts.tolist(),
-        'sessions': [asdict(session) for session in index.sessions],
+        'sessions': [asdict(replace(session, intrinsics=None)) for session in index.sessions],
         'map_id': index.map_id,
         'sample': base64.b64encode(sample).decode(),
     }

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, UTC
+import math
 from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
@@ -19,6 +20,7 @@ from stavpr_ros.units import DATED, SECOND
 if TYPE_CHECKING:
     from stavpr_ros.mapping import PlaceMap
 
+MAX_NAME = 64  # characters of the name of a camera
 # Tools of other packages, and the packages that provide them.
 TOOLS = {'align': 'stavpr_slam', 'colmap': 'stavpr_slam', 'plot': 'stavpr_lab'}
 
@@ -29,6 +31,7 @@ examples:
   map compact route.stavpr small.stavpr --drop-duplicates
   map colmap route.stavpr hloc --images drive.bag
   map merge both.stavpr day.stavpr night.stavpr
+  map merge both.stavpr front.stavpr rear.stavpr --cameras front:0 rear:180
   map close lap.stavpr closed.stavpr
   map sessions both.stavpr day.stavpr --keep day
   map recover route.stavpr.journal
@@ -129,6 +132,15 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='do not look for places that several sessions show; it takes the time of driving '
         'each session once on a map of the earlier ones',
+    )
+    action.add_argument(
+        '--cameras',
+        nargs='+',
+        default=[],
+        metavar='NAME[:DEG]',
+        help='camera of each map, and the yaw of its optical axis in the base of the robot, to '
+        'the left: front:0 left:90 rear:180, of maps that were recorded together; without '
+        'degrees, of the intrinsics of the map',
     )
     add_storage(action, '', halves)
     _add_routes(add, force)
@@ -256,6 +268,11 @@ def describe(place_map: 'PlaceMap', path: Path) -> str:
         assert place_map.session_index is not None
         places = np.count_nonzero(place_map.session_index == number)
         names = ''.join(f', {text}' for text in (session.name, session.robot) if text)
+        if session.camera:
+            yaw = session.yaw
+            names += f', camera {session.camera}' + (
+                '' if yaw is None else f' at {math.degrees(yaw):.0f} degrees'
+            )
         start = f', {_time(session.start)}' if session.start >= DATED else ''
         same = ''
         if place_map.same_as is not None:
@@ -327,10 +344,23 @@ def _merge(arguments: argparse.Namespace) -> None:
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
-    merged = merge_maps(maps, [Path(path).stem for path in arguments.maps])
+    cameras = [_camera(text) for text in arguments.cameras]
+    merged = merge_maps(maps, [Path(path).stem for path in arguments.maps], cameras)
     if not arguments.different_routes:
         merged = with_same_places(merged)
     _write(merged, arguments)
+
+
+def _camera(text: str) -> tuple[str, float | None]:
+    """Return name and yaw (radians) of a camera, given as NAME or NAME:DEGREES."""
+    name, colon, degrees = text.partition(':')
+    try:
+        yaw = math.radians(float(degrees)) if colon else None
+        if not 0 < len(name) <= MAX_NAME or (yaw is not None and not math.isfinite(yaw)):
+            raise ValueError
+    except ValueError:
+        raise SettingsError(f'--cameras {text!r}: expected NAME or NAME:DEGREES') from None
+    return name, yaw if yaw is None else math.remainder(yaw, 2 * math.pi)
 
 
 def _sessions(arguments: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera of a map: its intrinsics, and where it is on the robot."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
@@ -54,6 +55,11 @@ class Camera:
             )
         object.__setattr__(self, 'mount', tuple(checked_pose(np.array(self.mount)).tolist()))
 
+    @property
+    def yaw(self) -> float:
+        """Return the yaw of the optical axis in the base, radians to the left."""
+        return yaw_of(self.mount)
+
     def require_fitting(self, width: int, height: int) -> None:
         """
         Reject intrinsics of images of other proportions.
@@ -86,6 +92,12 @@ class Camera:
         if self.model == 'equidistant':
             return np.asarray(cv2.fisheye.undistortPoints(full, matrix, coefficients))[:, 0]
         return np.asarray(cv2.undistortPoints(full, matrix, coefficients))[:, 0]
+
+
+def yaw_of(mount: Sequence[float]) -> float:
+    """Return the yaw of the optical axis of a pose of an optical frame, radians to the left."""
+    x, y, z, w = mount[3:]
+    return math.atan2(2 * (y * z - x * w), 2 * (x * z + y * w))
 
 
 def mount_of(text: str) -> tuple[float, ...] | None:

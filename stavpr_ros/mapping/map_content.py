@@ -18,6 +18,7 @@ from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_schema import (
+    CAMERAS,
     Check,
     ERROR_RISKS,
     identity_fields,
@@ -107,7 +108,7 @@ def map_content(file: MapFile) -> PlaceMap:
         if name not in readable:
             return None
         check(data := missing | sections[name]['data'], f'section {name}')
-        return make(**{k: tuple(v) if type(v) is list else v for k, v in data.items()})
+        return _made(make, data)
 
     return PlaceMap(
         features=features,
@@ -116,13 +117,35 @@ def map_content(file: MapFile) -> PlaceMap:
         ids=tuple(ids),
         poses=arrays.get('poses'),
         thumbnails=_thumbnails(file, arrays.get('thumbnail_ends')),
-        sessions=tuple(Session(**session) for session in manifest['sessions']),
+        sessions=_sessions(manifest, 'cameras' in readable),
         session_index=arrays.get('session'),
         camera=section('intrinsics', INTRINSICS, Camera),
         same_as=arrays.get('same_places/same_as'),
         threshold=_threshold(sections['threshold']['data']) if 'threshold' in readable else None,
         map_id=file.map_id,
         error_risks=section('error_risks', ERROR_RISKS, ErrorRisks, recordings=[]),
+    )
+
+
+def _made(make: Callable[..., T], data: dict[str, Any]) -> T:
+    return make(**{k: tuple(v) if type(v) is list else v for k, v in data.items()})
+
+
+def _sessions(manifest: dict[str, Any], has_cameras: bool) -> tuple[Session, ...]:
+    sessions = tuple(Session(**session) for session in manifest['sessions'])
+    if not has_cameras:
+        return sessions
+    CAMERAS(data := manifest['sections']['cameras']['data'], 'section cameras')
+    if len(data) != len(sessions):
+        raise ValueError(f'section cameras has {len(data)} of them: expected {len(sessions)}')
+    return tuple(
+        replace(
+            session,
+            camera=each['name'],
+            yaw=each['yaw'],
+            intrinsics=each['intrinsics'] and _made(Camera, each['intrinsics']),
+        )
+        for session, each in zip(sessions, data, strict=True)
     )
 
 

@@ -17,7 +17,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
-from stavpr_ros.mapping.map_schema import identity_fields, SETTINGS
+from stavpr_ros.mapping.map_schema import identity_fields, SESSION, SETTINGS
 from stavpr_ros.mapping.map_statistics import MapStatistics, STATISTICS
 from stavpr_ros.mapping.map_version2 import (
     copy_with,
@@ -66,6 +66,15 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
     data: dict[str, Any] = {}
     if place_map.camera is not None:
         data['intrinsics'] = asdict(place_map.camera)
+    if any(each.camera or each.yaw is not None or each.intrinsics for each in place_map.sessions):
+        data['cameras'] = [
+            {
+                'name': each.camera,
+                'yaw': each.yaw,
+                'intrinsics': each.intrinsics and asdict(each.intrinsics),
+            }
+            for each in place_map.sessions
+        ]
     if place_map.same_as is not None:
         data['same_places'] = None
     if place_map.threshold is not None:
@@ -82,7 +91,7 @@ def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str
         'settings': {name: {**vars(settings), 'backbone': backbone}[name] for name in SETTINGS},
         'cells': place_map.features.cells,
         'projection': projection.name if projection else None,
-        'sessions': [asdict(session) for session in place_map.sessions],
+        'sessions': [{key: vars(each)[key] for key in SESSION} for each in place_map.sessions],
         'sections': {name: _section(each, name) for name, each in data.items()},
     }
 

@@ -157,6 +157,10 @@ INTRINSICS = record(
         'mount': list_of(number, 7, 7),
     }
 )
+CAMERAS = list_of(
+    record({'name': text(64), 'yaw': nullable(number), 'intrinsics': nullable(INTRINSICS)}),
+    most=1024,
+)
 VALUE_RANGE = list_of(integer(0, 65535 + 1), 2, 2)
 ERROR_RISKS = record(
     {

@@ -17,7 +17,11 @@ MAX_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
 # name: highest known version
 ERROR_RISKS = 'error_risks'
 KNOWN_SECTIONS = dict.fromkeys(
-    (ERROR_RISKS, 'intrinsics', 'same_places', 'statistics', 'threshold', 'value_range'), 1
+    (
+        *('cameras', ERROR_RISKS, 'intrinsics', 'same_places', 'statistics', 'threshold'),
+        'value_range',
+    ),
+    1,
 )
 _METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MAX_HEADER)))
 _TENSOR = record(

@@ -12,19 +12,29 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.place_map import PlaceMap, Session
 
 
-def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
+def merge_maps(
+    maps: Sequence[PlaceMap],
+    names: Sequence[str],
+    cameras: Sequence[tuple[str, float | None]] = (),
+) -> PlaceMap:
     """
     Return one map with the places of all, in their order; without threshold and error risks.
 
     :param names: id and name of the session that a map without sessions becomes; one each.
+    :param cameras: of each map, the name of its camera, and the yaw of the optical axis in the
+        base, radians to the left; None = of its intrinsics, else unknown. Empty = not stated.
     :raises FeatureMismatchError: features of different settings.
     :raises InputError: no map.
     """
     if not maps:
         raise InputError('no maps to merge: give at least one')
+    if len(cameras) not in (0, len(maps)):
+        raise InputError(f'{len(cameras)} cameras of {len(maps)} maps: expected one each')
+    # one section for the whole map
+    camera = maps[0].camera if len({each.camera for each in maps}) == 1 else None
     sessions: list[Session] = []
     index = []
-    for place_map, name in zip(maps, names, strict=True):
+    for number, (place_map, name) in enumerate(zip(maps, names, strict=True)):
         place_map.features.require_same_settings(maps[0].settings, 'the first map')
         if place_map.dimension != maps[0].dimension:
             raise FeatureMismatchError(
@@ -38,7 +48,14 @@ def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
             numbers = np.zeros(len(place_map), np.int32)
         index.append(numbers + np.int32(len(sessions)))
         for session in own:
-            sessions.append(replace(session, id=_free_id(session.id, sessions)))
+            intrinsics = session.intrinsics or (place_map.camera if camera is None else None)
+            one = replace(session, id=_free_id(session.id, sessions), intrinsics=intrinsics)
+            if cameras:
+                known, (label, yaw) = one.intrinsics or camera, cameras[number]
+                if yaw is None and known is not None:
+                    yaw = known.yaw
+                one = replace(one, camera=label, yaw=yaw)
+            sessions.append(one)
     poses = [
         np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
     ]
@@ -52,8 +69,7 @@ def merge_maps(maps: Sequence[PlaceMap], names: Sequence[str]) -> PlaceMap:
         thumbnails=tuple(thumbnails) if any(len(each.thumbnails) for each in maps) else (),
         sessions=tuple(sessions),
         session_index=np.concatenate(index),
-        # one section for the whole map
-        camera=maps[0].camera if len({each.camera for each in maps}) == 1 else None,
+        camera=camera,
         same_as=_joined_same_as(maps),
     )
 

@@ -26,18 +26,25 @@ LONGEST_ID = 4096  # characters
 @dataclass(frozen=True)
 class Session:
     """
-    One drive of several in a map.
+    One drive of several in a map, or one camera of a drive with several.
 
     :param id: unique in the map.
     :param name: for people, '' = none.
     :param robot: id of the robot, '' = unknown.
     :param start: time of its first image, ns, 0 = unknown.
+    :param camera: name of the camera, such as ``rear``, '' = unknown.
+    :param yaw: of its optical axis in the base of the robot, radians to the left (REP-103), pi =
+        backward; None = unknown.
+    :param intrinsics: of the camera, where the cameras of the map differ; None = the map's.
     """
 
     id: str
     name: str = ''
     robot: str = ''
     start: int = 0
+    camera: str = ''
+    yaw: float | None = None
+    intrinsics: Camera | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +80,7 @@ class PlaceMap:
         place; empty = none kept.
     :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
     :param session_index: number of each place's session, shape (n,), int32; None without sessions.
-    :param camera: of its images; None = unknown.
+    :param camera: of its images; None = unknown, or another one of each session.
     :param same_as: of each place, itself, or the place of an earlier session, or of the start of a
         closed route, that shows the same, shape (n,), int32; None = unknown. By
         :mod:`stavpr_ros.recognition.same_places`.
@@ -175,6 +182,11 @@ class PlaceMap:
     def session(self, place: int) -> Session | None:
         """Return the session that a place is of, None without sessions."""
         return None if self.session_index is None else self.sessions[self.session_index[place]]
+
+    def camera_of(self, place: int) -> Camera | None:
+        """Return the camera of a place's image, None = unknown."""
+        session = self.session(place)
+        return (session.intrinsics if session is not None else None) or self.camera
 
     def extractor(self, device: str = 'cpu', model: str = '') -> FeatureExtractor:
         """

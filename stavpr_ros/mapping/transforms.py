@@ -27,6 +27,15 @@ def to_poses(transforms: np.ndarray) -> np.ndarray:
     return np.concatenate([transforms[..., :3, 3], turns.reshape(*shape, 4)], axis=-1)
 
 
+def turned(pose: np.ndarray, yaw: float) -> np.ndarray:
+    """Return a pose (7,) turned about its own z axis, radians to the left."""
+    if not yaw:
+        return pose
+    (x, y, z, w), c, s = pose[3:], np.cos(yaw / 2), np.sin(yaw / 2)
+    turn = x * c + y * s, y * c - x * s, z * c + w * s, w * c - z * s
+    return np.array([*pose[:3], *turn])
+
+
 def inverse(transforms: np.ndarray) -> np.ndarray:
     """Return the inverses of rigid transforms (..., 4, 4)."""
     result = np.zeros_like(transforms)

@@ -350,7 +350,8 @@ class Operation(ABC):
         else:
             rows, unknown = list(self._window)[-count:], np.full(7, np.nan)
             poses = np.array([unknown if row.pose is None else row.pose for row in rows])
-        return matched_pair(match, place, places, self._query(result), poses, distances)
+        query, yaw = self._query(result), result.relative_yaw
+        return matched_pair(match, place, places, query, poses, distances, yaw)
 
 
 class Localizer(Operation):

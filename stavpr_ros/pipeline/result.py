@@ -34,6 +34,8 @@ class ImageResult:
     :param image_index: place of a growing map that this image has become, -1 = none.
     :param image: the decoded image, RGB; None = not decoded.
     :param stages: duration of each stage, seconds.
+    :param relative_yaw: of the robot in the base of the matched place, radians to the left, by the
+        mountings of the two cameras; 0 also where that of the map's is unknown.
     """
 
     status: Status
@@ -50,6 +52,7 @@ class ImageResult:
     image_index: int = -1
     image: np.ndarray | None = None
     stages: Mapping[str, float] = field(default_factory=dict)
+    relative_yaw: float = 0.0
 
     @classmethod
     def of_match(cls, match: Match) -> 'ImageResult':

@@ -7,6 +7,7 @@ A session is related to the sessions before it, and the end of a closed route to
 """
 
 from dataclasses import replace
+import math
 
 import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
@@ -59,8 +60,9 @@ def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
     Return the map with the places of its sessions related (:attr:`PlaceMap.same_as`).
 
     Each session is driven, as a query of mode robust, on a map of the sessions before it. Where it
-    is matched, its place is the matched one. The time grows with the square of the places, and a
-    terminal shows the progress.
+    is matched, its place is the matched one. Sessions of cameras whose yaws differ by more than 45
+    degrees are not compared. The time grows with the square of the places, and a terminal shows
+    the progress.
 
     :param first: session to begin with; earlier ones stay as they are.
     """
@@ -71,12 +73,22 @@ def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
     if first > 1 and place_map.same_as is not None:
         same_as = place_map.same_as.astype(np.int64)
     for session in Progress(numbers, desc='same places', unit='session'):
-        earlier, places = np.flatnonzero(index < session), np.flatnonzero(index == session)
+        views = [n for n in range(session) if not _looks_elsewhere(place_map, n, session)]
+        earlier, places = np.flatnonzero(np.isin(index, views)), np.flatnonzero(index == session)
+        if not len(earlier):
+            continue
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
         matched = _recognized(reference, place_map, places)
         is_matched = matched >= 0
         same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
     return replace(place_map, same_as=same_as.astype(np.int32))
+
+
+def _looks_elsewhere(place_map: PlaceMap, session: int, other: int) -> bool:
+    yaws = place_map.sessions[session].yaw, place_map.sessions[other].yaw
+    if yaws[0] is None or yaws[1] is None:
+        return False
+    return abs(math.remainder(yaws[0] - yaws[1], 2 * math.pi)) > math.pi / 4
 
 
 def with_seam(place_map: PlaceMap, is_closed: bool = False) -> PlaceMap:

@@ -14,7 +14,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
-from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
+from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses, turned
 from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
 from stavpr_ros.relative_pose.odometry import align
@@ -128,10 +128,9 @@ class EdgeEstimator:
 
     def _other(self, pair: MatchedPair, reason: str) -> Edge:
         """Return the edge by odometry where the method permits it, else one without a pose."""
-        if self.method in ('none', 'pnp'):
-            return Edge(Source.NONE, reason)
-        edge = align(pair)
-        return replace(edge, reason=f'{reason}; {edge.reason}' if edge.reason else reason)
+        edge = Edge(Source.NONE) if self.method in ('none', 'pnp') else align(pair)
+        reason = f'{reason}; {edge.reason}' if edge.reason else reason
+        return replace(edge, reason=reason, pose=turned(edge.pose, pair.relative_yaw))
 
     def _pnp(self, pair: MatchedPair, query_camera: Camera, place_camera: Camera) -> Edge:
         """

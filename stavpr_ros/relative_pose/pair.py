@@ -35,6 +35,8 @@ class MatchedPair:
     :param direction: 1 = the camera moves along the places, -1 = against them.
     :param thumbnails: of places of the same session at most ``TRIANGULATION_RADIUS`` away, by
         index: JPEG images, empty = none.
+    :param relative_yaw: of the base of the query in the base of the place, by the mountings of
+        the cameras, radians to the left.
     """
 
     source: PlaceMap | GrowingMap
@@ -47,6 +49,7 @@ class MatchedPair:
     poses: np.ndarray
     thumbnails: dict[int, bytes]
     direction: int = 1
+    relative_yaw: float = 0.0
 
     def pose(self, place: int) -> np.ndarray:
         """Return the pose of a place near by, shape (7,); NaN = unknown."""
@@ -72,12 +75,13 @@ def matched_pair(
     query: np.ndarray | None,
     query_poses: np.ndarray,
     distances_to: Callable[[np.ndarray], np.ndarray] | None,
+    relative_yaw: float = 0.0,
 ) -> MatchedPair:
     """
     Copy what the edge of a match needs.
 
     :param place: that it is of.
-    :param query, query_poses: see :class:`MatchedPair`.
+    :param query, query_poses, relative_yaw: see :class:`MatchedPair`.
     :param distances_to: returns the distances of the window to places (k,), shape (l, k), +inf =
         not compared; None = not needed. Called only where the pair has both poses.
     """
@@ -100,7 +104,7 @@ def matched_pair(
                 thumbnails[index] = _thumbnail(places, index - start)
     return MatchedPair(
         places, place, query, query_poses, match.position, distances, low, poses, thumbnails,
-        match.direction,
+        match.direction, relative_yaw,
     )  # fmt: skip
 
 

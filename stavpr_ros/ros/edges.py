@@ -89,7 +89,9 @@ class EdgePublisher:
         if not result.accepted:
             return edge, closures
         # a route has the camera of the query
-        place_camera = places.camera if isinstance(places, PlaceMap) else camera
+        place_camera = camera
+        if isinstance(places, PlaceMap):  # there, no match is late
+            place_camera = places.camera_of(result.place_index)
         for each in (result, *result.late):
             pair = operation.matched_pair(each, self._estimator.method)
             if each is result:

@@ -26,6 +26,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
+from stavpr_ros.mapping.transforms import turned
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.edge import Edge
@@ -129,7 +130,9 @@ def match_message(
     if match is not None and result.accepted and places is not None:
         place, newest = places.place(message.place_index), places.place(newest_index)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
-        message.session = place.session
+        message.session, message.relative_yaw = place.session, result.relative_yaw
+        session = places.session(message.place_index) if isinstance(places, PlaceMap) else None
+        message.camera = session.camera if session is not None else ''
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
         if edge is not None:
             message.has_relative_pose = edge.has_pose
@@ -253,22 +256,28 @@ def relative_pose_message(
     return message
 
 
+def newest_pose(result: ImageResult, places: PlaceMap | GrowingMap) -> np.ndarray | None:
+    """Return the pose of the robot at the place of the newest image, (7,); None = unknown."""
+    pose = places.place(result.newest_index).pose if result.accepted else None
+    return None if pose is None else turned(pose, result.relative_yaw)
+
+
 def matched_pose_message(
     header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None, frame: str
 ) -> PoseWithCovarianceStamped | None:
     """
     Return the pose of the place of the newest image; None without a match or a known pose.
 
-    The covariance is diagonal: the variance over the poses of the two places before and after it,
-    rotation vectors about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2. It does not
-    include a lateral offset of the camera from the route.
+    It is turned by the mountings of the cameras, where the map states them. The covariance is
+    diagonal: the variance over the poses of the two places before and after it, rotation vectors
+    about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2. It does not include a lateral
+    offset of the camera from the route.
 
     :param frame: of the poses of the map.
     """
     if not result.accepted or places is None:
         return None
-    newest = result.newest_index
-    pose = places.place(newest).pose
+    newest, pose = result.newest_index, newest_pose(result, places)
     if pose is None:
         return None
     first = places.first if isinstance(places, GrowingMap) else 0
@@ -276,7 +285,8 @@ def matched_pose_message(
     near = np.array([near for near in (places.place(i).pose for i in around) if near is not None])
     from scipy.spatial.transform import Rotation
 
-    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(pose[3:]).inv()
+    own = turned(pose, -result.relative_yaw)  # of the place
+    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(own[3:]).inv()
     variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
     message = PoseWithCovarianceStamped()
     message.header.stamp, message.header.frame_id = header.stamp, frame

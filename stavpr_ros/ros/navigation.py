@@ -17,7 +17,7 @@ from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
 from stavpr_ros.ros.beat import Beat
-from stavpr_ros.ros.messages import matched_pose_message, transform_message
+from stavpr_ros.ros.messages import matched_pose_message, newest_pose, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
 
@@ -81,7 +81,7 @@ class Navigation:
         if result.cause or not isinstance(places, PlaceMap):
             return
         map_frame = self._settings.map_frame
-        pose = places.place(result.newest_index).pose if result.accepted else None
+        pose = newest_pose(result, places)
         # a whole window without a match, or a new window
         length = self._settings.pipeline.sequence.length
         is_lost = self._unmatched >= length - 1

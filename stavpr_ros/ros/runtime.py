@@ -15,7 +15,7 @@ import numpy as np
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.mapping.camera import Camera
+from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of, yaw_of
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
@@ -408,6 +408,7 @@ class Runtime:
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
         result = self._match(item.message, pose, camera)
+        result = self._with_yaw(result, places, camera_input, frames.child, header.frame_id)
         began = time.monotonic()
         if self._navigation is not None:
             self._navigation.publish(header, result, places, pose, frames.odometry)
@@ -429,6 +430,26 @@ class Runtime:
         self.last_match, self.last_frame, status = message, frames.frame, result.status
         place = message.newest_index if status is Status.MAPPED else message.place_index
         self._statistics.add_match(status.name, result.reason, place, message.distance, stages)
+
+    def _with_yaw(
+        self,
+        result: ImageResult,
+        places: PlaceMap | GrowingMap | None,
+        camera_input: CameraInput | None,
+        base: str,
+        frame: str,
+    ) -> ImageResult:
+        """Return a result with the yaw by the mountings, where the map states its camera's."""
+        if not (result.accepted and isinstance(places, PlaceMap)):
+            return result
+        session = places.session(result.place_index)
+        if session is None or session.yaw is None:
+            return result
+        if camera_input is None:
+            own = yaw_of(mount_of(self.settings.camera_transform) or FORWARD)
+        else:
+            own = camera_input.yaw(base, frame)
+        return replace(result, relative_yaw=math.remainder(session.yaw - own, 2 * math.pi))
 
     def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
         """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""

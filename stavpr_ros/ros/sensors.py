@@ -13,7 +13,7 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of
+from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of, yaw_of
 from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.input import BEST_EFFORT, subscribe
@@ -116,6 +116,7 @@ class CameraInput:
         self._node, self._fixed_mount = node, mount_of(transform)
         self._info: CameraInfo | None = None
         self._known: tuple[Any, ...] = ()  # message, frames and camera of the last call
+        self._yaw: tuple[str | None, str, float] = (None, '', 0.0)  # frames, result of a call
         self.assumed = False
         topic = _topic(node)
         self.problem = f'nothing was received on {topic}'
@@ -130,6 +131,21 @@ class CameraInput:
                 return
             self._tf = Buffer()
             self._listener = TransformListener(self._tf, node)
+
+    def yaw(self, base: str, frame: str) -> float:
+        """
+        Return the yaw of the optical axis in the base, radians to the left.
+
+        While it is unknown, also without a frame of the base, that of a camera that looks ahead.
+        """
+        if self._fixed_mount is None and not base:
+            return 0.0
+        if self._yaw[:2] != (base, frame):
+            mount = self._mount(base, frame)
+            if mount is None:
+                return 0.0
+            self._yaw = base, frame, yaw_of(mount)
+        return self._yaw[2]
 
     @property
     def state(self) -> str:

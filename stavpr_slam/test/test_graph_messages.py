@@ -44,6 +44,11 @@ def test_closure_of_appearance_is_edge_of_meters_only_on_request():
     found = closure_of(message, appearance=True)
     assert found is not None
     assert np.sqrt(found.covariance[0, 0]) == pytest.approx(3)
+    np.testing.assert_array_equal(found.pose, [0, 0, 0, 0, 0, 0, 1])
+    message.relative_pose.pose.pose = pose_message(np.array([9.0, 0, 0, 0, 0, 1, 0]))
+    turned = closure_of(message, appearance=True)
+    assert turned is not None
+    np.testing.assert_array_equal(turned.pose, [0, 0, 0, 0, 0, 1, 0])  # by the mountings
     assert not found.is_independent
 
 

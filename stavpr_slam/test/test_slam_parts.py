@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts around the pose graph: sources of closures, stamps that jump back, tf."""
 
+import math
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -85,6 +86,11 @@ def test_camera_transform_of_tf_is_looked_up(context, monkeypatch):
     assert found is not None
     assert found.mount == (0, 0, 1.5, 0, 0, 0, 1)
     assert asked == [('base', 'optical', 0)] * 2
+    assert camera.yaw('', 'optical') == 0.0  # without odometry
+    found = camera.yaw('base', 'optical')
+    assert found == pytest.approx(0)  # its z is up
+    rear = CameraInput(node, '0 0 1 -1.5708 0 1.5708')
+    assert abs(rear.yaw('', '')) == pytest.approx(math.pi, abs=1e-4)
     camera.close()
     assert ended == [True]
     node.destroy_node()

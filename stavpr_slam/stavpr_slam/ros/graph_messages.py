@@ -11,7 +11,7 @@ from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure
-from stavpr_slam.pose_graph.alignment import APPEARANCE, IDENTITY
+from stavpr_slam.pose_graph.alignment import APPEARANCE
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -43,7 +43,8 @@ def closure_of(message: LoopClosure, appearance: bool) -> Closure | None:
     if not appearance:
         return None
     stamps = nanoseconds(message.query_stamp), nanoseconds(message.place_stamp)
-    return Closure(*stamps, IDENTITY, APPEARANCE, False, **known)
+    by_mounting = np.append(np.zeros(3), pose_array(relative.pose.pose)[3:])
+    return Closure(*stamps, by_mounting, APPEARANCE, False, **known)
 
 
 def pose_array(pose: object) -> np.ndarray:
