@@ -348,6 +348,17 @@ def _error_risks(**changes):
     return lambda manifest: manifest['sections'].update(error_risks=section)
 
 
+def _cameras(**changes):
+    one = {'name': 'rear', 'yaw': 3.1, 'intrinsics': None}
+    section = {'version': 1, 'required': False, 'data': [one, one | changes]}
+    return lambda manifest: manifest['sections'].update(cameras=section)
+
+
+def _more_cameras(manifest):
+    _cameras()(manifest)
+    manifest['sections']['cameras']['data'] *= 2
+
+
 HAND_MADE = [
     ({'stamps': np.zeros((24, 3), np.int64)}, None, r'stamps is I64 \(24, 3\)'),
     ({'stamps': np.full(24, 2**62)}, None, 'a stamp is out of range'),
@@ -393,6 +404,12 @@ HAND_MADE = [
     ({}, _error_risks(risks=['0', '0']), r"risks\[0\] is '0'"),
     ({}, _error_risks(probabilities=[0.5] * 2**16), 'a list of 1 to 256'),
     ({}, _error_risks(probabilities=[0.5, 10**400]), 'between 0 and 1|too large'),
+    ({}, _cameras(more=1), "unknown 'more'"),
+    ({}, _cameras(name='a' * 65), 'at most 64 characters'),
+    ({}, _cameras(yaw='left'), "yaw is 'left'"),
+    ({}, _cameras(yaw=float('nan')), 'yaw is nan|no number|JSON'),
+    ({}, _cameras(intrinsics={'width': 640}), "lacks '"),
+    ({}, _more_cameras, 'section cameras has 4 of them: expected 2'),
 ]
 
 

@@ -267,10 +267,16 @@ def _written_index(index: MapIndex) -> dict[str, Any]:
         'version': VERSION,
         'places': index.places,
         'firsts': index.firsts.tolist(),
-        'sessions': [asdict(replace(session, intrinsics=None)) for session in index.sessions],
+        'sessions': [_written_session(session) for session in index.sessions],
         'map_id': index.map_id,
         'sample': base64.b64encode(sample).decode(),
     }
+
+
+def _written_session(session: Session) -> dict[str, Any]:
+    """Return what is known of a session, without intrinsics; releases before 1.0 know no camera."""
+    values = asdict(replace(session, intrinsics=None))
+    return {key: value for key, value in values.items() if value not in ('', None)}
 
 
 def _read_index(payload: dict[str, Any]) -> MapIndex:

@@ -57,7 +57,7 @@ def seen_again(features, noise=0.6, seed=1):
 @pytest.fixture(scope='module')
 def city():
     features = walk(CITY)
-    sessions = Session('a', 'one'), Session('b')
+    sessions = Session('a', 'one'), Session('b', camera='rear', yaw=3.1)
     index = np.repeat(np.arange(2, dtype=np.int32), CITY // 2)
     return replace(descriptor_map(features), sessions=sessions, session_index=index)
 
