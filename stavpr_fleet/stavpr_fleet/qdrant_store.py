@@ -274,7 +274,7 @@ def _written_index(index: MapIndex) -> dict[str, Any]:
 
 
 def _written_session(session: Session) -> dict[str, Any]:
-    """Return what is known of a session, without intrinsics; releases before 1.0 know no camera."""
+    """Return what is known of a session but its intrinsics; release 0.9 knows no camera."""
     values = asdict(replace(session, intrinsics=None))
     return {key: value for key, value in values.items() if value not in ('', None)}
 
