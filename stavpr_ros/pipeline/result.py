@@ -35,7 +35,7 @@ class ImageResult:
     :param image: the decoded image, RGB; None = not decoded.
     :param stages: duration of each stage, seconds.
     :param relative_yaw: of the robot in the base of the matched place, radians to the left, by the
-        mountings of the two cameras; 0 also where that of the map's is unknown.
+        mountings of the two cameras; 0 also where the mounting in the map is unknown.
     """
 
     status: Status

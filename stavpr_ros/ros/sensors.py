@@ -136,7 +136,7 @@ class CameraInput:
         """
         Return the yaw of the optical axis in the base, radians to the left.
 
-        While it is unknown, also without a frame of the base, that of a camera that looks ahead.
+        While it is unknown, also without a frame of the base, the camera looks ahead: 0.
         """
         if self._fixed_mount is None and not base:
             return 0.0
