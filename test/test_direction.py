@@ -4,13 +4,17 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.commands import build_map
+from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.mapping import merge_maps
+from stavpr_ros.mapping import load_map, merge_maps
 from stavpr_ros.pipeline import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.robust import ROBUST
@@ -98,6 +102,33 @@ def test_map_of_two_cameras_names_the_one_that_saw_the_place(camera, against):
         session = place_map.session(match.place_index)
         assert (session.camera, session.yaw) == cameras[is_rear]
         assert match.direction == (-1 if against else 1)
+
+
+def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
+    rng, n = np.random.default_rng(4), 40
+    wide = rng.integers(0, 256, (n, 12, 48, 3), np.uint8)
+    panoramas = [cv2.resize(image, (192, 48)) for image in wide]
+    for i, image in enumerate(panoramas):
+        cv2.imwrite(str(tmp_path / f'{i:03}.png'), image[:, :, ::-1])
+    out, back, both = (str(tmp_path / f'{name}.stavpr') for name in ('out', 'back', 'both'))
+    build = ['--input', str(tmp_path), '--output']
+    assert build_map.main([*build, out]) == 0
+    assert build_map.main([*build, back, '--panorama-yaw', '180', '--force']) == 0
+    assert build_map.main([*build, back, '--panorama-yaw', '181', '--force']) == 2
+    merge = ['merge', both, out, back, '--cameras', 'panorama:0', 'panorama:180']
+    assert map_command.main(merge) == 0
+    place_map = load_map(both)
+    turned = [np.roll(image, 96, axis=1) for image in panoramas]  # of the robot
+    features = FeatureExtractor().extract(turned[::-1])
+    for i, match in list(enumerate(recognize(place_map, features)))[LENGTH:]:
+        assert match.accepted
+        assert place_map.session(match.place_index).yaw == pytest.approx(np.pi)
+        assert match.direction == -1
+        assert abs(match.newest_index - (2 * n - 1 - i)) <= 2
+    # to the left by a quarter: what was at the left is ahead
+    assert build_map.main([*build, back, '--panorama-yaw', '90', '--force']) == 0
+    expected = FeatureExtractor().extract([np.roll(panoramas[0], 48, axis=1)]).strips[:, 0]
+    np.testing.assert_allclose(load_map(back).features.strips[:, 0], expected, atol=1e-3)
 
 
 def test_changes_of_passes_are_to_the_passes_before():

@@ -101,6 +101,13 @@ def _parser() -> argparse.ArgumentParser:
         action='store_true',
         help='continue after an image that cannot be read',
     )
+    parser.add_argument(
+        '--panorama-yaw',
+        type=float,
+        default=0.0,
+        metavar='DEG',
+        help='turn images of 360 degrees to the left; 180: as the robot takes them on its return',
+    )
     _add_keyframe_options(parser)
     add_job_options(parser)
     add_feature_options(parser)
@@ -120,10 +127,16 @@ def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
 
 
 class _Images:
-    """Every N-th image of a source; counts the images that were read."""
+    """
+    Every N-th image of a source; counts the images that were read.
 
-    def __init__(self, source: 'FolderSource | VideoSource | BagSource', every: int) -> None:
-        self.source, self._every = source, every
+    :param yaw: degrees to the left by which panoramas are turned, 0 = as they are.
+    """
+
+    def __init__(
+        self, source: 'FolderSource | VideoSource | BagSource', every: int, yaw: float
+    ) -> None:
+        self.source, self._every, self._yaw = source, every, yaw
         self.read = 0
 
     def __len__(self) -> int:
@@ -132,18 +145,26 @@ class _Images:
     def __iter__(self) -> Iterator['Frame']:
         for frame in islice(self.source, 0, None, self._every):
             self.read += 1
-            yield frame
+            yield replace(frame, image=_turned(frame.image, self._yaw)) if self._yaw else frame
+
+
+def _turned(panorama: 'np.ndarray', yaw: float) -> 'np.ndarray':
+    """Return a panorama (h, w, c) as a camera that is turned to the left takes it, degrees."""
+    import numpy as np
+
+    return np.roll(panorama, round(yaw / 360 * panorama.shape[1]), axis=1)
 
 
 def _check(arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other, before anything is read."""
-    from stavpr_ros.checks import require_at_least
+    from stavpr_ros.checks import require_at_least, require_between
     from stavpr_ros.sources.bag_path import is_bag
     from stavpr_ros.sources.video import is_video, require_video
 
     moving = arguments.keyframe_distance or arguments.keyframe_angle
     bag = is_bag(Path(arguments.input))
     require_at_least('--every', arguments.every, 1)
+    require_between('--panorama-yaw', arguments.panorama_yaw, -180, 180)
     require_video(arguments.fps, [arguments.input])
     if arguments.poses and arguments.skip_bad_images:
         raise SettingsError(
@@ -215,7 +236,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     extractor = make_extractor(arguments)
     source = open_source(arguments.input, arguments.topic, bad_image, arguments.fps)
     fit_value_range(source, extractor)
-    images = _Images(source, arguments.every)
+    images = _Images(source, arguments.every, arguments.panorama_yaw)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
     poses = _poses(arguments, len(source))
     journal = build_journal(
