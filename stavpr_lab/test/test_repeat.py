@@ -16,7 +16,10 @@ from stavpr_lab.demonstration.repeat import (
     View,
 )
 from stavpr_lab.demonstration.street.laps import RingWorld
+from stavpr_lab.demonstration.street.rendering import FOCAL
 from stavpr_lab.demonstration.street.street import CELL
+from stavpr_lab.demonstration.street.traverses import GOOD_LIGHT, RAINY_DUSK, Traverse, World
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 
 COVERED = 18.0  # seconds
 
@@ -87,3 +90,21 @@ def test_view_at_a_pose_of_the_street(taught):
             heading,
         ])  # fmt: skip
         assert view.on_street(pose) == pytest.approx((along, right), abs=1e-6)
+
+
+def test_heading_on_the_other_lane_at_dusk_in_rain():
+    """The end of the street is not infinitely far: it is shifted as well, by about 1.5 degrees."""
+    along, world = np.arange(100, 140, 2.0), World(21)
+    taught, other = (
+        Traverse(world, along, np.zeros(len(along), bool), light)
+        for light in (GOOD_LIGHT, RAINY_DUSK)
+    )
+    estimator, errors = OffsetFilter(), []
+    for k in range(len(along)):
+        columns = [describe_columns(each[k].image) for each in (other, taught)]
+        offset = estimator.update(*columns)
+        truth = taught.camera(k)[2] - other.camera(k)[2]
+        errors.append((offset.heading(FOCAL) - truth, math.atan(offset.shift / FOCAL) - truth))
+    rms = np.degrees(np.sqrt(np.mean(np.square(errors), axis=0)))
+    assert rms[0] < 1.2
+    assert rms[0] < 0.8 * rms[1]

@@ -25,6 +25,7 @@ from stavpr_nav.ros.teach_node import TeachNode
 from stavpr_nav.taught_run import read_velocities
 from stavpr_ros.errors import InputError, OutputError, SettingsError
 from stavpr_ros.mapping import load_map
+from stavpr_ros.relative_pose.offset import DISTANT
 from stavpr_ros.ros.messages import image_message
 from std_msgs.msg import Bool, Header
 
@@ -143,7 +144,8 @@ def test_goal_is_reached_with_feedback_and_velocities_stop(rover, repeat):
     offset = rover.offsets[-1]
     assert (offset.place_index, offset.place_id) == (int(rover.place), f'place {int(rover.place)}')
     assert offset.is_valid
-    assert offset.heading == pytest.approx(math.atan(offset.shift * 2), abs=1e-6)
+    shift = offset.shift - DISTANT * offset.parallax
+    assert offset.heading == pytest.approx(math.atan(shift * 2), abs=1e-6)
     assert abs(offset.heading) < 0.02
 
 

@@ -38,6 +38,7 @@ DRIFT, STEP = 1.5, 3  # pixels that the shift changes between two images, deviat
 PEAK = 5  # pixels from the most probable shift that are one peak
 MIN_RATIO = 9.0  # of the peak of a valid offset to the second peak
 MIN_SIMILARITY = 0.12  # of a valid offset
+DISTANT = 0.3  # parallax of the distant scene, which is not infinitely far, over `parallax`
 FLOOR, INFLATION = 0.5, 2.0  # pixels of a sharp peak; errors of neighboring columns are dependent
 # Deviations of the prior: h in widths; a and b in half widths.
 PRIOR_H, PRIOR_A, PRIOR_B = 0.25, 0.08, 0.15
@@ -77,6 +78,14 @@ class Offset:
     def is_valid(self) -> bool:
         """Whether the images determine the shift."""
         return self.is_similar and self.ratio >= MIN_RATIO
+
+    def heading(self, focal: float) -> float:
+        """
+        Return the heading error of the camera, radians to the left: the shift without parallax.
+
+        :param focal: focal length, as a part of the width of the image.
+        """
+        return math.atan((self.shift - DISTANT * self.parallax) / focal)
 
 
 def describe_columns(image: np.ndarray) -> np.ndarray:

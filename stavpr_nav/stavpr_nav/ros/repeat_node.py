@@ -330,7 +330,7 @@ def offset_message(
     """
     return OffsetMessage(
         header=header, **place, is_valid=offset.is_valid,
-        heading=math.atan(offset.shift / focal), heading_deviation=offset.deviation / focal,
+        heading=offset.heading(focal), heading_deviation=offset.deviation / focal,
         shift=offset.shift, shift_deviation=offset.deviation, parallax=offset.parallax,
         similarity=offset.similarity,
     )  # fmt: skip
