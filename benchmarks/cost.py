@@ -5,7 +5,8 @@ Processor time of an image: stages of the library, and a node beside an empty su
 
 The node and a subscriber of rclpy without a callback's work receive the same images at the same
 time. Run it where the package is built and sourced: ``make shell``, then
-``python benchmarks/cost.py``.
+``python benchmarks/cost.py``. With ``--sessions``, only the recognition of an image on maps of so
+many sessions of Nordland, summer and winter in turn with noise, with one thread.
 """
 
 import argparse
@@ -23,9 +24,19 @@ import time
 from typing import Any
 
 from results import table
-from soak import about, HEIGHT, image_message, make_map, memory, publish, texture_route, WIDTH
+from soak import (
+    about,
+    HEIGHT,
+    image_message,
+    make_map,
+    memory,
+    publish,
+    texture_route,
+    WIDTH,
+)
 
 WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
+TURN, SETTLED_TURNS = 50, 4  # images of each map in turn, and turns before times count
 SETTLED = 5.0  # seconds after the first image, before times count
 SUBSCRIBER = dedent("""
     import rclpy
@@ -129,6 +140,54 @@ def stages(path: str, precision: str, threads: int) -> dict[str, float]:
     return result
 
 
+def measure_sessions(counts: list[int]) -> list[str]:
+    """Return a table of the processor time of an image, of Nordland driven so many times."""
+    from dataclasses import replace
+
+    from data import data_folder
+    import numpy as np
+    from stavpr_ros.features import FeatureExtractor
+    from stavpr_ros.mapping import build_map, merge_maps
+    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+    from stavpr_ros.sources import open_source
+    from stavpr_ros.threads import limit_threads
+
+    limit_threads(1)
+    seasons = [
+        build_map(open_source(data_folder() / 'nordland_64x32' / season), FeatureExtractor())
+        for season in ('summer', 'winter')
+    ]
+    places = len(seasons[0])
+
+    def drive(seed: int) -> Any:
+        route = seasons[seed % 2]
+        strips = route.features.strips
+        noise = np.random.default_rng(seed).standard_normal(strips.shape, np.float32)
+        strips = strips + 0.5 * noise / np.linalg.norm(noise, axis=2, keepdims=True)
+        strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+        return replace(route, features=replace(route.features, strips=strips))
+
+    query, rows = drive(1000).features, []
+    for precision in ('float32', 'int8'):
+        recognizers, medians = [], []
+        for count in counts:
+            one = merge_maps([drive(seed) for seed in range(count)], list(map(str, range(count))))
+            same_as = np.tile(np.arange(places, dtype=np.int32), count)
+            one = replace(one, same_as=same_as) if count > 1 else one
+            recognizers.append(PlaceRecognizer(one, RecognizerSettings(), precision=precision))
+        for first in range(0, 700, TURN):
+            times: list[list[float]] = [[] for _ in counts]
+            for own, recognizer in zip(times, recognizers, strict=True):
+                for i in range(first, first + TURN):
+                    began = time.thread_time()
+                    recognizer.update(query[i : i + 1])
+                    own.append(time.thread_time() - began)
+            medians.append([1e3 * statistics.median(own) for own in times])
+        each = [statistics.median(turns) for turns in zip(*medians[SETTLED_TURNS:], strict=True)]
+        rows.append([precision, *(f'{ms:.2f} ({ms / each[0]:.2f})' for ms in each)])
+    return table(['ms (times the first)', *map(str, counts)], rows)
+
+
 # ------------------------------------------------ node and subscriber
 
 
@@ -203,6 +262,7 @@ def main() -> None:
     parser.add_argument('--seconds', type=float, default=25, help='of each rate (%(default)s)')
     parser.add_argument('--map', help='instead of one of 2000 synthetic places')
     parser.add_argument('--threads', type=int, nargs='*', default=[1, 2], help='of the stages')
+    parser.add_argument('--sessions', type=int, nargs='*', help='on maps of so many sessions only')
     parser.add_argument('--stages', nargs=2, help=argparse.SUPPRESS)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
@@ -212,6 +272,9 @@ def main() -> None:
     if arguments.stages:
         precision, threads = arguments.stages
         print(json.dumps(measure_stages(arguments.map, precision, int(threads))))
+        return
+    if arguments.sessions:
+        print('\n'.join(measure_sessions(arguments.sessions)))
         return
     from stavpr_lab.demonstration.live import private_domain
     from stavpr_ros.ros.process import prepare_transport

@@ -24,6 +24,7 @@ from stavpr_ros.mapping import (
 )
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.recognition.sessions import layout_of
@@ -96,6 +97,9 @@ def test_map_of_one_session_has_no_gaps(town):
     query = features_of(route(0), 1.0, 9)[10:50]
     for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
         assert repr(found) == repr(expected)
+    here = recognizer(town[0])
+    here.update(query[:1])
+    assert here.place_probabilities().shape == (PLACES,)
 
 
 def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
@@ -150,6 +154,24 @@ def test_alike_sessions_share_their_probability_once_related(town):
     for match in matches[LENGTH + 10 :]:
         second = match.sequence.second_best_index
         assert second < 0 or abs(second % PLACES - match.sequence.middle % PLACES) > 8
+
+
+def test_second_best_is_the_most_probable_place_elsewhere_however_faint(town):
+    """Not the first place, where all others cost 1 to the last digit."""
+    matches = recognize(with_same_places(merge_maps(town, 'abc')), features_of(route(0), 0.3, 9))
+    accepted = [match.sequence for match in matches if match.accepted]
+    assert sum(one.second_best_index == 0 for one in accepted) < len(accepted) / 2
+    assert all(one.second_best_index != one.middle for one in accepted)
+
+
+@pytest.mark.parametrize('around', [0, 6])
+def test_sessions_are_normalized_each_alone(around):
+    row = np.random.default_rng(0).uniform(0.2, 1, 60).astype(np.float32)
+    row[[3, 40]] = np.inf
+    counted, parts = np.arange(60) % 7 > 0, (slice(0, 20), slice(20, 21), slice(21, 60))
+    alone = [z_normalized(row[part], around, counted[part]) for part in parts]
+    together = z_normalized(row, around, counted, np.array([0, 20, 21]))
+    np.testing.assert_array_equal(together, np.concatenate(alone))
 
 
 @pytest.mark.parametrize('mode', ['paper', 'robust'])

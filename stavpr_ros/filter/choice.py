@@ -158,13 +158,14 @@ class PathChoice:
     def second_best(
         self, chosen: ChosenPath, n: int, place: int, radius: int
     ) -> tuple[int, float]:
-        """Return the most probable column beyond a radius, and its probability, 0 if none."""
+        """Return the most probable column elsewhere, and its probability, 0 if none."""
         places, probabilities = chosen.places, chosen.probabilities
-        around = np.arange(max(0, place - radius), min(n, place + radius + 1))
-        excluded = np.concatenate([around, places])
+        near = self._layout.around(place, radius)
+        parts = [np.arange(max(0, low), min(n, end)) for low, end in near.tolist()]
+        excluded = np.concatenate([*parts, places])
         excluded.sort()
         now, faint = self._filter.most_probable(excluded)
-        second = _best_beyond(places, probabilities, place, radius)
+        second = _best_beyond(places, probabilities, near)
         if second >= 0 and probabilities[second] >= faint * NEGLIGIBLE:
             return int(places[second]), float(probabilities[second])
         return now, faint * NEGLIGIBLE
@@ -244,11 +245,14 @@ def _check(
 
 
 @kernel
-def _best_beyond(places: np.ndarray, probabilities: np.ndarray, place: int, radius: int) -> int:
-    """Return the most probable of places, its index, farther from a place; -1 = none."""
+def _best_beyond(places: np.ndarray, probabilities: np.ndarray, near: np.ndarray) -> int:
+    """Return the most probable of places outside of slices (m, 2), its index; -1 = none."""
     best = -1
     for i in range(len(places)):
         is_more = best < 0 or probabilities[i] > probabilities[best]
-        if abs(places[i] - place) > radius and is_more:
+        is_near = False
+        for low, end in near:
+            is_near |= low <= places[i] < end
+        if is_more and not is_near:
             best = i
     return best

@@ -27,7 +27,8 @@ states of these columns are moved one lap back (:meth:`ColumnLayout.repeated`)::
 import sys
 
 import numpy as np
-from stavpr_ros.filter.paths import Belief, CLOSE, NO_PLACES
+from stavpr_ros.compilation import kernel
+from stavpr_ros.filter.paths import Belief, CLOSE, NO_PLACES, sum_close
 
 ONE_SESSION: np.ndarray = np.zeros(1, np.int64)
 
@@ -44,8 +45,9 @@ class ColumnLayout:
     :param against: the camera may move against the map, too; not without places.
     :param repeated: first places of a closed route of one session that follow its last one.
 
-    ``runs`` are the places of each session, ``firsts`` the first passes of each, ``columns`` their
-    columns, None where each pass is the column of its number, and ``gaps`` the columns between.
+    ``runs`` are the places of each session, ``starts`` the first of each, ``firsts`` its first
+    passes, ``columns`` the columns of the passes, None where each is the column of its number, and
+    ``gaps`` the columns between.
     ``lap`` is the number of places of a closed route's lap, 0 of another route.
     """
 
@@ -57,7 +59,8 @@ class ColumnLayout:
         against: bool = False,
         repeated: int = 0,
     ) -> None:
-        self.firsts, self.runs, self.gaps = firsts, [slice(None)], NO_PLACES
+        self.starts = self.firsts = firsts
+        self.runs, self.gaps = [slice(None)], NO_PLACES
         self.columns: np.ndarray | None = None
         self.lap = 0
         if len(firsts) == 1 and not against and not repeated:
@@ -80,9 +83,11 @@ class ColumnLayout:
         self._same_as = same_as
         self._shared = np.arange(self._width)  # column where the position's probability is summed
         self._shared[self.columns] = self.columns[same_as[self._places]]
-        self._by_position = self.columns[np.argsort(self._shared[self.columns], kind='stable')]
-        self._positions = self._shared[self._by_position]
+        by_position = self.columns[np.argsort(self._shared[self.columns], kind='stable')]
+        self._sorted = by_position, self._shared[by_position]  # columns, and their positions
         self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
+        self._of_columns = np.full(self._width, n)  # place of each column, n in a gap
+        self._of_columns[self.columns] = self._places
 
     def passes(self, places: int) -> int:
         """Return the number of passes of so many places."""
@@ -113,8 +118,7 @@ class ColumnLayout:
         """Return distances to places (n,) as distances to columns, +inf in gaps."""
         if self.columns is None:
             return row
-        out: np.ndarray = np.full(self._width, np.inf, row.dtype)
-        out[self.columns] = row[self._places]
+        out: np.ndarray = np.append(row, row.dtype.type(np.inf)).take(self._of_columns)
         return out
 
     def to_places(self, values: np.ndarray) -> np.ndarray:
@@ -123,9 +127,11 @@ class ColumnLayout:
 
     def sums_of_places(self, values: np.ndarray) -> np.ndarray:
         """Return the sums of the values of each place's columns, (n,)."""
-        if self.columns is None:
-            return values
-        return np.bincount(self._places, values[self.columns])
+        sums = self.to_places(values)
+        if self.columns is not None and len(self._places) > len(sums):
+            n = len(sums)
+            sums = sums + np.bincount(self._places[n:], values[self.columns[n:]], n)
+        return sums
 
     def to_passes(self, values: np.ndarray) -> np.ndarray:
         """Return the values of the columns that are passes."""
@@ -186,23 +192,9 @@ class ColumnLayout:
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
         own = self._shared[self.columns[int(self.pass_before(np.array(column)))]]
-        near = self._columns_near(np.array([own]), radius)
-        runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
-        return np.array([[run[0], run[-1] + 1] for run in runs])
-
-    def _columns_near(self, positions: np.ndarray, radius: int) -> np.ndarray:
-        """Return the columns of positions near any of those, ascending."""
-        if self.lap:
-            positions = np.concatenate([positions - self.lap, positions, positions + self.lap])
-        firsts = np.searchsorted(self._positions, positions - radius)
-        ends = np.searchsorted(self._positions, positions + radius, 'right')
-        parts = [self._by_position[low:end] for low, end in zip(firsts, ends, strict=True)]
-        return np.unique(np.concatenate(parts))
-
-    def _apart(self, positions: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """Return how far positions are from others, on a closed route by the shorter arc."""
-        apart = np.abs(positions - others)
-        return np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
+        near = _columns_near(*self._sorted, np.array([own]), radius, self.lap)
+        ends = np.flatnonzero(np.diff(near) > 1)
+        return np.stack([near[np.append(0, ends + 1)], near[np.append(ends, -1)] + 1], axis=1)
 
     def merge_sessions(
         self, belief: Belief, n: int
@@ -220,16 +212,67 @@ class ColumnLayout:
             places, probabilities = belief.probabilities(n)
             own_states = np.ones(len(places), bool)
             return places, probabilities, own_states, int(np.argmax(probabilities))
-        positions = self._shared[belief.places]
-        columns = self._columns_near(np.unique(positions), CLOSE)
-        shared, own = self._shared[columns], np.zeros(len(columns))
-        near, probabilities_near = belief.probabilities(self._width)
-        is_place, at = np.isin(near, columns), np.searchsorted(columns, near)
-        own[at[is_place]] = probabilities_near[is_place]
-        is_close = self._apart(shared[:, None], positions) <= CLOSE
-        probabilities = np.minimum(is_close @ belief.weights, 1)
-        best = int(np.argmax(probabilities))
-        at_position = self._apart(shared, shared[best]) <= CLOSE
-        index = int(np.argmax(np.where(at_position, own, 0)))
-        probabilities[index] = probabilities[best]
-        return columns, probabilities, own > 0, index
+        arguments = belief.places, belief.weights, self._shared, *self._sorted, self.lap
+        columns, probabilities, own, index = _merged(*arguments)
+        return columns, probabilities, own, index
+
+
+# ------------------------------------------------ kernels
+
+
+@kernel
+def _columns_near(
+    by_position: np.ndarray, positions: np.ndarray, sought: np.ndarray, radius: int, lap: int
+) -> np.ndarray:
+    """
+    Return the columns of positions near any of those sought, ascending.
+
+    :param by_position, positions: columns by position, and their positions, (m,).
+    :param lap: of a closed route, else 0.
+    """
+    is_near = np.zeros(len(positions), np.bool_)
+    for position in sought:
+        for shifted in range(-1, 2) if lap else range(1):
+            low = np.searchsorted(positions, position + shifted * lap - radius)
+            end = np.searchsorted(positions, position + shifted * lap + radius, 'right')
+            is_near[low:end] = True
+    return np.sort(by_position[is_near])
+
+
+@kernel
+def _apart(a: int, b: int, lap: int) -> int:
+    """Return how far two positions are from each other, on a closed route by the shorter arc."""
+    return min(abs(a - b), abs(lap - abs(a - b))) if lap else abs(a - b)
+
+
+@kernel
+def _merged(
+    places: np.ndarray, weights: np.ndarray, shared: np.ndarray, by_position: np.ndarray,
+    positions: np.ndarray, lap: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:  # fmt: skip
+    """
+    Let places of one position share their probability: :meth:`ColumnLayout.merge_sessions`.
+
+    :param places, weights: of the belief, (m,); shared: position of each column.
+    :param by_position, positions, lap: as of :func:`_columns_near`.
+    """
+    near, sums = sum_close(places, weights, len(shared))
+    columns = _columns_near(by_position, positions, shared[places], CLOSE, lap)
+    own, probabilities = np.zeros(len(columns)), np.zeros(len(columns))
+    at = 0
+    for i in range(len(columns)):
+        while at < len(near) and near[at] < columns[i]:
+            at += 1
+        if at < len(near) and near[at] == columns[i]:
+            own[i] = sums[at]
+        for j in range(len(places)):
+            if _apart(shared[columns[i]], shared[places[j]], lap) <= CLOSE:
+                probabilities[i] += weights[j]
+        probabilities[i] = min(probabilities[i], 1.0)
+    best, index, largest = np.argmax(probabilities), 0, 0.0
+    for i in range(len(columns)):
+        is_close = _apart(shared[columns[i]], shared[columns[best]], lap) <= CLOSE
+        if is_close and own[i] > largest:
+            index, largest = i, own[i]
+    probabilities[index] = probabilities[best]
+    return columns, probabilities, own > 0, index

@@ -305,3 +305,25 @@ def advance(
                 totals[at, 2, k] = _sum_of_lanes(lanes, 0)
             maxima[at] = _copy_sums(places, count, by_place, first)
     return _sum_of_blocks(totals)
+
+
+@kernel
+def clear_gaps(a, gaps, by_place, maxima):
+    """
+    Set the states of columns between sessions to 0.
+
+    :param a, by_place, maxima: as of :func:`advance`.
+    :param gaps: the columns, ascending, (m,).
+    :returns: their sums until then, by level, (K,).
+    """
+    sums = np.zeros(a.shape[1])
+    for i in range(len(gaps)):
+        block, x = gaps[i] // BLOCK, gaps[i] % BLOCK
+        for k in range(a.shape[1]):
+            for v in range(a.shape[2]):
+                sums[k] += a[block, k, v, x]
+                a[block, k, v, x] = 0
+        by_place[gaps[i]] = 0
+        if i + 1 == len(gaps) or gaps[i + 1] // BLOCK > block:
+            maxima[block] = by_place[block * BLOCK : (block + 1) * BLOCK].max()
+    return sums

@@ -42,7 +42,7 @@ that makes their sum 1 is part of the next image's level changes.
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES
-from stavpr_ros.filter.kernels import advance, PLACES
+from stavpr_ros.filter.kernels import advance, clear_gaps, PLACES
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import (
     ALL_ENTERED,
@@ -128,16 +128,16 @@ class PlaceFilter(Filter):
         self._a[block_to, :, :, at_to] += self._a[block, :, :, at]
         self._by_place[y - count] += self._by_place[y]
         self._a[block, :, :, at] = self._by_place[y] = 0
-        self._find_maxima(slice(None))
+        self._find_maxima()
         for origins in self._origins:
             origins[block_to, :, :, at_to] = origins[block, :, :, at]
 
     def _set_by_place(self, by_place: np.ndarray) -> None:
         self._by_place[: len(by_place)], self._by_place[len(by_place) :] = by_place, 0
-        self._find_maxima(slice(None))
+        self._find_maxima()
 
-    def _find_maxima(self, blocks: slice | np.ndarray) -> None:
-        self._maxima[blocks] = self._by_place.reshape(-1, BLOCK)[blocks].max(axis=1)
+    def _find_maxima(self) -> None:
+        self._maxima[:] = self._by_place.reshape(-1, BLOCK).max(axis=1)
 
     def places_of_states(self) -> np.ndarray:
         """Return the probability of each place, (room,), float32."""
@@ -178,12 +178,10 @@ class PlaceFilter(Filter):
             self._origins[slot], self._by_place, self._maxima,
         )  # fmt: skip
         if len(self._gaps):  # likelihoods are 1 there
-            in_gaps = self._a[gaps].sum(axis=(0, 2), dtype=np.float64)
+            in_gaps = clear_gaps(self._a, self._gaps, self._by_place, self._maxima)
             entered = entering * (len(self._speeds) * len(self._gaps))
             lost = lost + (in_gaps - entered) / (1 - s.leave)
             on_map = on_map - in_gaps
-            self._a[gaps] = self._by_place[self._gaps] = 0
-            self._find_maxima(np.unique(self._gaps // BLOCK))
         off = off * (1 - s.enter) + (before - lost) * s.leave + lost
         total = float(off.sum() + on_map.sum())
         self._off, self._scale = off / total, 1 / total

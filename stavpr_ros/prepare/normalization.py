@@ -4,12 +4,16 @@
 
 import numpy as np
 from stavpr_ros.compilation import reassociating_kernel
+from stavpr_ros.filter.columns import ONE_SESSION
 
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 
 def z_normalized(
-    row: np.ndarray, around: int = 0, counted: np.ndarray | None = None
+    row: np.ndarray,
+    around: int = 0,
+    counted: np.ndarray | None = None,
+    firsts: np.ndarray = ONE_SESSION,
 ) -> np.ndarray:
     """
     Return a row with mean 0 and deviation 1 of its finite entries, shape (n,), float32.
@@ -18,29 +22,35 @@ def z_normalized(
         counts for less than -1, so that the right one counts little. Images of one light are
         nearer to each other than to all others, wherever they were taken. 0 = no.
     :param counted: places whose entries count for mean and deviation, (n,), bool; None = all.
+    :param firsts: first places of parts that are normalized each by itself, (m,), int64.
     """
     z = np.empty(len(row), np.float32)
-    _z_normalize(row, np.ones(len(row), bool) if counted is None else counted, z)
+    counted = np.ones(len(row), bool) if counted is None else counted
+    _z_normalize(row, counted, np.append(firsts, len(row)), z)
     if not around:
         return z
     from scipy.ndimage import uniform_filter1d
 
     clipped = np.where(np.isfinite(z), np.maximum(z, -1), np.float32(0))
-    return z - uniform_filter1d(clipped, 2 * around + 1, mode='nearest')
+    for part in np.split(clipped, firsts[1:]):
+        part[:] = uniform_filter1d(part, 2 * around + 1, mode='nearest')
+    return z - clipped
 
 
 @reassociating_kernel
-def _z_normalize(row: np.ndarray, counted: np.ndarray, z: np.ndarray) -> None:
-    """Write a row with mean 0 and deviation 1 of its finite entries, in float64 until then."""
-    total, squares, count = 0.0, 0.0, 0
-    for i in range(len(row)):
-        counts = counted[i] & np.isfinite(row[i])
-        total += row[i] if counts else 0.0
-        count += counts
-    mean = total / max(count, 1)
-    for i in range(len(row)):
-        off = row[i] - mean
-        squares += off * off if counted[i] & np.isfinite(row[i]) else 0.0
-    scale = np.float32(1 / max(np.sqrt(squares / max(count, 1)), MIN_DEVIATION))
-    for i in range(len(row)):
-        z[i] = (row[i] - np.float32(mean)) * scale
+def _z_normalize(row: np.ndarray, counted: np.ndarray, ends: np.ndarray, z: np.ndarray) -> None:
+    """Write parts with mean 0 and deviation 1 of finite entries, in float64 until then."""
+    for part in range(len(ends) - 1):
+        first, end = ends[part], ends[part + 1]
+        total, squares, count = 0.0, 0.0, 0
+        for i in range(first, end):
+            counts = counted[i] & np.isfinite(row[i])
+            total += row[i] if counts else 0.0
+            count += counts
+        mean = total / max(count, 1)
+        for i in range(first, end):
+            off = row[i] - mean
+            squares += off * off if counted[i] & np.isfinite(row[i]) else 0.0
+        scale = np.float32(1 / max(np.sqrt(squares / max(count, 1)), MIN_DEVIATION))
+        for i in range(first, end):
+            z[i] = (row[i] - np.float32(mean)) * scale

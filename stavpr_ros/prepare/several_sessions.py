@@ -13,6 +13,7 @@ Where the camera is not certainly on the map, all places are compared.
 from collections.abc import Callable
 
 import numpy as np
+from stavpr_ros.compilation import kernel
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 
 CERTAIN = 0.99  # probability of the map, above which places are left out
@@ -39,12 +40,13 @@ class SeveralSessions:
         same_as: np.ndarray,
         probabilities: Callable[[], np.ndarray],
     ) -> None:
-        self._matcher, self._runs, self._probabilities = matcher, runs, probabilities
+        self._matcher, self._probabilities = matcher, probabilities
         numbers = np.arange(len(same_as))
         related = np.where(same_as < numbers, numbers, -1)
         for run in runs:  # a place without a relation is where the one before it is
             related[run] = np.maximum.accumulate(related[run])
         self._chunks = np.where(related < 0, numbers, same_as[related]) // CHUNK  # of positions
+        self._ends = np.array([runs[0].start, *(run.stop for run in runs)])
         self._farther = np.zeros(len(runs))  # how much farther the nearest place of each is
         self._turn = 0
 
@@ -55,32 +57,68 @@ class SeveralSessions:
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,); +inf where it is left out."""
-        by_place, runs = self._probabilities(), self._runs
-        if not by_place.sum() > CERTAIN:
+        arguments = self._chunks, self._ends, self._farther
+        best, is_part, is_near, compared = _choose(self._probabilities(), *arguments, self._turn)
+        if not len(compared):
             return self._matcher.distances(strips, weights)
-        best = int(np.argmax(np.add.reduceat(by_place, [run.start for run in runs])))
-        others = [*np.argsort(self._farther)[:NEAREST].tolist(), self._turn % len(runs)]
-        self._turn += 1
-        probable = self._chunks[by_place > PROBABLE]
-        is_near, is_compared = np.zeros((2, -(-self.places // CHUNK)), bool)
-        for apart in range(-REACH, REACH + 1):
-            is_near[np.clip(probable + apart, 0, len(is_near) - 1)] = True
-        near = {
-            session: runs[session].start + np.flatnonzero(is_near[self._chunks[runs[session]]])
-            for session in {best, *others}
-        }
-        is_compared[runs[best].start // CHUNK : -(-runs[best].stop // CHUNK)] = True
-        for places in near.values():
-            is_compared[places // CHUNK] = True
-        compared = np.flatnonzero(is_compared)
-        out = np.full((len(is_compared), CHUNK), np.inf, np.float32)
+        self._turn = (self._turn + 1) % len(is_part)
+        out = np.full((-(-self.places // CHUNK), CHUNK), np.inf, np.float32)
         out[compared] = self._matcher.distances_at(strips, compared * CHUNK, CHUNK)
         row: np.ndarray = out.ravel()[: self.places]
-        nearest = {session: row[places].min(initial=np.inf) for session, places in near.items()}
-        for session, distance in nearest.items():
-            self._farther[session] = distance - nearest[best]
+        _note_farther(row, *arguments, best, is_part, is_near)
         return row
 
     def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of Q images to every place, (Q, n)."""
         return self._matcher.distance_matrix(strips, weights)
+
+
+# ------------------------------------------------ kernels
+
+
+@kernel
+def _choose(
+    by_place: np.ndarray, chunks: np.ndarray, ends: np.ndarray, farther: np.ndarray, turn: int
+) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Choose what an image is compared with.
+
+    :param by_place: probability of each place, (n,), and chunks: of their positions.
+    :param ends: first place of each session, and the end of the last, (S + 1,).
+    :param farther: of :class:`SeveralSessions`, (S,); turn: session that has its turn.
+    :returns: the most probable session, sessions of which places are compared, (S,), bool, chunks
+        of positions near the probable ones, bool, and the chunks of places that are compared,
+        ascending; none = all.
+    """
+    sums, is_part = np.zeros(len(farther)), np.zeros(len(farther), np.bool_)
+    count = (len(chunks) + CHUNK - 1) // CHUNK
+    is_near, is_compared = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    for session in range(len(sums)):
+        for place in range(ends[session], ends[session + 1]):
+            sums[session] += by_place[place]
+            if by_place[place] > PROBABLE:
+                is_near[max(chunks[place] - REACH, 0) : chunks[place] + REACH + 1] = True
+    best = int(np.argmax(sums))
+    if sums.sum() > CERTAIN:
+        is_part[best] = is_part[turn] = True
+        is_part[np.argsort(farther, kind='mergesort')[:NEAREST]] = True
+    for part in np.flatnonzero(is_part):
+        for place in range(ends[part], ends[part + 1]):
+            if part == best or is_near[chunks[place]]:
+                is_compared[place // CHUNK] = True
+    return best, is_part, is_near, np.flatnonzero(is_compared)
+
+
+@kernel
+def _note_farther(
+    row: np.ndarray, chunks: np.ndarray, ends: np.ndarray, farther: np.ndarray, best: int,
+    is_part: np.ndarray, is_near: np.ndarray,
+) -> None:  # fmt: skip
+    """Write how much farther the nearest place of each compared session is: :func:`_choose`."""
+    nearest = np.full(len(farther), np.inf, np.float32)
+    for session in np.flatnonzero(is_part):
+        for place in range(ends[session], ends[session + 1]):
+            if is_near[chunks[place]]:
+                nearest[session] = min(nearest[session], row[place])
+    for session in np.flatnonzero(is_part):
+        farther[session] = nearest[session] - nearest[best]

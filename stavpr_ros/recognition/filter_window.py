@@ -173,7 +173,7 @@ class FilterWindow(QueryWindow):
             self._of_window = self._own
         self._recent.add(self._of_window)
         self._at_rest = match if self._rests(middle) else None
-        return in_places(match, self.layout, nms_radius)
+        return in_places(match, self.layout)
 
     def _rests(self, position: int) -> bool:
         """Whether the camera has not moved since an image; of a full window in localization."""
@@ -187,7 +187,7 @@ class FilterWindow(QueryWindow):
         if count < MIN_IMAGES:
             return WindowMatch()
         match = self._match_image(count, (count - 1) // 2, nms_radius)
-        return in_places(replace(match, images=count), self.layout, nms_radius)
+        return in_places(replace(match, images=count), self.layout)
 
     def _since_entering(self) -> int:
         """

@@ -5,6 +5,7 @@
 from dataclasses import replace
 
 import numpy as np
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.filter.columns import ColumnLayout, ONE_SESSION
 from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.filter.motion import MAX_LAG
@@ -46,31 +47,35 @@ def session_gap(nms_radius: int, model: FilterSettings) -> int:
     return max(farthest, nms_radius) + 1
 
 
-def in_places(match: WindowMatch, layout: ColumnLayout, nms_radius: int) -> WindowMatch:
-    """Return a match whose columns have become places, with its second best."""
+def in_places(
+    match: WindowMatch, layout: ColumnLayout, nms_radius: int | None = None
+) -> WindowMatch:
+    """
+    Return a match whose columns have become places.
+
+    :param nms_radius: of the second best; None = the one of the match is at another position.
+    """
     if layout.columns is None or match.nearest is None:
         return match
 
     def sequences() -> WindowSequences:
-        costs, columns, probabilities = in_columns
+        costs, columns, probabilities = match.sequences()
+        possible = np.isfinite(costs)
         if probabilities is not None:
             probabilities = probabilities[possible]
         return WindowSequences(costs[possible], layout.names_of(columns[possible]), probabilities)
 
-    in_columns = match.sequences()
-    possible = np.isfinite(in_columns.costs)
-    columns = np.array([match.nearest.first, match.nearest.last, match.nearest.middle])
-    first, last, middle = layout.names_of(columns).tolist()
-    best = Candidate(middle, match.nearest.distance)
-    second = ranked_candidates(best, sequences(), 2, nms_radius, layout.positions)[1:]
-    nearest = replace(
-        match.nearest,
-        first=first,
-        last=last,
-        middle=middle,
-        second_best_index=second[0].place if second else -1,
-        second_best_distance=second[0].distance if second else float('nan'),
-    )
+    nearest = match.nearest
+    columns = np.array([nearest.first, nearest.last, nearest.middle, nearest.second_best_index])
+    first, last, middle, second = layout.names_of(columns).tolist()
+    second = second if nearest.second_best_index >= 0 else -1
+    distance = nearest.second_best_distance
+    if nms_radius is not None:
+        best = Candidate(middle, nearest.distance)
+        others = ranked_candidates(best, sequences(), 2, nms_radius, layout.positions)[1:]
+        second = others[0].place if others else -1
+        distance = others[0].distance if others else float('nan')
+    nearest = SequenceMatch(first, last, middle, nearest.distance, second, distance)
     path = match.path.copy()
     path[:, 1] = layout.names_of(path[:, 1])
     direction = layout.direction_of(match.nearest.middle)

@@ -217,9 +217,7 @@ class QueryWindow(ABC):
         """Return distances to the places, normalized, as a row of the buffer."""
         if self._normalizes:
             counted = self._counted(len(row))
-            row = np.concatenate(
-                [z_normalized(row[run], self._around, counted[run]) for run in self.layout.runs]
-            )
+            row = z_normalized(row, self._around, counted, self.layout.starts)
         return self.layout.to_columns(row)
 
     def _counted(self, n: int) -> np.ndarray:
