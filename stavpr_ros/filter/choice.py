@@ -36,7 +36,6 @@ CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
 MIN_CANDIDATE = REFUTED  # probability of its place, at least: above refuted ones
 AROUND = np.array([-BAND, -CLOSE, CLOSE + 1, BAND + 1])  # ends of slices around a place
-NEAR_LEVEL = -2.3  # mean z of right places, at most, as evidence between near places
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +183,8 @@ class PathChoice:
         z = images.z(columns_near(path, images.n))
         path, placed, z, masses = refined(
             z, path, images.weights * mean, images.numbers, images.stamps,
-            self._place_times[: images.n], min(mean, NEAR_LEVEL) / mean,
-            self._layout.first_column(path[-1]), self._change.equal, self._passes,
+            self._place_times[: images.n], self._layout.first_column(path[-1]),
+            self._change.equal, self._passes,
         )  # fmt: skip
         moved = int(numbers[-1] - numbers[0])
         speed = float(path[-1] - path[0]) / max(moved, 1)

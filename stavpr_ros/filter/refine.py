@@ -65,12 +65,12 @@ def columns_near(path: np.ndarray, n: int) -> np.ndarray:
 
 
 @kernel
-def refine(z, path, exponents, images, times, place_times, evidence):
+def refine(z, path, exponents, images, times, place_times):
     """
     Return where the camera was beside a path, by all images of the window.
 
-    The second mean offset is by other evidence, and by two models. With the likelihoods P of the
-    window if the camera advances evenly in time and Q if not, and the means by both, it is
+    The second mean offset is by two models. With the likelihoods P of the window if the camera
+    advances evenly in time and Q if not, and the means by both, it is
 
         (0.03 P even + 0.97 Q uneven) / (0.03 P + 0.97 Q)
 
@@ -83,19 +83,17 @@ def refine(z, path, exponents, images, times, place_times, evidence):
     :param images: the filter's number of each, (l,): equal ones are of a camera at rest.
     :param times: of the images, ascending, (l,), float64, of any unit.
     :param place_times: of the n places, ascending, (n,), float64, of any unit.
-    :param evidence: factor of the exponents for the second mean offset.
     :returns: probability of each offset for each image, (l, S), and mean offsets by the first
         model and by both, (2, l).
     """
     l, n = len(path), len(place_times)
     masses, means = np.empty(z.shape), np.zeros((2, l))
     likelihoods, moves = np.empty(z.shape), np.empty((l, len(STEPS)))
-    _window_likelihoods(z, path, exponents, 1.0, images, n, likelihoods, moves)
+    _window_likelihoods(z, path, exponents, images, n, likelihoods, moves)
     _start(START_DEVIATION, masses[0])
     uneven, log = masses, smooth(likelihoods, moves, masses)
     moved = (images[-1] - images[0]) / max(l - 1, 1)
-    if evidence != 1 or moved < 1:  # another model than the first
-        _window_likelihoods(z, path, exponents, evidence, images, n, likelihoods, moves)
+    if moved < 1:  # another model than the first
         uneven = np.empty(z.shape)
         _start(max(START_DEVIATION * moved, MIN_DEVIATION), uneven[0])
         log = smooth(likelihoods, moves, uneven)
@@ -113,15 +111,13 @@ def refine(z, path, exponents, images, times, place_times, evidence):
 
 
 @kernel
-def refined(z, path, exponents, images, stamps, place_times, evidence, first, equal, passes):
+def refined(z, path, exponents, images, stamps, place_times, first, equal, passes):
     """
     Return the places near a path that explain the images of the window best.
 
-    Bad conditions bring the right place nearer to all others, less to those around it: places
-    are estimated with the evidence of usual conditions. The path is checked where the evidence
-    of the filter has its mean: more would make paths through look-alike places more even.
+    The path is checked at the mean of the first model.
 
-    :param z, path, exponents, images, place_times, evidence: see :func:`refine`.
+    :param z, path, exponents, images, place_times: see :func:`refine`.
     :param stamps: ns, (l,), int64; 0 = unknown.
     :param first: least place.
     :param equal: which passes equal the one before: such are as one.
@@ -131,7 +127,7 @@ def refined(z, path, exponents, images, stamps, place_times, evidence, first, eq
         not close to the estimated column.
     """
     times, n = image_times(stamps, images), len(place_times)
-    masses, means = refine(z, path, exponents, images, times, place_times, evidence)
+    masses, means = refine(z, path, exponents, images, times, place_times)
     checked, placed = _ascending(path, means[0], first, n), _ascending(path, means[1], first, n)
     of_checked = np.empty(len(path), np.float32)
     begin, end = passes[max(path[0] - BAND, 0)], passes[min(path[-1] + BAND, n - 1)]
@@ -171,16 +167,16 @@ def _start(deviation, masses):
 
 
 @kernel
-def _window_likelihoods(z, path, exponents, evidence, images, n, likelihoods, moves):
+def _window_likelihoods(z, path, exponents, images, n, likelihoods, moves):
     """
     Write the input of :func:`smooth`.
 
-    :param evidence: factor of the exponents; n: places; others: see :func:`refine`.
+    :param n: places; others: see :func:`refine`.
     """
     for i in range(len(path)):
         for s in range(z.shape[1]):
             inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
-            likelihoods[i, s] = np.exp(evidence * exponents[i] * z[i, s]) if inside else 0
+            likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
         largest = likelihoods[i].max()
         for s in range(z.shape[1]):
             likelihoods[i, s] = likelihoods[i, s] / largest if largest > 0 else 1
