@@ -14,7 +14,7 @@ distinguish right paths from those through places that look alike, in all kinds 
 
 The odds of a path are multiplied by::
 
-    exp(-10 max(0, s - max(1.4, 0.45 |m|)) - 20 max(0, e - 0.04))
+    exp(-10 max(0, s - max(1.4, 0.45 |m|)) - 25 max(0, e - 0.04))
 
 The place of a camera at rest is not confirmed by later images. Its path needs the odds::
 
@@ -34,7 +34,7 @@ UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
 NEWEST = 0.7  # share of both that the newest images of a window may have
 MIN_PLACES = 3  # of a path whose deviation is meaningful
 SURE_AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
-EXCESS, EXCESS_WEIGHT = 0.04, 20.0  # of right paths at most, and its weight in the odds beyond
+EXCESS, EXCESS_WEIGHT = 0.04, 25.0  # of right paths at most, and its weight in the odds beyond
 
 
 @kernel
