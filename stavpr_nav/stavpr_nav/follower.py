@@ -11,8 +11,9 @@ the speed that falls with the probability of the place, and steers against the o
 shift is the heading error and parallax the lateral offset, in parts of the image's width (see
 ``stavpr_ros.relative_pose.offset``). Both errors converge, without a calibrated camera, as the
 bearing-only law of Krajnik et al. (Navigation without localisation, 2018) does, whose one shift of
-all features is the sum of the two. The integral over the path takes out a constant pull to one
-side, of unequal wheels or a camera that does not look straight ahead.
+all features is the sum of the two. The weighted parallax is limited: far beside the path the robot
+returns at a small angle, and does not swing beyond it. The integral over the path takes out a
+constant pull to one side, of unequal wheels or a camera that does not look straight ahead.
 """
 
 from collections import deque
@@ -27,8 +28,9 @@ from stavpr_ros.relative_pose.offset import Offset
 UNCERTAIN, CERTAIN = 0.5, 0.9  # probabilities of the slowest and of the full speed
 SLOWEST = 0.3  # share of the taught speed
 WITHOUT_OFFSET = 0.5  # share of the speed while the offset is not valid
-MAX_STEER = 0.2  # widths of the image
-INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image
+# Widths of the image: of the sum; of the parallax in it, for a small angle back to the path.
+MAX_STEER, MAX_APPROACH = 0.2, 0.1
+INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image, of summands too
 BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
 BRIDGE_TIME, BRIDGE_SHARE = 6.0, 0.5  # seconds of the taught run without a match; share of speed
 STUCK_TIME, STUCK_PLACES = 2.0, 4  # of the taught run, in which the place has to change
@@ -266,8 +268,8 @@ class RouteFollower:
         speed, turn = share * speed, share * turn
         self._steer = 0.0
         if offset.is_valid:
-            steer = offset.shift + settings.parallax_weight * offset.parallax
-            self._steer = min(max(steer, -MAX_STEER), MAX_STEER)
+            lateral = settings.parallax_weight * offset.parallax
+            self._steer = _limit(offset.shift + _limit(lateral, MAX_APPROACH), MAX_STEER)
         turn -= settings.gain * abs(speed) * (self._steer + self._integral)
         return Command(speed, turn)
 
@@ -285,10 +287,14 @@ class RouteFollower:
         speed = min(max(wanted.speed, self._last.speed - faster), self._last.speed + faster)
         turning = settings.max_turn_acceleration * step
         turn = min(max(wanted.turn, self._last.turn - turning), self._last.turn + turning)
-        turn = min(max(turn, -settings.max_turn), settings.max_turn)
+        turn = _limit(turn, settings.max_turn)
         taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
         done = speed / taught * step if abs(taught) > 1e-3 else step
         self._repeated.append((self._time, self._repeated[-1][1] + done))
-        integral = self._integral + self._steer * abs(speed) * step / INTEGRAL
-        self._integral = min(max(integral, -MAX_INTEGRAL), MAX_INTEGRAL)
+        added = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
+        self._integral = _limit(self._integral + added, MAX_INTEGRAL)
         return Command(speed, turn)
+
+
+def _limit(value: float, most: float) -> float:
+    return min(max(value, -most), most)

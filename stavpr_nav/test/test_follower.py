@@ -187,6 +187,37 @@ def test_integral_takes_out_a_constant_pull():
     assert abs(headings[-1]) < 1e-3
 
 
+def test_robot_beside_the_path_returns_at_a_small_angle():
+    """One meter to the right, turned 10 degrees away, images 0.4 s late, a pull to the left."""
+    robot = RouteFollower(taught(200, turn=0.0), FollowerSettings())
+    left, heading, along, late = -1.0, math.radians(-10), 0.0, []
+    robot.start(0)
+    path = []
+    for k in range(800):
+        time = k * STEP
+        if k % 4 == 0:
+            offset = Offset(0.62 * math.tan(heading), 0.01, 0.05 * left, 1e6, 0.6)
+            late.append(Observation(time, int(along / 0.4), 1.0, offset))
+        if late and late[0].stamp <= time - 0.4:
+            robot.observe(late.pop(0), time)
+        command = robot.command(time)
+        heading += (command.turn + 0.01 * command.speed) * STEP
+        left += command.speed * math.sin(heading) * STEP
+        along += command.speed * math.cos(heading) * STEP
+        path.append((along, left, heading))
+    assert max(path)[0] > 25
+    assert np.max(path, axis=0)[1] < 0.15
+    assert math.degrees(np.max(path, axis=0)[2]) < 12
+    assert all(abs(left) < 0.15 for along, left, _ in path if along > 15)
+
+
+def test_large_error_at_the_start_is_not_taken_for_a_pull():
+    commands = Run(run=taught(200)).drive(12, Offset(0.2, 0.01, 0.0, 1e6, 0.6))
+    driven = sum(command.speed for command in commands) * STEP
+    steered = (0.1 - commands[-1].turn) / 0.9 / commands[-1].speed
+    assert steered == pytest.approx(0.2 + 0.05 * driven / 15, abs=1e-3)
+
+
 def test_matched_image_much_less_similar_than_before_stops_at_once():
     run = Run()
     run.drive(3)
