@@ -32,15 +32,19 @@ def truth(freedom: int) -> np.ndarray:
     return np.array(poses)
 
 
-def write(path, freedom, false=0.0):
-    """Write a graph of noisy odometry and closures of later laps, a share of them false."""
+def write(path, freedom, false=0.0, stated=1.0):
+    """
+    Write a graph of noisy odometry and closures of later laps, a share of them false.
+
+    :param stated: factor on the errors that the file states.
+    """
     dice, T = np.random.default_rng(3), truth(freedom)
     pairs = [(i, i + 1) for i in range(COUNT - 1)]
     pairs += [(i - 4 * SIDE, i) for i in range(4 * SIDE, COUNT, 2)]
     deviations = np.array([0.017] * 3 + [0.05] * 3)
     if freedom == 3:
         deviations[[0, 1, 5]] = 0
-    lines = ['FIX 0']
+    lines, information = ['FIX 0'], np.array(INFORMATION[freedom]) / stated**2
     for start, end in pairs:
         place = end
         if end - start > 1 and dice.random() < false:
@@ -54,7 +58,7 @@ def write(path, freedom, false=0.0):
                 [*pose[:2], Rotation.from_matrix(motion[:3, :3]).as_rotvec()[2]],
                 'EDGE_SE2',
             )
-        lines.append(f'{tag} {start} {end} ' + ' '.join(map(str, [*pose, *INFORMATION[freedom]])))
+        lines.append(f'{tag} {start} {end} ' + ' '.join(map(str, [*pose, *information])))
     path.write_text('\n'.join(lines) + '\n')
     return str(path)
 
@@ -70,8 +74,19 @@ def test_closures_of_a_g2o_file_correct_its_odometry(tmp_path, freedom, false):
     assert graph.accepted == pytest.approx(48 * (1 - false), abs=12 * false)
 
 
-def test_written_graph_is_read_again(tmp_path):
-    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', 6, 0.3)))
+@pytest.mark.parametrize('precise', [decision.PRECISE, decision.TIGHT])
+def test_errors_that_a_file_states_too_large_are_recognized(tmp_path, monkeypatch, precise):
+    """At deviations of 3 m and a radian, false closures agree with a path that they bend."""
+    monkeypatch.setattr(decision, 'PRECISE', precise)
+    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', 3, 0.5, 60.0)))
+    found = to_poses(graph.update(final=True))
+    right = error(found, to_poses(truth(3))) < 0.2 and graph.accepted == 21
+    assert right == (precise < decision.TIGHT)
+
+
+@pytest.mark.parametrize(('freedom', 'stated'), [(6, 1.0), (3, 60.0)])
+def test_written_graph_is_read_again(tmp_path, freedom, stated):
+    graph = graph_of(read_edges(write(tmp_path / 'a.g2o', freedom, 0.3, stated)))
     graph.update(final=True)
     (tmp_path / 'b.g2o').write_text(g2o_text(graph))
     again = graph_of(read_edges(str(tmp_path / 'b.g2o')))

@@ -60,6 +60,16 @@ def test_only_false_closures_leave_the_odometry(kind):
     assert graph.accepted == 0
 
 
+@pytest.mark.parametrize(('drift', 'most'), [(0.25, 0.2), (8.0, 1.02)])
+def test_odometry_of_other_errors_is_corrected_or_stays(drift, most):
+    truth, queries = circle(4), range(LAP, 4 * LAP, 2)
+    closures = [
+        closure(truth, query, query % LAP, (query + shift) % LAP)
+        for query, shift in zip(queries, false_shifts(len(queries), 0.3, 20), strict=True)
+    ]
+    assert ratio(truth, slight(truth, drift), closures)[0] < most
+
+
 def test_false_closures_and_the_right_half_that_comes_later():
     truth, odometry, closures = false_drive('shift')
     graph = PoseGraph()

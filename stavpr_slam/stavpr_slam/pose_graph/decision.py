@@ -22,7 +22,7 @@ from stavpr_slam.pose_graph.network import Network
 # Chosen on KITTI 00 and 08 and a world of the demonstration; docs/slam.md has half and double.
 TIGHT = 0.125  # factor on the errors of the odometry that it is trusted by at first
 SCALES = TIGHT * 2.0 ** np.arange(6)  # those that evidence can loosen it to: up to 4
-PRECISE = TIGHT / 16  # the smallest one of a solution
+PRECISE = TIGHT / 16  # the smallest one of a solution; for measured graphs, by evidence
 CERTAIN = math.log(20)  # evidence from which a correction is published
 LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
 DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
@@ -98,6 +98,11 @@ class Decider:
             space = size.prod() * 8 * math.pi**2
         self._room = math.log(space) - network.freedom / 2 * math.log(2 * math.pi)
         self._precise = np.linalg.slogdet(network.information)[1] / 2
+
+    def odometry(self, scales: np.ndarray) -> np.ndarray:
+        """Return the information of all factors at factors on the errors of each robot."""
+        closures = float(scales.min()) if self._measured else 1.0
+        return self._network.odometry(scales[self._chain.robot], closures)
 
     def representatives(self, taken: np.ndarray) -> np.ndarray:
         """Return the closure in the middle of each event, (m,)."""
@@ -217,6 +222,8 @@ class Decider:
     def decide(self, robots: int) -> Decision:
         """Decide with a tight odometry, or a looser one for which there is evidence."""
         best = self.at(np.full(robots, TIGHT))
+        if self._measured:
+            best = self._better(best, self.at(np.full(robots, PRECISE)))
         self.tried = [best]
         for scale in SCALES[1 : 4 if self._measured else None]:
             self.tried.append(self.at(np.full(robots, scale), self.tried[-1]))
@@ -262,8 +269,7 @@ class Decider:
         self, scales: np.ndarray, values: np.ndarray, counted: np.ndarray
     ) -> tuple[np.ndarray, float, float]:
         """Estimate the variables with the closures that count, as :meth:`Network.solve`."""
-        odometry = self._network.odometry(scales[self._chain.robot])
-        return self._network.solve(odometry, values, counted * 1.0)
+        return self._network.solve(self.odometry(scales), values, counted * 1.0)
 
     def estimate(
         self, decision: Decision, independent: np.ndarray, searches: bool
@@ -277,11 +283,13 @@ class Decider:
             count, shape (n,), bool.
         """
         if self._measured:
-            odometry = self._network.odometry(np.ones(len(self._chain)))
+            scales = (decision.scales / TIGHT).clip(max=1.0)
+            odometry = self.odometry(scales)
             taken, values = self._network.robust(odometry, decision.values, AGAIN)
             if searches:
+                self._precise -= self._network.freedom * math.log(scales.min())
                 taken, values = self._improved(odometry, taken, values, False)
-            return np.ones_like(decision.scales), values, taken
+            return scales, values, taken
         counted = self.counted(decision.taken, independent)
 
         def solved(factor: float) -> tuple[float, float, np.ndarray]:

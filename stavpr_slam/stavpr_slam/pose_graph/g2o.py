@@ -38,8 +38,10 @@ def g2o_text(graph: PoseGraph) -> str:
     motions = inverse(T[before]) @ T[nodes]
     for row in zip(before.tolist(), nodes.tolist(), motions, covariances, strict=True):
         lines.append(_edge_text(*row))
+    closures = graph.scales.min(initial=1.0) ** 2 if graph.settings.measured else 1.0
     for edge in graph.used:
-        lines.append(_edge_text(edge.place, edge.query, edge.transform, edge.covariance))
+        covariance = closures * edge.covariance
+        lines.append(_edge_text(edge.place, edge.query, edge.transform, covariance))
     return '\n'.join(lines) + '\n'
 
 

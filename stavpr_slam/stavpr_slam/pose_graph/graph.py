@@ -220,11 +220,10 @@ class PoseGraph:
         numbers = np.concatenate([np.flatnonzero(self._taken), number[known:]])
         used = self._closures[numbers]
         network = Network(chain, initial, used, self._links)
-        odometry = network.odometry(self.scales[chain.robot])
-        residuals = network.residuals(odometry, network.values(initial))
+        decider = Decider(chain, network, initial, self.settings.measured)
+        residuals = network.residuals(decider.odometry(self.scales), network.values(initial))
         if (residuals[self.accepted :] > network.limit).any():
             return False
-        decider = Decider(chain, network, initial, self.settings.measured)
         counted = decider.counted(np.ones(len(used), bool), used.is_independent)
         values, _, _ = decider.solved(self.scales, network.values(initial), counted)
         self._taken = np.append(self._taken, number[known:] >= known)
@@ -312,6 +311,8 @@ class PoseGraph:
             found = decider.estimate(decision, used.is_independent, searches)
             self.scales, values, counted = found
             self._counted = np.flatnonzero(allowed)[counted]
+            if self.settings.measured:
+                self._taken[allowed] = counted
         self.solved = network.nodes(values)
 
     # results

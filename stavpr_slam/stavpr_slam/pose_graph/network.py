@@ -101,11 +101,12 @@ class Network:
         found[self._variables] = values
         return self._runs.filled(found)
 
-    def odometry(self, scales: np.ndarray) -> np.ndarray:
+    def odometry(self, scales: np.ndarray, closures: float = 1.0) -> np.ndarray:
         """
         Return the information of all factors; of the odometry, links and anchors they are first.
 
         :param scales: on the errors of the odometry of each node, shape (N,).
+        :param closures: on the errors of the closures.
         """
         d, own = self.freedom, self._variables[self._inside]
         covariances = scales[own, None, None] ** 2 * self._covariance
@@ -113,7 +114,7 @@ class Network:
         result[self._inside] = np.linalg.inv(covariances)
         result[~self._inside] = self._fixed
         self.log_determinant = float(np.linalg.slogdet(result)[1].sum()) / 2
-        return np.concatenate([result, self.information])
+        return np.concatenate([result, self.information / closures**2])
 
     def residuals(self, odometry: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the squared deviations of the closures, shape (n,)."""
