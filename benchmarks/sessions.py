@@ -30,7 +30,7 @@ last one is matched on it; sums of the orders. Nordland and the track have two s
 images of the second update the map, the odd ones are matched. The office is driven in two laps on
 two days, each lap is a session. Truth of the office and of the track: the best path of a whole
 session. Poisoned drives (images of another route, mirrored ones, the second half before the
-first): those that change a map, of all.
+first, which is right on the closed laps of the office): those that change a map, of all.
 """
 LAP = 207  # images of the office
 SETTINGS = upkeep.UpkeepSettings()

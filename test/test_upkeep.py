@@ -25,7 +25,7 @@ from stavpr_ros.mapping import (
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.versions import current_version, roll_back, save_version, Version
 from stavpr_ros.output_file import FileVersion
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, upkeep
 from stavpr_ros.recognition.upkeep import MIN_MISSED, update_map, UpkeepSettings
 from stavpr_ros.sources.frame import Frame
 
@@ -122,7 +122,8 @@ def test_detour_joins_the_map_as_a_stretch_of_its_own(first, around):
     assert recall(place_map, built([*ROUTE[60:80], *BYPASS, *ROUTE[90:120]], 4)) > 0.8
 
 
-def test_stretch_that_vanished_is_removed_after_max_age_drives(first, rebuilt):
+def test_stretch_that_vanished_is_removed_after_max_age_drives(first, rebuilt, monkeypatch):
+    monkeypatch.setattr(upkeep, 'OVERLAP', 20)
     place_map, version = updated(first, rebuilt)
     before = len(place_map)
     for day in range(3, 6):
@@ -136,6 +137,14 @@ def test_stretch_that_vanished_is_removed_after_max_age_drives(first, rebuilt):
     assert 'removed' in ' '.join(version.changes) or len(place_map) < before
     drive = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 9)
     assert recall(place_map, drive) > 0.8
+
+
+def test_a_vanished_stretch_stays_where_others_overlap_less_than_40_places(first):
+    missed = np.where(np.isin(np.arange(200), np.arange(80, 120)), 9, 0)
+    version = Version('', base_places=200, use=(1.0,) * 200, missed=tuple(missed.tolist()))
+    place_map, _ = updated(first, built([*ROUTE[:80], *OTHER[:40], *ROUTE[120:]], 1), version)
+    assert len(place_map) > 240
+    assert set(place_map.stamps.tolist()) >= set(first.stamps.tolist())
 
 
 def test_fewer_missed_places_than_a_stretch_stay(first):

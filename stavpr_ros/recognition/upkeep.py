@@ -44,6 +44,7 @@ MIN_HARD = 20  # images without a match, between two certain ones
 MARGIN = 10  # certain images beside a stretch that are part of it
 MIN_SESSION = 40  # places: fewer say little about the distances of others
 NEAR = 40  # places beside a missed one: their session fits the light of the drive
+OVERLAP = 40  # places on both sides that other sessions show as well: two windows of images
 MIN_MISSED = 10  # places in a row that are removed as one stretch
 PIECE = 20  # places that are removed together
 DECAY = 0.9  # of the use, a drive
@@ -428,7 +429,7 @@ def _is_replaced(grown: PlaceMap) -> np.ndarray:
     for run in np.unique(runs):
         own, is_other = np.flatnonzero(runs == run), np.zeros(len(grown), bool)
         is_other[roots[runs != run]] = True
-        is_replaced[own] = ~_is_near(~_is_near(is_other, SLACK)[roots[own]], MIN_HARD)
+        is_replaced[own] = ~_is_near(~_is_near(is_other, SLACK)[roots[own]], OVERLAP)
     return is_replaced
 
 
