@@ -15,6 +15,7 @@ from stavpr_ros.relative_pose.offset import (
     describe_columns,
     DRIFT,
     EVIDENCE,
+    JUMP,
     MIN_OVERLAP,
     Offset,
     OffsetFilter,
@@ -78,7 +79,7 @@ def plain_drifted(earlier):
     padded = np.pad(earlier, ((0, 0), (STEP, STEP)), mode='edge')
     steps = range(-STEP, STEP + 1)
     parts = [padded[:, STEP + by :][:, : len(SHIFTS)] - 0.5 * (by / DRIFT) ** 2 for by in steps]
-    return np.max(parts, axis=0)
+    return np.maximum(np.max(parts, axis=0), earlier.max() - JUMP)
 
 
 def test_kernels_equal_plain_sums():
@@ -108,6 +109,15 @@ def test_near_scene_beside_the_path_is_parallax_not_heading(beside):
     assert result.is_valid
     assert result.shift * WIDTH == pytest.approx(5.0, abs=3)
     assert result.parallax * WIDTH == pytest.approx(beside, rel=0.4)
+
+
+def test_camera_that_turns_at_once_is_followed():
+    image, one = panorama(2), OffsetFilter()
+    place = describe_columns(warped(image))
+    for shift in [0.0] * 8 + [40.0] * 2:
+        result = one.update(describe_columns(warped(image, shift)), place)
+    assert result.is_valid
+    assert result.shift * WIDTH == pytest.approx(40, abs=2)
 
 
 def test_repeating_structure_is_resolved_by_earlier_images():

@@ -134,7 +134,7 @@ class _Images:
     """
 
     def __init__(
-        self, source: 'FolderSource | VideoSource | BagSource', every: int, yaw: float
+        self, source: 'FolderSource | VideoSource | BagSource', every: int, yaw: float = 0.0
     ) -> None:
         self.source, self._every, self._yaw = source, every, yaw
         self.read = 0

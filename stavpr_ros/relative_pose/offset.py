@@ -34,7 +34,8 @@ CONTRAST, CLIP = 0.05, 2.5  # added to the local contrast; largest relative grad
 EVIDENCE = 60.0  # nats for a mean similarity of 1 over the whole image; images are dependent
 MIN_OVERLAP = 0.4  # of the blocks
 FORGETTING = 0.8  # factor on the sum of the earlier images
-DRIFT, STEP = 1.5, 3  # pixels that the shift changes between two images, deviation and maximum
+DRIFT, STEP = 3.0, 6  # pixels that the shift changes between two images, deviation and maximum
+JUMP = 8.0  # nats: the most that the earlier images say against a shift, a camera may turn at once
 PEAK = 5  # pixels from the most probable shift that are one peak
 MIN_RATIO = 9.0  # of the peak of a valid offset to the second peak
 MIN_SIMILARITY = 0.12  # of a valid offset
@@ -209,8 +210,8 @@ def _evidence(
 
 @kernel
 def _drifted(earlier: np.ndarray) -> np.ndarray:
-    """Return the sum of the earlier images where the shift has changed: a parabola for it."""
-    result = earlier.copy()
+    """Return the sum of the earlier images where the shift has changed: a parabola, or a jump."""
+    result = np.maximum(earlier, earlier.max() - JUMP)
     last = earlier.shape[1] - 1
     for model in range(len(earlier)):
         for k in range(last + 1):
