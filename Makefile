@@ -77,7 +77,7 @@ animation: demo ## write the animation of the README, docs/demo.webp
 	@$(RUN) python -m stavpr_lab.demonstration.animation demo_output docs/demo.webp
 
 repeat: override EXTRAS += slam
-repeat: build ## teach and repeat in a simulator, benchmarks/results/repeat.md
+repeat: build ## teach and repeat in a simulator, benchmarks/results/repeat_table.md
 	@$(RUN) python -m stavpr_lab.demonstration.repeat benchmarks/results
 
 days: build ## update a map by 30 synthetic days, and by real sessions, benchmarks/results/days.md
