@@ -291,6 +291,14 @@ def test_compressed_message_of_bayer_is_demosaiced(encoding, suffix):
     np.testing.assert_array_equal(image, scene)
 
 
+def test_mosaic_in_a_tiff_that_pillow_alone_decodes():
+    file = bytearray(encoded('.tiff', np.arange(96, dtype=np.uint8).reshape(8, 12)))
+    file[78] = 0
+    del file[114:]
+    image = decode_compressed_message(compressed('bayer_rggb8; png compressed ', bytes(file)))
+    assert image.shape == (8, 12, 3)
+
+
 @pytest.mark.parametrize(
     'transport',
     [

@@ -157,6 +157,8 @@ def decode_file(
         image = to_bytes(image) if to_bytes else (image >> 8).astype(np.uint8)
     image = _turned(image, turn)
     if demosaic is not None and is_mosaic:
+        if image.ndim == 3:  # a TIFF that OpenCV does not decode: three equal channels
+            image = np.ascontiguousarray(image[..., 0])
         return reduce(demosaic(image), least)
     code = cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB
     return np.asarray(cv2.cvtColor(reduce(image, least), code))
