@@ -84,7 +84,8 @@ class RepeatNode(Node):
         self._run = taught_run(self._map, velocities)
         self._columns = lru_cache(8)(self._columns_of)
         self._filter, self._focal = OffsetFilter(), math.nan
-        self._filter.update(*[self._columns(0)] * 2)  # compiles its kernels
+        blank = describe_columns(np.zeros((48, 64, 3), np.uint8))
+        self._filter.update(blank, blank)  # compiles its kernels
         self._filter.reset()
         self._lock = threading.Condition()
         self._images: dict[int, Any] = {}
