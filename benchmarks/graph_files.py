@@ -6,25 +6,33 @@ The benchmarks of pose graph papers with false closures, beside GNC and Cauchy o
 False closures are drawn with relative poses of right ones: at random nodes, in groups of 10
 successive nodes, or in such groups at most 40 nodes apart. A run succeeds where its ATE against
 the solution of the graph without them is at most 1 % of the diagonal of that solution. Files are
-in the folder pose_graphs of STAVPR_DATA. Writes benchmarks/results/graph_files.json.
+in the folder pose_graphs of STAVPR_DATA.
+
+Writes each cell (file, method, kind, share) to benchmarks/results/graph_files.json as soon as it
+is measured, and goes on where it was ended: cells of the present code are kept, others are
+measured anew. The table names the cells that are missing or of other code.
 """
 
 import argparse
 from collections.abc import Callable
 from functools import partial
+import importlib.metadata
+from itertools import groupby, product
 import json
 import os
 from pathlib import Path
+import subprocess
 import time
 from typing import Any
+from unittest.mock import patch
 
 import gtsam
 import numpy as np
-from results import environment, RESULTS
+from results import environment, RESULTS, ROOT, table, write_json
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph import PoseGraph
+from stavpr_slam.pose_graph import g2o, PoseGraph
 from stavpr_slam.pose_graph.g2o import Edge, graph_of, read_edges
 from stavpr_slam.pose_graph.path_errors import path_errors
 from stavpr_slam.pose_graph.transforms import adjoints, logarithms
@@ -34,6 +42,9 @@ FILES = 'MIT', 'intel', 'manhattan', 'smallGrid3D', 'sphere2500', 'parking-garag
 KINDS = {'random': (1, 0), 'grouped': (10, 0), 'locally grouped': (10, 40)}
 SHARES = 0.1, 0.3, 0.5
 ORDER = [3, 4, 5, 0, 1, 2]  # rotation first
+CODE = 'stavpr_slam/stavpr_slam/pose_graph'
+VALUES = 'success', 'precision', 'recall', 'seconds'
+Result = tuple[np.ndarray, np.ndarray | None, list[float]]
 
 
 def divided(edges: list[Edge]) -> tuple[list[Edge], list[Edge]]:
@@ -67,11 +78,37 @@ def false_closures(
     return made
 
 
-def ours(edges: list[Edge]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the positions (N, 3) and which closures are accepted."""
+def ours(edges: list[Edge]) -> Result:
+    """Return the positions (N, 3), which closures are accepted, and times of updates (ms)."""
     graph: PoseGraph = graph_of(edges)
     solved = graph.update(final=True)
-    return solved[:, :3, 3], np.array([edge.accepted for edge in graph.edges])
+    return solved[:, :3, 3], np.array([edge.accepted for edge in graph.edges]), []
+
+
+def one_at_a_time(edges: list[Edge]) -> Result:
+    """Return the same where closures come with the later one of their nodes, each an update."""
+    with patch.object(g2o, 'PoseGraph') as made:
+        graph_of(edges)
+    odometry, closures = (
+        [(call.args, call.kwargs) for call in calls.call_args_list]
+        for calls in (made.return_value.add_odometry, made.return_value.add_closure)
+    )
+    graph, times = PoseGraph(*made.call_args.args), list[float]()
+    at = np.array([max(each.query_stamp, each.place_stamp) for (each,), _ in closures])
+    order = np.argsort(at, kind='stable')
+    for number in order:
+        while odometry and odometry[0][0][0] <= at[number]:
+            given, named = odometry.pop(0)
+            graph.add_odometry(*given, **named)
+        graph.add_closure(*closures[number][0])
+        began = time.process_time()
+        graph.update()
+        times.append((time.process_time() - began) * 1e3)
+    for given, named in odometry:
+        graph.add_odometry(*given, **named)
+    solved, accepted = graph.update(final=True), np.zeros(len(order), bool)
+    accepted[order] = [edge.accepted for edge in graph.edges]
+    return solved[:, :3, 3], accepted, times
 
 
 def consistent(edges: list[Edge]) -> np.ndarray:
@@ -113,7 +150,7 @@ def consistent(edges: list[Edge]) -> np.ndarray:
     return np.isin(np.arange(len(closures)), best)
 
 
-def of_gtsam(edges: list[Edge], method: str) -> tuple[np.ndarray, np.ndarray | None]:
+def of_gtsam(edges: list[Edge], method: str) -> Result:
     """Return the same by GTSAM: GNC with the odometry as known inliers, Cauchy, or after PCM."""
     odometry, closures = divided(edges)
     weights, gnc = None, method == 'GNC'
@@ -143,11 +180,15 @@ def of_gtsam(edges: list[Edge], method: str) -> tuple[np.ndarray, np.ndarray | N
         weights = np.array(optimizer.getWeights())[len(odometry) + 1 :] > 0.5
     else:
         result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    return np.array([result.atPose3(i).translation() for i in range(values.size())]), weights
+    found = np.array([result.atPose3(i).translation() for i in range(values.size())])
+    return found, weights, []
 
 
-METHODS: dict[str, Callable[[list[Edge]], tuple[np.ndarray, np.ndarray | None]]] = {
-    'this graph': ours,
+OWN: dict[str, Callable[[list[Edge]], Result]] = {
+    'this graph': ours, 'one at a time': one_at_a_time,
+}  # fmt: skip
+METHODS: dict[str, Callable[[list[Edge]], Result]] = {
+    **OWN,
     **{name: partial(of_gtsam, method=name) for name in ('GNC', 'Cauchy', 'PCM')},
 }
 
@@ -158,57 +199,93 @@ def ate(found: np.ndarray, expected: np.ndarray) -> float:
     return float(distance / np.sqrt(len(found)))
 
 
-def measure(name: str, method: str, seeds: int) -> list[dict[str, Any]]:
-    """Return a row for each kind and share of false closures."""
-    edges = read_edges(str(Path(os.environ['STAVPR_DATA']) / 'pose_graphs' / f'{name}.g2o'))
+def version(method: str) -> str:
+    """Return what a method was computed by: the git tree of this graph, or GTSAM's version."""
+    if method not in OWN:
+        return f'gtsam {importlib.metadata.version("gtsam")}'
+    words = f'git rev-parse --short HEAD:{CODE}', f'git status --porcelain -- {CODE}'
+    tree, changed = (
+        subprocess.check_output(each.split(), cwd=ROOT, text=True).strip() for each in words
+    )
+    return tree + '+' * bool(changed)
+
+
+def measure(
+    edges: list[Edge], expected: np.ndarray, method: str, kind: str, share: float, seeds: int
+) -> dict[str, Any]:
+    """Return the values of a cell, means of its runs."""
     odometry, right = divided(edges)
-    expected, _ = ours(edges)
     diagonal = float(np.linalg.norm(np.ptp(expected, axis=0)))
-    rows = []
-    jobs = [(kind, share) for kind in KINDS for share in SHARES]
-    for kind, share in tqdm(jobs, desc=f'{name}, {method}'):
-        runs = []
-        for seed in range(seeds):
-            false = false_closures(right, len(odometry) + 1, share, kind, seed)
-            began = time.process_time()
-            try:
-                found, taken = METHODS[method]([*odometry, *right, *false])
-            except RuntimeError:  # of GTSAM: it is not solved
-                runs.append((np.inf, 0.0, 0.0, time.process_time() - began))
-                continue
-            seconds = time.process_time() - began
-            own = np.arange(len(right) + len(false)) < len(right)
-            taken = own if taken is None else taken
-            precision, recall = (taken & own).sum() / max(taken.sum(), 1), taken[own].mean()
-            runs.append((ate(found, expected) / diagonal, precision, recall, seconds))
-        error, precision, recall, seconds = np.array(runs).T
-        rows.append({
-            'file': name, 'method': method, 'kind': kind, 'share': share, 'runs': seeds,
-            'success': float((error <= 0.01).mean()), 'precision': float(precision.mean()),
-            'recall': float(recall.mean()), 'seconds': float(seconds.mean()),
-        })  # fmt: skip
-    return rows
+    runs, times = [], list[float]()
+    for seed in range(seeds):
+        false = false_closures(right, len(odometry) + 1, share, kind, seed)
+        began = time.process_time()
+        try:
+            found, taken, updates = METHODS[method]([*odometry, *right, *false])
+        except RuntimeError:  # of GTSAM: it is not solved
+            runs.append((False, 0.0, 0.0, time.process_time() - began))
+            continue
+        seconds = time.process_time() - began
+        own = np.arange(len(right) + len(false)) < len(right)
+        taken = own if taken is None else taken
+        precision, recall = (taken & own).sum() / max(taken.sum(), 1), taken[own].mean()
+        runs.append((ate(found, expected) <= 0.01 * diagonal, precision, recall, seconds))
+        times += updates
+    means = np.mean(np.array(runs, float), axis=0).round(4).tolist()
+    row = dict(zip(VALUES, means, strict=True))
+    if times:
+        spread = [np.mean(times), *np.percentile(times, [50, 90, 100])]
+        row['ms'] = np.round(spread, 1).tolist()  # mean, median, 90 %, most
+    return row
+
+
+def summary(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the means of each file and method as lines of Markdown."""
+    lines = []
+    for name, method in dict.fromkeys((row['file'], row['method']) for row in rows):
+        own = [row for row in rows if (row['file'], row['method']) == (name, method)]
+        other = sum(row.get('version') != version(method) for row in own)
+        means = [f'{np.mean([row[key] for row in own]):.3g}' for key in VALUES]
+        ms = np.array([row['ms'] for row in own if 'ms' in row]).reshape(-1, 4)
+        times = [f'{ms[:, 0].mean():.0f}', f'{ms[:, 3].max():.0f}'] if len(ms) else ['', '']
+        cells = f'{len(own)} of {len(KINDS) * len(SHARES)}' + f', {other} of other code' * (
+            other > 0
+        )
+        lines.append([name, method, *means, *times, cells])
+    head = 'file', 'method', *VALUES, 'mean update, ms', 'longest', 'cells'
+    return table(head, lines)
 
 
 def main() -> None:
-    """Measure and print the table."""
+    """Measure what is missing and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--files', nargs='*', default=FILES)
     parser.add_argument('--methods', nargs='*', default=list(METHODS))
-    parser.add_argument('--seeds', type=int, default=3, help='runs of each kind and share')
+    parser.add_argument('--kinds', nargs='*', default=list(KINDS))
+    parser.add_argument('--shares', nargs='*', type=float, default=SHARES)
+    parser.add_argument('--seeds', type=int, default=3, help='runs of each cell (%(default)s)')
+    parser.add_argument('--output', type=Path, default=RESULTS / 'graph_files.json')
     options = parser.parse_args()
-    path = RESULTS / 'graph_files.json'
+    path = options.output
     rows = json.loads(path.read_text())['rows'] if path.exists() else []
-    for name in options.files:
-        for method in options.methods:
-            rows = [row for row in rows if (row['file'], row['method']) != (name, method)]
-            rows += measure(name, method, options.seeds)
-            own = rows[-len(KINDS) * len(SHARES) :]
-            keys = 'success', 'precision', 'recall', 'seconds'
-            means = [f'{np.mean([row[key] for row in own]):.3g}' for key in keys]
-            print(f'| {name} | {method} | ' + ' | '.join(means) + ' |', flush=True)
-            text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
-            path.write_text(text + '\n')
+    jobs = product(options.files, options.methods, options.kinds, options.shares)
+    for name, group in groupby(jobs, key=lambda job: job[0]):
+        solved: list[tuple[list[Edge], np.ndarray]] = []
+        for _, method, kind, share in tqdm(list(group), desc=name):
+            key = {'file': name, 'method': method, 'kind': kind, 'share': share}
+            before = next((row for row in rows if key.items() <= row.items()), {})
+            code = version(method)
+            if before.get('version') == code and before['runs'] >= options.seeds:
+                continue
+            if not solved:
+                folder = Path(os.environ['STAVPR_DATA']) / 'pose_graphs'
+                edges = read_edges(str(folder / f'{name}.g2o'))
+                solved.append((edges, ours(edges)[0]))
+            values = measure(*solved[0], method, kind, share, options.seeds)
+            row = key | {'runs': options.seeds, 'version': code} | values
+            rows = [*(each for each in rows if each is not before), row]
+            write_json(path, {'about': environment(), 'rows': rows})
+    print('\n'.join(summary(rows)))
 
 
 if __name__ == '__main__':

@@ -83,3 +83,34 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     assert found['f1'] == 3 / 4  # three of four right, one wrong
     bins = outcome.calibration()['bins']
     assert [(row['images'], row['right']) for row in bins] == [(1, 1), (1, 0), (1, 1), (1, 1)]
+
+
+def test_public_graphs_go_on_where_they_were_ended(tmp_path, monkeypatch, capsys):
+    """Cells of the present code are kept; what is measured is written at once."""
+    graph_files = pytest.importorskip('graph_files', reason='needs gtsam', exc_type=ImportError)
+    measured: list[tuple[str, float]] = []
+
+    def measure(edges, expected, method, kind, share, seeds):
+        if len(measured) == 2:
+            raise KeyboardInterrupt
+        measured.append((kind, share))
+        return {'success': 1.0, 'precision': 1.0, 'recall': 1.0, 'seconds': 0.5}
+
+    for name, value in (('measure', measure), ('read_edges', list), ('ours', lambda _: [None])):
+        monkeypatch.setattr(graph_files, name, value)
+    path = tmp_path / 'a.json'
+    words = ['a', '--files', 'MIT', '--methods', 'this graph', '--kinds', 'random']
+    monkeypatch.setattr(sys, 'argv', [*words, '--output', str(path)])
+    with pytest.raises(KeyboardInterrupt):
+        graph_files.main()
+    document = json.loads(path.read_text())
+    document['rows'][0]['version'] = 'other'
+    path.write_text(json.dumps(document))
+    measured.pop(0)
+    with pytest.raises(KeyboardInterrupt):
+        graph_files.main()
+    assert measured == [('random', 0.3), ('random', 0.1)]
+    measured.clear()
+    graph_files.main()
+    assert measured == [('random', 0.5)]
+    assert '3 of 9' in capsys.readouterr().out
