@@ -49,6 +49,17 @@ def test_decode_image_of_any_buffer_is_exact(kind):
     np.testing.assert_array_equal(decode_image(4, 5, 'rgb8', False, step, kind(data)), expected)
 
 
+@pytest.mark.parametrize(
+    ('kind', 'padding', 'is_view'),
+    [(bytearray, 0, True), (bytes, 0, False), (bytearray, 2, False)],
+)
+def test_rgb8_is_a_view_of_bytes_that_can_be_written(kind, padding, is_view):
+    step, data, _ = message('rgb8', 4, 5, padding=padding)
+    held = kind(data)
+    image = decode_image(4, 5, 'rgb8', False, step, held)
+    assert np.shares_memory(image, np.frombuffer(held, np.uint8)) is is_view
+
+
 def test_decode_image_without_last_padding_is_exact():
     step, data, expected = message('bgr8', 3, 4, padding=5)
     np.testing.assert_array_equal(decode_image(3, 4, 'bgr8', False, step, data[:-5]), expected)

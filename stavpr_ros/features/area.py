@@ -4,18 +4,33 @@
 Gray area averages of images: the numbers of OpenCV's ``INTER_AREA``, in one pass.
 
 A pixel of the result is the sum over the rows that it covers of the sums over their columns, in
-float32, in the order of OpenCV, rounded to the nearest gray level.
+float32, in the order of OpenCV, rounded to the nearest gray level. LANES rows are summed at once,
+from gray levels in columns, so that neighboring pixels of a cell need no gathers.
 """
 
 from functools import cache
 import math
 
 import numpy as np
+from stavpr_ros.alignment.cpu.simd import (
+    bits,
+    from_bits,
+    LANES,
+    load,
+    load_splat,
+    load_thirds,
+    splat,
+    store,
+    store_bytes,
+    transpose,
+)
 from stavpr_ros.compilation import kernel
 
 F = np.float32
-RED, GREEN, BLUE, HALF, UNIT = F(9798), F(19235), F(3735), F(2**14), F(2**-15)  # as in OpenCV
-UNROLLED = 4  # pixels of a cell that are added at a time
+INT = np.int32
+RED, GREEN, BLUE, HALF, UNIT = INT(9798), INT(19235), INT(3735), INT(2**14), F(2**-15)  # as OpenCV
+LEVELS = INT(-(2**15))  # bits of a gray level over UNIT
+MAGIC, TWO_23 = INT(0x4B000000), F(2**23)  # bits of 2^23, whose last one counts 1
 MIN_SHARE = 1e-3  # of a pixel at the end of a cell; smaller ones do not count
 
 
@@ -26,7 +41,7 @@ def cells(length: int, size: int) -> tuple[np.ndarray, np.ndarray]:
 
     :param length: pixels of the axis, at least ``size``.
     :returns: the first pixel of each, (size,), int32, and the weights of it and the following
-        ones, (size, K), float32, K a multiple of UNROLLED.
+        ones, (size, K), float32.
     """
     scale = length / size
     firsts, rows = np.empty(size, np.int32), []
@@ -42,8 +57,7 @@ def cells(length: int, size: int) -> tuple[np.ndarray, np.ndarray]:
         if end - last > MIN_SHARE:
             weights.append(min(end - last, 1.0, width) / width)
         rows.append(weights)
-    count = max(map(len, rows))
-    table = np.zeros((size, -(-count // UNROLLED) * UNROLLED), np.float32)
+    table = np.zeros((size, max(map(len, rows))), np.float32)
     for i, weights in enumerate(rows):
         table[i, : len(weights)] = weights
     return firsts, table
@@ -57,49 +71,66 @@ def shrink(
     """
     Write an image in gray, averaged over cells, with a border equal to its neighbors.
 
-    :param image: RGB, shape (h, w, 3), uint8.
+    :param image: RGB, shape (h, w, 3), uint8, of at least LANES columns.
     :param firsts, weights, row_firsts, row_weights: of :func:`cells`, of the columns and the rows.
     :param table: new gray level of each, (256,), uint8.
     :param padded: shape (size + 2, size + 2), uint8, written.
     """
-    size, width, count = len(firsts), image.shape[1], weights.shape[1]
-    gray, line = np.zeros(width + count, F), np.empty(size, F)
-    total, summed = np.empty(size, F), -1
+    size, height, width, count = len(firsts), *image.shape[:2], weights.shape[1]
+    columns, square = np.zeros((width + count) * LANES, F), np.empty(LANES * LANES, F)
+    sums, lines = np.zeros((size + LANES) * LANES, F), np.empty((LANES, size + LANES), F)
+    total, levels = np.empty(size + LANES, F), np.empty(size + LANES, np.uint8)
+    first = -LANES  # of the rows in lines
     for y in range(size):
         total[:] = 0
         for t in range(row_weights.shape[1]):
             weight, row = row_weights[y, t], row_firsts[y] + t
             if weight == 0:
                 continue
-            if row != summed:  # else it is the last row of the cell before, too
-                _to_gray(image[row].reshape(-1), width, gray)
-                line[:] = 0
-                for k in range(0, count, UNROLLED):
-                    _add_pixels(gray[k:], firsts, weights[:, k : k + UNROLLED], line)
-                summed = row
+            while row >= first + LANES:
+                first += LANES
+                _to_gray(image.reshape(-1), first, height, width, square, columns)
+                _add_pixels(columns, firsts, weights, sums, lines)
+            line = lines[row - first]
             for x in range(size):
                 total[x] += line[x] * weight
+        for x in range(0, size, LANES):
+            store_bytes(levels, x, bits(load(total, x) + splat(TWO_23)))
         for x in range(size):
-            padded[y + 1, x + 1] = table[np.uint8(min(np.rint(total[x]), F(255)))]
+            padded[y + 1, x + 1] = table[levels[x]]
         padded[y + 1, 0], padded[y + 1, size + 1] = padded[y + 1, 1], padded[y + 1, size]
     padded[0], padded[size + 1] = padded[1], padded[size]
 
 
 @kernel
-def _to_gray(row: np.ndarray, width: int, gray: np.ndarray) -> None:
-    """Write gray levels, rounded; the sums are whole numbers below 2^24, exact in float32."""
-    for x in range(width):
-        total = F(row[3 * x]) * RED + F(row[3 * x + 1]) * GREEN + F(row[3 * x + 2]) * BLUE + HALF
-        gray[x] = np.floor(total * UNIT)
+def _to_gray(
+    image: np.ndarray, first: int, height: int, width: int, square: np.ndarray, columns: np.ndarray
+) -> None:
+    """Write gray levels, rounded, of LANES rows from ``first`` on, column by column."""
+    for x in range(0, width, LANES):
+        at = min(x, width - LANES)
+        for row in range(LANES):
+            pixel = min(first + row, height - 1) * width + at
+            r, g, b = load_thirds(image, 3 * pixel)
+            total = r * splat(RED) + g * splat(GREEN) + b * splat(BLUE) + splat(HALF)
+            whole = from_bits((total & splat(LEVELS)) | splat(MAGIC)) - splat(TWO_23)
+            store(square, row * LANES, whole * splat(UNIT))
+        transpose(square, 0, LANES, columns, at * LANES, LANES)
 
 
 @kernel
 def _add_pixels(
-    gray: np.ndarray, firsts: np.ndarray, weights: np.ndarray, line: np.ndarray
-) -> None:
-    """Add ``UNROLLED`` pixels of each cell to its sum, in order."""
-    for x in range(len(line)):
-        at, total = firsts[x], line[x]
-        for k in range(UNROLLED):
-            total += gray[at + k] * weights[x, k]
-        line[x] = total
+    columns: np.ndarray, firsts: np.ndarray, weights: np.ndarray, sums: np.ndarray,
+    lines: np.ndarray,
+) -> None:  # fmt: skip
+    """Write the sums of the pixels of each cell, in order, of LANES rows."""
+    flat, count = weights.reshape(-1), weights.shape[1]
+    for x in range(len(firsts)):
+        total = splat(F(0))
+        for k in range(count):
+            total = total + load(columns, (firsts[x] + k) * LANES) * load_splat(
+                flat, x * count + k
+            )
+        store(sums, x * LANES, total)
+    for x in range(0, len(firsts), LANES):
+        transpose(sums, x * LANES, LANES, lines.reshape(-1), x, lines.shape[1])

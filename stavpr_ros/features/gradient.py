@@ -21,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
+from stavpr_ros.alignment.cpu.simd import LANES
 from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import kernel
 from stavpr_ros.devices import DEVICES
@@ -80,7 +81,8 @@ class Gradient:
         size, table = self.settings.size, LOGARITHM if self.settings.logarithm else LINEAR
         height, width = image.shape[:2]
         is_whole = not (height % size or width % size)  # OpenCV adds up integers then
-        if self.settings.resize != 'area' or min(height, width) < size or is_whole:
+        is_small = height < size or width < max(size, LANES)
+        if self.settings.resize != 'area' or is_small or is_whole:
             gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
             small = cv2.LUT(resize_square(gray, size, self.settings.resize), table)
             return np.asarray(cv2.copyMakeBorder(small, 1, 1, 1, 1, cv2.BORDER_REPLICATE))

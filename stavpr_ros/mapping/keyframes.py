@@ -13,6 +13,7 @@ from stavpr_ros.units import SECOND
 
 OUT_OF_ORDER = SECOND // 10  # images later than this after a newer one: the clock jumped back
 SIZE = (32, 24)  # width and height of the images compared: averages noise out, but not motion
+MOST_ROWS = 257  # of a block, whose sums of bytes have 16 bits
 BLUR = 0.5  # pixels of the small image
 FLAT = 1.0  # standard deviation, gray levels, below which an image shows only noise
 
@@ -61,7 +62,8 @@ def small_gray(image: np.ndarray) -> np.ndarray:
     :returns: float32, shape (24, 32).
     """
     width, height = SIZE
-    if image.shape[0] % height or image.shape[1] % width or not image.flags.c_contiguous:
+    is_whole = not (image.shape[0] % height or image.shape[1] % width)
+    if not is_whole or image.shape[0] > MOST_ROWS * height or not image.flags.c_contiguous:
         small = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
     else:
         small = np.empty((height, width, 3), np.uint8)
@@ -80,12 +82,12 @@ def _block_means(rows: np.ndarray, small: np.ndarray) -> None:
     """
     height, count, length = rows.shape
     side = length // (3 * small.shape[1])  # pixels
-    scale, sums = np.float32(1) / np.float32(count * side), np.empty(length, np.uint32)
+    scale, sums = np.float32(1) / np.float32(count * side), np.empty(length, np.uint16)
     for i in range(height):
         sums[:] = 0
         for row in range(count):
             for x in range(length):
-                sums[x] += rows[i, row, x]
+                sums[x] += np.uint16(rows[i, row, x])
         for j in range(small.shape[1]):
             for channel in range(3):
                 total = np.uint32(0)

@@ -158,8 +158,9 @@ def decode_image(
     """
     Decode the fields of a raw ``sensor_msgs/Image``.
 
-    The bytes are viewed in place for any ``step``; the result has memory of its own. YUV is BT.601
-    in the range of video, as in cv_bridge.
+    The bytes are viewed in place for any ``step``; ``rgb8`` without padding remains such a view if
+    the bytes can be written, all others get memory of their own. YUV is BT.601 in the range of
+    video, as in cv_bridge.
 
     :param height: rows of the image; NV12, NV21 and NV24 have rows of color below them.
     :param width: pixels per row.
@@ -171,7 +172,7 @@ def decode_image(
     :param least: rows and columns that are needed of a large image, which is reduced then, see
         :func:`stavpr_ros.sources.files.reduce`; None = all.
     :param to_bytes: converts values of 16 bits; None = the upper byte.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: header and data contradict each other, the encoding is unsupported, or the
         image has more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
     """
@@ -194,7 +195,8 @@ def decode_image(
         strides = (step, layout.channels, 1)
         pixels: np.ndarray = np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
         image = files.reduce(layout.to_rgb(pixels), least)
-        return np.array(image, order='C') if image is pixels else image
+        is_own = image is not pixels or (image.flags.c_contiguous and image.flags.writeable)
+        return image if is_own else np.array(image, order='C')
     if to_bytes is None:  # the more significant byte lies first if big-endian
         pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
         high = np.asarray(cv2.extractChannel(pairs, 0 if is_bigendian else 1))
@@ -218,7 +220,7 @@ def decode_message(
     :param least: rows and columns that are needed of a large image, which is reduced then; None =
         all.
     :param to_bytes: converts values of 16 bits; None = the upper byte.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous, own memory.
+    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
     """
     if hasattr(message, 'decode'):

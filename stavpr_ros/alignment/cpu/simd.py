@@ -97,6 +97,58 @@ def store(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
 
 
 @intrinsic
+def load_thirds(typing: Any, array: Any, offset: Any) -> Any:
+    """Read 3 LANES neighbors of a flat array of uint8, from ``offset``, as int32: x, y, z."""
+    whole = Vector(types.int32)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        kind = ir.VectorType(ir.IntType(8), 3 * LANES).as_pointer()
+        pixels = builder.load(builder.bitcast(builder.gep(data, [arguments[1]]), kind), align=1)
+        masks = [range(first, 3 * LANES, 3) for first in range(3)]
+        parts = [_shuffled(builder, pixels, pixels, mask) for mask in masks]
+        wide = [builder.zext(part, ir.VectorType(ir.IntType(32), LANES)) for part in parts]
+        return context.make_tuple(builder, signature.return_type, wide)
+
+    return types.containers.UniTuple(whole, 3)(array, types.intp), generate
+
+
+@intrinsic
+def transpose(
+    typing: Any, source: Any, at: Any, pitch: Any, target: Any, to: Any, room: Any
+) -> Any:
+    """
+    Write LANES rows of a flat array as columns.
+
+    :param at, pitch: where the rows begin, and how far they are apart.
+    :param to, room: likewise, of the rows that are written, LANES numbers each.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def row(which: int, i: int) -> Any:
+            array, first, apart = arguments[which : which + 3]
+            offset = builder.add(first, builder.mul(apart, ir.Constant(apart.type, i)))
+            return _pointer(context, builder, signature.args[which], array, offset)
+
+        rows, half = [builder.load(row(0, i), align=4) for i in range(LANES)], LANES // 2
+        mixed = [[i // 2 + i % 2 * LANES + low for i in range(LANES)] for low in (0, half)]
+        for _ in range(LANES.bit_length() - 1):
+            pairs = zip(rows[:half], rows[half:], strict=True)
+            rows = [_shuffled(builder, a, b, mask) for a, b in pairs for mask in mixed]
+        for i in range(LANES):
+            builder.store(rows[i], row(3, i), align=4)
+        return context.get_dummy_value()
+
+    size = types.intp
+    return types.void(source, size, size, target, size, size), generate
+
+
+def _shuffled(builder: Any, a: Any, b: Any, lanes: Any) -> Any:
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), list(lanes))
+    return builder.shuffle_vector(a, b, mask)
+
+
+@intrinsic
 def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
     """
     Write the sums over the lanes of vectors into a flat array, from ``offset``.
@@ -110,8 +162,7 @@ def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
 
         def half(pair: Any, is_upper: bool) -> Any:
             taken = [i for i in range(2 * LANES) if (2 * (i % width) >= width) == is_upper]
-            mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), taken)
-            return builder.shuffle_vector(*pair, mask)
+            return _shuffled(builder, pair[0], pair[1], taken)
 
         while width > 1:
             parts += parts[-1:] * (len(parts) % 2)
@@ -128,8 +179,7 @@ def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
 def _on_all_lanes(builder: Any, number: Any) -> Any:
     empty = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
     first = builder.insert_element(empty, number, ir.Constant(ir.IntType(32), 0))
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
-    return builder.shuffle_vector(first, first, zeros)
+    return _shuffled(builder, first, first, [0] * LANES)
 
 
 @intrinsic
@@ -262,7 +312,7 @@ def _register(function: Any, instruction: Any) -> None:
 
 _register(operator.add, _operation('fadd', 'add'))
 _register(operator.sub, _operation('fsub', 'sub'))
-_register(operator.mul, _operation('fmul'))
+_register(operator.mul, _operation('fmul', 'mul'))
 _register(operator.truediv, _operation('fdiv'))
 _register(operator.lt, _less)
 _register(operator.and_, _operation('', 'and_'))
