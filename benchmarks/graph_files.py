@@ -34,7 +34,6 @@ from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph import g2o, PoseGraph
 from stavpr_slam.pose_graph.g2o import Edge, graph_of, read_edges
-from stavpr_slam.pose_graph.path_errors import path_errors
 from stavpr_slam.pose_graph.transforms import adjoints, logarithms
 from tqdm import tqdm
 
@@ -129,10 +128,10 @@ def consistent(edges: list[Edge]) -> np.ndarray:
         away = inverse(Z[i]) @ inverse(T[start]) @ T[place]
         loop = away @ Z @ inverse(T[query]) @ T[end]
         parts = (
-            (inverse(Z[i])[None], path_errors(chain, np.full_like(place, start), place)),
+            (inverse(Z[i])[None], chain.path_errors(np.full_like(place, start), place)),
             (away @ Z, covariance),
         )
-        spread = covariance[i] + path_errors(chain, np.full_like(query, end), query)
+        spread = covariance[i] + chain.path_errors(np.full_like(query, end), query)
         for motion, errors in parts:
             turn = adjoints(motion)
             spread = spread + turn @ errors @ turn.swapaxes(1, 2)

@@ -227,7 +227,7 @@ METHODS: dict[str, Method] = {
     'Cauchy kernel': lambda drive: plain(drive, ESTIMATORS.Cauchy.Create(1.0)),
     'dynamic covariance scaling': lambda drive: plain(drive, ESTIMATORS.DCS.Create(1.0)),
     'without evidence: each correction is published': lambda drive: ours(
-        drive, decision, 'CERTAIN', -np.inf
+        drive, decision, 'CERTAIN', -1e9
     ),
     'each closure is an event': lambda drive: ours(drive, decision, 'GAP', -1.0),
     'a tight odometry only': lambda drive: ours(drive, decision, 'SCALES', decision.SCALES[:1]),

@@ -5,7 +5,6 @@
 import numpy as np
 from stavpr_ros.mapping.transforms import matrices
 from stavpr_slam.pose_graph import GraphSettings, optimize
-from stavpr_slam.pose_graph.path_errors import path_errors
 from stavpr_slam.pose_graph.transforms import planar_poses
 from stavpr_slam.ros.graph_process import GraphServer, RobotOdometry
 from test_pose_graph import circle, closure, error, LAP, odometry_of
@@ -24,7 +23,7 @@ def errors(origin: np.ndarray, is_given: bool) -> np.ndarray:
     for i in range(10):
         grown = np.diag([0.001, 1.0, 0.001, 0.0, 0.0, 0.0]) * (i + 1)
         server.serve([odometry('a', i, grown.ravel().tolist() if is_given else None)], False, None)
-    return path_errors(server._graph.chain, np.array([0]), np.array([9]))[0]
+    return server._graph.chain.path_errors(np.array([0]), np.array([9]))[0]
 
 
 def test_server_uses_covariances_of_messages_in_the_frame_of_its_origin():

@@ -20,7 +20,7 @@ def chain_of(poses: np.ndarray) -> KeyframeChain:
 def test_merge_session_restores_the_chain():
     chain = chain_of(planar_poses(circle(1)))
     for node in (20, 40):
-        chain.split(node, (node + 1) * SECOND)
+        chain.split(node)
     assert chain.splits == [20, 40]
     assert np.bincount(chain.session).tolist() == [20, 20, 60]
     chain.merge_session(20)

@@ -96,7 +96,7 @@ def test_trajectory_after_a_split_belongs_to_the_session_from_its_stamp():
     chain = KeyframeChain(ChainSettings(), OdometryNoise())
     for i, pose in enumerate(planar_poses(np.arange(30)[:, None] / 4 * [1, 0, 0])):
         chain.add((i + 1) * SECOND, pose)
-    chain.split(4, 15 * SECOND)  # its keyframe has stamp 17, the one before 13
+    chain.split(4)  # at 15 s: its keyframe has stamp 17, the one before 13
     moved = chain.transforms.copy()
     moved[4:, 1, 3] = 7.0
     stamps, odometry, found = chain.trajectory(moved)

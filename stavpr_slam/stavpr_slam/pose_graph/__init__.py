@@ -4,9 +4,8 @@
 
 from stavpr_slam.pose_graph.alignment import align_maps
 from stavpr_slam.pose_graph.closures import Closure
-from stavpr_slam.pose_graph.graph import GraphEdge, GraphSettings, PoseGraph
+from stavpr_slam.pose_graph.graph import GraphEdge, GraphSettings, optimize, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings
-from stavpr_slam.pose_graph.offline import optimize
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 
 __all__ = [

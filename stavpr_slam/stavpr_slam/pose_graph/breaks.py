@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where closures prove that the odometry missed a motion: the robot was carried."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.closures import ClosureArrays
@@ -11,28 +9,15 @@ from stavpr_slam.pose_graph.keyframes import KeyframeChain
 
 GAIN = 24  # closures more that agree if there is a break, or
 EVIDENCE = 10.0  # so much more evidence
-SUPPORT, DISTANCE = 32, 40.0  # closures on each side of a break, and meters that they are along
+SUPPORT = 32  # closures on each side of a break
 NEAR = 2.0  # meters, and deviations of two closures, that agreeing ones are apart
 PAUSE = 1.5  # times the usual time between keyframes: the robot was carried then
 GAP = 15.0  # meters before and behind the closures at a break where it may be
 
 
-@dataclass(frozen=True)
-class Break:
-    """
-    A motion that the odometry missed.
-
-    :param node: first keyframe after it.
-    :param stamp: from which odometry and images are after it, ns.
-    """
-
-    node: int
-    stamp: int
-
-
 def find(
     chain: KeyframeChain, solved: np.ndarray, taken: np.ndarray, closures: ClosureArrays
-) -> Break | None:
+) -> int | None:
     """
     Return the break that lets most rejected closures agree; None = none.
 
@@ -54,14 +39,12 @@ def find(
         agree = (away < NEAR * (1 + np.maximum.outer(wide, wide))).astype(np.float32)
 
         def most(among: np.ndarray, agree: np.ndarray = agree) -> np.ndarray:
-            """Return the rejected closures among some that agree with most of them."""
+            """Return the rejected closures that agree with most others among them."""
             result: np.ndarray = (agree[np.argmax(agree @ among * among)] > 0) & among
             return result
 
         for node in np.unique(query[own])[:: SUPPORT // 4].tolist():
-            # a closure across the break: its place is not behind, or of another session
-            across = (chain.session[place[own]] != session) | (place[own] < node)
-            members = most((query[own] >= node) & across)
+            members = most(query[own] >= node)
             if members.sum() > len(best):
                 best = own[members]
                 before = np.flatnonzero(taken & here & (query < query[best].min()))
@@ -70,10 +53,10 @@ def find(
     return _between(chain, query, before, best)
 
 
-def strained(
-    chain: KeyframeChain, taken: np.ndarray, query: np.ndarray, node: int
-) -> Break | None:
-    """Return the break between the closures beside a node that the solution bends strongly at."""
+def strained(chain: KeyframeChain, taken: np.ndarray, query: np.ndarray, node: int) -> int | None:
+    """Return the break between the closures beside a strained node, as :func:`find`."""
+    if node < 0:
+        return None
     own = taken & (chain.session[query] == chain.session[node])
     before, behind = np.flatnonzero(own & (query < node)), np.flatnonzero(own & (query >= node))
     return _between(chain, query, before, behind)
@@ -81,11 +64,10 @@ def strained(
 
 def _between(
     chain: KeyframeChain, query: np.ndarray, before: np.ndarray, behind: np.ndarray
-) -> Break | None:
-    """Return the break at the longest pause between closures, else in the middle."""
-    for side in (before, behind):
-        if len(side) < SUPPORT or np.ptp(chain.travelled[query[side]]) < DISTANCE:
-            return None
+) -> int | None:
+    """Return the node behind the longest pause between closures, else in the middle."""
+    if min(len(before), len(behind)) < SUPPORT:
+        return None
     last, first = query[before].max(), query[behind].min()
     at, number = chain.travelled, np.arange(len(chain))
     own = (chain.session == chain.session[first]) & (chain.previous >= 0)
@@ -95,4 +77,4 @@ def _between(
     if pauses.max() <= PAUSE * np.median(pauses):
         nodes = np.flatnonzero(own & (number > last) & (number <= first))
         node = nodes[len(nodes) // 2]
-    return Break(int(node), int(chain.stamps[[node, chain.previous[node]]].mean()))
+    return int(node)

@@ -56,28 +56,44 @@ def events(chain: KeyframeChain, query: np.ndarray, place: np.ndarray) -> np.nda
 @dataclass(frozen=True, eq=False)
 class Decision:
     """
-    Which closures are right.
+    Which closures agree, with one factor on the errors of the odometry, and the evidence.
 
-    :param taken: shape (n,), bool.
     :param scales: factors on the errors of the odometry of each robot.
-    :param evidence: of the closures that are taken; 0 = none are.
-    :param rejected: evidence against a correction that is not published; 0 = there is none.
-    :param values: the variables.
-    :param agreeing, corrected: the closures, and the variables, of the robust solution, whether
-        it is published or not.
+    :param agreeing, values: closures of the robust solution, shape (n,), bool, and its variables.
+    :param evidence: of these closures.
+    :param least: evidence from which the solution is published.
     :param strained: node behind the part of the odometry that it bends most; -1 = none.
     :param chance: minus the logarithm of the probability to draw these events.
     """
 
-    taken: np.ndarray
     scales: np.ndarray
-    evidence: float
-    rejected: float
-    values: np.ndarray
     agreeing: np.ndarray
-    corrected: np.ndarray
+    values: np.ndarray
+    evidence: float
+    least: float = 0.0
     strained: int = -1
     chance: float = 0.0
+
+    @property
+    def is_published(self) -> bool:
+        """Return whether there is evidence for the solution."""
+        return self.evidence >= self.least
+
+    @property
+    def taken(self) -> np.ndarray:
+        """Return whether each closure is right, shape (n,), bool; without evidence none is."""
+        return self.agreeing & self.is_published
+
+    @property
+    def gain(self) -> float:
+        """
+        Return the evidence that is left beside the number of choices, at least 0.
+
+        Of many events, a few agree at random where the odometry explains everything: their chance
+        counts against them, and so does each doubling of the errors in the settings.
+        """
+        doublings = float(np.log2(self.scales.clip(1.0)).sum())
+        return max(0.0, self.evidence - self.chance - DOUBLED * doublings) * self.is_published
 
 
 class Decider:
@@ -97,31 +113,53 @@ class Decider:
         if network.freedom == 6:
             space = size.prod() * 8 * math.pi**2
         self._room = math.log(space) - network.freedom / 2 * math.log(2 * math.pi)
-        self._precise = np.linalg.slogdet(network.information)[1] / 2
 
-    def odometry(self, scales: np.ndarray) -> np.ndarray:
+    def information(self, scales: np.ndarray) -> np.ndarray:
         """Return the information of all factors at factors on the errors of each robot."""
         closures = float(scales.min()) if self._measured else 1.0
         return self._network.odometry(scales[self._chain.robot], closures)
 
     def representatives(self, taken: np.ndarray) -> np.ndarray:
         """Return the closure in the middle of each event, (m,)."""
-        numbers, found = np.flatnonzero(taken), []
-        at = self._chain.travelled[self._network.query]
-        for event in np.unique(self._events[taken]):
-            own = numbers[self._events[numbers] == event]
-            found.append(own[np.argsort(at[own], kind='stable')[len(own) // 2]])
-        return np.array(found, int)
+        numbers = np.flatnonzero(taken)
+        at = self._chain.travelled[self._network.query[numbers]]
+        numbers = numbers[np.lexsort((at, self._events[numbers]))]
+        _, first, count = np.unique(self._events[numbers], return_index=True, return_counts=True)
+        found: np.ndarray = numbers[first + count // 2]
+        return found
 
-    def _evidence(self, odometry: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
-        network, own = self._network, self.representatives(taken)
-        weights = np.zeros(len(taken))
-        weights[own] = 1.0
-        _, squared, determinant = network.solve(odometry, values, weights)
-        found = network.log_determinant - determinant - squared / 2
-        found += float(self._precise[own].sum()) + len(own) * self._room
+    def counted(self, taken: np.ndarray, independent: np.ndarray) -> np.ndarray:
+        """
+        Return which of the closures that are taken count in an estimate, shape (n,), bool.
+
+        :param independent: closures whose errors do not correlate, shape (n,), bool; of other
+            events one closure counts.
+        """
+        counted, own = taken & independent, self.representatives(taken)
+        counted[own[~np.isin(self._events[own], self._events[counted])]] = True
+        return counted
+
+    def fit(
+        self, information: np.ndarray, counted: np.ndarray, values: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """
+        Estimate the variables by least squares, and return them and the evidence.
+
+        :param counted: closures that count, shape (n,), bool.
+        """
+        network, own = self._network, np.flatnonzero(counted)
+        values, squared, determinant = network.solve(information, values, counted * 1.0)
+        whole = np.concatenate([np.ones(len(values), bool), counted])
+        known = float(np.linalg.slogdet(information[whole])[1].sum()) / 2
+        evidence = known - determinant - squared / 2 + len(own) * self._room
         # a session may begin anywhere in the same space
-        return found - network.joined(own) * (self._room + network.loose_determinant)
+        return values, evidence - network.joined(own) * (self._room + network.loose_determinant)
+
+    def _evidence(self, information: np.ndarray, taken: np.ndarray, values: np.ndarray) -> float:
+        """Return the evidence of closures, of which one of each event counts."""
+        counted = np.zeros_like(taken)
+        counted[self.representatives(taken)] = True
+        return self.fit(information, counted, values)[1]
 
     def _chance(self, taken: np.ndarray) -> float:
         """
@@ -136,7 +174,7 @@ class Decider:
         return max(0.0, float(np.log(rest / sizes).sum()) - math.lgamma(len(sizes) + 1))
 
     def _improved(
-        self, odometry: np.ndarray, taken: np.ndarray, values: np.ndarray, adds: bool
+        self, information: np.ndarray, taken: np.ndarray, values: np.ndarray, adds: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """
         Add and leave out closures, one by one, where that is evidence.
@@ -147,34 +185,22 @@ class Decider:
 
         :param adds: closures in the order of the drive, unless there are many.
         """
-        network, taken = self._network, taken.copy()
-
-        def solved(values: np.ndarray) -> tuple[np.ndarray, float]:
-            values, squared, determinant = network.solve(odometry, values, taken * 1.0)
-            found = float(self._precise[taken].sum()) + taken.sum() * self._room
-            return values, found - determinant - squared / 2
-
-        while True:
-            values, before = solved(values)
+        network, changed = self._network, True
+        latest = np.maximum(network.query, network.place)
+        values, evidence = self.fit(information, taken, values)
+        while changed:
+            changed, away = False, network.residuals(information, values)
             rejected, deviating = np.flatnonzero(~taken), np.flatnonzero(taken)
             rejected = rejected[: len(rejected) * (adds and len(rejected) <= MAX_TRIED)]
-            rejected = rejected[np.argsort(np.maximum(network.query, network.place)[rejected])]
-            deviating = deviating[np.argsort(-network.residuals(odometry, values)[deviating])][
-                :DROPPED
-            ]
-            changed = False
+            rejected = rejected[np.argsort(latest[rejected])]
+            deviating = deviating[np.argsort(-away[deviating])][:DROPPED]
             for number in [*rejected, *deviating]:
-                taken[number] = not taken[number]
-                try:
-                    moved, found = solved(values)
-                except np.linalg.LinAlgError:
-                    found = -math.inf
-                if found > before:
-                    values, before, changed = moved, found, True
-                else:
-                    taken[number] = not taken[number]
-            if not changed:
-                return taken, values
+                other = taken.copy()
+                other[number] = not taken[number]
+                moved, found = self.fit(information, other, values)
+                if found > evidence:
+                    taken, values, evidence, changed = other, moved, found, True
+        return taken, values
 
     def at(self, scales: np.ndarray, near: Decision | None = None) -> Decision:
         """
@@ -185,91 +211,60 @@ class Decider:
             and to search thoroughly.
         """
         network = self._network
-        odometry = network.odometry(scales[self._chain.robot])
+        information = network.odometry(scales[self._chain.robot])
         none, start = np.zeros(len(network.query), bool), self._start
         try:
             try:
-                taken, values = network.robust(odometry, start)
+                taken, values = network.robust(information, start)
             except np.linalg.LinAlgError:
                 if near is None:
                     raise
-                taken, values = network.robust(odometry, near.corrected, AGAIN)
-            evidence = self._evidence(odometry, taken, values) if taken.any() else 0.0
-            tried = []
+                taken, values = network.robust(information, near.values, AGAIN)
+            tried, evidence = [], self._evidence(information, taken, values)
             if taken.any():  # closures beside them may agree by now
-                tried.append(network.robust(odometry, values, AGAIN))
+                tried.append(network.robust(information, values, AGAIN))
             if self._measured and near is not None and scales.min() >= 1:
-                tried += [
-                    self._improved(odometry, *each, True) for each in (*tried, (none, start))
-                ]
+                begins = *tried, (none, start)
+                tried += [self._improved(information, *each, True) for each in begins]
             for more, moved in tried:
-                found = self._evidence(odometry, more, moved) if more.any() else 0.0
-                is_better = found > evidence
-                if not self._measured:
-                    is_better = more.sum() > taken.sum() and found > evidence - CERTAIN
-                if is_better:
+                found = self._evidence(information, more, moved)
+                if found > evidence and (self._measured or more.sum() > taken.sum()):
                     taken, values, evidence = more, moved, found
         except np.linalg.LinAlgError:
-            return Decision(none, scales, 0.0, math.inf, start, none, start)
+            return Decision(scales, none, start, -math.inf)
         joins = network.joined(np.flatnonzero(taken))
-        node, squared = network.most_strained(odometry, values)
-        strained = node if squared > STRAINED else -1
-        if evidence < CERTAIN - joins * (CERTAIN + network.limit):
-            return Decision(none, scales, 0.0, -evidence, start, taken, values, strained)
-        chance = self._chance(taken)
-        return Decision(taken, scales, evidence, 0.0, values, taken, values, strained, chance)
+        node, squared = network.most_strained(information, values)
+        return Decision(
+            scales, taken, values, evidence, CERTAIN - joins * (CERTAIN + network.limit),
+            node if squared > STRAINED else -1, self._chance(taken),
+        )  # fmt: skip
 
-    def decide(self, robots: int) -> Decision:
-        """Decide with a tight odometry, or a looser one for which there is evidence."""
+    def decide(self, robots: int) -> tuple[Decision, list[Decision]]:
+        """
+        Decide with a tight odometry, or a looser one for which there is evidence.
+
+        :returns: the best decision, and the ones with equal factors.
+        """
+
+        def better(best: Decision, other: Decision) -> Decision:
+            return other if other.gain - best.gain > LOOSENED else best
+
         best = self.at(np.full(robots, TIGHT))
+        tried = [best]
         if self._measured:
-            best = self._better(best, self.at(np.full(robots, PRECISE)))
-        self.tried = [best]
+            best = better(best, self.at(np.full(robots, PRECISE)))
         for scale in SCALES[1 : 4 if self._measured else None]:
-            self.tried.append(self.at(np.full(robots, scale), self.tried[-1]))
-            best = self._better(best, self.tried[-1])
-            if all(each.evidence < best.evidence - LOOSENED for each in self.tried[-2:]):
+            tried.append(self.at(np.full(robots, scale), tried[-1]))
+            best = better(best, tried[-1])
+            if best.is_published and all(
+                each.evidence < best.evidence - LOOSENED for each in tried[-2:]
+            ):
                 break
         for robot in range(robots) if robots > 1 else ():
             for scale in SCALES:
                 changed = np.where(np.arange(robots) == robot, scale, best.scales)
-                best = self._better(best, self.at(changed))
-        return best
-
-    def _better(self, best: Decision, other: Decision) -> Decision:
-        """
-        Return another decision if there is evidence for its odometry, else the best one.
-
-        Of many events, some agree at random where the odometry explains everything: the number of
-        choices counts against both, and so does each doubling of the errors in the settings.
-        """
-
-        def gain(decision: Decision) -> float:
-            doublings = np.log2(decision.scales.clip(1.0)).sum()
-            return decision.evidence - decision.chance - DOUBLED * float(doublings)
-
-        return other if gain(other) - max(gain(best), 0.0) > LOOSENED else best
-
-    def counted(self, taken: np.ndarray, independent: np.ndarray) -> np.ndarray:
-        """
-        Return which of the closures that are taken count in an estimate, shape (n,), bool.
-
-        :param independent: closures whose errors do not correlate, shape (n,), bool; of other
-            events one closure counts.
-        """
-        if self._measured:
-            return taken
-        counted = taken & independent
-        for number in self.representatives(taken):
-            if not (counted & (self._events == self._events[number])).any():
-                counted[number] = True
-        return counted
-
-    def solved(
-        self, scales: np.ndarray, values: np.ndarray, counted: np.ndarray
-    ) -> tuple[np.ndarray, float, float]:
-        """Estimate the variables with the closures that count, as :meth:`Network.solve`."""
-        return self._network.solve(self.odometry(scales), values, counted * 1.0)
+                best = better(best, self.at(changed))
+        return best, tried
 
     def estimate(
         self, decision: Decision, independent: np.ndarray, searches: bool
@@ -284,25 +279,22 @@ class Decider:
         """
         if self._measured:
             scales = (decision.scales / TIGHT).clip(max=1.0)
-            odometry = self.odometry(scales)
-            taken, values = self._network.robust(odometry, decision.values, AGAIN)
+            information = self.information(scales)
+            taken, values = self._network.robust(information, decision.values, AGAIN)
             if searches:
-                self._precise -= self._network.freedom * math.log(scales.min())
-                taken, values = self._improved(odometry, taken, values, False)
+                taken, values = self._improved(information, taken, values, False)
             return scales, values, taken
         counted = self.counted(decision.taken, independent)
 
-        def solved(factor: float) -> tuple[float, float, np.ndarray]:
-            network = self._network
-            values, squared, determinant = self.solved(
-                factor * decision.scales, decision.values, counted
-            )
-            return network.log_determinant - determinant - squared / 2, factor, values
+        def fitted(factor: float) -> tuple[float, float, np.ndarray]:
+            information = self.information(factor * decision.scales)
+            values, evidence = self.fit(information, counted, decision.values)
+            return evidence, factor, values
 
-        best, least = solved(1.0), PRECISE / decision.scales.min()
+        best, least = fitted(1.0), PRECISE / decision.scales.min()
         for change in (0.5, 2.0):
-            while best[1] * change >= least and best[1] * change < 64:
-                found = solved(best[1] * change)
+            while least <= best[1] * change < 64:
+                found = fitted(best[1] * change)
                 if found[0] <= best[0]:
                     break
                 best = found

@@ -16,7 +16,6 @@ from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
 from stavpr_slam.pose_graph.keyframes import ChainSettings
-from stavpr_slam.pose_graph.path_errors import path_errors
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 
 HALF = np.diag([1.0, 1, 1, 2, 2, 2])
@@ -34,7 +33,7 @@ def g2o_text(graph: PoseGraph) -> str:
     nodes = np.flatnonzero(chain.previous[:count] >= 0)
     before, T = chain.previous[nodes], chain.transforms
     scales = graph.scales[chain.robot[nodes]] if len(graph.scales) else np.ones(len(nodes))
-    covariances = scales[:, None, None] ** 2 * path_errors(chain, nodes, before)
+    covariances = scales[:, None, None] ** 2 * chain.path_errors(nodes, before)
     motions = inverse(T[before]) @ T[nodes]
     for row in zip(before.tolist(), nodes.tolist(), motions, covariances, strict=True):
         lines.append(_edge_text(*row))

@@ -3,19 +3,21 @@
 """The pose graph: odometry and loop closures in, a corrected trajectory out."""
 
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
-from stavpr_slam.pose_graph.decision import Decider, Decision, TIGHT
+from stavpr_slam.pose_graph.decision import TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
-from stavpr_slam.pose_graph.network import Network
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
-from stavpr_slam.pose_graph.sessions import extended, JOINS, Pair, place, session_pairs, weights
+from stavpr_slam.pose_graph.sessions import extended
+from stavpr_slam.pose_graph.solution import decided, followed, NOTHING, Solution
 from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
@@ -65,17 +67,19 @@ class PoseGraph:
         self._pending: list[Closure] = []
         self._known: list[Closure] = []  # those between nodes
         self._closures: ClosureArrays = between_nodes([])  # of them
-        self._solved_closures = 0  # of them, in the last solution
+        self._solution = NOTHING
         self._searched_at = 0, 0  # closures, and rejected ones, of the last search
-        self._links: dict[int, int] = {}
-        self._pairs = frozenset[Pair]()  # of sessions that are joined
-        self._decision: Decision | None = None
-        self._taken = np.zeros(0, bool)
-        self._solutions: list[tuple[np.ndarray, np.ndarray, int]] = []
-        self._counted = np.zeros(0, int)  # numbers of the edges of the solution
-        self.scales = np.zeros(0)
-        self.solved = np.zeros((0, 4, 4))
         self.counts: Counter[str] = Counter()
+
+    @property
+    def solved(self) -> np.ndarray:
+        """Return the transforms of the nodes in the map, by the last update, (n, 4, 4)."""
+        return self._solution.nodes
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Return the factor on the errors of the odometry of each robot."""
+        return self._solution.scales
 
     @property
     def scale(self) -> float:
@@ -85,7 +89,8 @@ class PoseGraph:
     @property
     def refused(self) -> float:
         """Return the evidence against a correction that is not published; 0 = there is none."""
-        return self._decision.rejected if self._decision else 0.0
+        decision = self._solution.decision
+        return 0.0 if decision.is_published else -decision.evidence
 
     def add_odometry(
         self, stamp: int, pose: np.ndarray, robot: str = '', covariance: np.ndarray | None = None
@@ -174,169 +179,97 @@ class PoseGraph:
         self._resolve()
         if not len(self.chain):
             return self.solved
+        last = self._solution
+        solved = len(last.accepted)
+        if not final and len(self._known) == solved:
+            nodes = extended(self.chain, last.nodes, last.placement.links)
+            self._solution = replace(last, nodes=nodes)
+            return self.solved
         try:
-            if final or len(self._known) != self._solved_closures:
-                self._update(final)
-            else:
-                self.solved = extended(self.chain, self.solved, self._links)
-        except (np.linalg.LinAlgError, FloatingPointError):
-            failed = len(self._known) - self._solved_closures
-            if not failed:
-                raise
-            self.counts['failed'] += failed
-            del self._known[self._solved_closures :]
-            self._closures = self._closures[: self._solved_closures]
-            self._update(final)
-        self._solved_closures = len(self._known)
+            self._solution = self._solve(final)
+        except np.linalg.LinAlgError:
+            self.counts['failed'] += len(self._known) - solved
+            del self._known[solved:]
+            self._closures = self._closures[:solved]
+            self._solution = self._solve(final)
         return self.solved
 
-    def _update(self, final: bool) -> None:
-        """Decide on all closures anew, and estimate."""
-        known, rejected = self._searched_at
-        if (
+    def _solve(self, final: bool) -> Solution:
+        last, (known, rejected) = self._solution, self._searched_at
+        if not (
             final or len(self._known) > GROWN * known
-            or self.rejected > max(GROWN * rejected, breaks.SUPPORT)
+            or last.rejected > max(GROWN * rejected, breaks.SUPPORT)
         ):  # fmt: skip
-            for node in self.chain.splits[::-1]:
-                self._split(breaks.Break(node, 0), False)
-            self._decide(True)
-            for _ in range(0 if self.settings.measured else MAX_BREAKS):
-                if not self._search_break():
-                    break
-            self._searched_at = len(self._known), self.rejected
-        elif not self._follow():
-            self._decide(False)
+            given = self.chain, self._closures, self.settings.measured
+            return followed(*given, last) or decided(*given, last.decision.scales)
+        for node in self.chain.splits[::-1]:
+            self._split(node, False)
+        found = self._decided()
+        for _ in range(0 if self.settings.measured else MAX_BREAKS):
+            better = self._with_break(found)
+            if better is None:
+                break
+            found = better
+        self._searched_at = len(self._known), found.rejected
+        return found
 
-    def _follow(self) -> bool:
-        """Add new closures to the estimate if all agree with it; return whether they do."""
-        chain, known = self.chain, len(self._taken)
-        if not len(self._counted) or len(self._links) < len(chain.starts()):
-            return False
-        pairs = session_pairs(chain, self._closures[known:]).tolist()
-        if any(a != b and (a, b) not in self._pairs for a, b in pairs):
-            return False
-        initial = extended(chain, self.solved, self._links)
-        number = np.arange(len(self._closures))
-        numbers = np.concatenate([np.flatnonzero(self._taken), number[known:]])
-        used = self._closures[numbers]
-        network = Network(chain, initial, used, self._links)
-        decider = Decider(chain, network, initial, self.settings.measured)
-        residuals = network.residuals(decider.odometry(self.scales), network.values(initial))
-        if (residuals[self.accepted :] > network.limit).any():
-            return False
-        counted = decider.counted(np.ones(len(used), bool), used.is_independent)
-        values, _, _ = decider.solved(self.scales, network.values(initial), counted)
-        self._taken = np.append(self._taken, number[known:] >= known)
-        self._counted = numbers[counted]
-        self.solved = network.nodes(values)
-        return True
+    def _decided(self) -> Solution:
+        return decided(self.chain, self._closures, self.settings.measured)
 
-    def _split(self, found: breaks.Break, begins: bool) -> None:
+    def _split(self, node: int, begins: bool) -> None:
         if begins:
-            self.chain.split(found.node, found.stamp)
+            self.chain.split(node)
         else:
-            self.chain.merge_session(found.node)
+            self.chain.merge_session(node)
         for number, closure in enumerate(self._known):
             resolved = self._resolved(closure)
             if resolved is not None:
                 self._closures[number] = resolved
 
-    def _search_break(self) -> bool:
-        """Begin a session where closures prove that the robot was carried."""
-        before = self._decision
-        assert before is not None
-        found: list[breaks.Break] = []
-        for number, (solved, agreeing, node) in enumerate(self._solutions):
-            if any(np.array_equal(agreeing, other) for _, other, _ in self._solutions[:number]):
-                continue
-            candidates = [breaks.find(self.chain, solved, agreeing, self._closures)]
-            if node >= 0:
-                candidates.append(
-                    breaks.strained(self.chain, agreeing, self._closures.query, node)
-                )
-            for each in candidates:
-                if each and all(abs(each.node - other.node) > breaks.GAP for other in found):
-                    found.append(each)
-        for each in found[:MAX_BREAKS]:
-            self._split(each, True)
-            self._decide(True)
-            after = self._decision
-            assert after is not None
-            gain = after.evidence - after.chance - before.evidence + before.chance
-            more = int(after.taken.sum()) - int(before.taken.sum())
-            if more >= breaks.GAIN or gain > breaks.EVIDENCE:
-                return True
-            self._split(each, False)
-        if found:
-            self._decide(True)
-        return False
-
-    def _decide(self, searches: bool) -> None:
-        """
-        Decide on the closures, and estimate all nodes.
-
-        :param searches: the errors of the odometry as well.
-        """
-        chain, denied = self.chain, set[Pair]()
-        while True:
-            placement = place(chain, self._closures, denied)
-            of_pair = session_pairs(chain, self._closures)
-            allowed = np.array(
-                [a == b or (a, b) in placement.pairs for a, b in of_pair.tolist()], bool
+    def _with_break(self, before: Solution) -> Solution | None:
+        """Begin a session where closures prove that the robot was carried; None = nowhere."""
+        nodes = dict.fromkeys(
+            node
+            for solved, agreeing, strained in before.tried
+            for node in (
+                breaks.find(self.chain, solved, agreeing, self._closures),
+                breaks.strained(self.chain, agreeing, self._closures.query, strained),
             )
-            used = self._closures[allowed]
-            network = Network(chain, placement.initial, used, placement.links)
-            decider = Decider(chain, network, placement.initial, self.settings.measured)
-            if searches or self._decision is None:
-                decision = decider.decide(len(chain.robots))
-            else:
-                decision = decider.at(self._decision.scales)
-            taken = used[decision.taken]
-            joined = weights(session_pairs(chain, taken), taken.query)
-            few = {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
-            if not few:
-                break
-            denied |= few
-        self._decision, self._links, self._pairs = decision, placement.links, placement.pairs
-        self._taken = allowed.copy()
-        self._taken[allowed] = decision.taken
-        self._solutions = []
-        for each in decider.tried if searches else ():
-            agreeing = allowed.copy()
-            agreeing[allowed] = each.agreeing
-            self._solutions.append((network.nodes(each.corrected), agreeing, each.strained))
-        self.scales, values = decision.scales, decision.values
-        self._counted = np.zeros(0, int)
-        if decision.taken.any():
-            found = decider.estimate(decision, used.is_independent, searches)
-            self.scales, values, counted = found
-            self._counted = np.flatnonzero(allowed)[counted]
-            if self.settings.measured:
-                self._taken[allowed] = counted
-        self.solved = network.nodes(values)
+            if node is not None
+        )
+        for node in [*nodes][:MAX_BREAKS]:
+            self._split(node, True)
+            after = self._decided()
+            if (
+                after.accepted.sum() - before.accepted.sum() >= breaks.GAIN
+                or after.decision.gain - before.decision.gain > breaks.EVIDENCE
+            ):
+                return after
+            self._split(node, False)
+        return None
 
     # results
 
     @property
     def edges(self) -> list[GraphEdge]:
         """Return all closures between nodes."""
-        ends = self._closures.query, self._closures.place, self._taken
+        ends = self._closures.query, self._closures.place, self._solution.accepted
         return [GraphEdge(*row) for row in zip(*(each.tolist() for each in ends), strict=False)]
 
     @property
     def accepted(self) -> int:
         """Return the number of accepted closures."""
-        return int(self._taken.sum())
+        return int(self._solution.accepted.sum())
 
     @property
     def rejected(self) -> int:
         """Return the number of rejected closures."""
-        return len(self._taken) - self.accepted
+        return self._solution.rejected
 
     @property
     def used(self) -> ClosureArrays:
         """Return the edges of the solution, see :func:`between_nodes`."""
-        return self._closures[self._counted]
+        return self._closures[: len(self._solution.counted)][self._solution.counted]
 
     @property
     def splits(self) -> int:
@@ -373,3 +306,29 @@ class PoseGraph:
         if node < 0:
             return np.array([0, 0, 0, 0, 0, 0, 1.0])
         return to_poses(self.solved[node] @ inverse(self.chain.transforms[node]))
+
+
+def optimize(
+    stamps: np.ndarray,
+    odometry: np.ndarray,
+    closures: Sequence[Closure],
+    settings: GraphSettings | None = None,
+) -> tuple[np.ndarray, PoseGraph]:
+    """
+    Correct a recorded drive by its loop closures; the same input gives the same result.
+
+    :param stamps: of the odometry, ns, shape (N,).
+    :param odometry: poses, shape (N, 7).
+    :returns: the corrected poses (N, 7), NaN where the graph has no odometry, and the graph.
+    :raises InputError: other shapes.
+    """
+    require_shape('odometry', odometry, f'{len(stamps)} 7')
+    graph = PoseGraph(settings)
+    for stamp, pose in zip(stamps.tolist(), odometry, strict=True):
+        graph.add_odometry(stamp, pose)
+    for closure in closures:
+        graph.add_closure(closure)
+    graph.update(final=True)
+    found = [graph.at(t, pose) for t, pose in zip(stamps.tolist(), odometry, strict=True)]
+    missing = np.full(7, np.nan)
+    return np.array([missing if pose is None else pose for pose in found]), graph

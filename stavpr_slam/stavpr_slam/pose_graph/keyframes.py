@@ -3,7 +3,6 @@
 """Keyframes of the odometry, and the sessions between its breaks."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +12,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
 from stavpr_slam.pose_graph.track import OdometryTrack
+from stavpr_slam.pose_graph.transforms import adjoints
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class OdometryRecording:
     """
     Odometry without a break, of one robot.
 
-    :param stamps, nodes: of its keyframes, ns.
+    :param nodes, begins: its keyframes, and the stamps from which odometry moves with each, ns.
     :param tail: stamp and pose of the newest odometry.
     :param spread: covariance of the odometry at the last keyframe as in its message, (6, 6).
     """
@@ -46,8 +46,8 @@ class OdometryRecording:
     track: OdometryTrack
     tail: tuple[int, np.ndarray]
     spread: np.ndarray | None
-    stamps: list[int] = field(default_factory=list)
     nodes: list[int] = field(default_factory=list)
+    begins: list[int] = field(default_factory=list)
 
 
 class KeyframeChain:
@@ -57,7 +57,7 @@ class KeyframeChain:
     Arrays of N nodes: ``stamps`` (ns), ``transforms`` in the odometry of its session, or in the
     map, (N, 4, 4), ``travelled`` (m), ``session`` (negative = fixed), ``recording`` (the session
     before splits), ``previous`` (the node before in its session, -1 = none), ``robot`` (number in
-    ``robots``), and for :mod:`path_errors` ``origin`` (3,) and ``spread`` (6, 6).
+    ``robots``), and for :meth:`path_errors` ``origin`` (3,) and ``spread`` (6, 6).
     """
 
     FIXED = -1
@@ -76,8 +76,7 @@ class KeyframeChain:
         self.robots: list[str] = []
         self.sessions = 0
         self._fixed: dict[tuple[str, int], int] = {}
-        # first nodes after splits: the stamps, and the nodes before
-        self._cuts: dict[int, tuple[int, int]] = {}
+        self._cuts: dict[int, int] = {}  # first nodes after splits, and the nodes before
         self.breaks: list[str] = []
 
     def __len__(self) -> int:
@@ -171,8 +170,8 @@ class KeyframeChain:
                 grown = LEAST * grown + given
             row['spread'] = before['spread'] + grown
         current.spread = covariance
-        current.stamps.append(stamp)
         current.nodes.append(node)
+        current.begins.append(stamp)
 
     def _extend(self, stamp: int, transform: np.ndarray, session: int, recording: int) -> int:
         if self._count == len(self._nodes):
@@ -182,6 +181,20 @@ class KeyframeChain:
         row['session'], row['recording'], row['previous'] = session, recording, -1
         self._count += 1
         return self._count - 1
+
+    def path_errors(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """
+        Return the errors of the motion between nodes of one session, in the axes of the start.
+
+        :param start, end: n nodes, in any order.
+        :returns: covariances, rotation first, (n, 6, 6).
+        """
+        local = self.transforms[start].copy()
+        local[:, :3, 3] -= self.origin[start]
+        turn = adjoints(inverse(local))
+        sign = np.where(end >= start, 1.0, -1.0)[:, None, None]
+        spread: np.ndarray = sign * (self.spread[end] - self.spread[start])
+        return turn @ spread @ turn.swapaxes(-1, -2)
 
     def fixed(self, map_id: str, stamp: int, pose: np.ndarray) -> int:
         """Return the node of a place of a map, whose pose in the map is known, shape (7,)."""
@@ -200,17 +213,9 @@ class KeyframeChain:
         """
         for each in reversed(self._recordings):
             first, last = each.track.span
-            if each.robot != robot or not first <= stamp <= last:
-                continue
-            i = bisect_right(each.stamps, stamp) - 1
-            if each.stamps[i] == stamp:
-                return each.nodes[i], np.eye(4)
-            node = each.nodes[i]
-            if i + 1 < len(each.nodes):
-                after = each.nodes[i + 1]
-                if stamp >= self._cuts.get(after, (each.stamps[i + 1], 0))[0]:
-                    node = after
-            return node, inverse(self.transforms[node]) @ matrices(each.track.at(stamp))
+            if each.robot == robot and first <= stamp <= last:
+                node = each.nodes[bisect_right(each.begins, stamp) - 1]
+                return node, inverse(self.transforms[node]) @ matrices(each.track.at(stamp))
         return None
 
     def trajectory(
@@ -227,15 +232,9 @@ class KeyframeChain:
             if each.robot != robot:
                 continue
             stamps, poses = each.track.kept
-            nodes = np.array(each.nodes)
-            i = np.searchsorted(each.stamps, stamps, 'right') - 1
-            for node, (cut, _) in self._cuts.items():
-                if node in each.nodes:
-                    # odometry behind the cut belongs to the session that begins there
-                    at = each.nodes.index(node)
-                    i[(i == at - 1) & (stamps >= cut)] = at
-            known = nodes[i] < len(solved)
-            rows.append((stamps[known], matrices(poses[known]), nodes[i[known]]))
+            nodes = np.array(each.nodes)[np.searchsorted(each.begins, stamps, 'right') - 1]
+            known = nodes < len(solved)
+            rows.append((stamps[known], matrices(poses[known]), nodes[known]))
         stamps, odometry, own = (np.concatenate(each) for each in zip(*rows, strict=True))
         return stamps, odometry, solved[own] @ inverse(self.transforms[own]) @ odometry
 
@@ -250,34 +249,35 @@ class KeyframeChain:
     def before(self, node: int) -> int:
         """Return the last keyframe of a robot before the first one of a session; -1 = none."""
         if node in self._cuts:
-            return self._cuts[node][1]
+            return self._cuts[node]
         number = int(self.recording[node])
         earlier = self._recordings[:number]
         own = [each for each in earlier if each.robot == self._recordings[number].robot]
         return own[-1].nodes[-1] if own else -1
 
-    def split(self, node: int, stamp: int) -> None:
-        """
-        Let a new session begin.
-
-        :param node: its first keyframe.
-        :param stamp: of its first odometry, ns, after the keyframe before.
-        """
+    def split(self, node: int) -> None:
+        """Let a new session begin at a node, and its odometry in the middle of the time before."""
         later = (self.session == self.session[node]) & (np.arange(self._count) >= node)
         self.session[later] = self.sessions
-        self._cuts[node] = stamp, int(self.previous[node])
-        self.previous[node] = -1
         self.sessions += 1
-
-    @property
-    def splits(self) -> Sequence[int]:
-        """Return the first nodes of sessions that began by a split."""
-        return list(self._cuts)
+        self._cuts[node] = before = int(self.previous[node])
+        self.previous[node] = -1
+        self._begin(node, int(self.stamps[[before, node]].mean()))
 
     def merge_session(self, node: int) -> None:
         """Let a session that began by a split at a node be part of the one before again."""
-        ended = self.session[node]
-        self.session[self.session == ended] = self.session[self._cuts[node][1]]
+        ended, before = self.session[node], self._cuts.pop(node)
+        self.session[self.session == ended] = self.session[before]
         self.session[self.session > ended] -= 1
         self.sessions -= 1
-        _, self.previous[node] = self._cuts.pop(node)
+        self.previous[node] = before
+        self._begin(node, int(self.stamps[node]))
+
+    def _begin(self, node: int, stamp: int) -> None:
+        recording = self._recordings[self.recording[node]]
+        recording.begins[recording.nodes.index(node)] = stamp
+
+    @property
+    def splits(self) -> list[int]:
+        """Return the first nodes of sessions that began by a split."""
+        return list(self._cuts)

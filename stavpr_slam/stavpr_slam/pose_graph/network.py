@@ -113,7 +113,6 @@ class Network:
         result = np.empty((len(self._variables), d, d))
         result[self._inside] = np.linalg.inv(covariances)
         result[~self._inside] = self._fixed
-        self.log_determinant = float(np.linalg.slogdet(result)[1].sum()) / 2
         return np.concatenate([result, self.information / closures**2])
 
     def residuals(self, odometry: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -9,11 +9,9 @@ two keyframes is the difference of two sums, whatever its shape.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from stavpr_ros.mapping.transforms import cross, inverse
-from stavpr_slam.pose_graph.transforms import adjoints
+from stavpr_ros.mapping.transforms import cross
 
 SHORTEST = 0.05  # meters that a step counts at least
 NEGLIGIBLE = 1e-6  # part of a covariance below which it is numerical noise
@@ -33,14 +31,6 @@ class OdometryNoise:
 
     translation: float = 0.05
     rotation: float = 0.012
-
-
-class Nodes(Protocol):
-    """Arrays of a :class:`KeyframeChain` that paths are computed from."""
-
-    transforms: np.ndarray
-    origin: np.ndarray
-    spread: np.ndarray
 
 
 def step_errors(ends: np.ndarray, noise: OdometryNoise) -> np.ndarray:
@@ -79,18 +69,3 @@ def given_growth(
     grown: np.ndarray = sums[1] - sums[0]
     values = np.linalg.eigvalsh((grown + grown.T) / 2)
     return grown if values[-1] > 0 and values[0] > -NEGLIGIBLE * values[-1] else None
-
-
-def path_errors(chain: Nodes, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """
-    Return the errors of the motion between nodes of one session, in the axes of the start.
-
-    :param start, end: n nodes, in any order.
-    :returns: covariances, rotation first, (n, 6, 6).
-    """
-    local = chain.transforms[start].copy()
-    local[:, :3, 3] -= chain.origin[start]
-    turn = adjoints(inverse(local))
-    sign = np.where(end >= start, 1.0, -1.0)[:, None, None]
-    spread: np.ndarray = sign * (chain.spread[end] - chain.spread[start])
-    return turn @ spread @ turn.swapaxes(-1, -2)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.pose_graph.path_errors import path_errors
 from stavpr_slam.pose_graph.transforms import exponentials, logarithms
 
 LONGEST = 10  # keyframes of a run
@@ -60,7 +59,7 @@ class Runs:
         after[order] = np.where(inside, order[np.minimum(later, count - 1)], -1)
         T, at = chain.transforms, chain.travelled
         length = np.maximum(at[after] - at[since], 1e-9)
-        covariance = path_errors(chain, number, since)
+        covariance = chain.path_errors(number, since)
         return cls(
             variable.astype(bool), before, after, inverse(T[since]) @ T,
             (at - at[since]) / length, covariance,

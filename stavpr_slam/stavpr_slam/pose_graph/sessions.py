@@ -25,11 +25,13 @@ class Placement:
     :param initial: transforms of all nodes, shape (N, 4, 4): the odometry of each session, moved.
     :param links: first node of each session: the node that it is tied to; -1 = it is an anchor.
     :param pairs: sessions that closures may join.
+    :param allowed: closures within a session, or of such a pair, shape (n,), bool.
     """
 
     initial: np.ndarray
     links: dict[int, int]
     pairs: frozenset[Pair]
+    allowed: np.ndarray
 
 
 def session_pairs(chain: KeyframeChain, closures: ClosureArrays) -> np.ndarray:
@@ -37,9 +39,10 @@ def session_pairs(chain: KeyframeChain, closures: ClosureArrays) -> np.ndarray:
     return np.sort(chain.session[np.stack([closures.query, closures.place], axis=1)], axis=1)
 
 
-def weights(pairs: np.ndarray, queries: np.ndarray) -> dict[Pair, int]:
+def weights(chain: KeyframeChain, closures: ClosureArrays) -> dict[Pair, int]:
     """Return at how many queries closures join two sessions."""
-    own = np.unique(np.column_stack([pairs, queries])[pairs[:, 0] != pairs[:, 1]], axis=0)
+    rows = np.column_stack([session_pairs(chain, closures), closures.query])
+    own = np.unique(rows[rows[:, 0] != rows[:, 1]], axis=0)
     return dict(Counter((a, b) for a, b, _ in own.tolist()))
 
 
@@ -49,11 +52,12 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
 
     :param denied: pairs of sessions that do not join.
     """
-    T, session = chain.transforms, chain.session
+    T, session, Z = chain.transforms, chain.session, closures.transform
     result, links = T.copy(), {}
-    of_pair = session_pairs(chain, closures)
-    joined = weights(of_pair, closures.query).items()
+    joined = weights(chain, closures).items()
     joins = {pair for pair, weight in joined if weight >= JOINS and pair not in denied}
+    pairs = session_pairs(chain, closures).tolist()
+    allowed = np.array([a == b or (a, b) in joins for a, b in pairs], bool)
     starts = {int(session[node]): int(node) for node in chain.starts()}
     waiting, known = list(starts), {KeyframeChain.FIXED}
     while waiting:
@@ -61,29 +65,24 @@ def place(chain: KeyframeChain, closures: ClosureArrays, denied: Collection[Pair
             (n for n in waiting if any(n in pair and known & {*pair} for pair in joins)),
             waiting[0],
         )
-        votes, others = [], []
-        for i in np.flatnonzero((of_pair == number).any(axis=1)).tolist():
-            if (*of_pair[i].tolist(),) in joins:
-                Z = closures.transform[i]
-                own, other = int(closures.query[i]), int(closures.place[i])
-                if session[own] != number:
-                    Z, own, other = inverse(Z), other, own
-                if session[other] in known:
-                    votes.append(result[other] @ Z @ inverse(T[own]))
-                    others.append(other)
-        mine, node = session == number, starts[number]
-        if votes:
-            thin = np.linspace(0, len(votes) - 1, min(SAMPLE, len(votes))).astype(int)
-            best = _best(np.array(votes)[thin], T[mine])
-            result[mine] = votes[thin[best]] @ T[mine]
-            links[node] = others[thin[best]]
+        mine, placed, node = session == number, np.isin(session, [*known]), starts[number]
+        ahead = allowed & mine[closures.query] & placed[closures.place]
+        back = allowed & mine[closures.place] & placed[closures.query]
+        others = np.concatenate([closures.place[ahead], closures.query[back]])
+        if len(others):
+            own = np.concatenate([closures.query[ahead], closures.place[back]])
+            thin = np.linspace(0, len(own) - 1, min(SAMPLE, len(own))).astype(int)
+            motions = np.concatenate([Z[ahead], inverse(Z[back])])[thin]
+            votes = result[others[thin]] @ motions @ inverse(T[own[thin]])
+            best = _best(votes, T[mine])
+            result[mine], links[node] = votes[best] @ T[mine], int(others[thin[best]])
         else:
             links[node] = link = chain.before(node)
             if link >= 0:
                 result[mine] = result[link] @ inverse(T[node]) @ T[mine]
         waiting.remove(number)
         known.add(number)
-    return Placement(result, links, frozenset(joins))
+    return Placement(result, links, frozenset(joins), allowed)
 
 
 def _best(votes: np.ndarray, transforms: np.ndarray) -> int:
@@ -102,17 +101,15 @@ def extended(chain: KeyframeChain, solved: np.ndarray, links: dict[int, int]) ->
     :param links: as in :class:`Placement`.
     :returns: shape (N, 4, 4).
     """
-    T, known, number = chain.transforms, len(solved), np.arange(len(chain))
-    result = T.copy()
-    result[:known] = solved
-    for session in np.unique(chain.session[known:]).tolist():
-        own = number[(chain.session == session) & (number >= known)]
-        before = int(chain.previous[own[0]])
-        if session >= 0:
-            if before < 0:
-                before = links.get(int(own[0]), chain.before(int(own[0])))
-                start = T[own[0]] if before < 0 else result[before]
-            else:
-                start = result[before] @ inverse(T[before]) @ T[own[0]]
-            result[own] = start @ inverse(T[own[0]]) @ T[own]
+    T, known = chain.transforms, len(solved)
+    result = np.concatenate([solved, T[known:]])
+    later = np.arange(len(chain)) >= known
+    for session in set(chain.session[known:].tolist()) - {KeyframeChain.FIXED}:
+        own = np.flatnonzero((chain.session == session) & later)
+        first, before = own[0], int(chain.previous[own[0]])
+        moved = T[before] if before >= 0 else T[first]
+        if before < 0:
+            before = links.get(int(first), chain.before(int(first)))
+        if before >= 0:
+            result[own] = result[before] @ inverse(moved) @ T[own]
     return result

@@ -1,0 +1,122 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Solutions of a pose graph: a decision on all closures, or new ones added to the last."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from stavpr_slam.pose_graph.closures import ClosureArrays
+from stavpr_slam.pose_graph.decision import Decider, Decision
+from stavpr_slam.pose_graph.keyframes import KeyframeChain
+from stavpr_slam.pose_graph.network import Network
+from stavpr_slam.pose_graph.sessions import (
+    extended,
+    JOINS,
+    Pair,
+    place,
+    Placement,
+    session_pairs,
+    weights,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """
+    The nodes by the accepted closures.
+
+    :param nodes: transforms in the map, (N, 4, 4).
+    :param accepted, counted: of n closures, which are right, and which count in the solution.
+    :param scales: factors on the errors of the odometry of each robot.
+    :param tried: robust solutions: nodes, closures that agree, and the strained node; where the
+        errors of the odometry were searched.
+    """
+
+    nodes: np.ndarray
+    accepted: np.ndarray
+    counted: np.ndarray
+    scales: np.ndarray
+    placement: Placement
+    decision: Decision
+    tried: list[tuple[np.ndarray, np.ndarray, int]]
+
+    @property
+    def rejected(self) -> int:
+        """Return the number of rejected closures."""
+        return int((~self.accepted).sum())
+
+
+def decided(
+    chain: KeyframeChain, closures: ClosureArrays, measured: bool, scales: np.ndarray | None = None
+) -> Solution:
+    """
+    Decide on all closures anew, and estimate all nodes.
+
+    :param measured: as in :class:`GraphSettings`.
+    :param scales: factors on the errors of the odometry of each robot, as decided before; None =
+        they are searched.
+    """
+    denied = set[Pair]()
+    while True:
+        placement = place(chain, closures, denied)
+        used = closures[placement.allowed]
+        network = Network(chain, placement.initial, used, placement.links)
+        decider = Decider(chain, network, placement.initial, measured)
+        if scales is None:
+            decision, tried = decider.decide(len(chain.robots))
+        else:
+            decision, tried = decider.at(scales), []
+        joined = weights(chain, used[decision.taken])
+        few = {pair for pair in placement.pairs if joined.get(pair, 0) < JOINS}
+        if not few:
+            break
+        denied |= few
+    accepted, found, values = decision.taken, decision.scales, network.values(placement.initial)
+    counted = accepted
+    if accepted.any():
+        found, values, counted = decider.estimate(decision, used.is_independent, scales is None)
+    if measured:
+        accepted = counted
+
+    def among_all(chosen: np.ndarray) -> np.ndarray:
+        result = placement.allowed.copy()
+        result[placement.allowed] = chosen
+        return result
+
+    return Solution(
+        network.nodes(values), among_all(accepted), among_all(counted), found, placement, decision,
+        [(network.nodes(each.values), among_all(each.agreeing), each.strained) for each in tried],
+    )  # fmt: skip
+
+
+def followed(
+    chain: KeyframeChain, closures: ClosureArrays, measured: bool, last: Solution
+) -> Solution | None:
+    """Add new closures to the last solution; None = not all agree with it."""
+    known, placement = len(last.accepted), last.placement
+    if not last.counted.any() or len(placement.links) < len(chain.starts()):
+        return None
+    pairs = session_pairs(chain, closures[known:]).tolist()
+    if any(a != b and (a, b) not in placement.pairs for a, b in pairs):
+        return None
+    nodes = extended(chain, last.nodes, placement.links)
+    accepted = np.append(last.accepted, np.ones(len(closures) - known, bool))
+    used = closures[accepted]
+    network = Network(chain, nodes, used, placement.links)
+    decider = Decider(chain, network, nodes, measured)
+    information, values = decider.information(last.scales), network.values(nodes)
+    new = network.residuals(information, values)[last.accepted.sum() :]
+    if (new > network.limit).any():
+        return None
+    counted = accepted.copy()
+    counted[accepted] = own = decider.counted(np.ones(len(used), bool), used.is_independent)
+    values, _ = decider.fit(information, own, values)
+    return replace(last, nodes=network.nodes(values), accepted=accepted, counted=counted)
+
+
+NOTHING = Solution(
+    np.zeros((0, 4, 4)), np.zeros(0, bool), np.zeros(0, bool), np.zeros(0),
+    Placement(np.zeros((0, 4, 4)), {}, frozenset(), np.zeros(0, bool)),
+    Decision(np.zeros(0), np.zeros(0, bool), np.zeros((0, 4, 4)), 0.0), [],
+)  # fmt: skip
+"""Of a graph without odometry."""
