@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The probability of a path by quantities without a unit."""
 
+from dataclasses import replace
+
 import numpy as np
+from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.filter.evidence import (
     changed_images,
@@ -11,6 +14,7 @@ from stavpr_ros.filter.evidence import (
     RecentWindows,
     straight_steps,
 )
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.device_windows import DeviceBuffer
 from stavpr_ros.recognition.window import SequenceBuffer
 import torch
@@ -63,9 +67,11 @@ def test_path_probability_by_hand():
 
 
 def test_recent_windows_start_even_forget_and_trust_sure_ones_soon():
-    recent = RecentWindows()
+    recent, learned = RecentWindows(-0.6), RecentWindows(1.5)
     for _ in range(4):
         recent.add(1.0)
+        learned.add(1.0)
+    assert learned.share < 0.5 < recent.share  # with learned features, 1.0 is not likely
     assert recent.share == pytest.approx((8 * 0.5 + 4) / 12)
     for _ in range(600):
         recent.add(-np.inf)
@@ -76,3 +82,19 @@ def test_recent_windows_start_even_forget_and_trust_sure_ones_soon():
     for _ in range(30):
         recent.add(1.0)  # likely, not sure
     assert 0.3 < recent.share < 0.5
+
+
+def test_weak_windows_make_a_drive_less_likely_with_learned_features():
+    """Where right windows are farther ahead, on floors that look alike, these are not right."""
+    probabilities = []
+    for kind in ('gradient', 'hybrid'):
+        places, query = features_of(route_strips(0, 120)), features_of(route_strips(0, 120), 7.0)
+        places, query = (
+            replace(part, settings=replace(part.settings, kind=kind)) for part in (places, query)
+        )
+        recognizer = PlaceRecognizer(map_of(places), RecognizerSettings(mode='robust'))
+        matches = recognize_all(recognizer, query)
+        probabilities.append(np.array([match.probability for match in matches]))
+    gradient, hybrid = np.nan_to_num(probabilities)
+    assert (hybrid <= gradient).all()
+    assert hybrid[40:].mean() < 0.9 * gradient[40:].mean()

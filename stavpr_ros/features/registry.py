@@ -172,10 +172,13 @@ class Kind:
     :param settings: the frozen dataclass of its settings.
     :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use;
         '' for features that are not computed from images.
+    :param likely: evidence by itself of a window that is a likely match
+        (:mod:`stavpr_ros.filter.evidence`), which shows that a drive is on the map.
     """
 
     settings: Any
     backbone: str = ''
+    likely: float = -0.6
 
 
 LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
@@ -185,9 +188,9 @@ _FEATURES = 'stavpr_ros.features'
 KINDS = {
     'gradient': Kind(GradientSettings, f'{_FEATURES}.gradient:Gradient'),
     'efficientnet_lite1': Kind(
-        EfficientNetSettings, f'{_FEATURES}.efficientnet_lite:EfficientNetLite1'
+        EfficientNetSettings, f'{_FEATURES}.efficientnet_lite:EfficientNetLite1', likely=1.5
     ),
-    'hybrid': Kind(HybridSettings, f'{_FEATURES}.hybrid:Hybrid'),
+    'hybrid': Kind(HybridSettings, f'{_FEATURES}.hybrid:Hybrid', likely=1.5),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
     'descriptors': Kind(DescriptorSettings),
 }
@@ -231,6 +234,15 @@ def settings_class(kind: str) -> Any:
     :raises SettingsError: no such kind.
     """
     return _kind(kind).settings
+
+
+def likely_evidence(kind: str) -> float:
+    """
+    Return the own evidence of a likely window with a kind of features.
+
+    :raises SettingsError: no such kind.
+    """
+    return _kind(kind).likely
 
 
 def _kind(name: str) -> Kind:

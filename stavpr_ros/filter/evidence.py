@@ -21,7 +21,9 @@ The probability is 1 / (1 + exp(-x)) with::
 
 r is the share of the windows before that are likely matches by themselves, own > -0.6, or, if that
 is larger, the share of the latest ones that are sure by themselves, own > 3.4: of a drive that
-comes to the map late. The mean of p separates less: by night p is low on right paths, too.
+comes to the map late. Of right windows with ``efficientnet_lite1`` or ``hybrid``, own is larger:
+own > 1.5 is likely (:class:`stavpr_ros.features.registry.Kind`), which by logarithmic loss suits
+both on sets left out. The mean of p separates less: by night p is low on right paths, too.
 
 By logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
 windows of drives, half of them with detours, and on the first images of drives. Each of six
@@ -39,7 +41,7 @@ from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
 
 CONSTANT, POSTERIOR, LEAD, RECENT = -7.01, 0.62, 2.56, 3.65
-LIKELY, SURE = -0.6, 3.4  # own evidence of windows that are counted
+SURE = 3.4  # own evidence of sure windows
 APART = 20  # places: paths nearer than that to the path are not elsewhere
 SPEEDS = np.array([1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0])  # of straight paths
 CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do not grow
@@ -53,9 +55,14 @@ CHUNK = 128  # places whose sums are computed together
 
 
 class RecentWindows:
-    """The share r of a drive's windows that are matches by themselves: .5 at first."""
+    """
+    The share r of a drive's windows that are matches by themselves: .5 at first.
 
-    def __init__(self) -> None:
+    :param likely: own evidence of a likely window.
+    """
+
+    def __init__(self, likely: float = SURE) -> None:
+        self._least = likely
         self._likely = self._sure = 0.5
         self._count = FIRST
 
@@ -67,7 +74,7 @@ class RecentWindows:
     def add(self, own: float) -> None:
         """Count another window by its own evidence."""
         self._count = min(self._count + 1, LAST)
-        self._likely += ((own > LIKELY) - self._likely) / self._count
+        self._likely += ((own > self._least) - self._likely) / self._count
         self._sure += ((own > SURE) - self._sure) / min(self._count, LATEST)
 
 

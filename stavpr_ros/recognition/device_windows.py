@@ -123,12 +123,12 @@ class DeviceFilterWindow(FilterWindow):
     :param device: of torch; other parameters: see :class:`FilterWindow`.
     """
 
-    def __init__(self, *arguments: Any, device: torch.device) -> None:
+    def __init__(self, *arguments: Any, device: torch.device, **options: Any) -> None:
         self._device = device
         self._row_columns: RowColumns | None = None
         self.buffer_class = partial(DeviceBuffer, device=device)
         self.filter_class = partial(DevicePlaceFilter, device=device)
-        super().__init__(*arguments)
+        super().__init__(*arguments, **options)
 
     def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
         if self._row_columns is None:  # the map has been learned

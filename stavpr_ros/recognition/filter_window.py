@@ -18,6 +18,7 @@ from stavpr_ros.filter.evidence import (
     own_evidence,
     path_probability,
     RecentWindows,
+    SURE,
 )
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.motion import ImageChange
@@ -46,6 +47,7 @@ class FilterWindow(QueryWindow):
     :param to_oldest: for loop closure: states are followed back to the oldest image of the
         window, which :meth:`match_oldest` requires, instead of the middle one, and the mean z of
         each place is subtracted (:mod:`stavpr_ros.filter.place_means`).
+    :param likely: of :class:`RecentWindows`.
 
     ``change`` compares images, ``filter`` contains the states.
     """
@@ -62,6 +64,7 @@ class FilterWindow(QueryWindow):
         normalizes: bool = False,
         around: int = 0,
         to_oldest: bool = False,
+        likely: float = SURE,
     ) -> None:
         layout = layout or ColumnLayout()
         length, width = sequence.length, layout.width(places)
@@ -72,7 +75,7 @@ class FilterWindow(QueryWindow):
         self.filter: Filter = self.filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(layout.passes(places), settings, length)
         self.choice = PathChoice(self.filter, self.change, layout, width)
-        self._recent = RecentWindows()
+        self._likely, self._recent = likely, RecentWindows(likely)
         self._own = self._of_window = -math.inf  # evidence of the latest match, and of the window
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
@@ -94,7 +97,7 @@ class FilterWindow(QueryWindow):
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._at_rest, self._entered, self._recent = None, 0, RecentWindows()
+        self._at_rest, self._entered, self._recent = None, 0, RecentWindows(self._likely)
         self._repeated = slice(0, 0)
 
     def grow(self, places: int) -> None:

@@ -13,6 +13,7 @@ from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features.registry import likely_evidence
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.paths import BLOCK
 from stavpr_ros.filter.place_filter import PlaceFilter
@@ -488,12 +489,13 @@ def _window_of(
     if options.place_filter:
         window: FilterWindow
         arguments = sequence, n, MODEL, layout, options.query_znorm
+        likely = likely_evidence(place_map.settings.kind)
         if isinstance(backend, str):
-            window = FilterWindow(*arguments)
+            window = FilterWindow(*arguments, likely=likely)
         else:
             from stavpr_ros.recognition.device_windows import DeviceFilterWindow
 
-            window = DeviceFilterWindow(*arguments, device=backend)
+            window = DeviceFilterWindow(*arguments, likely=likely, device=backend)
         window.choice.learn_times(place_map.stamps)
         return window
     if isinstance(backend, str):
