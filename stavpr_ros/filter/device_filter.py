@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.filter.kernels import speed_factors
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import Belief, merged, NEGLIGIBLE, NO_PLACES, TOP
 from stavpr_ros.filter.protocol import Filter
@@ -132,7 +133,7 @@ class DevicePlaceFilter(Filter):
         z: torch.Tensor,
         weight: float,
         speed_weights: np.ndarray,
-        speed_likelihoods: np.ndarray | float = 1.0,
+        speed_likelihoods: np.ndarray | None = None,
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """See :meth:`PlaceFilter.update`; z is on the device, (n,)."""
@@ -162,7 +163,9 @@ class DevicePlaceFilter(Filter):
         for places, probability in zip(back.T, self._step_probabilities, strict=True):
             taps[np.arange(V), self._reach - places] += probability
         sent['taps'][:, 0], sent['back'][:] = np.tile(taps, (K, 1)), back
-        factors = s.speed_changes(speed_weights, speed_likelihoods)
+        if speed_likelihoods is None:
+            speed_likelihoods = np.ones(V)
+        factors = speed_factors(speed_weights, speed_likelihoods, s.keep_speed)
         speeds, v = sent['speeds'], np.arange(V)
         speeds[v, 1, v], speeds[v[1:], 2, v[:-1]] = factors[0], factors[1, 1:]
         speeds[v[:-1], 3, v[1:]] = factors[2, :-1]

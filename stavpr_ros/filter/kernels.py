@@ -207,8 +207,60 @@ def _copy_sums(places, count, by_place, first):
 
 
 @kernel
-def _sum_of_blocks(totals):
-    return totals.sum(axis=0)
+def _add_up(totals, in_gaps, entered, off, leave, enter):
+    """
+    Update the probabilities of being off the map, by level, (K,); return the sum of all states.
+
+    :param totals: of all blocks, of :func:`advance`.
+    :param in_gaps: sums of the states between sessions, by level, and entered: of those that came
+        from off the map.
+    """
+    sums = totals.sum(axis=0)
+    # likelihoods are 1 between sessions
+    lost, on_map = sums[1] + (in_gaps - entered) / (1 - leave), sums[2] - in_gaps
+    off[:] = off * (1 - enter) + (sums[0] - lost) * leave + lost
+    total = off.sum() + on_map.sum()
+    off /= total
+    return total
+
+
+@kernel
+def speed_factors(weights, likelihoods, keep):
+    """
+    Return the factors of the speeds, (5, V), float32.
+
+    To stay, from the speed below, from the one above, of all by the speed after, and from any by
+    the speed before. They include the likelihood of the speed after.
+
+    :param weights: relative probability of each speed for this image, (V,), float64.
+    :param likelihoods: of each speed by the latest images, relative to off the map, (V,), float64.
+    :param keep: probability of keeping the speed.
+    """
+    V = len(weights)
+    near, far = (1 - keep) * 0.4, (1 - keep) * 0.2 / V
+    total, factors = keep * weights + far * weights.sum(), np.zeros((5, V), F)
+    total[1:] += near * weights[:-1]
+    total[:-1] += near * weights[1:]
+    for v in range(V):
+        factors[0, v], factors[3, v], factors[4, v] = (
+            keep * weights[v] / total[v],
+            weights[v],
+            far / total[v],
+        )
+        if v > 0:
+            factors[1, v] = near * weights[v] / total[v - 1]
+        if v + 1 < V:
+            factors[2, v] = near * weights[v] / total[v + 1]
+        for i in range(4):
+            factors[i, v] *= likelihoods[v]
+    return factors
+
+
+@kernel
+def _write_steps(speeds, count, steps):
+    """Write how many places each speed moves on, with image ``count``, to whole places."""
+    for v in range(len(speeds)):
+        steps[v] = np.rint(speeds[v] * (count + 1)) - np.rint(speeds[v] * count)
 
 
 @kernel
@@ -228,10 +280,22 @@ def _copy_halo(states, part, rows, reach, halos):
             store(halos, (part * rows + row) * reach + x, load(states, before + x))
 
 
+@kernel
+def _times(values, factor):
+    """Return float32 numbers; in a parallel kernel, each operation on arrays starts threads."""
+    return values * F(factor)
+
+
+@kernel
+def _entering(off, enter, states):
+    """Return the probability of each of so many states of a level to be entered, (K,)."""
+    return (off * enter / states).astype(F)
+
+
 @parallel_kernel
 def advance(
-    a, n, z, weight, mu, levels, speeds, steps, spread, stay_on, entering, halos, origins,
-    by_place, maxima,
+    a, n, z, weight, mu, level_changes, scale, speeds, speed_weights, speed_likelihoods, count,
+    keep_speed, spread, leave, enter, off, gaps, halos, origins, steps, by_place, maxima,
 ):  # fmt: skip
     """
     Advance all states by one image.
@@ -240,21 +304,28 @@ def advance(
     :param n: places, at least 1.
     :param z, weight, mu: z-normalized distances (n,), alpha, and mean of right places by level;
         blocks without states, whose places are all excluded by +inf, are skipped.
-    :param levels, speeds: see :func:`_mix`.
-    :param steps: places that each speed moves on, (V,).
+    :param level_changes: of :func:`_mix`; scale: factor that makes probabilities of the states.
+    :param speeds: places an image, (V,), float64, and count: number of the image.
+    :param speed_weights, speed_likelihoods, keep_speed: of :func:`speed_factors`.
     :param spread: probability of one place more, and of one less, never back.
-    :param stay_on: probability of staying on the map.
-    :param entering: probability of each state of a level to come from off the map, (K,).
+    :param leave, enter: probabilities of leaving the map, and of returning.
+    :param off: probability of being off the map before, by level, (K,), float64; updated.
+    :param gaps: columns between sessions, ascending, (m,).
     :param halos: (parts, K, V, reach), scratch; zeros in the first. Reach is of whole vectors.
-    :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written.
+    :param origins: of this image, (blocks, K, (V + 1) // 2, BLOCK), uint8, written; steps: places
+        that each speed moves on, (V,), likewise.
     :param by_place: sum of the states of each place, (n or more,), and maxima: the largest of each
         block, (blocks,); read and written.
-    :returns: sums before the motion, of the states that moved over the end of the map, and with
-        the image, (3, K).
+    :returns: sum of the states and of ``off``, not normalized.
     """
     _, K, V, _ = a.shape
+    levels = _times(level_changes, scale)
+    entering = _entering(off, enter, V * max(n - len(gaps), 1))
+    _write_steps(speeds, count, steps)
+    factors, stay_on = speed_factors(speed_weights, speed_likelihoods, keep_speed), F(1 - leave)
     reach, halves, parts = halos.shape[3], origins.shape[2], (n + PLACES - 1) // PLACES
     width, size = reach + BLOCK, K * V * BLOCK
+    # sums before the motion, of states that moved over the end of the map, and with the image
     totals = np.empty(((n + BLOCK - 1) // BLOCK, 3, K))
     states, flat_halos, flat_origins = a.reshape(-1), halos.reshape(-1), origins.reshape(-1)
     for part in range(1, parts):  # too little work to share
@@ -266,13 +337,13 @@ def advance(
         blocks = (min(n - part * PLACES, PLACES) + BLOCK - 1) // BLOCK
         for block in range(blocks - 1, -1, -1):
             first = part * PLACES + block * BLOCK
-            count, at = min(BLOCK, n - first), first // BLOCK
-            whole = (count + LANES - 1) // LANES * LANES
-            is_empty = weight != 0 and maxima[at] == 0 and first + count < n
-            if is_empty and not (z[first : first + count] < np.inf).any():
+            length, at = min(BLOCK, n - first), first // BLOCK
+            whole = (length + LANES - 1) // LANES * LANES
+            is_empty = weight != 0 and maxima[at] == 0 and first + length < n
+            if is_empty and not (z[first : first + length] < np.inf).any():
                 totals[at] = 0
                 continue
-            _likelihoods(z, first, count, weight, mu, likely)
+            _likelihoods(z, first, length, weight, mu, likely)
             for own in range(2):  # the columns before the block, and its own
                 source, pitch, from_, mixed_at, columns = states, BLOCK, at * size, reach, whole
                 if not own:
@@ -281,7 +352,7 @@ def advance(
                         source, pitch, from_ = flat_halos, reach, part * K * V * reach
                 sums[:] = 0
                 _mix(
-                    source, from_, pitch, columns, levels, speeds, b, mixed, mixed_at, width, sums
+                    source, from_, pitch, columns, levels, factors, b, mixed, mixed_at, width, sums
                 )
             places[:] = 0
             for k in range(K):
@@ -292,19 +363,20 @@ def advance(
                     following = (max(at - 1, 0) * K * V + k * V + v) * BLOCK
                     for line in range(following, following + BLOCK, LINE):
                         prefetch(states, line)
-                    if first + count == n:
-                        ending = mixed[row : row + reach + count]
-                        totals[at, 1, k] += _lost(ending, step, spread)
+                    if first + length == n:
+                        ending = mixed[row : row + reach + length]
+                        totals[at, 1, k] += _lost(ending, step, F(spread))
                     total = total + _move(
-                        mixed, row + reach - step, 1 if step > 0 else 0, whole, spread, stay_on,
+                        mixed, row + reach - step, 1 if step > 0 else 0, whole, F(spread), stay_on,
                         entering[k], likely.reshape(-1), k * BLOCK, states,
                         at * size + (k * V + v) * BLOCK, flat_origins,
                         ((at * K + k) * halves + v // 2) * BLOCK, v % 2, places,
                     )  # fmt: skip
                 store(lanes, 0, total)
                 totals[at, 2, k] = _sum_of_lanes(lanes, 0)
-            maxima[at] = _copy_sums(places, count, by_place, first)
-    return _sum_of_blocks(totals)
+            maxima[at] = _copy_sums(places, length, by_place, first)
+    in_gaps = clear_gaps(a, gaps, by_place, maxima)
+    return _add_up(totals, in_gaps, _times(entering, V * len(gaps)), off, leave, enter)
 
 
 @kernel

@@ -55,34 +55,6 @@ class FilterSettings:
             changes[k, neighbors] = (1 - changes[k, k]) / max(len(neighbors), 1)
         return changes
 
-    def speed_changes(
-        self, weights: np.ndarray, likelihoods: np.ndarray | float = 1.0
-    ) -> np.ndarray:
-        """
-        Return the factors of the speeds for the kernels, (5, V), float32.
-
-        To stay, from the speed below, from the one above, of all by the speed after, and from any
-        by the speed before. They include the likelihood of the speed after.
-
-        :param weights: relative probability of each speed for this image, (V,).
-        :param likelihoods: of each speed by the latest images, relative to off the map, (V,).
-        """
-        V = len(self.speeds)
-        near, far = (1 - self.keep_speed) * 0.4, (1 - self.keep_speed) * 0.2 / V
-        total = self.keep_speed * weights + far * weights.sum()
-        total[1:] += near * weights[:-1]
-        total[:-1] += near * weights[1:]
-        changes = np.zeros((5, V), np.float32)
-        changes[0], changes[3], changes[4] = (
-            self.keep_speed * weights / total,
-            weights,
-            far / total,
-        )
-        changes[1, 1:] = near * weights[1:] / total[:-1]
-        changes[2, :-1] = near * weights[:-1] / total[1:]
-        changes[:4] *= likelihoods
-        return changes
-
 
 MODEL = FilterSettings()
 """The model of localization; loop closure has its own."""

@@ -9,11 +9,11 @@ places in between is learned from the map, so that the query's changes show how 
 """
 
 from collections import deque
-from collections.abc import Collection
 import math
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
+from stavpr_ros.compilation import kernel
 from stavpr_ros.filter.model import FilterSettings
 
 MAX_LAG = 5  # places apart up to which the map's changes are learned
@@ -49,6 +49,8 @@ class ImageChange:
 
     def __init__(self, places: int, settings: FilterSettings, length: int = 20) -> None:
         self._settings, self._length = settings, length
+        self._at_rest: np.ndarray | None = None  # kept, as these that count, until the map changes
+        self._distinct: np.ndarray | None = None
         self._sums, self._counts = np.zeros(MAX_LAG + 1), np.zeros(MAX_LAG + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
         self._update_curve()
@@ -91,6 +93,7 @@ class ImageChange:
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
         self.equal[n - 1] = self._from_before[n - 1] < self.standstill
+        self._at_rest = self._distinct = None
         if changes and not changes[0] < self.standstill:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
@@ -130,8 +133,8 @@ class ImageChange:
         ratio = min(similarity[-1] / similarity[-2], 1) if similarity[-2] > 0 else 0.0
         beyond = np.arange(1, int(np.ceil(MAX_LAG * speeds.max())) - MAX_LAG + 1)
         further = self.curve[-1] + similarity[-1] * (1 - ratio**beyond)
-        self._extended: list[float] = [*self.curve.tolist(), *further.tolist()]
-        self._decay = float(-np.log(np.clip(similarity[1], MIN_SIMILARITY, 1)))
+        decay = float(-np.log(np.clip(similarity[1], MIN_SIMILARITY, 1)))
+        self._extended = np.append(self.curve, further), decay
         places = np.outer(speeds, range(1, MAX_LAG + 1)).tolist()
         changes = np.array(
             [[self.expected_change(each) + OFFSET for each in row] for row in places]
@@ -149,14 +152,11 @@ class ImageChange:
 
         :param places: at least 0.
         """
-        if places < 1:
-            return -float(np.expm1(-self._decay * places))
-        whole = min(int(places), len(self._extended) - 2)
-        low, high = self._extended[whole : whole + 2]
-        return (high - low) * min(places - whole, 1) + low
+        return _expected_change(float(places), *self._extended)
 
     def _find_equal(self) -> None:
         self.equal = self._from_before < self.standstill
+        self._at_rest = self._distinct = None
 
     def is_dark_stretch(self, by_place: np.ndarray) -> bool:
         """
@@ -177,16 +177,22 @@ class ImageChange:
         """Forget the query."""
         self._last: np.ndarray | None = None
         self._latest: deque[float] = deque(maxlen=SMOOTHED)
-        self._moving: deque[np.ndarray] = deque(maxlen=MAX_LAG + 1)  # latest images with motion
-        self._by_apart: deque[list[float]] = deque(maxlen=SMOOTHED)  # their latest changes
-        self._of_window: deque[list[float]] = deque(maxlen=self._length)  # of its images
+        # the latest images with motion, image i in slot i modulo their number, and how many came
+        self._moving, self._moved = np.empty((0, 0, 0), np.float32), 0
+        # changes of the images 1, 2, ... apart: the latest ones, and those of the window, as last
+        # rows; and their number since the reset
+        self._by_apart, self._compared = np.zeros((SMOOTHED, MAX_LAG)), 0
+        self._of_window = np.zeros((self._length, len(COMPARED)))
 
     def next_query(self, strips: np.ndarray) -> float:
         """Return the change of the query's next image (W, d) from the one before, 1 at first."""
         change = 1.0 if self._last is None else change_between(strips, self._last)
         self._last = strips
         if not self.is_standstill(change):
-            self._moving.append(strips)
+            if not self._moved:
+                self._moving = np.empty((MAX_LAG + 1, *strips.shape), np.float32)
+            self._moving[self._moved % len(self._moving)] = strips
+            self._moved += 1
         return change
 
     def recenter_query(self, strips: np.ndarray) -> None:
@@ -200,14 +206,19 @@ class ImageChange:
 
     def distinct(self, n: int) -> np.ndarray:
         """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
-        distinct = ~self.equal[:n]
-        return distinct if np.count_nonzero(distinct) >= MIN_DISTINCT else np.ones(n, bool)
+        if self._distinct is None or len(self._distinct) != n:
+            distinct = ~self.equal[:n]
+            has_few = np.count_nonzero(distinct) < MIN_DISTINCT
+            self._distinct = np.ones(n, bool) if has_few else distinct
+        return self._distinct
 
     def at_rest(self) -> np.ndarray:
         """Return the places where the map's camera was at rest, ascending, (m,)."""
-        at_rest = self.equal.copy()
-        at_rest[:-1] |= self.equal[1:]
-        return np.flatnonzero(at_rest)
+        if self._at_rest is None:
+            at_rest = self.equal.copy()
+            at_rest[:-1] |= self.equal[1:]
+            self._at_rest = np.flatnonzero(at_rest)
+        return self._at_rest
 
     def weight(self, change: float) -> float:
         """Return the exponent alpha of the image's likelihood."""
@@ -225,24 +236,14 @@ class ImageChange:
 
         :param speed: of the path of the window, places per image, at least 0.
         """
-        if not self._of_window:
-            return 0.0
-        changes = [min(change, 1) for change in _means(self._of_window)]
-        expected = [min(self.expected_change(speed * apart), 1) for apart in COMPARED]
-        noise = (1 - changes[0]) / max(1 - expected[0], MIN_SIMILARITY)
-        noise = min(max(noise, MIN_SIMILARITY_RATIO), 1)
-        logs = [
-            math.log((1 - min((1 - change) / noise, 1) + OFFSET) / (each + OFFSET))
-            for change, each in zip(changes, expected, strict=True)
-        ]
-        return sum(logs[1:]) / len(logs[1:])
+        count = min(self._compared, self._length)
+        return _excess(speed, self._of_window[self._length - count :], *self._extended)
 
     def speed_weights(self, change: float) -> np.ndarray:
         """Return the relative probability of each speed after another change, (V,)."""
         self._latest.append(change)
-        logarithm = np.log(sum(self._latest) / len(self._latest) + OFFSET)
-        off = (logarithm - self._expected[:, 0]) / self._settings.change_deviation
-        return np.asarray(np.exp(-0.5 * off**2) + MIN_SPEED_WEIGHT)
+        mean = sum(self._latest) / len(self._latest)
+        return _speed_weights(mean, self._expected, self._settings.change_deviation)
 
     def speed_likelihoods(self, change: float) -> np.ndarray:
         """
@@ -253,23 +254,14 @@ class ImageChange:
         the map. Light makes all of them smaller or larger, and noise larger: both count as
         Gaussian errors that the changes have in common.
         """
-        if len(self._moving) <= MAX_LAG or not self._settings.speed_weight:
+        if self._moved <= MAX_LAG or not self._settings.speed_weight:
             return np.ones(len(self._expected))
-        newest = self._moving[-1]
-        before = [self._moving[-1 - apart] for apart in range(2, MAX_LAG + 1)]
-        self._by_apart.append([change, *(change_between(newest, image) for image in before)])
-        self._of_window.append(self._by_apart[-1][: len(COMPARED)])
-        off = np.log(np.array(_means(self._by_apart)) + OFFSET) - self._expected
-        logs = -0.5 * np.einsum('vi,vij,vj->v', off, self._precisions, off)
-        likely = np.exp(
-            self._settings.speed_weight * np.maximum(logs - logs.max(), MIN_LOG_LIKELIHOOD)
-        )
-        return np.asarray(likely)
-
-
-def _means(rows: Collection[list[float]]) -> list[float]:
-    """Return the mean of each column; of few numbers, faster than NumPy."""
-    return [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+        self._compared += 1
+        rows = self._by_apart[SMOOTHED - min(self._compared, SMOOTHED) :]
+        return _speed_likelihoods(
+            self._moving, self._moved, change, self._by_apart, self._of_window, len(rows),
+            self._expected, self._precisions, self._settings.speed_weight,
+        )  # fmt: skip
 
 
 def change_weights(changes: np.ndarray) -> np.ndarray:
@@ -287,3 +279,81 @@ def change_weights(changes: np.ndarray) -> np.ndarray:
     weights: np.ndarray = np.clip((changes / large - REST) / (SLOW - REST), 0, 1)
     weights[:1] = 1
     return weights
+
+
+# ------------------------------------------------ kernels
+
+
+@kernel
+def _expected_change(places, curve, decay):
+    """Return the change of :meth:`ImageChange.expected_change`."""
+    if places < 1:
+        return -math.expm1(-decay * places)
+    whole = min(int(places), len(curve) - 2)
+    low, high = curve[whole], curve[whole + 1]
+    return (high - low) * min(places - whole, 1.0) + low
+
+
+@kernel
+def _excess(speed, changes, curve, decay):
+    """Return the excess of changes, (m, 3), of images 1, 2, 3 apart; 0 of none."""
+    if not len(changes):
+        return 0.0
+    means, expected = np.empty(len(COMPARED)), np.empty(len(COMPARED))
+    for i in range(len(COMPARED)):
+        means[i] = min(_mean(changes[:, i]), 1.0)
+        expected[i] = min(_expected_change(speed * COMPARED[i], curve, decay), 1.0)
+    noise = (1 - means[0]) / max(1 - expected[0], MIN_SIMILARITY)
+    noise, total = min(max(noise, MIN_SIMILARITY_RATIO), 1.0), 0.0
+    for i in range(1, len(COMPARED)):
+        change = 1 - min((1 - means[i]) / noise, 1.0)
+        total += math.log((change + OFFSET) / (expected[i] + OFFSET))
+    return total / (len(COMPARED) - 1)
+
+
+@kernel
+def _speed_weights(change, expected, deviation):
+    """Return the relative probability of each speed after a mean change, (V,)."""
+    off = (np.log(change + OFFSET) - expected[:, 0]) / deviation
+    return np.exp(-0.5 * off**2) + MIN_SPEED_WEIGHT
+
+
+@kernel
+def _speed_likelihoods(
+    moving, moved, change, by_apart, of_window, count, expected, precisions, exponent
+):
+    """
+    Return the likelihood of each speed, (V,), and add the changes of the newest image.
+
+    :param moving: latest images, (MAX_LAG + 1, W, d), of which so many have moved.
+    :param change: of the newest image from the one before.
+    :param by_apart, of_window: changes by images apart, (5, MAX_LAG) and (l, 3); updated.
+    :param count: rows of ``by_apart`` that are known, the last ones.
+    :param expected, precisions: logarithm of the changes at each speed, (V, MAX_LAG), and their
+        inverse covariance, (V, MAX_LAG, MAX_LAG).
+    """
+    newest, off = moving[(moved - 1) % len(moving)], np.empty(MAX_LAG)
+    for rows in (by_apart, of_window):
+        for i in range(len(rows) - 1):
+            rows[i] = rows[i + 1]
+    by_apart[-1, 0] = change
+    for apart in range(2, MAX_LAG + 1):
+        by_apart[-1, apart - 1] = change_between(newest, moving[(moved - 1 - apart) % len(moving)])
+    of_window[-1] = by_apart[-1, : len(COMPARED)]
+    for apart in range(MAX_LAG):
+        off[apart] = np.log(_mean(by_apart[len(by_apart) - count :, apart]) + OFFSET)
+    logs = np.zeros(len(expected))
+    for v in range(len(expected)):
+        for i in range(MAX_LAG):
+            for j in range(MAX_LAG):
+                product = (off[i] - expected[v, i]) * precisions[v, i, j]
+                logs[v] -= 0.5 * product * (off[j] - expected[v, j])
+    return np.exp(exponent * np.maximum(logs - logs.max(), MIN_LOG_LIKELIHOOD))
+
+
+@kernel
+def _mean(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total / len(values)

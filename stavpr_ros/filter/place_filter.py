@@ -42,7 +42,7 @@ that makes their sum 1 is part of the next image's level changes.
 
 import numpy as np
 from stavpr_ros.alignment.cpu.simd import LANES
-from stavpr_ros.filter.kernels import advance, clear_gaps, PLACES
+from stavpr_ros.filter.kernels import advance, PLACES
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import (
     ALL_ENTERED,
@@ -148,43 +148,33 @@ class PlaceFilter(Filter):
         z: np.ndarray,
         weight: float,
         speed_weights: np.ndarray,
-        speed_likelihoods: np.ndarray | float = 1.0,
+        speed_likelihoods: np.ndarray | None = None,
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """See :meth:`Filter.update`."""
         s, n, slot = self.settings, len(z), self.count % len(self._steps)
-        passed = np.rint(self._speeds * self.count)
-        self._steps[slot] = np.rint(self._speeds * (self.count + 1)) - passed
-        states = len(self._speeds) * max(n - len(self._gaps), 1)  # of a level
-        gaps = self._gaps // BLOCK, slice(None), slice(None), self._gaps % BLOCK
         if not self.count and n:
+            states = len(self._speeds) * max(n - len(self._gaps), 1)  # of a level
             self._a[: -(-n // BLOCK)] = s.start / (len(self._levels) * states)
             self._maxima[:] = s.start
-            self._a[gaps] = 0
+            self._a[self._gaps // BLOCK, :, :, self._gaps % BLOCK] = 0
             self._off[:] = (1 - s.start) / len(self._levels)
         if not self.count or n < self._known:
             self._clear_from(n)
-        off = self._off @ self._level_changes
-        entering = (off * s.enter / states).astype(np.float32)
         if len(self._gaps) or len(not_near):
             z = z.copy()
             z[not_near] = np.maximum(z[not_near], 0)
             z[self._gaps] = NO_PLACE
-        before, lost, on_map = advance(
+        if speed_likelihoods is None:
+            speed_likelihoods = np.ones(len(self._speeds))
+        self._off = self._off @ self._level_changes
+        total = advance(
             self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
-            self._level_changes * np.float32(self._scale),
-            s.speed_changes(speed_weights, speed_likelihoods), self._steps[slot],
-            np.float32(s.spread), np.float32(1 - s.leave), entering, self._halos,
-            self._origins[slot], self._by_place, self._maxima,
+            self._level_changes, self._scale, self._speeds, speed_weights, speed_likelihoods,
+            self.count, s.keep_speed, s.spread, s.leave, s.enter, self._off, self._gaps,
+            self._halos, self._origins[slot], self._steps[slot], self._by_place, self._maxima,
         )  # fmt: skip
-        if len(self._gaps):  # likelihoods are 1 there
-            in_gaps = clear_gaps(self._a, self._gaps, self._by_place, self._maxima)
-            entered = entering * (len(self._speeds) * len(self._gaps))
-            lost = lost + (in_gaps - entered) / (1 - s.leave)
-            on_map = on_map - in_gaps
-        off = off * (1 - s.enter) + (before - lost) * s.leave + lost
-        total = float(off.sum() + on_map.sum())
-        self._off, self._scale = off / total, 1 / total
+        self._scale = 1 / total
         self._known = n
         self.count += 1
 

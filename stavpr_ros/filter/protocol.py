@@ -28,7 +28,7 @@ class Filter(Protocol):
         z: Any,
         weight: float,
         speed_weights: np.ndarray,
-        speed_likelihoods: np.ndarray | float = 1.0,
+        speed_likelihoods: np.ndarray | None = None,
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """
@@ -38,7 +38,7 @@ class Filter(Protocol):
             on the filter's device; +inf excludes a place.
         :param weight: alpha; 0 = the image is no evidence.
         :param speed_weights: relative probability of each speed, (V,).
-        :param speed_likelihoods: of each speed, relative to off the map, (V,).
+        :param speed_likelihoods: of each speed, relative to off the map, (V,); None = 1.
         :param not_near: places below m whose z counts as 0 at least.
         """
 

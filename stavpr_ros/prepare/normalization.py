@@ -26,7 +26,7 @@ def z_normalized(
     """
     z = np.empty(len(row), np.float32)
     counted = np.ones(len(row), bool) if counted is None else counted
-    _z_normalize(row, counted, np.append(firsts, len(row)), z)
+    _z_normalize(row, counted, firsts, z)
     if not around:
         return z
     from scipy.ndimage import uniform_filter1d
@@ -38,10 +38,10 @@ def z_normalized(
 
 
 @reassociating_kernel
-def _z_normalize(row: np.ndarray, counted: np.ndarray, ends: np.ndarray, z: np.ndarray) -> None:
+def _z_normalize(row: np.ndarray, counted: np.ndarray, firsts: np.ndarray, z: np.ndarray) -> None:
     """Write parts with mean 0 and deviation 1 of finite entries, in float64 until then."""
-    for part in range(len(ends) - 1):
-        first, end = ends[part], ends[part + 1]
+    for part in range(len(firsts)):
+        first, end = firsts[part], firsts[part + 1] if part + 1 < len(firsts) else len(row)
         total, squares, count = 0.0, 0.0, 0
         for i in range(first, end):
             counts = counted[i] & np.isfinite(row[i])

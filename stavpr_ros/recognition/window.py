@@ -183,7 +183,8 @@ class QueryWindow(ABC):
         around: int = 0,
     ) -> None:
         self.buffer, self.layout = buffer, layout
-        self.images = np.empty(0, WINDOW_IMAGE)
+        self._images = np.empty(buffer.length, WINDOW_IMAGE)  # the latest are the last
+        self.images = self._images[:0]
         self._normalizes, self._around = normalizes, around
 
     @property
@@ -210,8 +211,10 @@ class QueryWindow(ABC):
     def _append(
         self, stamp: int, change: float = 0.0, weight: float = 0.0, number: int = 0
     ) -> None:
-        newest = np.array([(stamp, change, weight, number, False)], WINDOW_IMAGE)
-        self.images = np.concatenate([self.images, newest])[-self.buffer.length :]
+        rows = self._images
+        rows[:-1] = rows[1:]
+        rows[-1] = stamp, change, weight, number, False
+        self.images = rows[max(0, len(rows) - len(self.images) - 1) :]
 
     def _as_columns(self, row: Any) -> Any:
         """Return distances to the places, normalized, as a row of the buffer."""
