@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mistakes at the start of a node: its arguments, its transport, the log directory."""
 
+import signal
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -58,3 +61,28 @@ def test_images_of_the_other_transport_are_named(topic, published, remedy):
     node = SimpleNamespace(count_publishers=lambda name: int(name == published))
     expected = f'{published} is published: {remedy}' if remedy else ''
     assert transport_remedy(node, topic) == expected
+
+
+WAITING = """
+import threading, rclpy
+from stavpr_ros.ros import process
+from stavpr_ros.signals import run_until_signal
+
+def make():
+    node = rclpy.create_node('waiting')
+    node.THREADS = 2
+    threading.Timer(0.5, lambda: print('waits', flush=True)).start()
+    return node
+
+process.LONG_POLL = 60.0
+run_until_signal(lambda: process.run_node(make, []))
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signal_wakes_an_executor_that_waits(number):
+    with subprocess.Popen([sys.executable, '-c', WAITING], stdout=subprocess.PIPE) as node:
+        assert node.stdout is not None
+        assert node.stdout.readline() == b'waits\n'
+        node.send_signal(number)
+        assert node.wait(20) == 0

@@ -14,8 +14,8 @@ In localization, :mod:`stavpr_ros.filter.evidence` makes the probability of the 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 import sys
+from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.compilation import kernel
@@ -38,8 +38,7 @@ MIN_CANDIDATE = REFUTED  # probability of its place, at least: above refuted one
 AROUND = np.array([-BAND, -CLOSE, CLOSE + 1, BAND + 1])  # ends of slices around a place
 
 
-@dataclass(frozen=True, eq=False)
-class WindowImages:
+class WindowImages(NamedTuple):
     """
     The images of a window, oldest first, and the image whose place is sought.
 
@@ -64,8 +63,7 @@ class WindowImages:
     lag_at_rest: int | None
 
 
-@dataclass(frozen=True, eq=False)
-class ChosenPath:
+class ChosenPath(NamedTuple):
     """
     A path of the window, and the other places that the image may show.
 
@@ -152,7 +150,7 @@ class PathChoice:
         total = max(unchecked + sum(weights) + 1 - on_map, sys.float_info.min)
         share = float(chosen.shares[images.position])
         of_path, least = max(weights) / total * share, chosen.min_probability * share
-        return replace(chosen, probability=of_path, min_probability=least)
+        return chosen._replace(probability=of_path, min_probability=least)
 
     def second_best(
         self, chosen: ChosenPath, n: int, place: int, radius: int
@@ -160,10 +158,7 @@ class PathChoice:
         """Return the most probable column elsewhere, and its probability, 0 if none."""
         places, probabilities = chosen.places, chosen.probabilities
         near = self._layout.around(place, radius)
-        parts = [np.arange(max(0, low), min(n, end)) for low, end in near.tolist()]
-        excluded = np.concatenate([*parts, places])
-        excluded.sort()
-        now, faint = self._filter.most_probable(excluded)
+        now, faint = self._filter.most_probable(_excluded(places, near, n))
         second = _best_beyond(places, probabilities, near)
         if second >= 0 and probabilities[second] >= faint * NEGLIGIBLE:
             return int(places[second]), float(probabilities[second])
@@ -241,6 +236,20 @@ def _check(
         if abs(places[i] - places[best]) <= BAND:
             probabilities[i] *= factor
     return int(np.argmax(np.where(own, probabilities, 0)))
+
+
+@kernel
+def _excluded(places: np.ndarray, near: np.ndarray, n: int) -> np.ndarray:
+    """Return places, and those of n in slices (m, 2), ascending; one may be there twice."""
+    excluded, count = (
+        np.empty(len(places) + (near[:, 1] - near[:, 0]).sum(), np.int64),
+        len(places),
+    )
+    excluded[:count] = places
+    for low, end in near:
+        for place in range(max(low, 0), min(end, n)):
+            excluded[count], count = place, count + 1
+    return np.sort(excluded[:count])
 
 
 @kernel

@@ -207,17 +207,17 @@ def _copy_sums(places, count, by_place, first):
 
 
 @kernel
-def _add_up(totals, in_gaps, entered, off, leave, enter):
+def _add_up(totals, in_gaps, entering, states, off, leave, enter):
     """
     Update the probabilities of being off the map, by level, (K,); return the sum of all states.
 
     :param totals: of all blocks, of :func:`advance`.
-    :param in_gaps: sums of the states between sessions, by level, and entered: of those that came
-        from off the map.
+    :param in_gaps: sums of so many states of a level between sessions, by level, (K,).
     """
     sums = totals.sum(axis=0)
-    # likelihoods are 1 between sessions
-    lost, on_map = sums[1] + (in_gaps - entered) / (1 - leave), sums[2] - in_gaps
+    # likelihoods are 1 between sessions, and entering from off the map is no loss
+    lost = sums[1] + (in_gaps - entering * F(states)) / (1 - leave)
+    on_map = sums[2] - in_gaps
     off[:] = off * (1 - enter) + (sums[0] - lost) * leave + lost
     total = off.sum() + on_map.sum()
     off /= total
@@ -241,26 +241,14 @@ def speed_factors(weights, likelihoods, keep):
     total, factors = keep * weights + far * weights.sum(), np.zeros((5, V), F)
     total[1:] += near * weights[:-1]
     total[:-1] += near * weights[1:]
-    for v in range(V):
-        factors[0, v], factors[3, v], factors[4, v] = (
-            keep * weights[v] / total[v],
-            weights[v],
-            far / total[v],
-        )
-        if v > 0:
-            factors[1, v] = near * weights[v] / total[v - 1]
-        if v + 1 < V:
-            factors[2, v] = near * weights[v] / total[v + 1]
-        for i in range(4):
-            factors[i, v] *= likelihoods[v]
+    factors[0], factors[3], factors[4] = keep * weights / total, weights, far / total
+    factors[1, 1:], factors[2, :-1] = (
+        near * weights[1:] / total[:-1],
+        near * weights[:-1] / total[1:],
+    )
+    for factor in factors[:4]:
+        factor[:] = factor * likelihoods
     return factors
-
-
-@kernel
-def _write_steps(speeds, count, steps):
-    """Write how many places each speed moves on, with image ``count``, to whole places."""
-    for v in range(len(speeds)):
-        steps[v] = np.rint(speeds[v] * (count + 1)) - np.rint(speeds[v] * count)
 
 
 @kernel
@@ -281,15 +269,16 @@ def _copy_halo(states, part, rows, reach, halos):
 
 
 @kernel
-def _times(values, factor):
-    """Return float32 numbers; in a parallel kernel, each operation on arrays starts threads."""
-    return values * F(factor)
+def _inputs(level_changes, scale, off, enter, states, speeds, count, steps):
+    """
+    Return the changes of level of scaled states, and the probability to enter each, (K,).
 
+    In the parallel kernel, each of these operations on arrays would start threads.
 
-@kernel
-def _entering(off, enter, states):
-    """Return the probability of each of so many states of a level to be entered, (K,)."""
-    return (off * enter / states).astype(F)
+    :param states: of a level; steps: (V,), written; others: of :func:`advance`.
+    """
+    steps[:] = np.rint(speeds * (count + 1)) - np.rint(speeds * count)
+    return level_changes * F(scale), (off * enter / states).astype(F)
 
 
 @parallel_kernel
@@ -319,9 +308,8 @@ def advance(
     :returns: sum of the states and of ``off``, not normalized.
     """
     _, K, V, _ = a.shape
-    levels = _times(level_changes, scale)
-    entering = _entering(off, enter, V * max(n - len(gaps), 1))
-    _write_steps(speeds, count, steps)
+    entries = V * max(n - len(gaps), 1)
+    levels, entering = _inputs(level_changes, scale, off, enter, entries, speeds, count, steps)
     factors, stay_on = speed_factors(speed_weights, speed_likelihoods, keep_speed), F(1 - leave)
     reach, halves, parts = halos.shape[3], origins.shape[2], (n + PLACES - 1) // PLACES
     width, size = reach + BLOCK, K * V * BLOCK
@@ -376,7 +364,7 @@ def advance(
                 totals[at, 2, k] = _sum_of_lanes(lanes, 0)
             maxima[at] = _copy_sums(places, length, by_place, first)
     in_gaps = clear_gaps(a, gaps, by_place, maxima)
-    return _add_up(totals, in_gaps, _times(entering, V * len(gaps)), off, leave, enter)
+    return _add_up(totals, in_gaps, entering, V * len(gaps), off, leave, enter)
 
 
 @kernel

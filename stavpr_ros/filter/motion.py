@@ -301,7 +301,7 @@ def _excess(speed, changes, curve, decay):
         return 0.0
     means, expected = np.empty(len(COMPARED)), np.empty(len(COMPARED))
     for i in range(len(COMPARED)):
-        means[i] = min(_mean(changes[:, i]), 1.0)
+        means[i] = min(changes[:, i].mean(), 1.0)
         expected[i] = min(_expected_change(speed * COMPARED[i], curve, decay), 1.0)
     noise = (1 - means[0]) / max(1 - expected[0], MIN_SIMILARITY)
     noise, total = min(max(noise, MIN_SIMILARITY_RATIO), 1.0), 0.0
@@ -341,7 +341,7 @@ def _speed_likelihoods(
         by_apart[-1, apart - 1] = change_between(newest, moving[(moved - 1 - apart) % len(moving)])
     of_window[-1] = by_apart[-1, : len(COMPARED)]
     for apart in range(MAX_LAG):
-        off[apart] = np.log(_mean(by_apart[len(by_apart) - count :, apart]) + OFFSET)
+        off[apart] = np.log(by_apart[len(by_apart) - count :, apart].mean() + OFFSET)
     logs = np.zeros(len(expected))
     for v in range(len(expected)):
         for i in range(MAX_LAG):
@@ -349,11 +349,3 @@ def _speed_likelihoods(
                 product = (off[i] - expected[v, i]) * precisions[v, i, j]
                 logs[v] -= 0.5 * product * (off[j] - expected[v, j])
     return np.exp(exponent * np.maximum(logs - logs.max(), MIN_LOG_LIKELIHOOD))
-
-
-@kernel
-def _mean(values):
-    total = 0.0
-    for value in values:
-        total += value
-    return total / len(values)

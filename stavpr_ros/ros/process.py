@@ -3,11 +3,14 @@
 """Transport, start, spinning, discovery and end of every executable with a ROS node."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 import difflib
 import os
 from pathlib import Path
+import signal
+import socket
 import sys
+import threading
 import time
 import traceback
 from typing import Any, TypeVar
@@ -27,7 +30,8 @@ from stavpr_ros.errors import SettingsError, StavprError, UnavailableError
 from stavpr_ros.ros.rclpy_workarounds import log_failure, PromptExecutor, ros_arguments_checked
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
-SIGNAL_POLL = 0.2  # seconds until a signal is noticed
+SIGNAL_POLL = 0.2  # seconds until a signal is noticed by an executor that it does not wake
+LONG_POLL = 2.0  # seconds, by one that it wakes: each poll collects all entities of the node
 CALLBACK_SECONDS = 2.0  # for running callbacks at the end
 SERVICE_SECONDS = 2.0  # until a node shows its parameter service; tools may have none
 # read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
@@ -101,6 +105,35 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
             end_process(int(getattr(node, 'failed', False)))
 
 
+@contextmanager
+def waking(executor: Executor) -> Iterator[float]:
+    """
+    Let signals wake an executor, on the main thread; yield the longest wait, seconds.
+
+    Python's handlers run on the main thread, which a wait in C++ blocks.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield SIGNAL_POLL
+        return
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+
+    def wake() -> None:
+        while reader.recv(1):
+            executor.create_task(lambda: None)
+
+    before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    thread = threading.Thread(target=wake, name='signals', daemon=True)
+    thread.start()
+    try:
+        yield LONG_POLL
+    finally:
+        signal.set_wakeup_fd(before)
+        writer.close()
+        thread.join()
+        reader.close()
+
+
 def spin_until(node: Node, is_done: Callable[[], bool] = lambda: False, threads: int = 1) -> None:
     """
     Spin until ``is_done`` returns True or the context is shut down.
@@ -118,16 +151,17 @@ def spin_until(node: Node, is_done: Callable[[], bool] = lambda: False, threads:
     )
     executor.add_node(node)
     try:
-        while node.context.ok() and not is_done():
-            try:
-                with signals_deferred():
-                    executor.spin_once(timeout_sec=SIGNAL_POLL)
-            except (StavprError, ExternalShutdownException):
-                raise
-            except Exception:
-                if interrupted():  # inside a foreign library it may be raised as another error
+        with waking(executor) if threads > 1 else nullcontext(SIGNAL_POLL) as poll:
+            while node.context.ok() and not is_done():
+                try:
+                    with signals_deferred():
+                        executor.spin_once(timeout_sec=poll)
+                except (StavprError, ExternalShutdownException):
                     raise
-                log_failure(traceback.format_exc())
+                except Exception:
+                    if interrupted():  # inside a foreign library it may be raised as another error
+                        raise
+                    log_failure(traceback.format_exc())
     except ExternalShutdownException:
         pass
     finally:
