@@ -9,6 +9,7 @@ from stavpr_ros.commands.stavpr import main
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import decision
+from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges
 from stavpr_slam.pose_graph.transforms import exponentials
 from test_pose_graph import error
@@ -82,6 +83,39 @@ def test_errors_that_a_file_states_too_large_are_recognized(tmp_path, monkeypatc
     found = to_poses(graph.update(final=True))
     right = error(found, to_poses(truth(3))) < 0.2 and graph.accepted == 21
     assert right == (precise < decision.TIGHT)
+
+
+@pytest.mark.parametrize('kept', [decision.KEPT, 0.0])
+def test_closures_with_the_errors_that_a_file_states(data_folder, monkeypatch, kept):
+    """The odometry of the first half of intel alone has smaller errors than the file states."""
+    monkeypatch.setattr(decision, 'KEPT', kept)
+    edges = read_edges(str(data_folder / 'pose_graphs/intel.g2o'))
+    graph = graph_of([edge for edge in edges if max(edge[:2]) <= 900])
+    graph.update(final=True)
+    assert (graph.accepted == 387) == (kept > 0)
+
+
+def test_closures_that_agree_or_contradict_need_no_decision(tmp_path, monkeypatch):
+    """All are decided on where their number has grown by half."""
+    edges = read_edges(write(tmp_path / 'a.g2o', 3, 0.5))
+    whole = graph_of(edges)
+    whole.update(final=True)
+    odometry, closures = edges[: COUNT - 1], edges[COUNT - 1 :]
+    decided, decide = [], graph_module.decided
+
+    def recorded(chain, closures, measured, scales=None):
+        decided.append(scales is None)
+        return decide(chain, closures, measured, scales)
+
+    monkeypatch.setattr(graph_module, 'decided', recorded)
+    graph = graph_of([*odometry, *closures[:12]])
+    graph.update()
+    for each in graph_of(edges)._pending[12:]:
+        graph.add_closure(each)
+        graph.update()
+    assert decided.count(True) <= 5
+    assert len(decided) < 12
+    assert [each.accepted for each in graph.edges] == [each.accepted for each in whole.edges]
 
 
 @pytest.mark.parametrize(('freedom', 'stated'), [(6, 1.0), (3, 60.0)])

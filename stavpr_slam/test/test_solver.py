@@ -43,6 +43,19 @@ def moved(poses, x, at):
     return poses @ exponentials(twists)
 
 
+def derivatives(ends, motions, poses, at):
+    """Return the derivatives of all errors by the poses, by differences."""
+    size, h = N * len(at), 1e-6
+    columns = []
+    for k in range(size):
+        ahead, behind = (
+            errors_of(ends, motions, moved(poses, sign * h * np.eye(size)[k], at))[:, at]
+            for sign in (1, -1)
+        )
+        columns.append(((ahead - behind) / (2 * h)).ravel())
+    return np.array(columns).T
+
+
 @pytest.mark.parametrize('at', [PLANAR, SPATIAL])
 @pytest.mark.parametrize('turn', [1e-4, 0.1, 0.8])
 def test_step_is_that_of_gauss_and_newton(at, turn):
@@ -56,19 +69,30 @@ def test_step_is_that_of_gauss_and_newton(at, turn):
     np.testing.assert_allclose(
         squared, np.einsum('ni,nij,nj->n', errors, information, errors), rtol=1e-6, atol=1e-9
     )
-    size, h = N * len(at), 1e-6
-    J = np.empty((errors.size, size))
-    for k in range(size):
-        ahead, behind = (
-            errors_of(ends, motions, moved(poses, sign * h * np.eye(size)[k], at))[:, at]
-            for sign in (1, -1)
-        )
-        J[:, k] = ((ahead - behind) / (2 * h)).ravel()
+    J = derivatives(ends, motions, poses, at)
     W = block_diag(*(weights[:, None, None] * information))
     expected = moved(poses, -np.linalg.solve(J.T @ W @ J, J.T @ W @ errors.ravel()), at)
     result, determinant = solver.step(poses, weights)
     np.testing.assert_allclose(result, expected, atol=1e-4)
     assert determinant == pytest.approx(np.linalg.slogdet(J.T @ W @ J)[1] / 2, abs=1e-5)
+
+
+@pytest.mark.parametrize('at', [PLANAR, SPATIAL])
+def test_deviations_are_by_the_errors_of_both_ends(at):
+    ends, motions, information, poses = graph_of(at, 0.3)
+    chosen, weights = np.array([N, N + 1, N + 3]), np.ones(len(ends))
+    weights[chosen] = 0
+    solver = Solver(ends, motions, at)
+    solver.squared(poses, information)
+    errors, J = errors_of(ends, motions, poses)[:, at], derivatives(ends, motions, poses, at)
+    W = block_diag(*(weights[:, None, None] * information))
+    poses_covariance, expected = np.linalg.inv(J.T @ W @ J), []
+    for f in chosen:
+        own = J[f * len(at) : (f + 1) * len(at)]
+        spread = np.linalg.inv(information[f]) + own @ poses_covariance @ own.T
+        expected.append(errors[f] @ np.linalg.solve(spread, errors[f]))
+    found = solver.deviations(N, weights, chosen)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
 def test_pattern_of_more_factors_is_used_again():

@@ -28,6 +28,7 @@ LOOSENED = math.log(100)  # evidence from which the odometry is trusted less
 DOUBLED = math.log(20)  # evidence for each doubling of its errors beyond the settings
 AGAIN = 0.01  # parameter of graduated non-convexity: residuals of ten deviations count a little
 MAX_TRIED = 50  # closures that are tried one by one
+KEPT = 0.9  # of the closures, by an estimate with smaller errors than a file states
 DROPPED = 20  # that deviate most and are left out one by one
 STRAINED = 100.0  # squared deviations of a part of the odometry that may be a break
 GAP = 15.0  # meters that queries and places of an event are apart at most
@@ -278,9 +279,11 @@ class Decider:
             count, shape (n,), bool.
         """
         if self._measured:
-            scales = (decision.scales / TIGHT).clip(max=1.0)
-            information = self.information(scales)
-            taken, values = self._network.robust(information, decision.values, AGAIN)
+            for scales in (decision.scales / TIGHT).clip(max=1.0), np.ones_like(decision.scales):
+                information = self.information(scales)
+                taken, values = self._network.robust(information, decision.values, AGAIN)
+                if taken.sum() >= KEPT * decision.taken.sum():
+                    break
             if searches:
                 taken, values = self._improved(information, taken, values, False)
             return scales, values, taken

@@ -22,6 +22,7 @@ from stavpr_slam.pose_graph.transforms import body_covariance
 
 MAX_PENDING = 1000  # closures that wait for their odometry
 GROWN = 1.1  # factor on the number of closures from which scales and breaks are searched anew
+GROWN_MEASURED = 1.5  # the same of scales in measured graphs
 MAX_BREAKS = 4  # that are searched
 
 
@@ -196,9 +197,10 @@ class PoseGraph:
 
     def _solve(self, final: bool) -> Solution:
         last, (known, rejected) = self._solution, self._searched_at
+        grown = GROWN_MEASURED if self.settings.measured else GROWN
         if not (
-            final or len(self._known) > GROWN * known
-            or last.rejected > max(GROWN * rejected, breaks.SUPPORT)
+            final or len(self._known) > grown * known
+            or last.rejected > max(grown * rejected, breaks.SUPPORT)
         ):  # fmt: skip
             given = self.chain, self._closures, self.settings.measured
             return followed(*given, last) or decided(*given, last.decision.scales)

@@ -119,6 +119,17 @@ class Network:
         """Return the squared deviations of the closures, shape (n,)."""
         return self._solver.squared(values, odometry)[len(values) :]
 
+    def deviations(self, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """
+        Return by how much closures would deviate if they counted, squared, shape (n,).
+
+        :param weights: of all closures in the solution whose residuals were asked for at last.
+        :param chosen: numbers of n closures that have no weight.
+        """
+        before = len(self._variables)
+        whole = np.concatenate([np.ones(before), weights])
+        return self._solver.deviations(before, whole, chosen + before)
+
     def most_strained(self, odometry: np.ndarray, values: np.ndarray) -> tuple[int, float]:
         """Return the node behind the part of the odometry that deviates most, and how much."""
         squared = self._solver.squared(values, odometry)[: len(values)]

@@ -92,7 +92,15 @@ def decided(
 def followed(
     chain: KeyframeChain, closures: ClosureArrays, measured: bool, last: Solution
 ) -> Solution | None:
-    """Add new closures to the last solution; None = not all agree with it."""
+    """
+    Add new closures to the last solution, each of which agrees with it or contradicts it.
+
+    A closure agrees where its deviation is below the limit, by the errors of the solution at both
+    ends, with the odometry of the decision as well as of the estimate; it contradicts where it is
+    above in both.
+
+    :returns: None where that is not so.
+    """
     known, placement = len(last.accepted), last.placement
     if not last.counted.any() or len(placement.links) < len(chain.starts()):
         return None
@@ -100,17 +108,28 @@ def followed(
     if any(a != b and (a, b) not in placement.pairs for a, b in pairs):
         return None
     nodes = extended(chain, last.nodes, placement.links)
-    accepted = np.append(last.accepted, np.ones(len(closures) - known, bool))
-    used = closures[accepted]
+    number = np.arange(len(closures))
+    numbers = np.concatenate([np.flatnonzero(last.accepted), number[known:]])
+    used, first = closures[numbers], len(numbers) - len(closures) + known
     network = Network(chain, nodes, used, placement.links)
     decider = Decider(chain, network, nodes, measured)
     information, values = decider.information(last.scales), network.values(nodes)
-    new = network.residuals(information, values)[last.accepted.sum() :]
-    if (new > network.limit).any():
-        return None
-    counted = accepted.copy()
-    counted[accepted] = own = decider.counted(np.ones(len(used), bool), used.is_independent)
+    agree = (network.residuals(information, values) <= network.limit) | (
+        number[: len(used)] < first
+    )
+    far = np.flatnonzero(~agree)
+    if len(far):
+        before = np.append(last.counted[last.accepted], np.zeros(len(used) - first))
+        agree[far] = network.deviations(before, far) <= network.limit
+        network.residuals(decider.information(last.decision.scales), values)
+        if (network.deviations(before, far) > network.limit)[agree[far]].any():
+            return None
+    own = decider.counted(agree, used.is_independent)
     values, _ = decider.fit(information, own, values)
+    if (network.residuals(information, values)[far][agree[far]] > network.limit).any():
+        return None
+    accepted, counted = np.zeros((2, len(closures)), bool)
+    accepted[numbers[agree]], counted[numbers[own]] = True, True
     return replace(last, nodes=network.nodes(values), accepted=accepted, counted=counted)
 
 

@@ -258,10 +258,10 @@ def _queue(k, starts, rows, head, link, first):
 
 
 @kernel
-def _substitute(starts, rows, blocks, x):
-    """Solve the decomposed equations in place, x of shape (count, d) in the order of columns."""
+def _forward(starts, rows, blocks, first, x):
+    """Solve the lower half in place from a column on, x of shape (count, d) in their order."""
     count, d = x.shape
-    for j in range(count):
+    for j in range(first, count):
         for a in range(d):
             for c in range(a):
                 x[j, a] -= blocks[starts[j], a, c] * x[j, c]
@@ -270,6 +270,12 @@ def _substitute(starts, rows, blocks, x):
             for a in range(d):
                 for c in range(d):
                     x[rows[p], a] -= blocks[p, a, c] * x[j, c]
+
+
+@kernel
+def _backward(starts, rows, blocks, x):
+    """Solve the upper half in place."""
+    count, d = x.shape
     for j in range(count - 1, -1, -1):
         for p in range(starts[j] + 1, starts[j + 1]):
             for c in range(d):
@@ -293,11 +299,38 @@ def _solved(
     if np.isnan(determinant):
         return determinant
     x, twist = gradient[order], np.zeros(6)
-    _substitute(starts, rows, blocks, x)
+    _forward(starts, rows, blocks, 0, x)
+    _backward(starts, rows, blocks, x)
     for k in range(len(order)):
         for a in range(d):
             twist[at[a]] = x[k, a]
         _moved(poses[order[k]], twist, result[order[k]])
+    return determinant
+
+
+@kernel
+def _spread(
+    ends, errors, jacobians, information, weights, at, order, slots, starts, rows, chosen, result
+):
+    """Write the covariances of the motions between the ends of some of the factors."""
+    d, count = len(at), len(order)
+    blocks, gradient = np.empty((len(rows), d, d)), np.empty((count, d))
+    _assemble(ends, slots, errors, jacobians, information, weights, blocks, gradient)
+    determinant = _decompose(starts, rows, blocks)
+    column, x = np.empty(count, np.int64), np.empty((d, count, d))
+    for k in range(count):
+        column[order[k]] = k
+    for number in range(len(chosen)):
+        f = chosen[number]
+        i, j = ends[f]
+        for a in range(d):
+            x[a], x[a, column[j], a] = 0.0, 1.0
+            for b in range(d):
+                x[a, column[i], b] += jacobians[f, a, b]
+            _forward(starts, rows, blocks, min(column[i], column[j]), x[a])
+        for a in range(d):
+            for b in range(d):
+                result[number, a, b] = (x[a] * x[b]).sum()
     return determinant
 
 
@@ -418,6 +451,29 @@ class Solver:
         if not math.isfinite(determinant) or not np.isfinite(result).all():
             raise np.linalg.LinAlgError('the pose graph has no unique solution')
         return result, determinant
+
+    def deviations(self, count: int, weights: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """
+        Return the squared deviations of factors that do not count, by the errors of both ends.
+
+        At the poses that were linearized at last; a solution that counted such a factor as well
+        would deviate by as much in all.
+
+        :param count: number of poses.
+        :param weights: of the factors, (m,).
+        :param chosen: n of them, which have a first pose.
+        :returns: shape (n,); NaN = the poses have no unique solution.
+        """
+        used, d = self._pattern(weights > 0, count), len(self.at)
+        spread = np.empty((len(chosen), d, d))
+        _spread(
+            self.ends, self._errors, self._jacobians, self._local, weights, self.at, used.order,
+            used.slots, used.starts, used.rows, chosen, spread,
+        )  # fmt: skip
+        errors = self._errors[chosen]
+        inner = np.linalg.inv(np.linalg.inv(self._local[chosen]) + spread)
+        result: np.ndarray = np.einsum('ni,nij,nj->n', errors, inner, errors)
+        return result
 
     def _pattern(self, active: np.ndarray, count: int) -> Pattern:
         used = active.sum()
