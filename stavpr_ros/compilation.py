@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hwcap.h
 COMPILING = 'compiling kernels, once, one to two minutes'
-KERNELS = 253  # that `stavpr warm` compiles, for the progress bar
+KERNELS = 267  # that `stavpr warm` compiles, for the progress bar
 
 # Of numba's threading layers, the default's fallback aborts the process when two threads meet in
 # it.

@@ -158,7 +158,8 @@ class PathChoice:
         """Return the most probable column elsewhere, and its probability, 0 if none."""
         places, probabilities = chosen.places, chosen.probabilities
         near = self._layout.around(place, radius)
-        now, faint = self._filter.most_probable(_excluded(places, near, n))
+        parts = [np.arange(max(0, low), min(n, end)) for low, end in near.tolist()]
+        now, faint = self._filter.most_probable(np.sort(np.concatenate([*parts, places])))
         second = _best_beyond(places, probabilities, near)
         if second >= 0 and probabilities[second] >= faint * NEGLIGIBLE:
             return int(places[second]), float(probabilities[second])
@@ -236,20 +237,6 @@ def _check(
         if abs(places[i] - places[best]) <= BAND:
             probabilities[i] *= factor
     return int(np.argmax(np.where(own, probabilities, 0)))
-
-
-@kernel
-def _excluded(places: np.ndarray, near: np.ndarray, n: int) -> np.ndarray:
-    """Return places, and those of n in slices (m, 2), ascending; one may be there twice."""
-    excluded, count = (
-        np.empty(len(places) + (near[:, 1] - near[:, 0]).sum(), np.int64),
-        len(places),
-    )
-    excluded[:count] = places
-    for low, end in near:
-        for place in range(max(low, 0), min(end, n)):
-            excluded[count], count = place, count + 1
-    return np.sort(excluded[:count])
 
 
 @kernel
