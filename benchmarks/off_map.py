@@ -14,10 +14,10 @@ import sys
 import time
 from typing import Any
 
-from accuracy import extractors, FEATURES, long_cases, short_cases
+from accuracy import extractors, long_cases, short_cases
 from data import data_folder
 import numpy as np
-from off_map_page import DAY, JUMP, LEVEL, markdown, NIGHT, Results, summary_section
+from off_map_page import DAY, HYBRID, JUMP, KINDS, LEVEL, markdown, NIGHT, Results, summary_section
 from results import environment, options_parser, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
@@ -382,13 +382,17 @@ def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
     results: Results = {}
     for feature in features:
         try:
-            making = extractors(feature, folder)['robust']
+            making = (
+                FeatureExtractor(KINDS[HYBRID])
+                if feature == HYBRID
+                else extractors(feature, folder)['robust']
+            )
         except UnavailableError as error:
-            print(f'left out: {FEATURES[feature]}: {error}', file=sys.stderr)
+            print(f'left out: {KINDS[feature]}: {error}', file=sys.stderr)
             continue
         measurement = Measurement(feature, coarser)
         for pair in pairs_of(folder, feature, making):
-            print(f'{FEATURES[feature]}: {pair.name}', file=sys.stderr)
+            print(f'{KINDS[feature]}: {pair.name}', file=sys.stderr)
             measurement.pair(pair)
         paths = sorted(path for path in (folder / TOWER).iterdir() if path.is_dir())
         measurement.floors({path.name: extracted(open_source(path), making) for path in paths})
@@ -399,11 +403,11 @@ def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = options_parser(__doc__, 'gradient features, coarser steps; to off_map-quick')
-    kinds = tuple(FEATURES)
-    parser.add_argument('--features', nargs='+', choices=kinds, default=kinds)
+    parser.add_argument('--features', nargs='+', choices=tuple(KINDS), help='default: all')
     options = parser.parse_args(arguments)
     about, began = environment(named_commit=options.commit), time.perf_counter()
-    features, steps = (('g',), COARSER) if options.quick else (options.features, 1)
+    steps = COARSER if options.quick else 1
+    features = options.features or (['g'] if options.quick else list(KINDS))
     results = measure(data_folder(), features, steps)
     path = options.output / f'off_map{"-quick" if options.quick else ""}.json'
     step = 'each' if steps == 1 else f'every {steps}th'

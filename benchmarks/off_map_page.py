@@ -8,6 +8,8 @@ from typing import Any
 from accuracy import FEATURES
 from results import heading, table
 
+HYBRID = 'h'
+KINDS = FEATURES | {HYBRID: 'hybrid'}  # of features
 DAY, NIGHT = 'gardens_point', 'walk_night'
 JUMP = 'after a jump'  # from half of the query away
 LEVEL = 0.95  # declared probability whose precision the summary gives
@@ -137,14 +139,14 @@ def _begun(rows: dict[str, Any]) -> str:
 
 def summary_section(results: Results) -> list[str]:
     """Return the summary: a row a question, a column a kind of features."""
-    features = sorted({key.split('/')[1] for key in results}, key=list(FEATURES).index)
+    features = sorted({key.split('/')[1] for key in results}, key=list(KINDS).index)
     columns = {feature: summary(results, feature) for feature in features}
     labels = list(dict.fromkeys(label for column in columns.values() for label in column))
     lines = []
     for label in labels:
         cells = [columns[feature].get(label, ('-', '')) for feature in features]
         lines.append([label, *(text for cell in cells for text in cell)])
-    head = [title for feature in features for title in (FEATURES[feature], 'wanted')]
+    head = [title for feature in features for title in (KINDS[feature], 'wanted')]
     return table(['', *head], lines)
 
 
