@@ -87,7 +87,7 @@ def test_recent_windows_start_even_forget_and_trust_sure_ones_soon():
 def test_weak_windows_make_a_drive_less_likely_with_learned_features():
     """Where right windows are farther ahead, on floors that look alike, these are not right."""
     probabilities = []
-    for kind in ('gradient', 'hybrid'):
+    for kind in ('gradient', 'hybrid', 'unknown'):
         places, query = features_of(route_strips(0, 120)), features_of(route_strips(0, 120), 7.0)
         places, query = (
             replace(part, settings=replace(part.settings, kind=kind)) for part in (places, query)
@@ -95,6 +95,7 @@ def test_weak_windows_make_a_drive_less_likely_with_learned_features():
         recognizer = PlaceRecognizer(map_of(places), RecognizerSettings(mode='robust'))
         matches = recognize_all(recognizer, query)
         probabilities.append(np.array([match.probability for match in matches]))
-    gradient, hybrid = np.nan_to_num(probabilities)
+    gradient, hybrid, unknown = np.nan_to_num(probabilities)
+    assert unknown.tolist() == gradient.tolist()
     assert (hybrid <= gradient).all()
     assert hybrid[40:].mean() < 0.9 * gradient[40:].mean()

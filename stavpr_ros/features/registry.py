@@ -238,11 +238,11 @@ def settings_class(kind: str) -> Any:
 
 def likely_evidence(kind: str) -> float:
     """
-    Return the own evidence of a likely window with a kind of features.
+    Return the own evidence of a likely window with a kind of features, or one without an entry.
 
-    :raises SettingsError: no such kind.
+    Features of a map in memory can have any name.
     """
-    return _kind(kind).likely
+    return (KINDS.get(kind) or _all().get(kind) or Kind(None)).likely
 
 
 def _kind(name: str) -> Kind:
