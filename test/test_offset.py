@@ -5,14 +5,16 @@
 import cv2
 import numpy as np
 import pytest
-from stavpr_ros.errors import InputError
+from stavpr_ros.errors import ImageError, InputError
 from stavpr_ros.mapping import thumbnail_of
 from stavpr_ros.relative_pose import offset as module
+from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import (
     A,
     B,
     BLOCKS,
     describe_columns,
+    DISTANT,
     DRIFT,
     EVIDENCE,
     JUMP,
@@ -85,7 +87,7 @@ def plain_drifted(earlier):
 def test_kernels_equal_plain_sums():
     image = panorama(3)
     query, place = describe_columns(warped(image, 9, 4)), describe_columns(warped(image))
-    evidence, is_enough = module._evidence(query, place, OffsetFilter()._beside)
+    evidence, is_enough = module.block_evidence(query, place, OffsetFilter()._beside)
     expected, enough = plain_evidence(query, place)
     np.testing.assert_allclose(evidence, expected, rtol=0, atol=1e-4)
     np.testing.assert_array_equal(is_enough, enough)
@@ -144,6 +146,40 @@ def test_covered_camera_has_no_valid_offset_from_its_first_image():
     noise = rng.normal(20, 3, (HEIGHT, WIDTH, 3)).clip(0, 255).astype(np.uint8)
     for covered in (noise, np.zeros_like(noise)):
         assert not estimator.update(describe_columns(covered), place).is_valid
+
+
+def forward(image, outward):
+    """Return the middle of a panorama after a move forward; pixels outward at both sides."""
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    u = (x + 0.5 - WIDTH / 2) / (WIDTH / 2)
+    source = (PANORAMA - WIDTH) / 2 + x - outward * u * (DISTANT + abs(u))
+    return cv2.remap(image, source.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+
+
+@pytest.mark.parametrize('spacing', [0.5, 0.25])
+def test_lateral_offset_follows_from_the_expansion_between_places(spacing):
+    """With an expansion of 0.06 half widths per meter, 1 m has a parallax of 0.06 f widths."""
+    image, damaged = panorama(1), 3
+    places = [describe_columns(forward(image, 0.06 * spacing * k * WIDTH / 2)) for k in range(8)]
+
+    def columns(k):
+        if k == damaged:
+            raise ImageError('damaged', kind='damaged')
+        return places[k]
+
+    one = Offset(0.0, 0.01, 0.03, 1e6, 0.6, parallax_deviation=0.003)
+    expansion = Expansion(columns, np.arange(8) * spacing)
+    lateral, deviation = expansion.lateral(one, 4, 0.5)
+    assert lateral == pytest.approx(1.0, rel=0.2)
+    assert 0.1 < deviation < 0.5
+    assert np.isnan(expansion.lateral(one, 4, np.nan)).all()
+
+
+def test_lateral_offset_is_uncertain_where_places_are_at_rest():
+    place = describe_columns(warped(panorama()))
+    one = Offset(0.0, 0.01, 0.03, 1e6, 0.6, parallax_deviation=0.003)
+    lateral, deviation = Expansion(lambda _: place, np.zeros(12)).lateral(one, 4, 0.5)
+    assert deviation > lateral
 
 
 def test_image_of_another_type_is_rejected():

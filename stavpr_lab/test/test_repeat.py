@@ -19,6 +19,7 @@ from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
 from stavpr_lab.demonstration.street.street import CELL
 from stavpr_lab.demonstration.street.traverses import GOOD_LIGHT, RAINY_DUSK, Traverse, World
+from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 
 COVERED = 18.0  # seconds
@@ -108,3 +109,19 @@ def test_heading_on_the_other_lane_at_dusk_in_rain():
     rms = np.degrees(np.sqrt(np.mean(np.square(errors), axis=0)))
     assert rms[0] < 1.2
     assert rms[0] < 0.8 * rms[1]
+
+
+def test_lateral_offset_in_meters_at_dusk(taught):
+    columns = [describe_columns(taught.place_map.thumbnail(k)) for k in range(70)]
+    expansion = Expansion(columns.__getitem__, taught.run.distances[:70])
+    view = View(taught.world, CONDITIONS['dusk'])
+    for left in (1.0, -1.0):
+        estimator, results = OffsetFilter(), []
+        for k in range(30, 60, 2):
+            x, y, heading = taught.poses[k]
+            pose = x - left * math.sin(heading), y + left * math.cos(heading), heading
+            offset = estimator.update(describe_columns(view.image(np.array(pose), k)), columns[k])
+            results.append(expansion.lateral(offset, k, FOCAL))
+        lateral, deviation = np.median(results, axis=0)
+        assert lateral == pytest.approx(left, abs=0.4)
+        assert 0.1 < deviation < 1.0

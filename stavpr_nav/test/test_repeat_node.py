@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes teach and repeat over ROS: goals, offsets, velocities, bad input, the end."""
 
+from dataclasses import replace
 import math
 from pathlib import Path
 import time
@@ -24,7 +25,8 @@ from stavpr_nav.ros.repeat_node import RepeatNode
 from stavpr_nav.ros.teach_node import TeachNode
 from stavpr_nav.taught_run import read_velocities
 from stavpr_ros.errors import InputError, OutputError, SettingsError
-from stavpr_ros.mapping import load_map
+from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping.merging import select_places
 from stavpr_ros.relative_pose.offset import DISTANT
 from stavpr_ros.ros.messages import image_message
 from std_msgs.msg import Bool, Header
@@ -54,7 +56,7 @@ class Rover:
         subscribe(kind, 'cmd_vel', self.commands.append, 10)
         subscribe(Offset, 'repeat/offset', self.offsets.append, 10)
         self.client = ActionClient(self.node, Repeat, 'repeat')
-        self.images, self.map_id = images, map_id
+        self.images, self.map_id, self.seam = images, map_id, None
         self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
         self.node.create_timer(PERIOD, self.look)
 
@@ -73,7 +75,10 @@ class Rover:
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
         if self.commands and hasattr(self.commands[-1], 'linear'):
             step = self.commands[-1].linear.x * PERIOD
-            self.place = min(self.place + step, len(self.images) - 1)
+            self.place += step
+            last = len(self.images) - 1
+            if self.place >= last:
+                self.place = last if self.seam is None else self.place - last + self.seam
 
     def until(self, done):
         end = time.monotonic() + TIMEOUT
@@ -113,7 +118,8 @@ def repeat(context, rover, map_file):
     made = []
 
     def make(**parameters):
-        node = RepeatNode(context=context, **overrides(map_path=map_file, **FAST | parameters))
+        values = {'map_path': map_file} | FAST | parameters
+        node = RepeatNode(context=context, **overrides(**values))
         made.append(node)
         rover.executor.add_node(node)
         return node
@@ -147,6 +153,7 @@ def test_goal_is_reached_with_feedback_and_velocities_stop(rover, repeat):
     shift = offset.shift - DISTANT * offset.parallax
     assert offset.heading == pytest.approx(math.atan(shift * 2), abs=1e-6)
     assert abs(offset.heading) < 0.02
+    assert abs(offset.lateral) < 2 * offset.lateral_deviation
 
 
 def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rover, repeat):
@@ -181,6 +188,24 @@ def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rove
     answer = rover.result_of(handle.get_result_async())
     assert answer.result.code == Repeat.Result.CANCELED
     assert rover.rests()
+
+
+def test_two_laps_of_a_closed_map(rover, repeat, map_file, tmp_path):
+    """Its 10 places end where place 2 is; the goal is the second pass of place 5."""
+    same_as = np.arange(10, dtype=np.int32)
+    same_as[9] = 2
+    closed = replace(select_places(load_map(map_file), np.arange(10)), same_as=same_as)
+    save_map(closed, tmp_path / 'closed.stavpr')
+    node = repeat(map_path=str(tmp_path / 'closed.stavpr'))
+    assert node._run.seam == 2
+    rover.images, rover.seam, rover.map_id = rover.images[:10], 2, node._map.map_id
+    handle = rover.send(place_index=5, start_index=3, laps=2)
+    assert handle.accepted
+    result = rover.result_of(handle.get_result_async()).result
+    assert (result.code, result.place_index, result.laps) == (Repeat.Result.REACHED, 5, 1)
+    assert result.distance == pytest.approx(9, abs=1.5)
+    assert rover.rests()
+    assert max(one.laps for one in rover.feedback) == 1
 
 
 def test_node_that_ends_stops_the_robot(rover, repeat):

@@ -40,13 +40,16 @@ PEAK = 5  # pixels from the most probable shift that are one peak
 MIN_RATIO = 9.0  # of the peak of a valid offset to the second peak
 MIN_SIMILARITY = 0.12  # of a valid offset
 DISTANT = 0.3  # parallax of the distant scene, which is not infinitely far, over `parallax`
-FLOOR, INFLATION = 0.5, 2.0  # pixels of a sharp peak; errors of neighboring columns are dependent
+# Pixels of a sharp peak; errors of neighboring columns are dependent.
+FLOOR, INFLATION = 0.5, 2.0
+FLOOR_B = 0.007  # of the parallax: of a step of B
 # Deviations of the prior: h in widths; a and b in half widths.
 PRIOR_H, PRIOR_A, PRIOR_B = 0.25, 0.08, 0.15
 A, B = (axis.ravel() for axis in np.meshgrid(
     np.linspace(-0.1, 0.1, 5), np.linspace(-0.3, 0.3, 13), indexing='ij'
 ))  # fmt: skip
 SHIFTS = np.arange(-REACH, REACH + 1)
+BLOCK_CENTERS = ((np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5) * 2
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Offset:
     :param ratio: of the probabilities of the peak and of the second peak.
     :param similarity: mean similarity of the columns of this image alone at the peak; about 0 for
         a covered camera, or for images of other places.
+    :param parallax_deviation: NaN = unknown.
     """
 
     shift: float
@@ -69,6 +73,7 @@ class Offset:
     parallax: float
     ratio: float
     similarity: float
+    parallax_deviation: float = math.nan
 
     @property
     def is_similar(self) -> bool:
@@ -125,7 +130,7 @@ class OffsetFilter:
     """Estimates the offset of each image of a sequence."""
 
     def __init__(self) -> None:
-        u = ((np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5) * 2
+        u = BLOCK_CENTERS
         beside = (A[:, None] * u * abs(u) + B[:, None] * abs(u)) * WIDTH / 2
         self._beside = np.rint(beside).astype(np.int64)
         of_model = (A / PRIOR_A) ** 2 + (B / PRIOR_B) ** 2
@@ -142,7 +147,7 @@ class OffsetFilter:
 
         :param query, place: their columns, as :func:`describe_columns` returns them.
         """
-        evidence, is_covered = _evidence(query, place, self._beside)
+        evidence, is_covered = block_evidence(query, place, self._beside)
         self._earlier = FORGETTING * _drifted(self._earlier) + evidence
         log = np.where(is_covered, self._earlier + self._prior, -np.inf)
         posterior = np.exp(log - log.max())
@@ -154,12 +159,17 @@ class OffsetFilter:
         probability = float(by_shift[part].sum())
         shift = float(by_shift[part] @ SHIFTS[part]) / probability
         variance = float(by_shift[part] @ (SHIFTS[part] - shift) ** 2) / probability
-        parallax = float(posterior[:, part].sum(axis=1) @ B) / probability / 2
+        by_model = posterior[:, part].sum(axis=1) / probability
+        parallax = float(by_model @ B) / 2
+        variance_b = INFLATION**2 * float(by_model @ (B / 2 - parallax) ** 2)
         deviation = INFLATION * math.sqrt(variance + FLOOR**2)
         second = masses[abs(SHIFTS - SHIFTS[peak]) > 2 * PEAK].max()
         ratio = masses[peak] / max(second, 1e-12)
         similarity = float(evidence[:, part].max()) / EVIDENCE
-        return Offset(shift / WIDTH, deviation / WIDTH, parallax, float(ratio), similarity)
+        return Offset(
+            shift / WIDTH, deviation / WIDTH, parallax, float(ratio), similarity,
+            math.sqrt(variance_b + FLOOR_B**2),
+        )  # fmt: skip
 
 
 # ------------------------------------------------ kernels
@@ -174,7 +184,7 @@ def _dot(x: np.ndarray, y: np.ndarray) -> np.float32:
 
 
 @kernel
-def _evidence(
+def block_evidence(
     query: np.ndarray, place: np.ndarray, beside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """

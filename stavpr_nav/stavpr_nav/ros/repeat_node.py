@@ -31,6 +31,7 @@ from stavpr_nav.taught_run import read_velocities, taught_run
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.mapping import open_map
 from stavpr_ros.mapping.camera import FORWARD
+from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
 from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.messages import camera_of, nanoseconds
@@ -82,7 +83,8 @@ class RepeatNode(Node):
             raise InputError(f'{values["map_path"]} has no thumbnails: expected images of places')
         velocities = read_velocities(values['run_path']) if values['run_path'] else None
         self._run = taught_run(self._map, velocities)
-        self._columns = lru_cache(8)(self._columns_of)
+        self._columns = lru_cache(32)(self._columns_of)
+        self._expansion = Expansion(self._columns, self._run.distances)
         self._filter, self._focal = OffsetFilter(), math.nan
         blank = describe_columns(np.zeros((48, 64, 3), np.uint8))
         self._filter.update(blank, blank)  # compiles its kernels
@@ -213,7 +215,8 @@ class RepeatNode(Node):
         if 0 <= place < len(self._map):
             columns = describe_columns(decode_message(image))
             offset = self._filter.update(columns, self._columns(place))
-            self._offset.publish(offset_message(offset, image.header, self._focal, {
+            lateral = self._expansion.lateral(offset, place, self._focal)
+            self._offset.publish(offset_message(offset, lateral, image.header, self._focal, {
                 'map_id': self._map.map_id, 'place_index': place, 'place_id': self._map.ids[place],
             }))  # fmt: skip
         else:
@@ -322,18 +325,23 @@ class RepeatNode(Node):
 
 
 def offset_message(
-    offset: Offset, header: Any, focal: float, place: Mapping[str, Any]
+    offset: Offset,
+    lateral: tuple[float, float],
+    header: Any,
+    focal: float,
+    place: Mapping[str, Any],
 ) -> OffsetMessage:
     """
     Return the message of an offset.
 
+    :param lateral: meters to the left of the path, and their deviation.
     :param focal: focal length in widths of the image; NaN = unknown.
     """
     return OffsetMessage(
         header=header, **place, is_valid=offset.is_valid,
         heading=offset.heading(focal), heading_deviation=offset.deviation / focal,
         shift=offset.shift, shift_deviation=offset.deviation, parallax=offset.parallax,
-        similarity=offset.similarity,
+        lateral=lateral[0], lateral_deviation=lateral[1], similarity=offset.similarity,
     )  # fmt: skip
 
 
