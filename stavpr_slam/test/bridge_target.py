@@ -81,9 +81,9 @@ class Target(Node):
         self.edges: list[dict] = []
         targets = {'rtabmap': self._rtabmap, 'hydra': self._hydra, 'kimera': self._kimera}
         self.keyframes = targets.get(target, self._swarm)()
-        topics = {'odom': Odometry, 'stavpr/loop_closure': LoopClosure}
-        self.odometry, self.closures = (
-            self.create_publisher(kind, topic, QOS) for topic, kind in topics.items()
+        self.closures = self.create_publisher(LoopClosure, 'stavpr/loop_closure', QOS)
+        self.odometry, self.other = (
+            self.create_publisher(Odometry, topic, QOS) for topic in ('odom', 'place_odom')
         )
         self.received = False  # the bridge has received a closure
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
@@ -201,13 +201,11 @@ class Target(Node):
             self.create_publisher(KeyframeOdom, topic, QOS)
             for topic in ('cslam/keyframe_odom', '/r1/cslam/keyframe_odom')
         ]
-        other = self.create_publisher(Odometry, 'place_odom', QOS)
 
         def publish(number: int, stamp: int, pose) -> None:
             message = KeyframeOdom(id=number)
             message.odom = odometry_message(stamp, to_poses(pose))
             for publisher in publishers:
-                other.publish(message.odom)
                 publisher.publish(message)
 
         return publishers[0], publish
@@ -246,7 +244,8 @@ def main(target: str, on_map: bool) -> None:
     for message in closures(drive, on_map):
         node.closures.publish(message)
     for image in range(2 * LAP - 1):
-        node.odometry.publish(odometry_message(stamp_of(image), to_poses(drive.at(image))))
+        for each in (node.odometry, node.other):
+            each.publish(odometry_message(stamp_of(image), to_poses(drive.at(image))))
         if image % KEYFRAME == 0:  # known before the odometry after it
             publish(image // KEYFRAME + 1, stamp_of(image + 0.3), drive.at(image + 0.3))
         executor.spin_once(timeout_sec=0.01)

@@ -218,6 +218,14 @@ class KeyframeChain:
                 return node, inverse(self.transforms[node]) @ matrices(each.track.at(stamp))
         return None
 
+    def motion(self, start: int, end: int, robot: str = '') -> np.ndarray | None:
+        """Return the odometry between two stamps (ns), shape (4, 4); None = it is unknown."""
+        first, last = self.find(start, robot), self.find(end, robot)
+        if first is None or last is None or self.session[first[0]] != self.session[last[0]]:
+            return None
+        before, after = (self.transforms[node] @ motion for node, motion in (first, last))
+        return inverse(before) @ after
+
     def trajectory(
         self, solved: np.ndarray, robot: str = ''
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from geometry_msgs.msg import Point
 import numpy as np
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.units import SECOND
@@ -15,6 +16,8 @@ from stavpr_slam.pose_graph.alignment import APPEARANCE
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 ACCEPTED, REJECTED = ColorRGBA(r=0.1, g=0.7, b=0.2, a=0.8), ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.5)
 
 

@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
@@ -36,14 +36,18 @@ from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, repeat_responses
 from stavpr_slam.pose_graph import ChainSettings, GraphSettings
 from stavpr_slam.ros.correction import LEVER, LimitedCorrection
-from stavpr_slam.ros.graph_messages import closure_of, edge_markers, path_bytes
+from stavpr_slam.ros.graph_messages import (
+    closure_of,
+    CLOSURE_QOS,
+    edge_markers,
+    ODOMETRY_QOS,
+    path_bytes,
+)
 from stavpr_slam.ros.graph_process import GraphProcess, RobotOdometry, Snapshot
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD = 1.0  # seconds between two diagnostics
 UNUSABLE = {  # counts of closures without a measurement, by the source of the relative pose
     RelativePose.REFUTED: 'refuted closures',

@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.ros.diagnostics import one_status
@@ -23,10 +22,8 @@ from stavpr_slam.ros.bridges.external_keyframes import (
     keyframe_edge,
     KeyframeEdge,
 )
-from stavpr_slam.ros.graph_messages import closure_of, pose_array
+from stavpr_slam.ros.graph_messages import closure_of, CLOSURE_QOS, ODOMETRY_QOS
 
-CLOSURE_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-ODOMETRY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 PERIOD = 1.0  # seconds between two diagnostics
 MAX_PENDING = 1000  # closures that wait for keyframes
 REMEDIES = {
@@ -191,7 +188,7 @@ class EdgeBridge(Bridge):
 
     def _on_odometry(self, message: Odometry, robot: int) -> None:
         try:
-            self.keyframes[robot].add_odometry(
+            self.keyframes[robot].odometry.add(
                 nanoseconds(message.header.stamp), odometry_pose(message)
             )
         except InputError as error:
@@ -229,13 +226,7 @@ class EdgeBridge(Bridge):
             if closure.query_stamp > queries.newest or not len(places):
                 waiting.append((message, closure))
                 continue
-            known = message.has_poses
-            query = queries.near(
-                closure.query_stamp, pose_array(message.query_pose) if known else None
-            )
-            place = places.near(
-                closure.place_stamp, pose_array(message.place_pose) if known else None
-            )
+            query, place = queries.near(closure.query_stamp), places.near(closure.place_stamp)
             if query is None or place is None:
                 self.counts['no_keyframe'] += 1
             elif (place[0], query[0]) in self._sent or (

@@ -6,10 +6,11 @@ from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
-from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
+from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
+from stavpr_slam.pose_graph.path_errors import OdometryNoise
 
 MAX_KEYFRAMES = 1_000_000
 
@@ -32,7 +33,7 @@ class KeyframeEdge:
 
 class ExternalKeyframes:
     """
-    Keyframes by their stamps, with the odometry there.
+    Keyframes by their stamps, and the odometry between them.
 
     :param max_gap: seconds between an image and its keyframe at most.
     """
@@ -41,9 +42,7 @@ class ExternalKeyframes:
         self._max_gap = round(max_gap * SECOND)
         self._stamps: list[int] = []
         self._numbers: list[int] = []
-        self._poses: dict[int, np.ndarray] = {}  # by stamp
-        self._waiting: list[int] = []  # stamps of keyframes that wait for the odometry after them
-        self._odometry = Trajectory(timeout=0.05)
+        self.odometry = KeyframeChain(ChainSettings(), OdometryNoise())
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -61,38 +60,13 @@ class ExternalKeyframes:
             return
         self._stamps.insert(i, stamp)
         self._numbers.insert(i, number)
-        self._waiting.append(stamp)
         if len(self._stamps) > MAX_KEYFRAMES:
-            self._poses.pop(self._stamps.pop(0), None)
-            del self._numbers[0]
-        self._find_poses()
+            del self._stamps[0], self._numbers[0]
 
-    def add_odometry(self, stamp: int, pose: np.ndarray) -> None:
+    def near(self, stamp: int) -> tuple[int, np.ndarray] | None:
         """
-        Add the odometry; only its last poses are kept.
+        Return the nearest keyframe, and the transform (4, 4) from it to a stamp (ns).
 
-        :param stamp: ns.
-        :param pose: shape (7,).
-        :raises InputError: an invalid pose or stamp.
-        """
-        self._odometry.add(stamp, pose)
-        if self._waiting:
-            self._find_poses()
-
-    def _find_poses(self) -> None:
-        for stamp in self._waiting[:]:
-            pose = self._odometry.at(stamp)
-            if pose is not None:
-                self._poses[stamp] = pose
-                self._waiting.remove(stamp)
-        del self._waiting[:-100]
-
-    def near(self, stamp: int, pose: np.ndarray | None) -> tuple[int, np.ndarray] | None:
-        """
-        Return the nearest keyframe, and the transform (4, 4) from it to a stamp.
-
-        :param stamp: ns.
-        :param pose: odometry at the stamp, shape (7,); None = unknown.
         :returns: None without a keyframe that is near and whose motion to the stamp is known.
         """
         i = bisect_left(self._stamps, stamp)
@@ -100,12 +74,11 @@ class ExternalKeyframes:
         if not around:
             return None
         best = min(around, key=lambda index: abs(self._stamps[index] - stamp))
-        found = self._stamps[best]
-        if found == stamp:
+        if self._stamps[best] == stamp:
             return self._numbers[best], np.eye(4)
-        if abs(found - stamp) > self._max_gap or pose is None or found not in self._poses:
+        motion = self.odometry.motion(self._stamps[best], stamp)
+        if abs(self._stamps[best] - stamp) > self._max_gap or motion is None:
             return None
-        motion = inverse(matrices(self._poses[found])) @ matrices(pose)
         return self._numbers[best], motion
 
 

@@ -4,11 +4,11 @@
 
 from typing import Any
 
-from geometry_msgs.msg import Transform, Vector3
+from geometry_msgs.msg import Transform
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
 from stavpr_ros.mapping.transforms import to_poses
-from stavpr_ros.ros.messages import nanoseconds, pose_message
+from stavpr_ros.ros.messages import nanoseconds, transform_message
 from stavpr_slam.ros.bridges.bridge import EdgeBridge, interfaces
 from stavpr_slam.ros.bridges.external_keyframes import body_information, KeyframeEdge
 from stavpr_slam.ros.bridges.poses import PoseBridge
@@ -19,9 +19,7 @@ USER_CLOSURE = 4  # rtabmap::Link::kUserClosure
 
 def transform_of(transform: np.ndarray) -> Transform:
     """Return a transform (4, 4) as a message."""
-    pose = pose_message(to_poses(transform))
-    p = pose.position
-    return Transform(translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=pose.orientation)
+    return transform_message(to_poses(transform), '', '').transform
 
 
 class RtabmapBridge(EdgeBridge):
