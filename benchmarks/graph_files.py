@@ -34,7 +34,7 @@ from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph import g2o, PoseGraph
 from stavpr_slam.pose_graph.g2o import Edge, graph_of, read_edges
-from stavpr_slam.pose_graph.transforms import adjoints, logarithms
+from stavpr_slam.pose_graph.transforms import adjoints
 from tqdm import tqdm
 
 FILES = 'MIT', 'intel', 'manhattan', 'smallGrid3D', 'sphere2500', 'parking-garage'
@@ -135,7 +135,7 @@ def consistent(edges: list[Edge]) -> np.ndarray:
         for motion, errors in parts:
             turn = adjoints(motion)
             spread = spread + turn @ errors @ turn.swapaxes(1, 2)
-        off = logarithms(loop)
+        off = np.array([gtsam.Pose3.Logmap(gtsam.Pose3(each)) for each in loop])
         agree[i] = np.einsum('ni,nij,nj->n', off, np.linalg.inv(spread), off) < limit
     agree &= agree.T
     np.fill_diagonal(agree, False)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Graphs of other programs: g2o files in two and three dimensions, with false closures."""
 
+from motions import exponentials
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,7 +12,6 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import decision
 from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges
-from stavpr_slam.pose_graph.transforms import exponentials
 from test_pose_graph import error
 
 SIDE, LAPS = 12, 3

@@ -5,6 +5,7 @@
 from dataclasses import replace
 from unittest.mock import Mock
 
+from motions import exponentials
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import align_maps, Closure, optimize, PoseGraph
 from stavpr_slam.pose_graph import graph as graph_module
 from stavpr_slam.pose_graph.files import save_graph
-from stavpr_slam.pose_graph.transforms import body_covariance, exponentials, planar_poses
+from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
 
 SECOND = 10**9
 LAP = 100  # images of 2 m

@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 
+from motions import exponentials
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
@@ -17,7 +18,7 @@ from stavpr_slam.pose_graph import (
     sessions,
     solution,
 )
-from stavpr_slam.pose_graph.transforms import adjoints, exponentials, planar_poses
+from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 from test_pose_graph import carried_drive, circle, closure, error, LAP, odometry_of, SECOND
 
 

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps of the pose graph's solver, beside a dense solution whose derivatives are differences."""
 
+from motions import exponentials, logarithms
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.solver import Solver
-from stavpr_slam.pose_graph.transforms import exponentials, logarithms
 
 PLANAR, SPATIAL = np.array([3, 4, 2]), np.arange(6)
 N = 12

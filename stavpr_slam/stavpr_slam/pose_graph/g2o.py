@@ -7,11 +7,12 @@ The information of an edge has the translation first, and in three dimensions th
 vector of a quaternion, half of the rotation.
 """
 
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
 from stavpr_slam.pose_graph.graph import GraphSettings, PoseGraph
@@ -20,6 +21,7 @@ from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 
 HALF = np.diag([1.0, 1, 1, 2, 2, 2])
 OUT_OF_PLANE = 1e4  # information of z, roll and pitch that a plane's edges are given
+ORDER = [3, 4, 5, 0, 1, 2]  # rotation first, or translation
 Edge = tuple[int, int, np.ndarray, np.ndarray]  # start, end, motion (4, 4), information (6, 6)
 
 
@@ -45,8 +47,7 @@ def g2o_text(graph: PoseGraph) -> str:
 
 
 def _edge_text(start: int, end: int, transform: np.ndarray, covariance: np.ndarray) -> str:
-    order = [3, 4, 5, 0, 1, 2]
-    information = np.linalg.inv(covariance)[np.ix_(order, order)]
+    information = np.linalg.inv(covariance)[np.ix_(ORDER, ORDER)]
     upper = (HALF @ information @ HALF)[np.triu_indices(6)]
     return f'EDGE_SE3:QUAT {start} {end} {_numbers(to_poses(transform))} {_numbers(upper)}'
 
@@ -128,18 +129,12 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
         )
     infinite = ChainSettings(distance=0.0, angle=0.0, max_gap=np.inf, max_speed=np.inf)
     graph = PoseGraph(GraphSettings(infinite, measured=True))
-    pose, spread = np.eye(4), np.zeros((6, 6))
-    graph.add_odometry(SECOND, to_poses(pose), covariance=spread)
-    for i in range(first, first + count):
-        _, _, motion, information = odometry[i]
-        pose = pose @ motion
-        turn, order = adjoints(pose[None])[0], [3, 4, 5, 0, 1, 2]
-        spread = spread + turn @ np.linalg.inv(information)[np.ix_(order, order)] @ turn.T
-        back = np.zeros((6, 6))  # about the node, as in geometry_msgs/PoseWithCovariance
-        back[:3, 3:] = back[3:, :3] = np.eye(3)
-        back[:3, :3] = -cross(pose[None, :3, 3])[0]
-        covariance = back @ spread @ back.T
-        graph.add_odometry((i - first + 2) * SECOND, to_poses(pose), covariance=covariance)
+    _, _, motions, given = zip(*(odometry[i] for i in range(first, first + count)), strict=True)
+    poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
+    for number, pose in enumerate(to_poses(poses), 1):
+        graph.add_odometry(number * SECOND, pose)
+    turn, errors = adjoints(poses[1:]), np.linalg.inv(given)[:, ORDER][:, :, ORDER]
+    graph.chain.spread[1:] = np.cumsum(turn @ errors @ turn.swapaxes(1, 2), axis=0)
     for start, end, motion, information in closures:
         turn = np.kron(np.eye(2), motion[:3, :3])  # to the axes of the start
         covariance = turn @ np.linalg.inv(information) @ turn.T

@@ -57,7 +57,8 @@ class KeyframeChain:
     Arrays of N nodes: ``stamps`` (ns), ``transforms`` in the odometry of its session, or in the
     map, (N, 4, 4), ``travelled`` (m), ``session`` (negative = fixed), ``recording`` (the session
     before splits), ``previous`` (the node before in its session, -1 = none), ``robot`` (number in
-    ``robots``), and for :meth:`path_errors` ``origin`` (3,) and ``spread`` (6, 6).
+    ``robots``), and for :meth:`path_errors` ``origin`` (3,) and ``spread`` (6, 6): the sum of the
+    covariances of the steps, in the axes of the odometry at ``origin``.
     """
 
     FIXED = -1

@@ -6,9 +6,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph.keyframes import KeyframeChain
-from stavpr_slam.pose_graph.transforms import exponentials, logarithms
 
 LONGEST = 10  # keyframes of a run
 
@@ -75,7 +75,10 @@ class Runs:
         free = np.flatnonzero(~self.variable)
         result[free] = values[self.before[free]] @ self.motion[free]
         inner = free[self.after[free] >= 0]
-        before, after = self.before[inner], self.after[inner]
-        off = logarithms(values[before] @ self.motion[after] @ inverse(values[after]))
-        result[inner] = exponentials(-self.share[inner, None] * off) @ result[inner]
+        share, after = self.share[inner, None], self.after[inner]
+        end = values[self.before[inner]] @ self.motion[after]
+        turn = Rotation.from_matrix(values[after, :3, :3] @ end[:, :3, :3].swapaxes(1, 2))
+        turned = Rotation.from_rotvec(share * turn.as_rotvec()).as_matrix()
+        result[inner, :3, :3] = turned @ result[inner, :3, :3]
+        result[inner, :3, 3] += share * (values[after] - end)[:, :3, 3]
         return result
