@@ -203,28 +203,22 @@ class Decider:
                     taken, values, evidence, changed = other, moved, found, True
         return taken, values
 
-    def at(self, scales: np.ndarray, near: Decision | None = None) -> Decision:
+    def at(self, scales: np.ndarray, thorough: bool = False) -> Decision:
         """
         Decide with an odometry.
 
         :param scales: factors on its errors, of each robot.
-        :param near: a decision with a tighter one, to begin at where the odometry is too far off,
-            and to search thoroughly.
+        :param thorough: closures of a measured graph are added and left out one by one.
         """
         network = self._network
         information = network.odometry(scales[self._chain.robot])
         none, start = np.zeros(len(network.query), bool), self._start
         try:
-            try:
-                taken, values = network.robust(information, start)
-            except np.linalg.LinAlgError:
-                if near is None:
-                    raise
-                taken, values = network.robust(information, near.values, AGAIN)
+            taken, values = network.robust(information, start)
             tried, evidence = [], self._evidence(information, taken, values)
             if taken.any():  # closures beside them may agree by now
                 tried.append(network.robust(information, values, AGAIN))
-            if self._measured and near is not None and scales.min() >= 1:
+            if thorough:
                 begins = *tried, (none, start)
                 tried += [self._improved(information, *each, True) for each in begins]
             for more, moved in tried:
@@ -255,7 +249,8 @@ class Decider:
         if self._measured:
             best = better(best, self.at(np.full(robots, PRECISE)))
         for scale in SCALES[1 : 4 if self._measured else None]:
-            tried.append(self.at(np.full(robots, scale), tried[-1]))
+            thorough = self._measured and scale >= 1
+            tried.append(self.at(np.full(robots, scale), thorough))
             best = better(best, tried[-1])
             if best.is_published and all(
                 each.evidence < best.evidence - LOOSENED for each in tried[-2:]

@@ -69,7 +69,7 @@ class PoseGraph:
         self._known: list[Closure] = []  # those between nodes
         self._closures: ClosureArrays = between_nodes([])  # of them
         self._solution = NOTHING
-        self._searched_at = 0, 0  # closures, and rejected ones, of the last search
+        self._searched = 0  # closures of the last search
         self.counts: Counter[str] = Counter()
 
     @property
@@ -196,13 +196,9 @@ class PoseGraph:
         return self.solved
 
     def _solve(self, final: bool) -> Solution:
-        last, (known, rejected) = self._solution, self._searched_at
+        last, given = self._solution, (self.chain, self._closures, self.settings.measured)
         grown = GROWN_MEASURED if self.settings.measured else GROWN
-        if not (
-            final or len(self._known) > grown * known
-            or last.rejected > max(grown * rejected, breaks.SUPPORT)
-        ):  # fmt: skip
-            given = self.chain, self._closures, self.settings.measured
+        if not final and len(self._known) <= grown * self._searched:
             return followed(*given, last) or decided(*given, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
@@ -212,7 +208,7 @@ class PoseGraph:
             if better is None:
                 break
             found = better
-        self._searched_at = len(self._known), found.rejected
+        self._searched = len(self._known)
         return found
 
     def _decided(self) -> Solution:
