@@ -78,7 +78,7 @@ class KeyframeChain:
         self.sessions = 0
         self._fixed: dict[tuple[str, int], int] = {}
         self._cuts: dict[int, int] = {}  # first nodes after splits, and the nodes before
-        self.breaks: list[str] = []
+        self.breaks: list[tuple[str, str]] = []  # robot and reason
 
     def __len__(self) -> int:
         return self._count
@@ -111,7 +111,7 @@ class KeyframeChain:
         cause = self._break(current, stamp, pose)
         if current is None or cause:
             if current is not None:
-                self.breaks.append(cause)
+                self.breaks.append((robot, cause))
             track = OdometryTrack(self._settings.distance, self._settings.angle)
             current = OdometryRecording(robot, track, (stamp, pose), covariance)
             self._current[robot] = current

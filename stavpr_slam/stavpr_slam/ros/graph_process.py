@@ -93,7 +93,7 @@ class GraphServer:
 
     def __init__(self, settings: GraphSettings, origins: dict[str, np.ndarray]) -> None:
         self._graph, self._origins = PoseGraph(settings), origins
-        self._corrections, self._breaks = dict(origins), list[tuple[str, str]]()
+        self._corrections = dict(origins)
 
     def serve(
         self,
@@ -126,7 +126,7 @@ class GraphServer:
         except Exception as error:  # one solution failed: the next may succeed
             failure = saved = f'{type(error).__name__}: {error}'
         return Snapshot(
-            self._corrections, self._values(), self._breaks, invalid, failure, saved, paths
+            self._corrections, self._values(), graph.chain.breaks, invalid, failure, saved, paths
         )
 
     def _add(self, item: RobotOdometry | Closure) -> None:
@@ -138,10 +138,7 @@ class GraphServer:
         if item.covariance is not None:
             turn = np.kron(np.eye(2), origin[:3, :3])
             covariance = turn @ np.array(item.covariance).reshape(6, 6) @ turn.T
-        breaks = self._graph.chain.breaks
-        known = len(breaks)
         self._graph.add_odometry(item.stamp, to_poses(origin @ pose), item.robot, covariance)
-        self._breaks += [(item.robot, reason) for reason in breaks[known:]]
 
     def _save(self, path: str, force: Force) -> int | str:
         if not len(self._graph.update(final=True)):
@@ -159,7 +156,7 @@ class GraphServer:
             'nodes': len(graph.chain),
             'sessions': graph.chain.sessions,
             'breaks': '; '.join(
-                f'{robot} {reason}'.strip() for robot, reason in self._breaks[-3:]
+                f'{robot} {reason}'.strip() for robot, reason in graph.chain.breaks[-3:]
             ),
             'breaks_by_closures': graph.splits,
             'accepted_closures': graph.accepted,
