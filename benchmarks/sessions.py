@@ -191,19 +191,18 @@ def update(
 
 
 def main() -> None:
-    """Write the rows."""
+    """Write the rows, with each route those so far."""
     listed = list(routes(data_folder()))
     others = [route.orders[0][0].drive for route in [*listed[2:], *listed[:2]]]
-    rows = []
-    for route, other in zip(listed, others, strict=True):
-        rows.append(drive_route(route, other))
-        print(*rows[-1], flush=True)
     maps = ', '.join(MAPS)
     columns = ['route', 'images', f'recall: {maps}', 'wrong', 'places', 'poisoned']
-    lines = [HEADING, TEXT, *table(columns, rows)]
-    target = RESULTS / 'days.md'
-    days = target.read_text().split(HEADING)[0]
-    target.write_text('\n'.join([days + lines[0], *lines[1:]]) + '\n')
+    target, rows = RESULTS / 'days.md', []
+    for route, other in zip(listed, others, strict=True):
+        rows.append(drive_route(route, other))
+        lines = [HEADING, TEXT, *table(columns, rows)]
+        days, _, after = target.read_text().partition(HEADING)
+        _, heading, after = after.partition('\n## ')
+        target.write_text('\n'.join([days + lines[0], *lines[1:]]) + f'\n{heading}{after}')
 
 
 if __name__ == '__main__':

@@ -25,7 +25,7 @@ from stavpr_ros.mapping import (
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.versions import current_version, roll_back, save_version, Version
 from stavpr_ros.output_file import FileVersion
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, upkeep
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.upkeep import MIN_MISSED, update_map, UpkeepSettings
 from stavpr_ros.sources.frame import Frame
 
@@ -122,29 +122,48 @@ def test_detour_joins_the_map_as_a_stretch_of_its_own(first, around):
     assert recall(place_map, built([*ROUTE[60:80], *BYPASS, *ROUTE[90:120]], 4)) > 0.8
 
 
-def test_stretch_that_vanished_is_removed_after_max_age_drives(first, rebuilt, monkeypatch):
-    monkeypatch.setattr(upkeep, 'OVERLAP', 20)
+def numbers_of(place_map):
+    """Return the numbers of the places of the first drive that a map still has."""
+    return {int(stamp // 10**9) - 1 for stamp in place_map.stamps if stamp < 10_000 * 10**9}
+
+
+def test_stretch_that_vanished_is_renewed_after_max_age_drives(first, rebuilt):
     place_map, version = updated(first, rebuilt)
     before = len(place_map)
     for day in range(3, 6):
+        assert numbers_of(place_map) == set(range(200))
         drive = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], day)
         place_map, version = updated(place_map, drive, version)
-    old = [i for i in range(len(place_map)) if place_map.stamps[i] < 10_000 * 10**9]
-    numbers = {int(place_map.stamps[i] // 10**9) - 1 for i in old}
-    assert not numbers & set(range(90, 130))
-    assert numbers >= set(range(70)) | set(range(150, 200))
-    assert len(place_map) < before
-    assert 'removed' in ' '.join(version.changes) or len(place_map) < before
-    drive = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 9)
-    assert recall(place_map, drive) > 0.8
+    assert any('renewed' in text for text in version.changes)
+    assert not numbers_of(place_map) & set(range(80, 140))
+    assert numbers_of(place_map) >= set(range(40)) | set(range(180, 200))
+    assert len(place_map) == before
+    assert set(version.missed[80:140]) == {0}
+    assert place_map.ids[:200] == tuple(map(str, range(200)))
+    np.testing.assert_array_equal(place_map.poses[:200], first.poses)
+    new = np.flatnonzero(place_map.stamps[:200] > 10_000 * 10**9)
+    seconds = place_map.stamps[new] // 10**9 - 50_000 - 1
+    np.testing.assert_allclose(seconds, new, atol=2)  # each place has the image of its own
+    only_first = select_places(place_map, np.arange(200))
+    assert recall(only_first, built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 9)) > 0.85
 
 
-def test_a_vanished_stretch_stays_where_others_overlap_less_than_40_places(first):
-    missed = np.where(np.isin(np.arange(200), np.arange(80, 120)), 9, 0)
+def test_vanished_stretch_gets_no_images_of_the_road_around_it(first, around):
+    place_map, version = updated(first, around)
+    missed = np.zeros(len(place_map), np.int64)
+    missed[78:92] = 9
+    version = replace(version, missed=tuple(missed.tolist()))
+    again = built([*ROUTE[:80], *BYPASS, *ROUTE[90:180]], 3)
+    place_map, _ = updated(place_map, again, version)
+    assert numbers_of(place_map) == set(range(200))
+
+
+def test_vanished_stretch_stays_where_no_other_session_shows_all_of_it(first, rebuilt):
+    missed = np.where(np.isin(np.arange(200), np.arange(80, 140)), 9, 0)
     version = Version('', base_places=200, use=(1.0,) * 200, missed=tuple(missed.tolist()))
-    place_map, _ = updated(first, built([*ROUTE[:80], *OTHER[:40], *ROUTE[120:]], 1), version)
+    place_map, _ = updated(first, rebuilt, version)
     assert len(place_map) > 240
-    assert set(place_map.stamps.tolist()) >= set(first.stamps.tolist())
+    assert numbers_of(place_map) == set(range(200))
 
 
 def test_fewer_missed_places_than_a_stretch_stay(first):

@@ -8,8 +8,8 @@ An update has four steps; docs/upkeep.md describes them.
 1. The drive is recognized on the map. It teaches nothing unless it is certain where it is.
 2. Between two certain images, images that are not recognized are a stretch to be learned: an
    experience of places that look otherwise today, or a detour.
-3. A stretch that is not recognized by ``max_age`` drives in a row is removed, where the places
-   beside it were.
+3. A stretch that is not recognized by ``max_age`` drives in a row, where the places beside it
+   were, gets the images of a drive that is certain of it by other sessions.
 4. Above ``max_places``, the places that helped least to recognize are removed.
 
 Every stretch is a session of the map, so that no path leads from one into the other. The root of a
@@ -24,6 +24,7 @@ import re
 
 import numpy as np
 from stavpr_ros.errors import InputError
+from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import merge_maps, PlaceMap, Session
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
@@ -44,8 +45,8 @@ MIN_HARD = 20  # images without a match, between two certain ones
 MARGIN = 10  # certain images beside a stretch that are part of it
 MIN_SESSION = 40  # places: fewer say little about the distances of others
 NEAR = 40  # places beside a missed one: their session fits the light of the drive
-OVERLAP = 40  # places on both sides that other sessions show as well: two windows of images
-MIN_MISSED = 10  # places in a row that are removed as one stretch
+WIDER = 30  # places on both sides of a vanished stretch that are renewed with it
+MIN_MISSED = 10  # places in a row that are renewed as one stretch
 PIECE = 20  # places that are removed together
 DECAY = 0.9  # of the use, a drive
 PROBES, FAR = 24, 25  # images of the geometric check; places to where another one is
@@ -58,7 +59,7 @@ class UpkeepSettings:
     Settings of the upkeep.
 
     :param max_places: of the map; 0 = half more than before the first update.
-    :param max_age: drives in a row that pass a stretch unrecognized until it is removed.
+    :param max_age: drives in a row that pass a stretch unrecognized until it is renewed.
     """
 
     max_places: int = 0
@@ -97,6 +98,12 @@ def update_map(
     _require_certain(place_map, drive, driven, roots)
     use, missed = _used(place_map, driven, roots, version)
     changes, stretches = [], []
+    images = _renewing(place_map, driven, roots, missed >= settings.max_age)
+    if renewed := int((images >= 0).sum()):
+        place_map, missed = _with_images(place_map, drive, images), np.where(images < 0, missed, 0)
+        changes.append(
+            f'renewed {renewed} places beside some not recognized by {settings.max_age} drives'
+        )
     for stretch in _stretches(place_map, drive, driven, roots):
         stretches.append(stretch)
         kind = 'a detour' if stretch.is_detour else 'an experience'
@@ -106,14 +113,10 @@ def update_map(
     grown = _with_stretches(place_map, drive, name, stretches)
     use = np.concatenate([use, np.ones(len(grown) - n)])
     missed = np.concatenate([missed, np.zeros(len(grown) - n, np.int64)])
-    is_kept = ~_long((missed >= settings.max_age) & _is_replaced(grown), _runs(grown))
-    if removed := int((~is_kept).sum()):
-        changes.append(f'removed {removed} places not recognized by {settings.max_age} drives')
     limit = settings.max_places or round(1.5 * (version.base_places or n))
-    fits = _within(grown, use, is_kept, limit)
-    if removed := int((is_kept & ~fits).sum()):
+    kept = np.flatnonzero(_within(grown, use, limit))
+    if removed := len(grown) - len(kept):
         changes.append(f'removed {removed} places that helped least, above {limit} places')
-    kept = np.flatnonzero(fits)
     certain = (driven.of_windows >= 0).mean()
     changes.insert(0, f'certain of {certain:.0%} of {len(drive)} images')
     return keep_places(grown, kept), replace(
@@ -409,11 +412,53 @@ def _poses(place_map: PlaceMap, drive: PlaceMap, stretch: _Stretch) -> np.ndarra
     return poses
 
 
-def _long(is_missed: np.ndarray, runs: np.ndarray) -> np.ndarray:
-    """Return which of the missed places are of a stretch of them, (n,): others are noise."""
+def _renewing(
+    place_map: PlaceMap, driven: _Driven, roots: np.ndarray, is_missed: np.ndarray
+) -> np.ndarray:
+    """
+    Return the images of a drive that take the places of vanished ones, (n,); -1 = none.
+
+    The drive is certain of the session beside the stretch, whose light is the one of today
+    therefore, and within it, by other sessions, of all places.
+    """
+    runs, of_windows, n = _runs(place_map), driven.of_windows, len(place_map)
+    images, certain = np.full(n, -1), np.flatnonzero(driven.of_windows >= 0)
     begins = (np.diff(is_missed, prepend=False) != 0) | (np.diff(runs, prepend=runs[0]) != 0)
-    part = np.cumsum(begins)
-    return is_missed & (np.bincount(part)[part] >= MIN_MISSED)
+    for gone in np.split(np.arange(n), np.flatnonzero(begins)):
+        if not len(gone) or not is_missed[gone[0]] or len(gone) < MIN_MISSED:
+            continue
+        low, high, run = gone[0], gone[-1], runs[gone[0]]
+        own = np.where(runs[of_windows[certain]] == run, of_windows[certain], -n)
+        before = certain[(own < low) & (own >= low - NEAR)]
+        after = certain[(own > high) & (own <= high + NEAR)]
+        after = after[after > before[-1:].sum()]
+        if not len(before) or not len(after):
+            continue
+        reach = FASTEST * (NEAR + WIDER)
+        seen = certain[(certain > before[-1] - reach) & (certain < after[0] + reach)]
+        is_route = runs[roots[of_windows[seen]]] == runs[roots[low]]
+        if not is_route[(seen >= before[-1]) & (seen <= after[0])].all():
+            continue  # it went around
+        seen = seen[is_route]
+        passed = np.maximum.accumulate(roots[of_windows[seen]])
+        places = np.arange(max(low - WIDER, 0), min(high + WIDER + 1, n))
+        places = places[runs[places] == run]
+        if _is_near(np.isin(np.arange(n), passed), SLACK)[roots[places]].all():
+            images[places] = np.rint(np.interp(roots[places], passed, seen))
+    return images
+
+
+def _with_images(place_map: PlaceMap, drive: PlaceMap, images: np.ndarray) -> PlaceMap:
+    """Return a map with images of a drive at some places, (n,); -1 = as it is."""
+    n = len(place_map)
+    order = np.where(images < 0, np.arange(n), n + images)
+    thumbnails = [*place_map.thumbnails, *(drive.thumbnails or [b''] * len(drive))]
+    return replace(
+        place_map,
+        features=LocalFeatures.concatenate([place_map.features, drive.features])[order],
+        stamps=np.concatenate([place_map.stamps, drive.stamps])[order],
+        thumbnails=tuple(thumbnails[i] for i in order) if place_map.thumbnails else (),
+    )
 
 
 def _is_near(mask: np.ndarray, reach: int) -> np.ndarray:
@@ -422,20 +467,9 @@ def _is_near(mask: np.ndarray, reach: int) -> np.ndarray:
     return np.asarray(near > 0.5)
 
 
-def _is_replaced(grown: PlaceMap) -> np.ndarray:
-    """Return which places other sessions show, and a window of places on both sides, (n,)."""
-    runs, is_replaced = _runs(grown), np.zeros(len(grown), bool)
-    roots = np.arange(len(grown)) if grown.same_as is None else grown.same_as
-    for run in np.unique(runs):
-        own, is_other = np.flatnonzero(runs == run), np.zeros(len(grown), bool)
-        is_other[roots[runs != run]] = True
-        is_replaced[own] = ~_is_near(~_is_near(is_other, SLACK)[roots[own]], OVERLAP)
-    return is_replaced
-
-
-def _within(grown: PlaceMap, use: np.ndarray, is_kept: np.ndarray, limit: int) -> np.ndarray:
+def _within(grown: PlaceMap, use: np.ndarray, limit: int) -> np.ndarray:
     """Return which places stay, (n,): whole pieces that helped least go, the only ones last."""
-    is_kept, runs = is_kept.copy(), _runs(grown)
+    is_kept, runs = np.ones(len(grown), bool), _runs(grown)
     roots = np.arange(len(grown)) if grown.same_as is None else grown.same_as
     pieces = [
         piece

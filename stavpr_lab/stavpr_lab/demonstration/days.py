@@ -4,7 +4,8 @@
 A map that is updated day by day, beside the first session alone and all sessions kept.
 
 ``python3 -m stavpr_lab.demonstration.days 30 benchmarks/results/days`` (``make days``) drives
-the synthetic street and writes a table and a plot, in half an hour.
+the synthetic street and writes a table and a plot, in half an hour; a third argument is the seed
+of another street.
 """
 
 from collections.abc import Iterator
@@ -14,7 +15,8 @@ import sys
 
 import matplotlib as mpl
 import numpy as np
-from stavpr_lab.demonstration.street.days import Days
+from stavpr_lab.demonstration.street.days import DAY, Days
+from stavpr_lab.demonstration.street.traverses import EPOCH
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, merge_maps, PlaceMap
@@ -36,6 +38,7 @@ class Day:
     :param recall: share of the images that are rightly matched.
     :param wrong: number of wrong matches.
     :param places: of the map after the day.
+    :param vanished: places of the updated map after the day that show replaced buildings.
     :param changes: of the update.
     """
 
@@ -43,6 +46,7 @@ class Day:
     recall: tuple[float, ...]
     wrong: tuple[int, ...]
     places: tuple[int, ...]
+    vanished: int
     changes: tuple[str, ...]
 
 
@@ -91,21 +95,26 @@ def run(days: Days, count: int, settings: UpkeepSettings) -> Iterator[Day]:
         everything = with_last_related(merge_maps([everything, drive], ['', f'day {number}']))
         recall, wrong = zip(*measured, strict=True)
         places = len(first), len(everything), len(updated)
-        yield Day(number, recall, wrong, places, changes)
+        begin, low, high = days.built
+        old = updated.stamps[updated.stamps < EPOCH + begin * DAY] if number >= begin else []
+        vanished = sum(low <= positions[int(stamp)] < high for stamp in old)
+        yield Day(number, recall, wrong, places, vanished, changes)
 
 
 def table(results: list[Day]) -> str:
     """Return the results as a table in Markdown."""
     lines = [
         f'| day | recall: {" | ".join(MAPS)} | wrong: {" | ".join(MAPS)} | places: updated map | '
-        'update |',
-        '|' + '---|' * 9,
+        'of them vanished | update |',
+        '|' + '---|' * 10,
     ]
     for day in results:
         recall = ' | '.join(f'{value:.3f}' for value in day.recall)
         wrong = ' | '.join(map(str, day.wrong))
         text = '; '.join(day.changes)
-        lines.append(f'| {day.number} | {recall} | {wrong} | {day.places[-1]} | {text} |')
+        lines.append(
+            f'| {day.number} | {recall} | {wrong} | {day.places[-1]} | {day.vanished} | {text} |'
+        )
     return '\n'.join(lines)
 
 
@@ -130,17 +139,21 @@ def plot(results: list[Day], path: Path) -> None:
 
 
 def main() -> None:
-    """Run the days, and write table and plot."""
+    """Run the days, and write table and plot with each of them; other parts of the file stay."""
     count, target = int(sys.argv[1]), Path(sys.argv[2])
-    results = []
-    for day in run(Days(), count, UpkeepSettings()):
+    page, results = target.with_suffix('.md'), []
+    _, heading, others = page.read_text().partition('\n## ') if page.exists() else ('', '', '')
+    text = f"""# Days
+
+`python3 -m stavpr_lab.demonstration.days {' '.join(sys.argv[1:])}`; the images of a day are
+matched before the map learns from them.
+
+![recall and places]({target.name}.png)
+"""
+    for day in run(Days(*map(int, sys.argv[3:])), count, UpkeepSettings()):
         results.append(day)
-        print(table([day]).splitlines()[-1], flush=True)
-    command = f'`python3 -m stavpr_lab.demonstration.days {count}`'
-    text = f'# Days\n\n{command}; the images of a day are matched before the map learns from them.'
-    image_link = f'![recall and places]({target.name}.png)'
-    target.with_suffix('.md').write_text(f'{text}\n\n{image_link}\n\n{table(results)}\n')
-    plot(results, target.with_suffix('.png'))
+        page.write_text(f'{text}\n{table(results)}\n{heading}{others}')
+        plot(results, target.with_suffix('.png'))
 
 
 if __name__ == '__main__':
