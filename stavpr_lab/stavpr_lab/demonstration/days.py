@@ -150,7 +150,8 @@ matched before the map learns from them.
 
 ![recall and places]({target.name}.png)
 """
-    for day in run(Days(*map(int, sys.argv[3:])), count, UpkeepSettings()):
+    days = Days(int(sys.argv[3])) if sys.argv[3:] else Days()
+    for day in run(days, count, UpkeepSettings()):
         results.append(day)
         page.write_text(f'{text}\n{table(results)}\n{heading}{others}')
         plot(results, target.with_suffix('.png'))
