@@ -9,7 +9,9 @@ from stavpr_lab.demonstration.days import plot, run, table
 from stavpr_lab.demonstration.street.days import Days
 from stavpr_ros.recognition.upkeep import UpkeepSettings
 
-DAYS = Days(images=200, size=(96, 72), length=300.0, closed=(2, 4, 160.0, 200.0), built=(9, 0, 0))
+DAYS = Days(
+    images=200, size=(96, 72), length=300.0, closed=(2, 4, 160.0, 200.0), built=(5, 20, 40)
+)
 
 
 @pytest.fixture(scope='module')
@@ -26,6 +28,7 @@ def test_updated_map_knows_the_detour_and_stays_small(results):
     assert results[-1].places[2] <= 1.5 * results[-1].places[0]
     assert results[-1].places[1] == 6 * results[-1].places[0]
     assert everything.min() > 0.5
+    assert [day.vanished for day in results] == [0, 0, 0, 0, 13]
 
 
 def test_results_are_a_table_and_a_plot(results, tmp_path):

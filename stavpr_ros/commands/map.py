@@ -195,7 +195,7 @@ def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
         type=int,
         default=5,
         metavar='DRIVES',
-        help='in a row that pass a stretch unrecognized until it is removed (%(default)s)',
+        help='in a row that pass a stretch unrecognized until it is renewed (%(default)s)',
     )
     add('log', _log, 'Show the versions of a map, and what each update added and removed.', 'map')
     action = add('rollback', _rollback, 'Make an earlier version the map again.', 'map')

@@ -96,8 +96,8 @@ def run(days: Days, count: int, settings: UpkeepSettings) -> Iterator[Day]:
         recall, wrong = zip(*measured, strict=True)
         places = len(first), len(everything), len(updated)
         begin, low, high = days.built
-        old = updated.stamps[updated.stamps < EPOCH + begin * DAY] if number >= begin else []
-        vanished = sum(low <= positions[int(stamp)] < high for stamp in old)
+        rebuilt, stamps = EPOCH + begin * DAY if number >= begin else 0, updated.stamps.tolist()
+        vanished = sum(each < rebuilt and low <= positions[each] < high for each in stamps)
         yield Day(number, recall, wrong, places, vanished, changes)
 
 
