@@ -101,9 +101,7 @@ def update_map(
     images = _renewing(place_map, driven, roots, missed >= settings.max_age)
     if renewed := int((images >= 0).sum()):
         place_map, missed = _with_images(place_map, drive, images), np.where(images < 0, missed, 0)
-        changes.append(
-            f'renewed {renewed} places beside some not recognized by {settings.max_age} drives'
-        )
+        changes.append(f'renewed {renewed} places where {settings.max_age} drives matched nothing')
     for stretch in _stretches(place_map, drive, driven, roots):
         stretches.append(stretch)
         kind = 'a detour' if stretch.is_detour else 'an experience'
@@ -435,21 +433,21 @@ def _renewing(
         if not len(before) or not len(after):
             continue
         reach = FASTEST * (NEAR + WIDER)
-        seen = certain[(certain > before[-1] - reach) & (certain < after[0] + reach)]
-        is_route = runs[roots[of_windows[seen]]] == runs[roots[low]]
-        if not is_route[(seen >= before[-1]) & (seen <= after[0])].all():
+        passing = certain[(certain > before[-1] - reach) & (certain < after[0] + reach)]
+        is_route = runs[roots[of_windows[passing]]] == runs[roots[low]]
+        if not is_route[(passing >= before[-1]) & (passing <= after[0])].all():
             continue  # it went around
-        seen = seen[is_route]
-        passed = np.maximum.accumulate(roots[of_windows[seen]])
+        passing = passing[is_route]
+        passed = np.maximum.accumulate(roots[of_windows[passing]])
         places = np.arange(max(low - WIDER, 0), min(high + WIDER + 1, n))
         places = places[runs[places] == run]
         if _is_near(np.isin(np.arange(n), passed), SLACK)[roots[places]].all():
-            images[places] = np.rint(np.interp(roots[places], passed, seen))
+            images[places] = np.rint(np.interp(roots[places], passed, passing))
     return images
 
 
 def _with_images(place_map: PlaceMap, drive: PlaceMap, images: np.ndarray) -> PlaceMap:
-    """Return a map with images of a drive at some places, (n,); -1 = as it is."""
+    """Return a map with images of a drive at places with an image, (n,); -1 = as it is."""
     n = len(place_map)
     order = np.where(images < 0, np.arange(n), n + images)
     thumbnails = [*place_map.thumbnails, *(drive.thumbnails or [b''] * len(drive))]
