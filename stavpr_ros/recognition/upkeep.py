@@ -426,7 +426,7 @@ def _renewing(
         if not len(gone) or not is_missed[gone[0]] or len(gone) < MIN_MISSED:
             continue
         low, high, run = gone[0], gone[-1], runs[gone[0]]
-        own = np.where(runs[of_windows[certain]] == run, of_windows[certain], -n)
+        own = np.where(runs[of_windows[certain]] == run, of_windows[certain], -n - NEAR)
         before = certain[(own < low) & (own >= low - NEAR)]
         after = certain[(own > high) & (own <= high + NEAR)]
         after = after[after > before[-1:].sum()]
