@@ -31,7 +31,7 @@ from slam_pairs import recognized, SharedViews, with_edges
 from stavpr_lab.demonstration import false_places
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import drive_laps
-from stavpr_ros.mapping.transforms import matrices, to_poses
+from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import (
     breaks,
     Closure,
@@ -42,7 +42,7 @@ from stavpr_slam.pose_graph import (
     PoseGraph,
     runs,
 )
-from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
+from stavpr_slam.pose_graph.transforms import body_covariance, exponentials, planar_poses
 from tqdm import tqdm
 
 SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -63,6 +63,13 @@ TRIED = {  # of each kind of drive
     'sessions': ['', '30 % in runs'], 'carried': [each for each in FALSE if 'alone' not in each],
 }  # fmt: skip
 SIGMAS = OdometryNoise()
+MEASURED = np.diag([0.3] * 3 + [0.02] * 3) ** 2  # of the closures on a circle
+ODOMETRIES = {  # twists: deviation per square root of a meter, and bias per meter
+    'wheels': ([0, 0, 0.0087, 0.03, 0.01, 0], [0, 0, 0.00035, -0.01, 0, 0]),
+    'stereo': ([0.004, 0.004, 0.004, 0.03, 0.03, 0.03], [0, 0.0002, 0, 0, 0, 0]),
+    'legs': ([0.004, 0.004, 0.012, 0.06, 0.04, 0.03], [0, 0, 0, -0.03, 0, 0]),
+}
+FACTORS, FALSE_IN_RUNS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0), (0.0, 0.3, 0.5, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +149,39 @@ def ours(drive: Drive, *replaced: Any) -> np.ndarray:
         with patch.object(*replaced):
             return ours(drive)
     return optimize(drive.stamps, drive.odometry, drive.closures)[0]
+
+
+def circle(kind: str, factor: float, share: float) -> Drive:
+    """
+    Return four laps of a circle of 200 m with an odometry of wheels, stereo or legs.
+
+    :param factor: on its errors.
+    :param share: of the closures, false in runs of 20.
+    """
+    lap, dice = 100, np.random.default_rng(9)
+    angle = np.arange(4 * lap) * 2 * np.pi / lap
+    truth = np.column_stack(
+        [2 * lap / (2 * np.pi) * np.array([np.cos(angle), np.sin(angle)]).T, angle + np.pi / 2]
+    )
+    T, (deviation, bias) = matrices(planar_poses(truth)), ODOMETRIES[kind]
+    steps = inverse(T[:-1]) @ T[1:]
+    length = np.linalg.norm(steps[:, :3, 3], axis=1)[:, None]
+    errors = np.sqrt(length) * deviation * dice.normal(size=(len(steps), 6)) + length * bias
+    poses = [np.eye(4)]
+    for step in steps @ exponentials(factor * errors):
+        poses.append(poses[-1] @ step)
+    stamps, closures, right = (np.arange(len(T), dtype=np.int64) + 1) * 10**9, [], []
+    for number, query in enumerate(range(lap, len(T), 2)):
+        if number % 20 == 0:
+            shift = int(dice.integers(31, 70)) * (dice.random() < share)
+        motion = inverse(T[query % lap]) @ T[query]
+        motion[:2, 3] += 0.1 * dice.normal(size=2)
+        ends = int(stamps[query]), int(stamps[(query + shift) % lap])
+        closures.append(Closure(*ends, to_poses(motion), MEASURED, query % 3 == 0))
+        right.append(shift == 0)
+    odometry = to_poses(np.array(poses))
+    name = f'{kind} x {factor:g}, {share:.0%} false'
+    return Drive('circle', name, stamps, truth, odometry, closures, np.array(right))
 
 
 def driven(drive: Drive, group: int) -> dict[str, Any]:
@@ -289,7 +329,16 @@ def main() -> None:
     parser.add_argument('--folder', type=Path, help='keeps images and pairs')
     parser.add_argument('--gnc', action='store_true', help='GNC on worlds as well: 20 s a drive')
     parser.add_argument('--drives', action='store_true', help='KITTI in groups alone')
+    parser.add_argument('--noise', action='store_true', help='odometries of other errors alone')
     options = parser.parse_args()
+    if options.noise:
+        jobs = product(ODOMETRIES, FALSE_IN_RUNS, FACTORS)
+        rows = [driven(circle(kind, factor, share), 10) for kind, share, factor in jobs]
+        text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
+        (RESULTS / 'graph_noise.json').write_text(text + '\n')
+        print('\n'.join(f'{row["drive"]}: {row["odometry"]} -> {row["error"]}' for row in rows))
+        print('most above the odometry on the way:', max(row['above'] for row in rows), 'm')
+        return
     if options.drives:
         rows = []
         for name, alpha, group in product(KITTI, ('0.00', '0.30'), GROUPS):

@@ -22,14 +22,18 @@ DELAY = 10  # keyframes until a closure is known
 COVARIANCE = np.diag([0.5, 0.4, 0.4, 0.02, 0.02, 0.02]) ** 2
 
 
-def measure(nodes: int, timed: int, drift: float) -> tuple[np.ndarray, PoseGraph]:
-    """Return the processor time of each of the last updates, ms, and the graph."""
+def measure(nodes: int, timed: int, drift: float, late: int) -> tuple[np.ndarray, PoseGraph]:
+    """
+    Return the processor time of each of the last updates, ms, and the graph.
+
+    :param late: closures that come at once, when so many are there.
+    """
     angle = np.arange(nodes) * 2 * np.pi / LAP
     radius = STEP * LAP / (2 * np.pi)
     truth = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2])
     dice = np.random.default_rng(1)
     odometry = planar_poses(drifted(truth, np.ones(nodes, bool), dice, drift))
-    T, graph, times = matrices(planar_poses(truth)), PoseGraph(), []
+    T, graph, times, waiting = matrices(planar_poses(truth)), PoseGraph(), [], []
     for i in range(nodes):
         graph.add_odometry((i + 1) * SECOND, odometry[i])
         query = i - DELAY
@@ -37,7 +41,11 @@ def measure(nodes: int, timed: int, drift: float) -> tuple[np.ndarray, PoseGraph
             Z = inverse(T[query - LAP]) @ T[query]
             Z[:2, 3] += dice.normal(size=2) * 0.12
             stamps = (query + 1) * SECOND, (query - LAP + 1) * SECOND
-            graph.add_closure(Closure(*stamps, to_poses(Z), COVARIANCE, query % 5 == 0))
+            waiting.append(Closure(*stamps, to_poses(Z), COVARIANCE, query % 5 == 0))
+        if len(waiting) >= late:
+            for closure in waiting:
+                graph.add_closure(closure)
+            waiting = []
         if i >= nodes - timed:
             began = time.process_time()
             graph.update()
@@ -53,12 +61,13 @@ def main() -> None:
     parser.add_argument('--nodes', type=int, nargs='+', default=[1000, 3000, 10000])
     parser.add_argument('--updates', type=int, default=200, help='that are timed (%(default)s)')
     parser.add_argument('--drift', type=float, default=0.06, help='of the odometry (%(default)s)')
+    parser.add_argument('--late', type=int, default=1, help='closures that come at once')
     options = parser.parse_args()
     print(f'{cpu_model()}, {commit()}: processor time of an update in ms\n')
     print('| nodes | edges | median | 90 % | 99 % | most |')
     print('|---|---|---|---|---|---|')
     for nodes in options.nodes:
-        times, graph = measure(nodes, options.updates, options.drift)
+        times, graph = measure(nodes, options.updates, options.drift, options.late)
         p50, p90, p99, most = np.percentile(times, [50, 90, 99, 100])
         print(
             f'| {nodes} | {len(graph.used)} | {p50:.0f} | {p90:.0f} | {p99:.0f} | {most:.0f} |',

@@ -89,6 +89,22 @@ def test_optimize_with_closures_corrects_drift(drive):
     assert graph.accepted >= 0.95 * len(closures)
 
 
+def test_burst_of_late_closures_ends_as_all_at_once(drive):
+    """60 closures come together when the drive is over, the others as the robot drives."""
+    truth, closures = drive
+    graph, odometry = PoseGraph(), odometry_of(truth)
+    for i, pose in enumerate(odometry):
+        graph.add_odometry((i + 1) * SECOND, pose)
+        if i - LAP >= 60:
+            graph.add_closure(closures[i - LAP])
+        if i % 10 == 9:
+            graph.update()
+    for each in closures[:60]:
+        graph.add_closure(each)
+    live = error(to_poses(graph.update()), truth)
+    assert live == pytest.approx(error(solve(truth, closures)[0], truth), rel=0.05)
+
+
 def test_optimize_twice_gives_same_trajectory(drive):
     truth, closures = drive
     assert np.array_equal(solve(truth, closures[::4])[0], solve(truth, closures[::4])[0])

@@ -209,6 +209,19 @@ def test_wrong_closures_prove_no_break():
     assert found < 1.02
 
 
+def test_few_false_runs_prove_no_break():
+    """A session that begins anywhere lets 37 of 150 agree, all of which are false."""
+    truth, dice = circle(4), np.random.default_rng(36)
+    shifts = np.repeat(dice.integers(31, 70, 8), 20)[: 3 * LAP // 2].tolist()
+    closures = [
+        closure(truth, query, query % LAP, (query + shift) % LAP)
+        for query, shift in zip(range(LAP, 4 * LAP, 2), shifts, strict=True)
+    ]
+    found, graph = ratio(truth, odometry_of(truth, drift=0.5, seed=36), closures)
+    assert (graph.accepted, graph.splits) == (0, 0)
+    assert found < 1.02
+
+
 def test_carried_robot_without_breaks(monkeypatch):
     """With breaks, see test_optimize_carried_robot_cuts_where_the_odometry_stands."""
     monkeypatch.setattr(breaks, 'SUPPORT', 10**6)

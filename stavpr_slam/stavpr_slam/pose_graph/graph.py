@@ -225,7 +225,11 @@ class PoseGraph:
                 self._closures[number] = resolved
 
     def _with_break(self, before: Solution) -> Solution | None:
-        """Begin a session where closures prove that the robot was carried; None = nowhere."""
+        """
+        Begin a session where closures prove that the robot was carried; None = nowhere.
+
+        Where none is accepted before, most have to agree then: a few false runs always do.
+        """
         nodes = dict.fromkeys(
             node
             for solved, agreeing, strained in before.tried
@@ -238,7 +242,7 @@ class PoseGraph:
         for node in [*nodes][:MAX_BREAKS]:
             self._split(node, True)
             after = self._decided()
-            if (
+            if (before.accepted.any() or after.accepted.sum() > after.rejected) and (
                 after.accepted.sum() - before.accepted.sum() >= breaks.GAIN
                 or after.decision.gain - before.decision.gain > breaks.EVIDENCE
             ):
