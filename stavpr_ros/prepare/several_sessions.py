@@ -17,6 +17,7 @@ from stavpr_ros.compilation import kernel
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 
 CERTAIN = 0.99  # probability of the map, above which places are left out
+# Half and double change nothing on ten sessions of a synthetic street.
 PROBABLE = 1e-3  # probability of a place, above which the places around it are compared
 CHUNK = 32  # places compared together; a multiple of all LANES
 REACH = 2  # chunks around a probable place
