@@ -2,8 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Breaks of the odometry that closures prove: where they are, and when they end."""
 
+import tracemalloc
+
 import numpy as np
-from stavpr_slam.pose_graph import PoseGraph
+from stavpr_ros.mapping.transforms import matrices
+from stavpr_slam.pose_graph import breaks, PoseGraph
+from stavpr_slam.pose_graph.closures import BETWEEN_NODES
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.transforms import planar_poses
@@ -47,3 +51,20 @@ def test_update_false_break_ends_when_closures_are_against_it():
     assert splits[-1] == 0
     assert graph.chain.sessions == 1
     assert error(found, truth) < 1.5
+
+
+def test_break_is_found_among_4000_rejected_closures_in_little_memory():
+    """From node 200 on, all closures move the robot by 30 m to the left."""
+    poses = planar_poses(np.column_stack([np.arange(400.0), np.zeros((400, 2))]))
+    rng, closures = np.random.default_rng(0), np.zeros(8000, BETWEEN_NODES).view(np.recarray)
+    closures.query = np.sort(rng.integers(20, 400, 8000))
+    closures.place = rng.integers(0, 20, 8000)
+    taken = closures.query < 200
+    moves = np.column_stack([closures.query - closures.place, 30.0 * ~taken, np.zeros(8000)])
+    closures.transform, closures.covariance = matrices(planar_poses(moves)), np.eye(6) * 0.01
+    tracemalloc.start()
+    node = breaks.find(chain_of(poses), matrices(poses), taken, closures)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert abs(node - 200) <= 1
+    assert peak < 200e6
