@@ -42,7 +42,7 @@ from stavpr_slam.pose_graph import (
     PoseGraph,
     runs,
 )
-from stavpr_slam.pose_graph.transforms import body_covariance, exponentials, planar_poses
+from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
 from tqdm import tqdm
 
 SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -168,8 +168,8 @@ def circle(kind: str, factor: float, share: float) -> Drive:
     length = np.linalg.norm(steps[:, :3, 3], axis=1)[:, None]
     errors = np.sqrt(length) * deviation * dice.normal(size=(len(steps), 6)) + length * bias
     poses = [np.eye(4)]
-    for step in steps @ exponentials(factor * errors):
-        poses.append(poses[-1] @ step)
+    for step, error in zip(steps, factor * errors, strict=True):
+        poses.append(poses[-1] @ step @ gtsam.Pose3.Expmap(error).matrix())
     stamps, closures, right = (np.arange(len(T), dtype=np.int64) + 1) * 10**9, [], []
     for number, query in enumerate(range(lap, len(T), 2)):
         if number % 20 == 0:

@@ -3,7 +3,9 @@
 """The benchmarks, end to end on tiny sizes: matching, comparison, outcomes."""
 # ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
+import ast
 from dataclasses import replace
+import importlib.util
 import json
 from pathlib import Path
 import sys
@@ -114,3 +116,17 @@ def test_public_graphs_go_on_where_they_were_ended(tmp_path, monkeypatch, capsys
     graph_files.main()
     assert measured == [('random', 0.5)]
     assert '3 of 9' in capsys.readouterr().out
+
+
+def test_benchmarks_import_only_what_the_packages_have():
+    """Also of those whose own packages, such as gtsam, are not installed here."""
+    missing = []
+    for path in sorted(BENCHMARKS.glob('*.py')):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('stavpr_'):
+                module = importlib.import_module(node.module)
+                for name in (each.name for each in node.names):
+                    submodule = f'{node.module}.{name}'
+                    if not hasattr(module, name) and importlib.util.find_spec(submodule) is None:
+                        missing.append(f'{path.name}: {submodule}')
+    assert not missing
