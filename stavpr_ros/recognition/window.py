@@ -131,7 +131,7 @@ class SequenceBuffer:
         """
         Return the largest mean of -z of straight paths of the newest images.
 
-        :param numbers, position, excluded: of
+        :param numbers, excluded, position: of
             :func:`stavpr_ros.filter.evidence.best_elsewhere`.
         """
         rows = self._ring(len(numbers))

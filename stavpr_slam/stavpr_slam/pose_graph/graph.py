@@ -202,12 +202,17 @@ class PoseGraph:
             return followed(*given, last) or decided(*given, last.decision.scales)
         for node in self.chain.splits[::-1]:
             self._split(node, False)
-        found = self._decided()
+        found = without = self._decided()
         for _ in range(0 if self.settings.measured else MAX_BREAKS):
             better = self._with_break(found)
             if better is None:
                 break
             found = better
+        # where none is accepted without breaks, a few false runs agree with them
+        if not without.accepted.any() and found.accepted.sum() <= found.rejected:
+            for node in self.chain.splits[::-1]:
+                self._split(node, False)
+            found = without
         self._searched = len(self._known)
         return found
 
@@ -225,11 +230,7 @@ class PoseGraph:
                 self._closures[number] = resolved
 
     def _with_break(self, before: Solution) -> Solution | None:
-        """
-        Begin a session where closures prove that the robot was carried; None = nowhere.
-
-        Where none is accepted before, most have to agree then: a few false runs always do.
-        """
+        """Begin a session where closures prove that the robot was carried; None = nowhere."""
         nodes = dict.fromkeys(
             node
             for solved, agreeing, strained in before.tried
@@ -242,7 +243,7 @@ class PoseGraph:
         for node in [*nodes][:MAX_BREAKS]:
             self._split(node, True)
             after = self._decided()
-            if (before.accepted.any() or after.accepted.sum() > after.rejected) and (
+            if (
                 after.accepted.sum() - before.accepted.sum() >= breaks.GAIN
                 or after.decision.gain - before.decision.gain > breaks.EVIDENCE
             ):
