@@ -100,7 +100,7 @@ def versions() -> dict[str, str]:
 def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
     """Return machine, versions, commit and date of a run, for a call before it begins."""
     import numba
-    from stavpr_ros.alignment.cpu.simd import LANES
+    from stavpr_ros.simd import LANES
     import torch
 
     flags = _cpu_info(r'^(?:flags|Features)\s*: (.*)$').split()

@@ -5,6 +5,7 @@
 from collections.abc import Callable
 import ctypes
 from functools import partial
+import hashlib
 import logging
 import multiprocessing
 import os
@@ -21,6 +22,8 @@ from tqdm import tqdm
 
 AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hwcap.h
 COMPILING = 'compiling kernels, once, one to two minutes'
+PACKAGE = Path(__file__).parent
+OWN_CACHE = PACKAGE / '__pycache__' / 'kernels'
 KERNELS = 267  # that `stavpr warm` compiles, for the progress bar
 
 # Of numba's threading layers, the default's fallback aborts the process when two threads meet in
@@ -84,7 +87,7 @@ def cache_folder() -> Path | None:
         folders = [Path(environment)]
     else:
         user = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
-        folders = [Path(__file__).parent / '__pycache__' / 'kernels', Path(user) / 'stavpr']
+        folders = [OWN_CACHE, Path(user) / 'stavpr']
     for folder in folders:
         if folder.is_absolute() and _is_writable(folder):
             return folder
@@ -138,10 +141,26 @@ progress = _Progress()
 """Set its ``announce`` to log one line instead of the progress bar."""
 
 event.register('numba:compile', progress)
+
+
+def _digest() -> str:
+    """Return a digest of all kernels: numba compares the module of each alone with its cache."""
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted(PACKAGE.rglob('*.py')):
+        source = path.read_bytes()
+        if b'stavpr_ros.compilation' in source or b'numba' in source:
+            digest.update(source)
+    return digest.hexdigest()
+
+
 CACHE = cache_folder()
-"""Folder of the compiled kernels, None = none can be written."""
+"""Folder of these compiled kernels, None = none can be written."""
 
 if CACHE is not None:
+    of_version = CACHE / _digest()
+    if CACHE == OWN_CACHE and not of_version.is_dir():
+        shutil.rmtree(CACHE, ignore_errors=True)  # of an earlier version of the package
+    CACHE = of_version
     nb.config.CACHE_DIR = str(CACHE)
 _can_cache = CACHE is not None
 

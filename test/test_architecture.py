@@ -34,7 +34,7 @@ CORE = {
 MAY_IMPORT = {
     'alignment': set(),
     'sources': set(),
-    'features': {'alignment'},
+    'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
     'filter': {'alignment'},
     'prepare': {'alignment', 'features', 'mapping', 'filter'},

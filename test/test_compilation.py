@@ -3,6 +3,7 @@
 """The cache folder of compiled kernels, and the announcement of their compilation."""
 
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
@@ -40,6 +41,29 @@ def test_package_without_home_keeps_its_kernels_itself(monkeypatch):
     monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
     monkeypatch.setenv('HOME', '/proc/nohome')
     assert cache_folder() == Path(compilation.__file__).parent / '__pycache__' / 'kernels'
+
+
+def test_kernels_of_another_version_are_not_read(tmp_path):
+    """Numba unpickles an index before it compares versions: a type that has moved is an error."""
+    package = tmp_path / 'stavpr_ros'
+    shutil.copytree(compilation.PACKAGE, package, ignore=shutil.ignore_patterns('__pycache__'))
+    variables = environment() | {'PYTHONPATH': str(tmp_path)}
+    variables.pop('NUMBA_CACHE_DIR', None)
+    folders = []
+    for addition in ('', '\n', ''):
+        path = package / 'alignment' / 'cpu' / 'dtw.py'
+        path.write_text(path.read_text().rstrip('\n') + '\n' + addition)
+        command = [
+            sys.executable,
+            '-c',
+            'from stavpr_ros import compilation; print(compilation.CACHE)',
+        ]
+        printed = subprocess.check_output(command, cwd=tmp_path, env=variables, text=True)
+        folders.append(Path(printed.strip()))
+        folders[-1].mkdir(parents=True)
+    assert folders[0] == folders[2] != folders[1]
+    assert not folders[1].exists()  # of the version in between
+    assert folders[0].parent == package / '__pycache__' / 'kernels'
 
 
 def test_compilation_is_announced_once():

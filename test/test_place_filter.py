@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from stavpr_ros.alignment.cpu.simd import LANES, load, store
 from stavpr_ros.compilation import kernel
 from stavpr_ros.filter.kernels import exp
 from stavpr_ros.filter.model import FilterSettings
 from stavpr_ros.filter.paths import CLOSE, NEGLIGIBLE, TOP
 from stavpr_ros.filter.place_filter import PlaceFilter
+from stavpr_ros.simd import LANES, load, store
 
 
 @kernel

@@ -53,7 +53,7 @@ class SequenceMatch:
 
 def padded_width(n: int, k: int) -> int:
     """Return the kernel's columns for n starts: whole vectors, and the last start's k images."""
-    from stavpr_ros.alignment.cpu.simd import LANES
+    from stavpr_ros.simd import LANES
 
     return -(-n // LANES) * LANES + k - 1
 

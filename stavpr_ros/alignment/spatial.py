@@ -34,7 +34,7 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     :raises SettingsError: xi > W, or the strategy ``none``.
     """
     from stavpr_ros.alignment.cpu import dtw
-    from stavpr_ros.alignment.cpu.simd import LANES
+    from stavpr_ros.simd import LANES
 
     d = no_nan(float_array(d, 'strip distances', 'W W n'), 'strip distances')
     W, _, n = d.shape

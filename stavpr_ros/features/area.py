@@ -12,7 +12,8 @@ from functools import cache
 import math
 
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import (
+from stavpr_ros.compilation import kernel
+from stavpr_ros.simd import (
     bits,
     from_bits,
     LANES,
@@ -24,7 +25,6 @@ from stavpr_ros.alignment.cpu.simd import (
     store_bytes,
     transpose,
 )
-from stavpr_ros.compilation import kernel
 
 F = np.float32
 INT = np.int32

@@ -21,13 +21,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import LANES
 from stavpr_ros.checks import require_choice
 from stavpr_ros.compilation import kernel
 from stavpr_ros.devices import DEVICES
 from stavpr_ros.features.area import cells, shrink
 from stavpr_ros.features.extractor import resize_square
 from stavpr_ros.features.registry import GradientSettings
+from stavpr_ros.simd import LANES
 from stavpr_ros.threads import thread_count
 
 FLOOR = 1e-4  # squared gradient (intensities 0..1) below which a block counts as flat

@@ -37,8 +37,8 @@ other quantities, and what half and double of each factor does.
 import math
 
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel
+from stavpr_ros.simd import LANES, load, select, splat, store
 
 CONSTANT, POSTERIOR, LEAD, RECENT = -7.01, 0.62, 2.56, 3.65
 SURE = 3.4  # own evidence of sure windows

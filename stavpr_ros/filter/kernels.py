@@ -17,7 +17,9 @@ below the precision of all results.
 
 import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import (
+from stavpr_ros.compilation import kernel, parallel_kernel
+from stavpr_ros.filter.paths import BLOCK, ENTERED
+from stavpr_ros.simd import (
     bits,
     from_bits,
     LANES,
@@ -31,8 +33,6 @@ from stavpr_ros.alignment.cpu.simd import (
     store,
     store_bytes,
 )
-from stavpr_ros.compilation import kernel, parallel_kernel
-from stavpr_ros.filter.paths import BLOCK, ENTERED
 
 F, INT = np.float32, np.int32
 PLACES = 2048  # of a part; a multiple of BLOCK

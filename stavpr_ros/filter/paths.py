@@ -16,8 +16,8 @@ an even speed in the lower half and for the next speed in the upper one::
 from dataclasses import dataclass
 
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import prefetch
 from stavpr_ros.compilation import kernel
+from stavpr_ros.simd import prefetch
 
 BLOCK = 128  # places whose states are neighbors in memory; a multiple of all LANES
 ENTERED = 9  # origin of a state that came from off the map

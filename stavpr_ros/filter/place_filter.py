@@ -41,7 +41,6 @@ that makes their sum 1 is part of the next image's level changes.
 """
 
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import LANES
 from stavpr_ros.filter.kernels import advance, PLACES
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import (
@@ -56,6 +55,7 @@ from stavpr_ros.filter.paths import (
 )
 from stavpr_ros.filter.protocol import Filter
 from stavpr_ros.memory import aligned_zeros
+from stavpr_ros.simd import LANES
 
 NO_PLACE = np.float32(-np.inf)  # z of a gap between sessions, where likelihoods are 1
 

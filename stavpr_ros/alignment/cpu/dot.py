@@ -14,9 +14,9 @@ from numba.extending import overload
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
-from stavpr_ros.alignment.cpu.simd import LANES, LINE, load, prefetch, splat, store, store_sums
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
+from stavpr_ros.simd import LANES, LINE, load, prefetch, splat, store, store_sums
 
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES

@@ -13,8 +13,8 @@ import math
 
 import numba as nb
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
+from stavpr_ros.simd import LANES, load, select, splat, store
 
 SLOT = 2 * LANES  # S, then C
 VERTICAL, HORIZONTAL, DIAGONAL = 0, 1, 2

@@ -23,9 +23,9 @@ from numba.core import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 import numpy as np
-from stavpr_ros.alignment.cpu.simd import LANES, load, load_splat, splat, store, Vector
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
+from stavpr_ros.simd import LANES, load, load_splat, splat, store, Vector
 
 TILE = 7  # query strips whose sums stay in registers
 QUAD = 4  # dimensions of a lane

@@ -5,8 +5,8 @@
 import numba as nb
 import numpy as np
 from stavpr_ros.alignment.cpu.dtw import open_edge, SLOT, sweep_four_rows, sweep_row
-from stavpr_ros.alignment.cpu.simd import LANES, load, select, splat, store
 from stavpr_ros.compilation import kernel, parallel_kernel
+from stavpr_ros.simd import LANES, load, select, splat, store
 
 BLOCKS = 8  # vectors of starts that a thread takes at a time
 
