@@ -103,6 +103,7 @@ def test_public_graphs_go_on_where_they_were_ended(tmp_path, monkeypatch, capsys
     path = tmp_path / 'a.json'
     words = ['a', '--files', 'MIT', '--methods', 'this graph', '--kinds', 'random']
     monkeypatch.setattr(sys, 'argv', [*words, '--output', str(path)])
+    monkeypatch.setenv('STAVPR_DATA', str(tmp_path))
     with pytest.raises(KeyboardInterrupt):
         graph_files.main()
     document = json.loads(path.read_text())
