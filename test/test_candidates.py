@@ -13,7 +13,7 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
 from stavpr_ros.recognition import Candidate, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.match import ranked_candidates, WindowSequences
-from stavpr_ros.recognition.robust import ROBUST
+from stavpr_ros.recognition.settings import RobustOptions
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 
@@ -67,7 +67,7 @@ def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
         sequence=SHORT,
         nms_radius=5,
         mode='paper' if mode == 'paper' else 'robust',
-        robust_options=ROBUST.without('place_filter') if mode == 'dtw' else None,
+        robust_options=RobustOptions(place_filter=False) if mode == 'dtw' else None,
     )
     one = PlaceRecognizer(small_map, settings)
     assert one.ranked(3) == []

@@ -18,6 +18,7 @@ from stavpr_ros.mapping import Session
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.device_windows import z_normalized_on_device
+from stavpr_ros.recognition.settings import RobustOptions
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -196,6 +197,6 @@ def test_settings_that_need_the_cpu_are_rejected(device):
     settings = RecognizerSettings(mode='robust', time_budget_ms=1.0)
     with pytest.raises(SettingsError, match='first stage is of backend'):
         PlaceRecognizer(place_map, settings, device)
-    options = RecognizerSettings(mode='robust').applied_options.without('place_filter')
+    options = RobustOptions(place_filter=False)
     with pytest.raises(SettingsError, match='mode paper only'):
         PlaceRecognizer(place_map, RecognizerSettings(robust_options=options), device)

@@ -17,7 +17,7 @@ from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.mapping import load_map, merge_maps
 from stavpr_ros.pipeline import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.robust import ROBUST
+from stavpr_ros.recognition.settings import RobustOptions
 from test_relative_motion import poses_of, track
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -73,7 +73,8 @@ def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
     )
     strips = np.concatenate([route_strips(0, N)[:, 50:], route_strips(0, N)[:, :60:-1]], axis=1)
     query = features_of(strips, 1.0, 9)
-    options = ROBUST.without('mean_centering', 'whitening')  # statistics of other samples
+    # statistics of other samples
+    options = RobustOptions(mean_centering=False, whitening=False)
     settings, forward = (replace(each, robust_options=options) for each in (BOTH, FORWARD))
     both = recognize(merge_maps(maps, 'ab'[:sessions]), query, settings)
     for match, expected in zip(both, recognize(twice, query, forward), strict=True):

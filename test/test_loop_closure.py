@@ -29,12 +29,12 @@ from stavpr_ros.recognition.loop_closer import (
 )
 from stavpr_ros.recognition.match import Limits, WindowMatch
 from stavpr_ros.recognition.recognizer import Verdict
-from stavpr_ros.recognition.robust import PAPER, ROBUST
+from stavpr_ros.recognition.settings import PAPER, ROBUST, RobustOptions
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)
 SECOND = 10**9
-LM_DTW = ROBUST.without('mean_centering', 'whitening', 'place_filter')
+LM_DTW = RobustOptions(mean_centering=False, whitening=False, place_filter=False)
 
 
 def laps_of(count, places, noise=0.4, seed=0):
@@ -374,7 +374,7 @@ def test_reset_keeps_znorm_of_places_and_forgets_place(laps):
 # ------------------------------------------------ candidates, errors
 
 
-@pytest.mark.parametrize('robust_options', [PAPER, ROBUST, ROBUST.without('place_filter')])
+@pytest.mark.parametrize('robust_options', [PAPER, ROBUST, RobustOptions(place_filter=False)])
 def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
     closer = LoopCloser(settings_of(robust_options), 12, laps.settings, limit=200)
     assert closer.ranked(5) == []
@@ -410,7 +410,7 @@ def test_update_with_error_changes_nothing(laps):
 @pytest.mark.parametrize('exclude', [1, 12])
 def test_loop_closer_with_smallest_limit_matches(exclude):
     features = laps_of(120, 9)
-    settings = settings_of(ROBUST.without('mean_centering', 'whitening'))
+    settings = settings_of(RobustOptions(mean_centering=False, whitening=False))
     with pytest.raises(SettingsError, match=r'limit = 0 .* take at least \d+') as refused:
         LoopCloser(settings, exclude, features.settings, limit=0)
     least = int(str(refused.value).split()[-1])

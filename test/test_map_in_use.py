@@ -86,7 +86,7 @@ def test_stored_map_that_is_overwritten_is_never_read_as_its_own(in_use, small_m
     copied_over(in_use, in_use)  # the content is the same; that is not known
     for read in (
         lambda: places.features[:3],
-        lambda: places.features.stored_strip(0),
+        lambda: places.features.strip(0),
         lambda: places.thumbnails[0],
         lambda: save_map(places, tmp_path / 'copy.stavpr'),
         lambda: verify_map(places),

@@ -12,7 +12,7 @@ from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings, read_map
 from stavpr_ros.prepare.matcher import PRECISIONS
-from stavpr_ros.recognition.robust import MODES
+from stavpr_ros.recognition.settings import MODES
 from stavpr_ros.recognition.verification import METHODS
 from stavpr_ros.relative_pose.estimator import METHODS as EDGE_METHODS
 import yaml

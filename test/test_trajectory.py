@@ -169,9 +169,9 @@ def test_read_odometry_returns_sorted_poses(tmp_path, ros1):
 
 def test_read_odometry_of_missing_topic_fails(tmp_path):
     path = write_odometry(tmp_path / 'bag', [SECOND])
-    with pytest.raises(SourceError, match=r"'/other' is not in .*: topics of that type are /odom"):
+    with pytest.raises(SourceError, match=r"'/other' is not in .*: expected one of /odom"):
         read_odometry(path, '/other')
-    with pytest.raises(SourceError, match=r'std_msgs/msg/String, not nav_msgs'):
+    with pytest.raises(SourceError, match=r'std_msgs/msg/String in .*: expected one of /odom'):
         read_odometry(path, '/text')
     with pytest.raises(SourceError, match='no messages'):
         read_odometry(write_odometry(tmp_path / 'empty', []), '/odom')

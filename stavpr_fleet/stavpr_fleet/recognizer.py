@@ -25,8 +25,8 @@ from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.robust import ROBUST
 from stavpr_ros.recognition.sessions import session_gap
+from stavpr_ros.recognition.settings import ROBUST
 from stavpr_ros.threads import call_on_thread
 
 CHUNK = 32  # places that are fetched together

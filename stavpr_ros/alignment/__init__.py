@@ -10,8 +10,7 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.path import aligned_index
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings, STRATEGIES
-from stavpr_ros.alignment.similarity import strip_distances
-from stavpr_ros.alignment.spatial import image_distances
+from stavpr_ros.alignment.spatial import image_distances, strip_distances
 
 __all__ = [
     'STRATEGIES',

@@ -143,16 +143,12 @@ class _Images:
         return (len(self.source) + self._every - 1) // self._every
 
     def __iter__(self) -> Iterator['Frame']:
+        import numpy as np
+
         for frame in islice(self.source, 0, None, self._every):
             self.read += 1
-            yield replace(frame, image=_turned(frame.image, self._yaw)) if self._yaw else frame
-
-
-def _turned(panorama: 'np.ndarray', yaw: float) -> 'np.ndarray':
-    """Return a panorama (h, w, c) as a camera that is turned to the left takes it, degrees."""
-    import numpy as np
-
-    return np.roll(panorama, round(yaw / 360 * panorama.shape[1]), axis=1)
+            shift = round(self._yaw / 360 * frame.image.shape[1])
+            yield replace(frame, image=np.roll(frame.image, shift, axis=1)) if shift else frame
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -259,7 +255,9 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
         skipped['odometry'] += poses.rejected
     if unread := left_out(skipped, getattr(source, 'left_out', {})):
         say(unread, sys.stderr)
-    say(f'{len(place_map)} of {images.read} images became places{_known_poses(place_map)}')
+    count = sum(place_map.pose(place) is not None for place in range(len(place_map)))
+    with_pose = f', {count} of them with a pose' if count else ''
+    say(f'{len(place_map)} of {images.read} images became places{with_pose}')
     return place_map, journal
 
 
@@ -269,12 +267,6 @@ def _source_of(arguments: argparse.Namespace) -> str:
     # places of a journal without skipped images are also the first ones with skipping
     decisive = options.keys() - {'output', 'force', 'skip_bad_images'}
     return json.dumps({name: options[name] for name in sorted(decisive)})
-
-
-def _known_poses(place_map: 'PlaceMap') -> str:
-    """Return the number of places with a pose, in words; '' if none has."""
-    count = sum(place_map.pose(place) is not None for place in range(len(place_map)))
-    return f', {count} of them with a pose' if count else ''
 
 
 def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float | None':

@@ -220,8 +220,7 @@ def _tool(name: str) -> Callable[..., Any]:
             f'{name} needs the package {TOOLS[name]}, which is not installed: build it, or '
             '`pip install .` in the repository'
         )
-    tool: Callable[..., Any] = tools[name]
-    return tool
+    return tools[name]
 
 
 def describe(place_map: 'PlaceMap', path: Path) -> str:
@@ -502,7 +501,6 @@ def main(args: list[str] | None = None) -> int:
     def work() -> int | None:
         arguments = _parser().parse_args(args)
         _check_output(arguments)
-        exit_code: int | None = arguments.work(arguments)
-        return exit_code
+        return arguments.work(arguments)
 
     return run_program('map', work)

@@ -307,12 +307,11 @@ def cut_strips(feature_maps: np.ndarray, W: int, pooling: str = 'flatten') -> np
     if pooling == 'flatten':
         return strips.reshape(W, n, channels * height * width)
     cells = strips.reshape(W, n, channels, height * width)
-    values: np.ndarray = (
+    return (
         cells.mean(3)
         if pooling == 'mean'
         else np.cbrt((np.maximum(cells, 1e-6) ** GEM_EXPONENT).mean(3))
     )
-    return values
 
 
 def normalize(strips: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -42,5 +42,4 @@ class Hybrid:
         maps = (kind.feature_maps(images) for kind in (self._gradient, self._learned))
         (g, a), (e, b) = (normalize(cut_strips(each, STRIPS)) for each in maps)
         strips = np.concatenate([g, e], axis=2) * (np.sqrt(a**2 + b**2) / 2)[:, :, None]
-        columns: np.ndarray = strips.transpose(1, 2, 0)[:, :, None]
-        return columns
+        return strips.transpose(1, 2, 0)[:, :, None]

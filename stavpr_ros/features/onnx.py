@@ -10,6 +10,7 @@ data: weights and operators of the ONNX standard; nothing in it is executed as P
 from collections.abc import Sequence
 from dataclasses import replace
 import logging
+import math
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,7 +20,6 @@ from stavpr_ros.devices import choose_device
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.features.extractor import resize_square, TEST_SIDE
 from stavpr_ros.features.model_files import read_model
-from stavpr_ros.features.outputs import as_maps
 from stavpr_ros.features.registry import OnnxSettings
 from stavpr_ros.threads import thread_limit
 
@@ -159,10 +159,7 @@ class Onnx:
             tokens nor vectors.
         """
         name = f'layer {self.settings.layer!r} of {self.settings.model}'
-        maps: np.ndarray = as_maps(
-            self._run(images), len(images), self.settings.prefix_tokens, name
-        )
-        return maps
+        return as_maps(self._run(images), len(images), self.settings.prefix_tokens, name)
 
     def _run(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the output of the layer for images, in a batch if that changes nothing."""
@@ -205,8 +202,7 @@ class Onnx:
                 f'layer {self.settings.layer!r} of {self.settings.model} returns {output.shape} '
                 f'for {len(images)} images: expected as many rows; name another layer'
             )
-        values: np.ndarray = output.astype(np.float32, copy=False)
-        return values
+        return output.astype(np.float32, copy=False)
 
     def _prepare(self, image: np.ndarray) -> np.ndarray:
         """Resize, order the channels, scale and shift: (3, size, size), float32."""
@@ -234,3 +230,38 @@ def _inputs(node: Any) -> set[str]:
     """Return the names that a node takes, also those within its branches and loops."""
     graphs = [attribute.g for attribute in node.attribute if attribute.HasField('g')]
     return set(node.input).union(*(_inputs(inner) for graph in graphs for inner in graph.node))
+
+
+def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:
+    """
+    Return what a network computes for a batch as feature maps or vectors.
+
+    :param output: maps (n, C, H, Wf), vectors (n, D) or (n, D, 1, 1), or the tokens of a vision
+        transformer (n, T, C), of square images; a NumPy array or a tensor.
+    :param images: number n of images.
+    :param prefix_tokens: leading tokens that are no patches.
+    :param name: of the layer.
+    :returns: maps or vectors, likewise.
+    :raises SettingsError: another shape or type; tokens that are no square.
+    """
+    shape = tuple(getattr(output, 'shape', ()))
+    if len(shape) not in (2, 3, 4) or shape[0] != images or 0 in shape:
+        form = shape if shape else f'type {type(output).__name__}'
+        raise SettingsError(
+            f'{name} returns {form} for {images} images: expected maps (n, C, H, W), tokens '
+            '(n, T, C) or vectors (n, D); name another layer'
+        )
+    if shape[2:] == (1, 1):  # of a pooling over the whole map
+        return output[:, :, 0, 0]
+    if len(shape) != 3:
+        return output
+    n, T, C = shape
+    side = math.isqrt(max(T - prefix_tokens, 0))
+    if side < 1 or side**2 != T - prefix_tokens:
+        largest = math.isqrt(T)
+        raise SettingsError(
+            f'{name} returns {T} tokens, {T - prefix_tokens} without the first {prefix_tokens}: '
+            f'expected those of a square; prefix_tokens = {T - largest**2} leaves {largest} x '
+            f'{largest}'
+        )
+    return output[:, prefix_tokens:].swapaxes(1, 2).reshape(n, C, side, side)

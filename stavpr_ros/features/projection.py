@@ -53,5 +53,4 @@ class Projection:
         :raises InputError: another d than the matrix has rows.
         """
         require_shape('local features', strips, f'W n {len(self.matrix)}')
-        result: np.ndarray = strips @ self.matrix
-        return result
+        return strips @ self.matrix

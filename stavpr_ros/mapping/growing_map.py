@@ -31,7 +31,6 @@ class GrowingMap:
 
     :param projection: the random projection of the features, if they have one.
     :param limit: most places kept, at least 1.
-    :param cells: see :class:`LocalFeatures`; taken from the first place if not given.
     :param held_features: provider of the features of the places, copies, where another object is
         their owner; None = this object is.
     :raises SettingsError: no room for a place.
@@ -45,13 +44,13 @@ class GrowingMap:
         settings: FeatureSettings,
         projection: Projection | None,
         limit: int,
-        cells: tuple[int, int] | None = None,
         held_features: Callable[[], LocalFeatures] | None = None,
     ) -> None:
         require_at_least('limit', limit, 1, 'place')
         require_projection(projection, settings)
         self.settings, self.projection, self.limit = settings, projection, limit
-        self._cells, self._held_features = cells, held_features
+        self._held_features = held_features
+        self._cells: tuple[int, int] | None = None  # of the features of the first place
         self.dimension = 0  # d of a strip, once there is a place
         self.first = self._count = 0
         # a row for each place, and for those to come; strips (room, W, d) once there is a place
@@ -78,8 +77,8 @@ class GrowingMap:
                 f'a map of {n} places does not fit into a limit of {limit}: raise the limit'
             )
         features = place_map.features
-        growing = cls(place_map.settings, place_map.projection, limit, features.cells)
-        growing.dimension = features.dimension
+        growing = cls(place_map.settings, place_map.projection, limit)
+        growing.dimension, growing._cells = features.dimension, features.cells
         growing._make_room(max(n, min(ROOM, limit)), _rows_of(features[:1]))
         for low in range(0, n, ROOM):  # they may be in the map's file
             places = slice(low, min(low + ROOM, n))
@@ -197,7 +196,7 @@ class GrowingMap:
         self.dimension = features.dimension
         for name, row in (rows | added).items():
             self._rows[name][n] = row[0]
-        if not n and not self.first and self._cells is None:
+        if not n and not self.first:
             self._cells = features.cells
         self.ids.append(identifier)
         self.thumbnails.append(thumbnail)

@@ -162,7 +162,7 @@ def _strips(features: LocalFeatures, dtype: np.dtype) -> Iterator[np.ndarray]:
     """Yield the features of one strip after the other, (n, d)."""
     for j in range(features.settings.strips):
         if isinstance(features, StoredFeatures):
-            yield features.stored_strip(j).astype(dtype, copy=False)
+            yield features.strip(j).astype(dtype, copy=False)
         else:
             yield features.strips[j].astype(dtype, copy=False)
 

@@ -16,6 +16,7 @@ from stavpr_ros.features.registry import settings_class
 
 SHA256 = re.compile('[0-9a-f]{64}')
 NAME = re.compile('[a-z][a-z0-9_]{0,63}')  # of a section
+MAX_KEYS = 64
 Check = Callable[[Any, str], None]
 
 
@@ -40,19 +41,13 @@ def integer(low: int = 0, high: int = 2**31 - 1) -> Check:
 
 def text(longest: int = 256, pattern: re.Pattern[str] | None = None) -> Check:
     """Take a string that can be written as UTF-8 and published: no lone surrogates, no NUL."""
-    string = _rule(
-        lambda value: type(value) is str and len(value) <= longest and _is_text(value),
-        f'a text of at most {longest} characters',
-    )
-    if pattern is None:
-        return string
-    like = _rule(lambda value: bool(pattern.fullmatch(value)), f'a text like {pattern.pattern}')
+    expected = f' like {pattern.pattern}' if pattern else f' of at most {longest} characters'
 
-    def check(value: Any, where: str) -> None:
-        string(value, where)
-        like(value, where)
+    def is_valid(value: Any) -> bool:
+        is_text = type(value) is str and len(value) <= longest and _is_text(value)
+        return is_text and (pattern is None or bool(pattern.fullmatch(value)))
 
-    return check
+    return _rule(is_valid, f'a text{expected}')
 
 
 def list_of(item: Check, least: int = 0, most: int = 2**16) -> Check:
@@ -91,11 +86,11 @@ def record(keys: dict[str, Check]) -> Check:
     return check
 
 
-def mapping(key: Check, item: Check, most: int = 64) -> Check:
+def mapping(key: Check, item: Check) -> Check:
     """Take an object whose keys are names of one kind, with values of one kind."""
     sized = _rule(
-        lambda value: type(value) is dict and len(value) <= most,
-        f'an object with at most {most} keys',
+        lambda value: type(value) is dict and len(value) <= MAX_KEYS,
+        f'an object with at most {MAX_KEYS} keys',
     )
 
     def check(value: Any, where: str) -> None:

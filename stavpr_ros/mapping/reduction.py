@@ -67,13 +67,11 @@ def _directions(features: LocalFeatures, d: int) -> np.ndarray:
         _, vectors = np.linalg.eigh(centered @ centered.T)
         directions = vectors.T @ centered
         norms = np.linalg.norm(directions, axis=1, keepdims=True)
-        unit: np.ndarray = (directions / norms.clip(1e-9)).T
-        return unit
+        return (directions / norms.clip(1e-9)).T
     total, squares = np.zeros((W, d)), np.zeros((d, d))
     for low in range(0, n, BLOCK_PLACES):
         strips = features[low : low + BLOCK_PLACES].strips
         rows = strips.reshape(-1, d)
         total += strips.sum(axis=1)
         squares += rows.T @ rows
-    directions = np.linalg.eigh(squares - total.T @ total / max(n, 1))[1]
-    return directions
+    return np.linalg.eigh(squares - total.T @ total / max(n, 1))[1]

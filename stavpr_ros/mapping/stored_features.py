@@ -97,13 +97,10 @@ class StoredFeatures(LocalFeatures):
         """Return the features, read from the file; shape (W, n, d), float32."""
         return self._read(np.arange(len(self)))
 
-    def stored_strip(self, j: int) -> np.ndarray:
-        """Return the features of one strip in the type of the file, shape (n, d)."""
-        _, n, d = self._part.shape
-        strip: np.ndarray = np.empty((n, d), DTYPES[self._part.dtype])
-        with errors_of(self.file.path):
-            self.file.fill(strip, self._part.start + j * strip.nbytes)
-            require_normalized(strip, f'strips, strip {j}', 0)
+    def strip(self, j: int) -> np.ndarray:
+        """Return the features of one strip, shape (n, d), float32."""
+        strip: np.ndarray = np.empty(self._part.shape[1:], np.float32)
+        self._fill(strip, j, np.arange(len(self)))
         return strip
 
     @property

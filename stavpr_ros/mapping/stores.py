@@ -55,5 +55,4 @@ def store_of(address: str) -> Store:
             f'{address} needs the package stavpr_fleet, which is not installed: build it, or '
             "`pip install '.[fleet]'` in the repository"
         )
-    store: Store = stores[scheme]
-    return store
+    return stores[scheme]

@@ -81,17 +81,7 @@ class PipelineSettings:
 
     def recognition(self) -> RecognizerSettings:
         """Return the settings of the recognizer."""
-        return RecognizerSettings(
-            self.threshold,
-            sequence=self.sequence,
-            nms_radius=self.nms_radius,
-            mode=self.mode,
-            odometry_error=self.odometry_error,
-            time_budget_ms=self.time_budget_ms,
-            min_probability=self.min_probability,
-            max_error=self.max_error,
-            direction=self.direction,
-        )
+        return RecognizerSettings(**_of_same_name(RecognizerSettings, vars(self)))
 
     def require_operation(self, operation: str) -> None:
         """

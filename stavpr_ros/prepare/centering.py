@@ -210,8 +210,7 @@ def normalize(strips: np.ndarray) -> np.ndarray:
 
 def norms_of(strips: np.ndarray) -> np.ndarray:
     """Return the norms of features (..., d), shape (...)."""
-    norms: np.ndarray = np.sqrt(np.einsum('...d,...d->...', strips, strips))
-    return norms
+    return np.sqrt(np.einsum('...d,...d->...', strips, strips))
 
 
 @reassociating_kernel

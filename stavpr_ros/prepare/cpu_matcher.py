@@ -81,8 +81,7 @@ class CpuMatcher:
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,)."""
-        row: np.ndarray = self.distance_matrix(strips[:, None], weights[:, None])[0]
-        return row
+        return self.distance_matrix(strips[:, None], weights[:, None])[0]
 
     def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of Q images to every place, (Q, n)."""
@@ -131,8 +130,7 @@ class CpuMatcher:
         if self._spatial.strategy == 'sliding_window':
             return image_distances(d[:W], self._spatial)
         similarity = 1 - d.diagonal()[:, :W]  # (n, W)
-        row: np.ndarray = 1 - (similarity * self._weights.T) @ weights
-        return row
+        return 1 - (similarity * self._weights.T) @ weights
 
 
 class CpuRouteMatcher(CpuMatcher):

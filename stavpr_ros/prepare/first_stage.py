@@ -67,22 +67,19 @@ class FirstStage:
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,); exact ones where they count."""
-        n = self.places
-        out: np.ndarray = np.empty(n, np.float32)
-        nearest = np.empty(self._chunks, np.float32)
+        rows = np.full((self._chunks, CHUNK), np.inf, np.float32)
+        out, nearest = rows.ravel()[: self.places], np.empty(self._chunks, np.float32)
         query = int8.tiled(self._shifted(strips)[:, None])
         int8.smallest_distances(self._reduced.kernel_arguments(), query, CHUNK, out, nearest)
-        coarse = self._of_sample(out)
+        coarse = rows[self._sample]
         chunks = np.union1d(self._sample, self._candidates(nearest))
         exact = self._matcher.distances_at(strips, chunks * CHUNK, CHUNK)
-        sampled = exact[np.searchsorted(chunks, self._sample)].ravel()
-        sampled = sampled[np.isfinite(sampled)]
+        sampled = exact[np.searchsorted(chunks, self._sample)]
+        coarse, sampled = (each[np.isfinite(each)] for each in (coarse, sampled))
         scale = sampled.std() / max(coarse.std(), np.float32(MIN_DEVIATION))
         out *= scale
         out += sampled.mean() - scale * coarse.mean()
-        places = (chunks[:, None] * CHUNK + np.arange(CHUNK)).ravel()
-        inside = places < n
-        out[places[inside]] = exact.ravel()[inside]
+        rows[chunks] = exact
         return out
 
     @property
@@ -93,10 +90,6 @@ class FirstStage:
     def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the exact distances of Q images to every place, (Q, n)."""
         return self._matcher.distance_matrix(strips, weights)
-
-    def _of_sample(self, row: np.ndarray) -> np.ndarray:
-        places = (self._sample[:, None] * CHUNK + np.arange(CHUNK)).ravel()
-        return row[places[places < len(row)]]
 
     def _candidates(self, nearest: np.ndarray) -> np.ndarray:
         count = min(NEAREST, self._chunks)

@@ -207,8 +207,7 @@ class RouteFeatures:
         """Return the mean of the places from ``first`` on, of these weights."""
         less = np.append(np.zeros(first), 1 - weights)
         total = self._sum - self._total(less) if less.any() else self._sum
-        mean: np.ndarray = (total / weights.sum()).astype(np.float32)
-        return mean
+        return (total / weights.sum()).astype(np.float32)
 
     def _learn(self, first: int) -> None:
         """Take the mean and, until the route is settled, whitening; ``first`` becomes place 0."""

@@ -50,14 +50,12 @@ class DeviceBuffer(SequenceBuffer):
 
     def newest(self) -> np.ndarray:
         """Return the row of the newest image, (n,), copied from the device."""
-        row: np.ndarray = self._slots[self.oldest - 1][0].cpu().numpy()
-        return row
+        return self._slots[self.oldest - 1][0].cpu().numpy()
 
     def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
         """See :meth:`SequenceBuffer.at`; copied from the device."""
         flat = torch.from_numpy(self._ring(images)[:, None] * self.memory.shape[1] + columns)
-        entries: np.ndarray = self.memory.take(flat.to(self._device)).cpu().numpy()
-        return entries
+        return self.memory.take(flat.to(self._device)).cpu().numpy()
 
     def best_elsewhere(self, numbers: np.ndarray, position: int, excluded: np.ndarray) -> float:
         """See :meth:`SequenceBuffer.best_elsewhere`; waits for the device."""

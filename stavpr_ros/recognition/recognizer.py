@@ -44,7 +44,7 @@ from stavpr_ros.recognition.relative_motion import (
     with_odometry_test,
 )
 from stavpr_ros.recognition.sessions import layout_of
-from stavpr_ros.recognition.settings import RecognizerSettings
+from stavpr_ros.recognition.settings import PAPER, RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
 from stavpr_ros.threads import one_thread
 
@@ -500,7 +500,7 @@ def _window_of(
         return window
     if isinstance(backend, str):
         return LmDtwWindow(sequence, n, layout, options.query_znorm)
-    if options.any:
+    if options != PAPER:
         raise SettingsError(
             f"options {options} with backend '{backend}': without the place filter, it runs mode "
             "paper only; take 'cpu'"

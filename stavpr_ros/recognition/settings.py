@@ -1,6 +1,11 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the recognizers."""
+"""
+Settings of the recognizers, and the options of mode robust beyond the paper.
+
+Everything is causal: only images that have arrived count. The probability of a match has memory,
+and successive ones are correlated.
+"""
 
 from dataclasses import dataclass, field
 
@@ -16,9 +21,46 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.parameters import default
 from stavpr_ros.recognition.error_rate import least_probability
-from stavpr_ros.recognition.robust import options_of, RobustOptions
 
 DIRECTIONS = ('forward', 'both')
+MODES = ('paper', 'robust')
+
+
+@dataclass(frozen=True)
+class RobustOptions:
+    """
+    Failure modes of the paper's method and their mitigations.
+
+    :param mean_centering: subtract the mean of the map's features from its features, and the
+        running mean of the query from the query's: the part shared by all images distinguishes no
+        places.
+    :param whitening: shrink the directions in which the map's places vary most
+        (:class:`Whitening`): a direction that many places share distinguishes few of them.
+    :param query_znorm: z-normalize the distances of an image to all places (:func:`z_normalized`):
+        certain images are far from all places.
+    :param place_filter: follow place and speed with a Bayes filter with a state off the
+        map (:mod:`stavpr_ros.filter.place_filter`) instead of matching each window by LM-DTW,
+        where one place may absorb a window.
+    """
+
+    mean_centering: bool = True
+    whitening: bool = True
+    query_znorm: bool = True
+    place_filter: bool = True
+
+
+PAPER = RobustOptions(False, False, False, False)
+ROBUST = RobustOptions()
+
+
+def options_of(mode: str) -> RobustOptions:
+    """
+    Return the options of a mode.
+
+    :raises SettingsError: no such mode.
+    """
+    require_choice('mode', mode, MODES)
+    return ROBUST if mode == 'robust' else PAPER
 
 
 @dataclass(frozen=True)
@@ -33,7 +75,7 @@ class RecognizerSettings:
     :param nms_radius: the second best's midpoint is more than this many places from the nearest
         one's.
     :param mode: ``robust``, with all options of
-        :class:`stavpr_ros.recognition.robust.RobustOptions`, or ``paper``, LM-DTW as published.
+        :class:`stavpr_ros.recognition.settings.RobustOptions`, or ``paper``, LM-DTW as published.
     :param robust_options: another choice of options than the mode's.
     :param odometry_error: of a distance by odometry, as a share of it; where query and places have
         poses, the path of a match is compared with them; 0 = never. See

@@ -110,13 +110,11 @@ class SequenceBuffer:
         """Return the window, (l, n + padding), float32; padding is +inf. A view of two copies."""
         if self._copies == 1:
             return np.roll(self.memory, -self.oldest, axis=0)
-        rows: np.ndarray = self.memory[self.oldest : self.oldest + self.length]
-        return rows
+        return self.memory[self.oldest : self.oldest + self.length]
 
     def newest(self) -> np.ndarray:
         """Return the row of the newest image, (n,)."""
-        row: np.ndarray = self._slots[self.oldest - 1][0]
-        return row
+        return self._slots[self.oldest - 1][0]
 
     def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
         """
@@ -124,8 +122,7 @@ class SequenceBuffer:
 
         :param images: their number; None = all in the window.
         """
-        entries: np.ndarray = self.memory[self._ring(images)[:, None], columns]
-        return entries
+        return self.memory[self._ring(images)[:, None], columns]
 
     def best_elsewhere(self, numbers: np.ndarray, position: int, excluded: np.ndarray) -> float:
         """
@@ -140,8 +137,7 @@ class SequenceBuffer:
     def _ring(self, images: int | None = None) -> np.ndarray:
         """Return the rows of one copy of the newest images, oldest first, (images,)."""
         end = self.oldest + self.length
-        rows: np.ndarray = self._order[end - (images or len(self)) : end]
-        return rows
+        return self._order[end - (images or len(self)) : end]
 
     def clear(self) -> None:
         """Empty the window."""

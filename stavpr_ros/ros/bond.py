@@ -14,8 +14,8 @@ import uuid
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from stavpr_ros.ros.beat import Beat
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
+from stavpr_ros.ros.worker import Beat
 
 TOPIC, TIMEOUT = 'bond', 4.0  # seconds, as nav2_util::LifecycleNode
 PUBLISHED, RECEIVED = 5, 100  # depths of the queues, as bondcpp

@@ -10,8 +10,8 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from stavpr_ros.pipeline.statistics import ImageCounts, RECENT
-from stavpr_ros.ros.beat import Beat
 from stavpr_ros.ros.health import findings, Health, loss
+from stavpr_ros.ros.worker import Beat
 from std_msgs.msg import Header
 
 # first words of the causes shown with the input; the others are shown with the processing

@@ -16,9 +16,9 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
-from stavpr_ros.ros.beat import Beat
 from stavpr_ros.ros.messages import matched_pose_message, newest_pose, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
+from stavpr_ros.ros.worker import Beat
 from std_msgs.msg import Header
 
 # (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: a place does not determine the lateral

@@ -178,8 +178,7 @@ class CameraInput:
                 self._known = info, base, frame, None
                 self.problem = f'camera_info: {error}'
                 self._node.get_logger().warning(self.problem, throttle_duration_sec=REPORT_PERIOD)
-        camera: Camera | None = self._known[3]
-        return camera
+        return self._known[3]
 
     def _on_info(self, info: CameraInfo) -> None:
         info.header.stamp = Time().to_msg()  # a new stamp alone is no change

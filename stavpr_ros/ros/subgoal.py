@@ -2,16 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image of the map further ahead, as the subgoal of a learned policy of navigation."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage
-from stavpr_msgs.msg import PlaceCandidate, PlaceCandidates
+from stavpr_msgs.msg import PlaceCandidates
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.ros.messages import origin, time_message
+from stavpr_ros.recognition import Candidate
+from stavpr_ros.ros.messages import candidates_message
 from stavpr_ros.ros.output import is_requested
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Header
@@ -42,21 +45,9 @@ class SubgoalPublisher:
         direction = result.match.direction if result.match else 1
         distance = self._settings.subgoal_distance
         index = place_ahead(places, result.newest_index, distance, direction)
-        place = places.place(index)
-        candidate = PlaceCandidate(
-            place_index=index,
-            distance=result.distance,
-            probability=result.probability,
-            place_stamp=time_message(place.stamp),
-            place_id=place.identifier,
-            session=place.session,
-        )
-        message = PlaceCandidates(
-            header=header,
-            **origin(self._settings.robot_id, places),
-            threshold=result.threshold,
-            candidates=[candidate],
-        )
+        subgoal = Candidate(index, result.distance, result.probability)
+        only = replace(result, candidates=(subgoal,), session_probabilities=())
+        message = candidates_message(header, only, places, self._settings.robot_id)
         content = thumbnail_of_width(places, index, self._settings.subgoal_width)
         with until_shutdown(self._node):
             self._place.publish(message)

@@ -1,6 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The worker: one thread does the heavy work, behind a queue that drops its oldest item."""
+"""
+Threads of a node: the worker does the heavy work, behind a queue that drops its oldest item.
+
+A beat acts again and again, whatever the executor and the recognition are busy with.
+"""
 
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +15,9 @@ import traceback
 from typing import Any, TypeVar
 
 from rclpy.logging import get_logger
+from rclpy.node import Node
 from stavpr_ros.errors import StavprError
+from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.signals import time_left
 
 STOP_TIMEOUT = 3.0  # seconds for the work in progress at the end
@@ -140,3 +146,34 @@ class Worker:
             except Exception as error:
                 future.set_exception(error)
         self._running = None
+
+
+class Beat:
+    """
+    Calls a function every period, on the steady clock, from now on: a paused bag does not stop it.
+
+    :param node: it logs errors; the next call may succeed.
+    :param period: seconds.
+    :param name: of the thread, and of what an error prevents.
+    """
+
+    def __init__(self, node: Node, period: float, act: Callable[[], object], name: str) -> None:
+        self._node, self._period, self._act = node, period, act
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, after a call in progress."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._period):
+            try:
+                self._act()
+            except Exception as error:
+                self._node.get_logger().error(
+                    f'no {self._thread.name}: {type(error).__name__}: {error}',
+                    throttle_duration_sec=REPORT_PERIOD,
+                )

@@ -157,20 +157,11 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
 
 
 def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
-    """Return the requested topic, or the only one; an error lists the topics."""
-    images = {name: info for name, info in topics.items() if info[0] in {RAW, COMPRESSED, *VIDEO}}
+    """Return the requested image topic, or the only one; an error lists the topics."""
+    kinds = {RAW, COMPRESSED, *VIDEO}
+    images = {name: info for name, info in topics.items() if info[0] in kinds}
     if topic is not None:
-        name = next((name for name in topics if name.lstrip('/') == topic.lstrip('/')), None)
-        if name in images:
-            if not images[name][1]:
-                raise SourceError(
-                    f'topic {name!r} of {path} has no messages: there are {_listed(images)}'
-                )
-            return name
-        where = 'is not in' if name is None else f'is of type {topics[name][0]}, not an image, in'
-        raise SourceError(
-            f'topic {topic!r} {where} {path}: expected one of {_listed(images or topics)}'
-        )
+        return _named(path, topics, topic, kinds)
     nonempty = {name: info for name, info in images.items() if info[1]}
     if len(nonempty) == 1:
         return next(iter(nonempty))
@@ -178,8 +169,21 @@ def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -
         raise SourceError(
             f'{path} has {len(nonempty)} image topics, choose one (--topic): {_listed(nonempty)}'
         )
-    kinds = ', '.join([RAW, COMPRESSED, *sorted(VIDEO)])
-    raise SourceError(f'{path} has no images (expected {kinds}): there are {_listed(topics)}')
+    expected = ', '.join([RAW, COMPRESSED, *sorted(VIDEO)])
+    raise SourceError(f'{path} has no images (expected {expected}): there are {_listed(topics)}')
+
+
+def _named(path: Path, topics: dict[str, tuple[str, int]], topic: str, kinds: set[str]) -> str:
+    """Return the topic of this name, with or without a slash, if it is of these kinds."""
+    suitable = {name: info for name, info in topics.items() if info[0] in kinds}
+    name = next((name for name in topics if name.strip('/') == topic.strip('/')), None)
+    if name in suitable and topics[name][1]:
+        return name
+    where = 'is not in' if name is None else f'is of type {topics[name][0]} in'
+    where = 'has no messages in' if name in suitable else where
+    raise SourceError(
+        f'topic {topic!r} {where} {path}: expected one of {_listed(suitable or topics)}'
+    )
 
 
 def _listed(topics: dict[str, tuple[str, int]]) -> str:
@@ -202,7 +206,9 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     stamps: list[int] = []
     poses = []
     with open_bag(path) as bag:
-        for _, time_ns, raw in bag.messages(_connections(bag, path, topic)):
+        name = _named(path, _topics(bag), topic, {ODOMETRY})
+        connections = [each for each in bag.reader.connections if each.topic == name]
+        for _, time_ns, raw in bag.messages(connections):
             try:
                 message = bag.deserialize(raw, ODOMETRY)
             except Exception:  # garbage raises errors of any type
@@ -213,32 +219,18 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
             p, q = message.pose.pose.position, message.pose.pose.orientation
             poses.append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     if not stamps:
-        raise SourceError(f'odometry {topic!r} of {path} has no messages: expected at least one')
+        raise SourceError(f'odometry {topic!r} of {path} has none of the messages that it states')
     when, where = np.array(stamps, np.int64), np.array(poses, np.float64)
     before, after = when[:-2], when[2:]  # a single stamp of another time is invalid
     is_alone = (when[1:-1] < before - LATE) | (when[1:-1] > after + LATE)
     alone = 1 + np.flatnonzero(is_alone & (after >= before - LATE))
     when[alone], where[alone] = when[alone - 1], np.nan
-    _require_one_run(when, f'odometry {topic!r} of {path}')
-    order = np.argsort(when, kind='stable')
-    return when[order], where[order]
-
-
-def _connections(bag: OpenBag, path: Path, topic: str) -> list[Any]:
-    topics = _topics(bag)
-    name = next((name for name in topics if name.strip('/') == topic.strip('/')), None)
-    if name is not None and topics[name][0] == ODOMETRY:
-        return [each for each in bag.reader.connections if each.topic == name]
-    where = 'is not in' if name is None else f'is of type {topics[name][0]}, not {ODOMETRY}, in'
-    others = ', '.join(other for other in topics if topics[other][0] == ODOMETRY) or 'none'
-    raise SourceError(f'odometry topic {topic!r} {where} {path}: topics of that type are {others}')
-
-
-def _require_one_run(stamps: np.ndarray, name: str) -> None:
-    back = np.maximum.accumulate(stamps) - stamps
+    back = np.maximum.accumulate(when) - when
     if back.max() > LATE:
         i = int(np.argmax(back > LATE))
         raise SourceError(
-            f'{name} goes back by {back[i] / SECOND:.1f} s at message {i}: expected one run, cut '
-            'the bag'
+            f'odometry {topic!r} of {path} goes back by {back[i] / SECOND:.1f} s at message {i}: '
+            'expected one run, cut the bag'
         )
+    order = np.argsort(when, kind='stable')
+    return when[order], where[order]

@@ -17,7 +17,7 @@ from stavpr_lab.evaluation.seqslam import match_differences, match_lines, SeqSla
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.robust import MODES
+from stavpr_ros.recognition.settings import MODES
 
 TOLERANCES = (0, 1, 2, 10)  # places
 LENGTHS = (1, 4, 5, 10, 20)  # images

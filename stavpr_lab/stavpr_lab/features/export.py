@@ -19,8 +19,7 @@ import warnings
 import numpy as np
 from stavpr_lab.features.weights import last_line
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.features.onnx import BATCH, import_onnx, ON_CPU, TOLERANCE
-from stavpr_ros.features.outputs import as_maps
+from stavpr_ros.features.onnx import as_maps, BATCH, import_onnx, ON_CPU, TOLERANCE
 import torch
 from torch import nn
 

@@ -20,7 +20,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.robust import PAPER, ROBUST, RobustOptions
+from stavpr_ros.recognition.settings import PAPER, ROBUST, RobustOptions
 import torch
 
 W = 7
@@ -99,7 +99,7 @@ PRESETS: dict[str, tuple[Configuration, ...]] = {
             Configuration(
                 f'without_{option.name}',
                 f'without {option.name}',
-                robust_options=ROBUST.without(option.name),
+                robust_options=replace(ROBUST, **{option.name: False}),
             )
             for option in fields(RobustOptions)
             if getattr(ROBUST, option.name)
