@@ -31,7 +31,7 @@ import numpy as np
 from results import environment, RESULTS, ROOT, table, write_json
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from stavpr_ros.mapping.transforms import inverse
+from stavpr_ros.mapping.transforms import inverse, to_poses
 from stavpr_slam.pose_graph import g2o, PoseGraph
 from stavpr_slam.pose_graph.g2o import Edge, graph_of, read_edges
 from stavpr_slam.pose_graph.transforms import adjoints
@@ -86,25 +86,29 @@ def ours(edges: list[Edge]) -> Result:
 
 def one_at_a_time(edges: list[Edge]) -> Result:
     """Return the same where closures come with the later one of their nodes, each an update."""
+    given = graph_of(edges)
     with patch.object(g2o, 'PoseGraph') as made:
         graph_of(edges)
-    odometry, closures = (
-        [(call.args, call.kwargs) for call in calls.call_args_list]
-        for calls in (made.return_value.add_odometry, made.return_value.add_closure)
-    )
-    graph, times = PoseGraph(*made.call_args.args), list[float]()
-    at = np.array([max(each.query_stamp, each.place_stamp) for (each,), _ in closures])
+    closures = [call.args[0] for call in made.return_value.add_closure.call_args_list]
+    graph, times = PoseGraph(given.settings), list[float]()
+    poses = to_poses(given.chain.transforms)
+
+    def advance(stamp: int) -> None:
+        """Add the odometry up to a stamp, with the errors of the file."""
+        until = int(np.searchsorted(given.chain.stamps, stamp, 'right'))
+        for node in range(len(graph.chain), until):
+            graph.add_odometry(int(given.chain.stamps[node]), poses[node])
+            graph.chain.spread[node] = given.chain.spread[node]
+
+    at = np.array([max(each.query_stamp, each.place_stamp) for each in closures])
     order = np.argsort(at, kind='stable')
     for number in order:
-        while odometry and odometry[0][0][0] <= at[number]:
-            given, named = odometry.pop(0)
-            graph.add_odometry(*given, **named)
-        graph.add_closure(*closures[number][0])
+        advance(at[number])
+        graph.add_closure(closures[number])
         began = time.process_time()
         graph.update()
         times.append((time.process_time() - began) * 1e3)
-    for given, named in odometry:
-        graph.add_odometry(*given, **named)
+    advance(given.chain.stamps[-1])
     solved, accepted = graph.update(final=True), np.zeros(len(order), bool)
     accepted[order] = [edge.accepted for edge in graph.edges]
     return solved[:, :3, 3], accepted, times

@@ -119,6 +119,21 @@ def test_public_graphs_go_on_where_they_were_ended(tmp_path, monkeypatch, capsys
     assert '3 of 9' in capsys.readouterr().out
 
 
+def test_public_graph_one_closure_at_a_time_ends_like_all_at_once():
+    """By the errors that its file states, here far above the default ones."""
+    graph_files = pytest.importorskip('graph_files', reason='needs gtsam', exc_type=ImportError)
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(1.9), -np.sin(1.9)], [np.sin(1.9), np.cos(1.9)]]
+    turn[0, 3] = 1.0
+    edges = [(i, i + 1, turn, np.eye(6) * 10) for i in range(40)]
+    edges += [(i, i + 4, np.eye(4), np.eye(6) * 1e4) for i in range(30)]
+    expected = graph_files.ours(edges)
+    found, accepted, times = graph_files.one_at_a_time(edges)
+    assert accepted.tolist() == expected[1].tolist() == [True] * 30
+    np.testing.assert_allclose(found, expected[0], atol=1e-3)
+    assert len(times) == 30
+
+
 def test_benchmarks_import_only_what_the_packages_have():
     """Also of those whose own packages, such as gtsam, are not installed here."""
     missing = []

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import math
 
 import numpy as np
-from scipy.sparse import coo_matrix, eye_array
+from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 from stavpr_ros.compilation import kernel
 
@@ -334,41 +334,6 @@ def _spread(
     return determinant
 
 
-@kernel
-def _filled(first, below, starts):
-    """
-    Return the rows of the blocks of a decomposition, by columns, and write where each one begins.
-
-    :param first, below: rows below the diagonal of each column of the matrix, likewise.
-    """
-    count = len(first) - 1
-    rows, used = np.empty(4 * (len(below) + count), np.int64), 0
-    seen, head, link = np.full(count, -1), np.full(count, -1), np.full(count, -1)
-    for j in range(count):
-        while used + count > len(rows):
-            rows = np.append(rows, np.empty_like(rows))
-        starts[j] = used
-        rows[used], seen[j] = j, j
-        used += 1
-        child = -2  # the column itself, then those whose first row below the diagonal it is
-        while child != -1:
-            begin, end = (
-                (first[j], first[j + 1]) if child < 0 else (starts[child], starts[child + 1])
-            )
-            for p in range(begin, end):
-                row = below[p] if child < 0 else rows[p]
-                if row > j and seen[row] != j:
-                    rows[used], seen[row] = row, j
-                    used += 1
-            child = head[j] if child < 0 else link[child]
-        rows[starts[j] : used].sort()
-        starts[j + 1] = used
-        if used > starts[j] + 1:
-            parent = rows[starts[j] + 1]
-            link[j], head[parent] = head[parent], j
-    return rows[:used]
-
-
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """
@@ -387,20 +352,15 @@ class Pattern:
 
     @classmethod
     def of(cls, ends: np.ndarray, count: int, active: np.ndarray) -> 'Pattern':
-        """Order by minimum degree, as SuperLU does."""
+        """Order by minimum degree, and take the blocks of a matrix without zeros in its roots."""
         i, j = ends[active & (ends[:, 0] >= 0)].T
-        graph = coo_matrix((np.full(len(i), -1.0), (i, j)), (count, count))
+        graph = coo_array((np.full(len(i), -1.0), (i, j)), (count, count))
         graph = graph + graph.T
-        graph = (graph + eye_array(count) * (1 - graph.sum(axis=0).min())).tocsc()
+        graph = (graph + diags_array(1e-3 - graph.sum(axis=0))).tocsc()
         options = {'SymmetricMode': True}
-        place = splu(graph, 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, options=options).perm_c
-        starts = np.zeros(count + 1, np.int64)
-        first, second = place[i], place[j]
-        column, row = np.minimum(first, second), np.maximum(first, second)
-        by_column = np.argsort(column, kind='stable')
-        rows = _filled(
-            np.searchsorted(column[by_column], np.arange(count + 1)), row[by_column], starts
-        )
+        found = splu(graph, 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, relax=1, options=options)
+        place, L = found.perm_c, found.L.tocsc().sorted_indices()
+        starts, rows = L.indptr.astype(np.int64), L.indices.astype(np.int64)
         keys = np.repeat(np.arange(count), np.diff(starts)) * count + rows
         first, second = place[ends[:, 0]], place[ends[:, 1]]
         column, row = np.minimum(first, second), np.maximum(first, second)
