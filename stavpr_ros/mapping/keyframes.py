@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_between
 from stavpr_ros.compilation import kernel
+from stavpr_ros.features.area import BLUE, GREEN, HALF, RED
 from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
 from stavpr_ros.units import SECOND
 
 OUT_OF_ORDER = SECOND // 10  # images later than this after a newer one: the clock jumped back
 SIZE = (32, 24)  # width and height of the images compared: averages noise out, but not motion
 MOST_ROWS = 257  # of a block, whose sums of bytes have 16 bits
-BLUR = 0.5  # pixels of the small image
+BLUR = cv2.getGaussianKernel(5, 0.5, cv2.CV_32F).ravel()  # by .5 pixels of the small image
 FLAT = 1.0  # standard deviation, gray levels, below which an image shows only noise
 
 
@@ -68,8 +69,7 @@ def small_gray(image: np.ndarray) -> np.ndarray:
     else:
         small = np.empty((height, width, 3), np.uint8)
         _block_means(image.reshape(height, -1, image.shape[1] * 3), small)
-    gray = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(gray, (0, 0), BLUR))
+    return np.asarray(_blurred(small))
 
 
 @kernel
@@ -96,6 +96,27 @@ def _block_means(rows: np.ndarray, small: np.ndarray) -> None:
                 small[i, j, channel] = np.uint8(np.rint(np.float32(total) * scale))
 
 
+@kernel
+def _blurred(small: np.ndarray) -> np.ndarray:
+    """Return an RGB image (h, w, 3) in OpenCV's gray levels, blurred, mirrored at its edges."""
+    height, width, reach = small.shape[0], small.shape[1], len(BLUR) // 2
+    bottom, right = height - 1, width - 1
+    levels = np.empty((height + 2 * reach, width + 2 * reach))
+    for y in range(levels.shape[0]):
+        for x in range(levels.shape[1]):
+            row = small[bottom - abs(bottom - abs(y - reach))]
+            pixel = row[right - abs(right - abs(x - reach))]
+            levels[y, x] = (pixel[0] * RED + pixel[1] * GREEN + pixel[2] * BLUE + HALF) >> 15
+    gray = np.zeros((height, width), np.float32)
+    for i in range(len(BLUR)):
+        for y in range(height):
+            for j in range(len(BLUR)):
+                for x in range(width):
+                    gray[y, x] += BLUR[i] * BLUR[j] * levels[y + i, x + j]
+    return gray
+
+
+@kernel
 def image_change(a: np.ndarray, b: np.ndarray) -> float:
     """
     Return 1 - the normalized cross-correlation, invariant to brightness and gain.
@@ -103,13 +124,18 @@ def image_change(a: np.ndarray, b: np.ndarray) -> float:
     :param a: of :func:`small_gray`, shape (24, 32), float32; so is b.
     :returns: 0 (equal) to 2 (negatives of each other); two flat images 0, one flat image 1.
     """
-    a, b = a - a.mean(), b - b.mean()
-    least = FLAT * np.sqrt(a.size)
-    norms = float(np.linalg.norm(a)), float(np.linalg.norm(b))
-    flat = [norm < least for norm in norms]
-    if any(flat):
-        return 0.0 if all(flat) else 1.0
-    return float(np.clip(1.0 - np.vdot(a, b) / (norms[0] * norms[1]), 0.0, 2.0))
+    sum_a = sum_b = aa = bb = ab = 0.0
+    for y in range(a.shape[0]):
+        for x in range(a.shape[1]):
+            sum_a, sum_b = sum_a + a[y, x], sum_b + b[y, x]
+    for y in range(a.shape[0]):
+        for x in range(a.shape[1]):
+            of_a, of_b = a[y, x] - sum_a / a.size, b[y, x] - sum_b / b.size
+            aa, bb, ab = aa + of_a * of_a, bb + of_b * of_b, ab + of_a * of_b
+    least = FLAT**2 * a.size
+    if aa < least or bb < least:
+        return 0.0 if aa < least and bb < least else 1.0
+    return min(max(1 - ab / np.sqrt(aa * bb), 0.0), 2.0)
 
 
 class KeyframeSelector:
