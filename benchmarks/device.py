@@ -26,8 +26,8 @@ from unittest.mock import patch
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
+from stavpr_ros.prepare.blocks import rounded
 from stavpr_ros.prepare.centering import MeanCentering
-from stavpr_ros.prepare.int8_features import rounded
 from stavpr_ros.prepare.prepared_map import PreparedMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 import torch

@@ -28,8 +28,8 @@ from stavpr_lab.demonstration.false_places import FalsePlaces
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import CARRIED, drive_laps, LapDrive
 from stavpr_ros.mapping.transforms import inverse, matrices
-from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.relative_pose.pair import Source
 from stavpr_slam.pose_graph import Closure, optimize, PoseGraph
 from stavpr_slam.pose_graph.transforms import planar_poses
 from tqdm import tqdm

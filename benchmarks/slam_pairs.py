@@ -14,10 +14,9 @@ from stavpr_lab.demonstration.street.laps import CAMERA_IN_BASE, intrinsics, Lap
 from stavpr_lab.demonstration.street.traverses import SIZE
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
-from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.landmarks import View
-from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 from stavpr_ros.sources.frame import ImageRecord
 from stavpr_slam.pose_graph import Closure
 from stavpr_slam.pose_graph.alignment import APPEARANCE, IDENTITY

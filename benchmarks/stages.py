@@ -19,16 +19,21 @@ from peaks import reader
 from results import READING
 from run import Peer, Run
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
-from stavpr_ros.alignment.lm_dtw import best_match, match_padded, padded_width, SequenceDistances
-from stavpr_ros.alignment.path import trace_sequence
+from stavpr_ros.alignment.lm_dtw import (
+    best_match,
+    match_padded,
+    padded_width,
+    SequenceDistances,
+    trace_sequence,
+)
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.pipeline import LoadedMap, Pipeline, PipelineSettings
+from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import MeanCentering, normalize
-from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -215,7 +220,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     """Measure the image distances of a map in int8 and its first stage, on a CPU."""
     from stavpr_ros.filter.paths import BLOCK, TOP
     from stavpr_ros.prepare.cpu_matcher import CpuMatcher
-    from stavpr_ros.prepare.first_stage import FirstStage
+    from stavpr_ros.prepare.first_stage import BYTES, FirstStage
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
@@ -232,7 +237,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     works = [bounds.product(sizes, 'int8'), bounds.spatial_alignment(sizes)]
     call = partial(exact.distances, *arguments)
     run.measure('image_distances', (n, d), call, works, precision='int8')
-    reduced = [bounds.product(Sizes(n, stage.dimension, 1), 'int8')]
+    reduced = [bounds.product(Sizes(n, BYTES // STRIPS * STRIPS, 1), 'int8')]
     call = partial(stage.distances, *arguments)
     peer = Peer('exact', timed(partial(exact.distances, *arguments)), 'all places exactly')
     run.measure('first_stage', (n, d), call, reduced, [peer], 'int8', 'robust')

@@ -13,9 +13,8 @@ from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
 from stavpr_ros.parameters import BY_NAME
-from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
-from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 from stavpr_ros.relative_pose.verification import load_verifier, verified_edge
 
 PLACE = 5

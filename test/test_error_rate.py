@@ -9,7 +9,7 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping import save_map
-from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.error_rate import ERRORS, least_probability, PROBABILITIES

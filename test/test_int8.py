@@ -18,7 +18,7 @@ from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.prepare.int8_features import rounded
+from stavpr_ros.prepare.blocks import rounded
 from stavpr_ros.prepare.matcher import make_matcher
 
 TILE = int8.TILE

@@ -16,7 +16,7 @@ from stavpr_ros.alignment import (
     SequenceDistances,
     SequenceSettings,
 )
-from stavpr_ros.alignment.path import trace_sequence
+from stavpr_ros.alignment.lm_dtw import trace_sequence
 from test_spatial import DTYPES, random_distances
 
 INF = math.inf

@@ -36,8 +36,8 @@ from stavpr_ros.mapping import (
     Session,
     verify_map,
 )
-from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.map_file import save_error_risks
+from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 

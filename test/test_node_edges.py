@@ -16,8 +16,8 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.camera import FORWARD, mount_of
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
+from stavpr_ros.relative_pose.pair import Edge, Source
 from stavpr_ros.ros import edges
 from stavpr_ros.ros.edges import EdgePublisher, MAX_WAITING, WaitingClosure
 from stavpr_ros.ros.messages import camera_of

@@ -26,8 +26,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.commands import replay
 from stavpr_ros.errors import SourceError, UnavailableError
 from stavpr_ros.ros import process
-from stavpr_ros.ros.message_types import message_class
-from stavpr_ros.ros.messages import record_message
+from stavpr_ros.ros.messages import message_class, record_message
 from stavpr_ros.ros.playback import Playback
 from stavpr_ros.ros.replay import Replayer, ReplayOptions
 from stavpr_ros.sources.bag import BagSource

@@ -8,7 +8,7 @@ import numpy as np
 from places import recognize_all
 import pytest
 from stavpr_ros.alignment import best_match, match_sequence, SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.path import trace_sequence
+from stavpr_ros.alignment.lm_dtw import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, load_map, PlaceMap

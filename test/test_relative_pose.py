@@ -15,10 +15,9 @@ from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.relative_pose import landmarks
-from stavpr_ros.relative_pose.edge import Source
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
 from stavpr_ros.relative_pose.odometry import align
-from stavpr_ros.relative_pose.pair import MatchedPair, TRIANGULATION_RADIUS
+from stavpr_ros.relative_pose.pair import MatchedPair, Source, TRIANGULATION_RADIUS
 from stavpr_ros.relative_pose.pnp import MIN_INLIERS
 from test_pnp import CAMERA, in_camera, points_ahead, pose, SIZE
 

@@ -22,7 +22,7 @@ from stavpr_ros.mapping import (
     select_places,
     select_session,
 )
-from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status

@@ -1,12 +1,15 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Temporal alignment: a window against every place of the map, LM-DTW (section 4)."""
+"""Temporal alignment of a window with every place of the map, LM-DTW (section 4); its path."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import float_array, no_nan
+from stavpr_ros.errors import InputError
+
+NO_PATH = np.empty((0, 2), np.int32)
 
 
 @dataclass(frozen=True)
@@ -114,3 +117,39 @@ def best_match(matches: SequenceDistances, nms_radius: int) -> SequenceMatch | N
         second_best_index=int(middles[second]) if second >= 0 else -1,
         second_best_distance=float(distances[second]) if second >= 0 else float('nan'),
     )
+
+
+def trace_sequence(window: np.ndarray, start: int, k: int) -> np.ndarray:
+    """
+    Trace the path of one start in a checked window: to the first end with the smallest S / C.
+
+    :param window: image distances D, shape (l, n).
+    :param k: map images a start searches.
+    :returns: the cells from the first to the last, shape (m, 2), int32: (query index, map index),
+        both 0-based, the map index counted from the map's start.
+    """
+    from stavpr_ros.alignment.cpu import dtw
+
+    d = np.ascontiguousarray(window[:, start : start + k])
+    S, C, step = np.empty_like(d), np.empty_like(d), np.empty(d.shape, np.int8)
+    dtw.accumulate(d, S, C, step)
+    path = np.empty((sum(d.shape), 2), np.int32)
+    count = dtw.backtrack(step, len(d) - 1, int(np.argmin(S[-1] / C[-1])), path)
+    path[:, 1] += start
+    return path[:count][::-1].copy()
+
+
+def aligned_index(path: np.ndarray, query_index: int) -> int:
+    """
+    Return the map index aligned with one query image: the middle one (floor) of several.
+
+    :param path: a warping path, shape (m, 2).
+    :param query_index: 0-based row of the path.
+    :raises InputError: the path has no such row.
+    """
+    columns = path[path[:, 0] == query_index, 1]
+    if not columns.size:
+        raise InputError(
+            f'query index {query_index} is not on the path, which has rows 0 to {path[:, 0].max()}'
+        )
+    return int(columns[0] + columns[-1]) // 2

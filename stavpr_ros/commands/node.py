@@ -3,10 +3,13 @@
 """``ros2 run stavpr_ros node``: the place-recognition node."""
 
 import sys
+from typing import TYPE_CHECKING
 
-from stavpr_ros.parameters import BY_NAME, PARAMETERS
-from stavpr_ros.signals import run_until_signal
-from stavpr_ros.threads import wait_passively
+from stavpr_ros import parameters
+from stavpr_ros.commands.program import run_node_program
+
+if TYPE_CHECKING:
+    from stavpr_ros.ros.node import PlaceRecognitionNode
 
 BLAS = 'scipy.linalg.cython_blas'  # numba imports it where SciPy is installed
 
@@ -32,30 +35,23 @@ recorded map could not be saved at the end
 """
 
 
-def _help() -> str:
-    rows = []
-    for row in PARAMETERS:
-        unit = f' [{row.unit}]' if row.unit else ''
-        rows.append(f'  {row.name} (default {row.default!r})\n      {row.sentence}{unit}\n')
-    return HELP.format(parameters=''.join(rows))
+PARAMETERS = {
+    row.name: (row.default, row.sentence + (f' [{row.unit}]' if row.unit else ''))
+    for row in parameters.PARAMETERS
+}
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until it is stopped."""
-    arguments = sys.argv[1:] if args is None else args
-    if arguments[:1] in (['-h'], ['--help']):
-        print(_help())
-        return 0
-    wait_passively()
-    return run_until_signal(lambda: _run(args))
+    return run_node_program(HELP, __name__, 'make_node', args)
 
 
-def _run(args: list[str] | None) -> int:
+def make_node() -> 'PlaceRecognitionNode':
+    """Make the node; ROS is initialized."""
     _import_numba()
     from stavpr_ros.ros.node import PlaceRecognitionNode
-    from stavpr_ros.ros.process import run_node
 
-    return run_node(PlaceRecognitionNode, args, BY_NAME)
+    return PlaceRecognitionNode()
 
 
 def _import_numba() -> None:

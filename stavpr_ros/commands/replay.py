@@ -16,7 +16,7 @@ from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run
 from stavpr_ros.commands.record import Recorder
 from stavpr_ros.errors import ImageError, left_out, SourceError, StavprError, UnavailableError
 from stavpr_ros.output_file import atomic_output, RECORDING
-from stavpr_ros.ros.message_types import message_class
+from stavpr_ros.ros.messages import message_class
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import (
     NoResultError,

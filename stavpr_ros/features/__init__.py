@@ -10,14 +10,17 @@ from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from stavpr_ros.features.extractor import FeatureExtractor, FeatureSettings, LocalFeatures
-    from stavpr_ros.features.projection import Projection
+    from stavpr_ros.features.extractor import (
+        FeatureExtractor,
+        FeatureSettings,
+        LocalFeatures,
+        Projection,
+    )
 
 __all__ = ['FeatureExtractor', 'FeatureSettings', 'LocalFeatures', 'Projection']
-_MODULES = {'Projection': 'projection'}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    return getattr(import_module(f'{__name__}.{_MODULES.get(name, "extractor")}'), name)
+    return getattr(import_module(f'{__name__}.extractor'), name)

@@ -9,11 +9,9 @@ once, on any machine with torch; a robot needs that file and onnxruntime. Requir
 ``learned``.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features.model_files import cache_folder, models_folder
 from stavpr_ros.features.onnx import Onnx
@@ -28,7 +26,7 @@ MEAN, STD = (127.0,) * 3, (128.0,) * 3  # of the training, for values 0..255
 
 class EfficientNetLite1:
     """
-    Feature maps (n, 112, 7, 7).
+    Feature maps (n, 112, 7, 7), by :class:`stavpr_ros.features.onnx.Onnx`.
 
     :param device: as for features ``onnx``.
     :raises UnavailableError: the file or onnxruntime is not there.
@@ -46,17 +44,9 @@ class EfficientNetLite1:
             mean=MEAN,
             std=STD,
         )
-        self._network = Onnx(onnx, device)
-        self.settings = replace(settings, sha256=self._network.settings.sha256)
-
-    def feature_maps(self, images: Sequence[np.ndarray]) -> np.ndarray:
-        """
-        Compute the feature maps of a batch of images.
-
-        :param images: RGB, each (h, w, 3) uint8, of any size.
-        :returns: shape (n, 112, 7, 7), float32.
-        """
-        return self._network.feature_maps(images)
+        network = Onnx(onnx, device)
+        self.feature_maps = network.feature_maps
+        self.settings = replace(settings, sha256=network.settings.sha256)
 
 
 def find_file() -> Path:

@@ -14,23 +14,29 @@ from stavpr_ros.errors import InputError, printable
 from stavpr_ros.features import FeatureSettings, Projection
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
-from stavpr_ros.mapping.map_schema import (
+from stavpr_ros.mapping.map_version2 import (
     CAMERAS,
     Check,
     ERROR_RISKS,
     identity_fields,
     INTRINSICS,
+    KNOWN_SECTIONS,
     number,
     record,
+    RISKS,
     VALUE_RANGE,
 )
-from stavpr_ros.mapping.map_statistics import CHANGES, STATISTICS, statistics_of
-from stavpr_ros.mapping.map_version2 import KNOWN_SECTIONS
-from stavpr_ros.mapping.place_map import PlaceMap, Session
-from stavpr_ros.mapping.stored_features import LONGEST, StoredFeatures, StoredThumbnails
+from stavpr_ros.mapping.place_map import ErrorRisks, PlaceMap, Session
+from stavpr_ros.mapping.stored_features import (
+    CHANGES,
+    LONGEST,
+    STATISTICS,
+    statistics_of,
+    StoredFeatures,
+    StoredThumbnails,
+)
 
 T = TypeVar('T')
 _log = logging.getLogger(__name__)
@@ -123,7 +129,7 @@ def map_content(file: MapFile) -> PlaceMap:
         same_as=arrays.get('same_places/same_as'),
         threshold=_threshold(sections['threshold']['data']) if 'threshold' in readable else None,
         map_id=file.map_id,
-        error_risks=section('error_risks', ERROR_RISKS, ErrorRisks, recordings=[]),
+        error_risks=section(ERROR_RISKS, RISKS, ErrorRisks, recordings=[]),
     )
 
 

@@ -19,8 +19,7 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import KeyframeSelector
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.pipeline.geometric_check import GeometricCheck
-from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.pipeline.result import GeometricCheck, ImageResult
 from stavpr_ros.pipeline.save_state import SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
@@ -76,7 +75,8 @@ class Operation(ABC):
     :param save_state: of the places.
     :raises StavprError: invalid settings, a map that cannot be used, or a missing model.
 
-    ``places`` is a map, a growing one, or None while localization waits for one.
+    ``places`` is a map, a growing one, or None while localization waits for one; ``recognizer``
+    is None without a map.
     """
 
     name = ''
@@ -91,7 +91,7 @@ class Operation(ABC):
         self.settings, self.extractor, self.save_state = settings, extractor, save_state
         self.places: PlaceMap | GrowingMap | None = place_map
         self.reference = place_map  # that images are matched with; None = the recorded route
-        self._recognizer: SequenceRecognizer | None = None
+        self.recognizer: SequenceRecognizer | None = None
         self._start(place_map)
         self._to_bytes: ToBytes | None = None
         if self.extractor is not None:
@@ -119,11 +119,6 @@ class Operation(ABC):
     def matched_places(self) -> PlaceMap | GrowingMap | None:
         """Return the places that matches are of: the map, or the recorded route."""
         return self.places if self.reference is None else self.reference
-
-    @property
-    def recognizer(self) -> SequenceRecognizer | None:
-        """Return the recognizer; None without a map."""
-        return self._recognizer
 
     @property
     def contrast(self) -> float:
@@ -170,8 +165,8 @@ class Operation(ABC):
         :raises SettingsError: limits out of range; nothing is changed then.
         """
         before, check = self.threshold, settings.geometric
-        if self._recognizer is not None:
-            self._recognizer.set_limits(
+        if self.recognizer is not None:
+            self.recognizer.set_limits(
                 settings.threshold, settings.min_probability, settings.max_error
             )
         self.settings, self._keyframes.settings = settings, settings.keyframes
@@ -184,7 +179,7 @@ class Operation(ABC):
         """Empty the window: the next images do not continue those before."""
         self._last = None
         self._window.clear()
-        for each in (self._keyframes, self._check, self._recognizer):
+        for each in (self._keyframes, self._check, self.recognizer):
             if each is not None:
                 each.reset()
 
@@ -368,12 +363,12 @@ class Localizer(Operation):
             return
         if settings.update_map and os.path.isfile(self.save_state.path):
             self._begin_drive()
-        self._recognizer = _map_recognizer(settings, self.name, place_map, self.extractor)
+        self.recognizer = _map_recognizer(settings, self.name, place_map, self.extractor)
 
     def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
-        assert self._recognizer is not None
+        assert self.recognizer is not None
         jpeg = row.jpeg if self._drives else b''
-        result = ImageResult.of_match(self._recognizer.update(features, row.stamp, row.pose))
+        result = ImageResult.of_match(self.recognizer.update(features, row.stamp, row.pose))
         if self._drives and sum(map(len, self._drives)) < self.settings.max_places:
             self._drives[-1].add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
         return result
@@ -435,7 +430,7 @@ class Mapper(Operation):
         self.places = GrowingMap.from_map(place_map, limit)
         if len(place_map):
             self.places.begin_session(Path(path).stem or 'recorded')
-            self._recognizer = _map_recognizer(self.settings, self.name, place_map, extractor)
+            self.recognizer = _map_recognizer(self.settings, self.name, place_map, extractor)
 
     @property
     def missing(self) -> str:
@@ -481,9 +476,7 @@ class RouteCloser(Operation):
     def _start(self, place_map: PlaceMap | None) -> None:
         settings, self.reference = self.settings, None
         self.extractor = extractor = self.extractor or settings.extractor()
-        self._recognizer = self._closer = _loop_closer(
-            settings, settings.exclude_places, extractor
-        )
+        self.recognizer = self._closer = _loop_closer(settings, settings.exclude_places, extractor)
         # a closer that excludes next to nothing needs few images to warm up, on a second lap
         lap = _noise(extractor.extract([BLANK_IMAGE]), settings.sequence.length + WARM_IMAGES)
         closer = _loop_closer(settings, 1, extractor)

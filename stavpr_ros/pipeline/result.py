@@ -1,15 +1,25 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The result for one image: a match, if its window has one, and what the pipeline adds to it."""
+"""
+The result for one image: a match, if its window has one, and what the pipeline adds to it.
+
+The geometric check compares the thumbnails of query and place, by keypoints.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
-from stavpr_ros.alignment.path import aligned_index
+from stavpr_ros.alignment.lm_dtw import aligned_index
+from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.recognition import Candidate, Match, Status
 from stavpr_ros.recognition.match import Limits
+from stavpr_ros.recognition.verification import (
+    GeometricEvidence,
+    GeometricSettings,
+    PlaceVerifier,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,3 +118,51 @@ class ImageResult:
             for first in ranked[:1]
         ]
         return replace(self, candidates=(*own, *ranked[1:]))
+
+
+class GeometricCheck:
+    """Checks matches; it learns from those since the last reset how often right ones pass."""
+
+    def __init__(self, settings: GeometricSettings) -> None:
+        self.settings = settings
+        self._verifier = PlaceVerifier(settings)
+        self._evidence = GeometricEvidence()
+
+    def reset(self) -> None:
+        """Forget the passes of earlier matches."""
+        self._evidence = GeometricEvidence()
+
+    def checked(
+        self,
+        result: ImageResult,
+        places: PlaceMap | GrowingMap,
+        query: np.ndarray | None,
+        is_weighed: bool,
+    ) -> ImageResult:
+        """
+        Return a result after the check; without thumbnails, as it is.
+
+        Matches with too few inliers are rejected.
+
+        :param query: thumbnail of its image, RGB (h, w, 3) uint8; None = unknown.
+        :param is_weighed: the result changes the probability instead (:class:`GeometricEvidence`),
+            where the match is doubtful.
+        """
+        match = result.match
+        if match is None or match.sequence is None or query is None:
+            return result
+        if not (self._evidence.wants(match.probability) if is_weighed else match.accepted):
+            return result
+        inliers = self._verifier.inliers(query, places, match.sequence.middle)
+        if inliers is None:
+            return result
+        least, result = self.settings.min_inliers, replace(result, inliers=inliers)
+        if is_weighed:
+            probability = self._evidence.updated(match.probability, inliers >= least)
+            return result.with_probability(probability)
+        if inliers >= least:
+            return result
+        reason = (
+            f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
+        )
+        return replace(result, status=Status.NO_MATCH, reason=reason)

@@ -10,16 +10,35 @@ computed by one thread, several blocks at the same time.
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.features import LocalFeatures
+from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.threads import thread_count
 
 PIECE = 256  # places read or centered at a time
+
+
+@dataclass(frozen=True)
+class Int8Features:
+    """
+    Features of a map in int8, one byte a value: :class:`stavpr_ros.features.LocalFeatures`.
+
+    :param strips: the features, rounded.
+    """
+
+    strips: Int8Strips
+    weights: np.ndarray
+    settings: FeatureSettings
+    cells: tuple[int, int] | None = None
+
+    def __len__(self) -> int:
+        return self.strips.shape[1]
 
 
 def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
@@ -64,6 +83,24 @@ def converted(
         visit(block)
         strips[:, places] = block
     return LocalFeatures(strips, features.weights, features.settings, features.cells)
+
+
+def rounded(
+    features: LocalFeatures,
+    convert: Callable[[LocalFeatures], LocalFeatures],
+    visit: Callable[[np.ndarray], None] = lambda strips: None,
+) -> Int8Features:
+    """
+    Return features, converted and rounded to int8 block by block.
+
+    :param visit: called with the strips of each block, before they are rounded.
+    """
+    W, n = features.weights.shape
+    strips = Int8Strips(W, n, features.dimension)
+    for places, block in converted_blocks(features, lambda block: convert(block).strips):
+        visit(block)
+        strips.write(places.start, np.ascontiguousarray(block))
+    return Int8Features(strips, features.weights, features.settings, features.cells)
 
 
 def _slices(features: LocalFeatures) -> list[slice]:

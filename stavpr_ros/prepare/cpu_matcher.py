@@ -12,8 +12,8 @@ from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty, is_aligned
+from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import normalize
-from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.route_strips import RouteStrips
 
 
@@ -50,7 +50,7 @@ class CpuMatcher:
         self._prepare(len(features.strips), spatial)
         self._cells = features.cells if spatial.vertical else None
         self._weights = features.weights
-        self._places = self._weights.shape[1]
+        self.places = self._weights.shape[1]
         if isinstance(features, Int8Features):
             self._map = features.strips.kernel_arguments()
             return
@@ -73,11 +73,6 @@ class CpuMatcher:
         self._spatial = spatial
         self._band = spatial.band(W)
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
-
-    @property
-    def places(self) -> int:
-        """Return the number of places n."""
-        return self._places
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,)."""
@@ -152,5 +147,5 @@ class CpuRouteMatcher(CpuMatcher):
         :param strips: of the route; newest: of the image, (W, 1, d), float32.
         """
         self._map = strips.kernel_arguments() if isinstance(strips, Int8Strips) else strips
-        self._places = places
+        self.places = places
         return self.distances(newest[:, 0], newest[:, 0, 0])

@@ -8,7 +8,7 @@ from stavpr_ros.alignment.device import spatial_alignment
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.prepare.int8_features import Int8Features
+from stavpr_ros.prepare.blocks import Int8Features
 import torch
 
 WIDENED = 2**23  # most int8 values that are float32 at a time: 32 MiB, which fit into a cache
@@ -32,17 +32,17 @@ class DeviceMatcher:
     ) -> None:
         W, n, d = features.strips.shape
         self._lengths: torch.Tensor | None = None
-        places = n
+        self.places = at_once = n
         if isinstance(features, Int8Features):
             lengths = features.strips.reciprocals[:, :n]
             strips, self._lengths = features.strips.rounded(), torch.from_numpy(lengths).to(device)
-            places = max(1, WIDENED // (W * d))
+            at_once = max(1, WIDENED // (W * d))
         else:
             strips = np.ascontiguousarray(features.strips, np.float32)
-        # a piece of the map each, (W, places, d)
+        # a piece of the map each, (W, at_once, d)
         self._pieces = [
-            torch.from_numpy(strips[:, first : first + places]).to(device).contiguous()
-            for first in range(0, n, max(1, places))
+            torch.from_numpy(strips[:, first : first + at_once]).to(device).contiguous()
+            for first in range(0, n, max(1, at_once))
         ]
         self._query = torch.zeros(W, d + 2, device=device)  # strip, its length if int8, weight
         self._sent = HostCopy(self._query)
@@ -55,11 +55,6 @@ class DeviceMatcher:
         self._graph = DeviceGraph(device, self._compute)
         for _ in range(2 if n else 0):  # the second one captures the graph
             self.distances(np.zeros((W, d), np.float32), np.zeros(W, np.float32))
-
-    @property
-    def places(self) -> int:
-        """Return the number of places n of the map."""
-        return len(self._row)
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> torch.Tensor:
         """Return the distances of one image to every place, (n,), on the device."""

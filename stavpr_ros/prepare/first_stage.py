@@ -19,9 +19,9 @@ from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, TILE
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.paths import BLOCK
+from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import evenly, normalize
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
-from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 
 BYTES = 128  # of a place, at most
@@ -49,6 +49,7 @@ class FirstStage:
     ) -> None:
         self._matcher, self._probable = matcher, probable
         W, n, d = features.strips.shape
+        self.places = n
         learned = features.strips[:, evenly(n, LEARNED)]
         _, vectors = np.linalg.eigh(learned.transpose(0, 2, 1) @ learned)
         self._basis = vectors[..., -min(d, max(1, BYTES // W)) :]  # (W, d, p)
@@ -59,11 +60,6 @@ class FirstStage:
             self._reduced.write(low, np.ascontiguousarray(by_place))
         self._chunks = -(-n // CHUNK)
         self._sample = evenly(self._chunks, SAMPLED)
-
-    @property
-    def places(self) -> int:
-        """Return the number of places n."""
-        return self._matcher.places
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,); exact ones where they count."""
@@ -81,11 +77,6 @@ class FirstStage:
         out += sampled.mean() - scale * coarse.mean()
         rows[chunks] = exact
         return out
-
-    @property
-    def dimension(self) -> int:
-        """Return the number of bytes of a place."""
-        return self._reduced.shape[2]
 
     def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the exact distances of Q images to every place, (Q, n)."""

@@ -11,7 +11,7 @@ from stavpr_ros.checks import require_choice
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.prepare.int8_features import Int8Features, rounded
+from stavpr_ros.prepare.blocks import Int8Features, rounded
 
 if TYPE_CHECKING:
     import torch

@@ -15,11 +15,9 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
-from stavpr_ros.mapping.map_statistics import MapStatistics
-from stavpr_ros.mapping.stored_features import StoredFeatures
-from stavpr_ros.prepare.blocks import converted_blocks, PlaceChanges
+from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
+from stavpr_ros.prepare.blocks import converted_blocks, Int8Features, PlaceChanges, rounded
 from stavpr_ros.prepare.centering import MeanCentering, RANK, SAMPLE, STRENGTH
-from stavpr_ros.prepare.int8_features import Int8Features, rounded
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {MAX_LAG}, 2'
 CODES_AT_ONCE = 4096  # places; a multiple of all LANES
@@ -33,7 +31,7 @@ class PreparedMap:
 
     :param features: for the matcher, in memory once.
     :param centering: learned from them; None without.
-    :param changes: see :attr:`stavpr_ros.mapping.map_statistics.MapStatistics.changes`.
+    :param changes: see :attr:`stavpr_ros.mapping.stored_features.MapStatistics.changes`.
     :param note: why statistics in the map's file are not used, for the log; empty = they are, or
         there are none.
     """

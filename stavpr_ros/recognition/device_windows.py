@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.device import lm_dtw, nearest_starts
-from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch
-from stavpr_ros.alignment.path import trace_sequence
+from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.filter.columns import ColumnLayout

@@ -15,7 +15,7 @@ the drives. The mean over drives like these is controlled, not every single driv
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.place_map import ErrorRisks
 
 # error rates, descending, and the least probability of matches that keep them
 ERRORS = np.array([0.1, 0.05, 0.02, 0.01, 0.005])

@@ -9,8 +9,8 @@ from stavpr_ros.alignment.lm_dtw import (
     best_match,
     match_padded,
     padded_width,
+    trace_sequence,
 )
-from stavpr_ros.alignment.path import trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences

@@ -9,8 +9,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.alignment.path import aligned_index, NO_PATH
+from stavpr_ros.alignment.lm_dtw import aligned_index, NO_PATH, SequenceMatch
 from stavpr_ros.errors import InputError
 
 NO_SHARES, NO_COLUMNS = np.empty(0), np.empty((0, 0), np.float32)

@@ -20,9 +20,8 @@ from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.prepare.blocks import blocks
+from stavpr_ros.prepare.blocks import blocks, Int8Features
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
-from stavpr_ros.prepare.int8_features import Int8Features
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.prepare.several_sessions import SeveralSessions

@@ -18,7 +18,7 @@ from stavpr_ros.checks import (
     require_number,
 )
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.parameters import default
 from stavpr_ros.recognition.error_rate import least_probability
 

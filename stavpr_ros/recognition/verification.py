@@ -146,19 +146,10 @@ def mutual_matches(
     none = np.empty(0, np.intp)
     if not len(mine) or len(theirs) < 2:
         return none, none
-    if mine.dtype == np.uint8:
-        distances, nearest = cv2.batchDistance(
-            mine, theirs, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
-        )
-        clear = np.flatnonzero(distances[:, 0] < ratio * distances[:, 1])
-        matched = nearest[clear, 0]
-        if not len(clear):
-            return clear, matched
-        _, back = cv2.batchDistance(
-            theirs[matched], mine, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1
-        )
-        mutual = back[:, 0] == clear
-        return clear[mutual], matched[mutual]
+    limit = ratio**2
+    if mine.dtype == np.uint8:  # the square of the distance of bits is Hamming's
+        bits = (np.unpackbits(each, axis=1).astype(np.float32) for each in (mine, theirs))
+        (mine, theirs), limit = bits, ratio
     # squares of L2 by one product: exact: SIFT's are whole numbers below 2**24
     squares = mine @ theirs.T
     squares *= -2
@@ -168,7 +159,7 @@ def mutual_matches(
     back = squares.argmin(axis=0)
     least = squares[rows, nearest].copy()
     squares[rows, nearest] = np.inf
-    clear = (least < ratio**2 * squares.min(axis=1)) & (back[nearest] == rows)
+    clear = (least < limit * squares.min(axis=1)) & (back[nearest] == rows)
     return np.flatnonzero(clear), nearest[clear]
 
 

@@ -15,10 +15,9 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
 from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses, turned
-from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
 from stavpr_ros.relative_pose.odometry import align
-from stavpr_ros.relative_pose.pair import LANDMARK_RADIUS, MatchedPair, NEIGHBORS
+from stavpr_ros.relative_pose.pair import Edge, LANDMARK_RADIUS, MatchedPair, NEIGHBORS, Source
 from stavpr_ros.relative_pose.pnp import MIN_INLIERS, PnpPose, solve_pnp
 from stavpr_ros.relative_pose.verification import verified_edge, Verifier
 

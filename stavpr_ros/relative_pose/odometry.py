@@ -7,8 +7,7 @@ import math
 import numpy as np
 from stavpr_ros.mapping.trajectory import interpolate
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.relative_pose.edge import Edge, Source
-from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 
 FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
 NEAR = 0.5  # of the least sum: where a parabola is fitted, places

@@ -1,10 +1,12 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A matched pair of images with the images, poses and distances around them."""
+"""A matched pair of images, with what is around them, and their relative pose: an edge."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+import enum
 from functools import cached_property
+import math
 
 import numpy as np
 from stavpr_ros.errors import MapFileError
@@ -14,6 +16,44 @@ from stavpr_ros.recognition import Match
 NEIGHBORS = 4  # places before and after a place that its keypoints are triangulated with
 LANDMARK_RADIUS = 1  # places before and after the place whose landmarks are used as well
 TRIANGULATION_RADIUS = NEIGHBORS + LANDMARK_RADIUS
+
+
+class Source(enum.IntEnum):
+    """Source of a relative pose; the constants of ``stavpr_msgs/RelativePose``."""
+
+    NONE = 0
+    ALIGNED = 1
+    PNP = 2
+    REFUTED = 3
+    DROPPED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """
+    The pose of the query's base in the base of the place.
+
+    :param source: what it follows from; only ``ALIGNED`` and ``PNP`` have a pose.
+    :param reason: why the source is not ``PNP``; empty = it is ``PNP``.
+    :param pose: x y z (meters) and quaternion x y z w, shape (7,).
+    :param covariance: of x y z and of rotations about the fixed axes of the place, shape (6, 6).
+    :param inliers: of PnP, -1 = not tried.
+    :param error: root mean square of their distances, pixels of the thumbnail; NaN = none.
+    :param independent: far enough from the last such edge.
+    """
+
+    source: Source
+    reason: str = ''
+    pose: np.ndarray = field(default_factory=lambda: np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
+    inliers: int = -1
+    error: float = math.nan
+    independent: bool = False
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether there is a relative pose."""
+        return self.source in (Source.ALIGNED, Source.PNP)
 
 
 @dataclass(frozen=True, eq=False)

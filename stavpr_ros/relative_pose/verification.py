@@ -11,8 +11,7 @@ from stavpr_ros.errors import InputError, SettingsError, UnavailableError
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.relative_pose.edge import Edge, Source
-from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 
 Verifier = Callable[[np.ndarray, np.ndarray, Camera | None, Camera | None, Edge], bool | Edge]
 """

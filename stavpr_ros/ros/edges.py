@@ -16,9 +16,8 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.relative_pose.edge import Edge, Source
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
-from stavpr_ros.relative_pose.pair import MatchedPair
+from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 from stavpr_ros.ros.messages import (
     loop_closure_message,
     PoseFrames,

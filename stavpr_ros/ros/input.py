@@ -25,8 +25,7 @@ from rclpy.subscription import Subscription
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import StampWatch, Statistics
-from stavpr_ros.ros.message_types import message_class
-from stavpr_ros.ros.messages import nanoseconds
+from stavpr_ros.ros.messages import message_class, nanoseconds
 from stavpr_ros.ros.parameters import transport_remedy, TRANSPORTS
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, ReceivedGroup, Receiver
 from stavpr_ros.sources.video_topic import VideoStream

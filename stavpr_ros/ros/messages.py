@@ -5,7 +5,10 @@
 import array
 from copy import copy
 from dataclasses import dataclass
+import importlib.util
 import math
+from pathlib import Path
+import re
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
@@ -22,6 +25,7 @@ from stavpr_msgs.msg import (
     PlaceMatch,
     RelativePose,
 )
+from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
@@ -29,7 +33,7 @@ from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.mapping.transforms import turned
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
-from stavpr_ros.relative_pose.edge import Edge
+from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.sources.frame import ImageRecord
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Header
@@ -393,3 +397,25 @@ def map_info_message(
         is_map = isinstance(places, PlaceMap)
         message.has_thumbnails = bool(len(thumbnails)) if is_map else any(thumbnails)
     return message
+
+
+def message_class(name: str) -> type:
+    """
+    Return the class of a message type.
+
+    :param name: such as ``nav_msgs/msg/Odometry``; it may come from a foreign file, so only
+        packages with messages are imported.
+    :raises UnavailableError: its package is not installed.
+    """
+    if words := re.fullmatch(r'([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)', name):
+        package, kind = words.groups()
+        spec = importlib.util.find_spec(package)  # does not import it
+        folders = (spec.submodule_search_locations if spec else None) or []
+        if any(Path(folder, 'msg').is_dir() for folder in folders):
+            kind_class = getattr(importlib.import_module(f'{package}.msg'), kind, None)
+            if isinstance(kind_class, type):
+                return kind_class
+    raise UnavailableError(
+        f'the message type {name} is not installed: install its package and source its '
+        'environment, or leave the topic out'
+    )

@@ -16,7 +16,7 @@ from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.relative_pose.edge import Edge
+from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.ros.messages import (
     candidates_message,
     image_message,

@@ -19,8 +19,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
-from stavpr_ros.ros.message_types import message_class
-from stavpr_ros.ros.messages import record_message, time_message
+from stavpr_ros.ros.messages import message_class, record_message, time_message
 from stavpr_ros.ros.playback import keyboard, Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.ros.subscriber_progress import READY, RECORDER, SubscriberProgress

@@ -11,7 +11,7 @@ import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
-from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.prepare import prepared_map
 from stavpr_ros.sources.frame import Frame
 

@@ -19,8 +19,8 @@ from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_ris
 from stavpr_ros.commands.program import say
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import open_map, select_places
-from stavpr_ros.mapping.error_risks import ErrorRisks
 from stavpr_ros.mapping.map_file import save_error_risks
+from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.output_file import FileVersion, MAP, require_replaceable
 from stavpr_ros.progress import Progress
 from stavpr_ros.recognition import PlaceRecognizer

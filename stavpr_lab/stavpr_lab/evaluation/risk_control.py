@@ -16,7 +16,7 @@ import numpy as np
 from stavpr_lab.evaluation.drive import Drive, DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import ImageMatches
-from stavpr_ros.mapping.error_risks import ErrorRisks
+from stavpr_ros.mapping.place_map import ErrorRisks
 
 KINDS = ('same', '0.5x', '2x', 'varying')  # drives of the whole map
 DETOURS = 3  # drives, each without every third stretch of the map, of as many places as a block
@@ -50,7 +50,7 @@ def measured_risks(
     :param driven: drives of it, the first one as recorded, their matches, and the images of
         these: :func:`stavpr_lab.evaluation.metrics.published_matches`.
     :param block: images of a block; the last one also has the rest.
-    :param method: of :class:`stavpr_ros.mapping.error_risks.ErrorRisks`.
+    :param method: of :class:`stavpr_ros.mapping.place_map.ErrorRisks`.
     """
     driven = list(driven)
     units = max(1, len(driven[0][0].images) // block)
