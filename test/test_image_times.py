@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
-from stavpr_ros.filter.refine import image_times, LONGEST
+from stavpr_ros.filter.refine import image_times, LONGEST, usual_interval
 from stavpr_ros.mapping.place_map import Session
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
@@ -16,7 +16,8 @@ SECOND = 10**9
 
 def times(stamps, numbers=None):
     numbers = np.arange(len(stamps)) if numbers is None else np.array(numbers)
-    return image_times((np.array(stamps) * SECOND).astype(np.int64), numbers).tolist()
+    stamps = (np.array(stamps) * SECOND).astype(np.int64)
+    return image_times(stamps, numbers, usual_interval(stamps)).tolist()
 
 
 def test_times_are_in_intervals_of_most_images():

@@ -99,7 +99,8 @@ def shrink(
         for x in range(size):
             padded[y + 1, x + 1] = table[levels[x]]
         padded[y + 1, 0], padded[y + 1, size + 1] = padded[y + 1, 1], padded[y + 1, size]
-    padded[0], padded[size + 1] = padded[1], padded[size]
+    for x in range(size + 2):
+        padded[0, x], padded[size + 1, x] = padded[1, x], padded[size, x]
 
 
 @kernel

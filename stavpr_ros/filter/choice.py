@@ -121,7 +121,9 @@ class PathChoice:
         """
         passes = self._layout.of_passes(np.arange(len(stamps)))
         columns = self._layout.columns_of(np.arange(len(passes)))
-        between = np.append(np.diff(image_times(stamps, passes[: len(stamps)])), 1.0)
+        intervals = np.diff(stamps)[(np.diff(stamps) > 0) & (stamps[:-1] > 0)]
+        usual = float(np.median(intervals)) if len(intervals) else 1.0
+        between = np.append(np.diff(image_times(stamps, passes[: len(stamps)], usual)), 1.0)
         before, after = passes[:-1], passes[1:]
         steps = np.ones(len(self._place_times))
         steps[columns[1:]] = np.where(
@@ -233,10 +235,13 @@ def _check(
     places: np.ndarray, probabilities: np.ndarray, own: np.ndarray, best: int, factor: float
 ) -> int:
     """Multiply the probabilities near a place by a factor; return the best of ``own`` then."""
+    following = 0
     for i in range(len(places)):
         if abs(places[i] - places[best]) <= BAND:
             probabilities[i] *= factor
-    return int(np.argmax(np.where(own, probabilities, 0)))
+        if own[i] and not (own[following] and probabilities[following] >= probabilities[i]):
+            following = i
+    return following
 
 
 @kernel

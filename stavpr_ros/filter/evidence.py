@@ -38,6 +38,7 @@ import math
 
 import numpy as np
 from stavpr_ros.compilation import kernel
+from stavpr_ros.filter.paths import is_excluded
 from stavpr_ros.simd import LANES, load, select, splat, store
 
 CONSTANT, POSTERIOR, LEAD, RECENT = -7.01, 0.62, 2.56, 3.65
@@ -111,7 +112,8 @@ def changed_images(numbers: np.ndarray) -> np.ndarray:
     :param numbers: of the images, (l,); equal ones are of a camera at rest.
     """
     changed = np.ones(len(numbers), np.bool_)
-    changed[1:] = numbers[1:] != numbers[:-1]
+    for i in range(1, len(numbers)):
+        changed[i] = numbers[i] != numbers[i - 1]
     return changed
 
 
@@ -130,6 +132,19 @@ def straight_steps(numbers: np.ndarray, position: int) -> np.ndarray:
 
 
 @kernel
+def _counted(rows, numbers, steps):  # type: ignore[no-untyped-def]
+    """Return the rows and steps of images that differ from the one before, (m,), (V, m)."""
+    counted, changed, count = np.empty_like(rows), changed_images(numbers), 0
+    for i in range(len(rows)):
+        if changed[i]:
+            counted[count] = rows[i]
+            for v in range(len(steps)):
+                steps[v, count] = steps[v, i]
+            count += 1
+    return counted[:count], steps[:, :count]
+
+
+@kernel
 def best_elsewhere(
     memory: np.ndarray, rows: np.ndarray, n: int, numbers: np.ndarray, position: int,
     excluded: np.ndarray,
@@ -143,15 +158,14 @@ def best_elsewhere(
         before do not count.
     :param excluded: first ones and ends of the places whose paths do not count, (m, 2).
     """
-    counted = np.flatnonzero(changed_images(numbers))
-    rows, images = rows[counted], len(counted)
-    steps = straight_steps(numbers, position)[:, counted]
-    before, behind = -min(steps.min(), 0), max(steps.max(), 0)
+    rows, steps = _counted(rows, numbers, straight_steps(numbers, position))
+    images = len(rows)
+    before, behind = max(-steps[-1, 0], 0), max(steps[-1, images - 1], 0)  # of the largest speed
     width = before + CHUNK + behind
     near = np.empty((images, width), np.float32)  # z of the images around a chunk, finite
     flat, sums, least = near.reshape(-1), np.empty(CHUNK, np.float32), splat(INF)
     for start in range(0, n, CHUNK):
-        if not (memory[rows[-1], start : min(start + CHUNK, n)] < INF).any():
+        if is_excluded(memory[rows[-1]], start, min(start + CHUNK, n)):
             continue
         first, end = max(start - before, 0), min(start + CHUNK + behind, n)
         for i in range(images):
@@ -177,7 +191,9 @@ def best_elsewhere(
             for x in range(0, CHUNK, LANES):
                 least = select(load(sums, x) < least, load(sums, x), least)
     store(sums, 0, least)
-    return -float(sums[:LANES].min()) / images
+    for lane in range(1, LANES):
+        sums[0] = min(sums[0], sums[lane])
+    return -float(sums[0]) / images
 
 
 def _log_odds(probability: float, least: float) -> float:

@@ -18,7 +18,7 @@ below the precision of all results.
 import numba as nb
 import numpy as np
 from stavpr_ros.compilation import kernel, parallel_kernel
-from stavpr_ros.filter.paths import BLOCK, ENTERED
+from stavpr_ros.filter.paths import BLOCK, ENTERED, is_excluded
 from stavpr_ros.simd import (
     bits,
     from_bits,
@@ -214,14 +214,19 @@ def _add_up(totals, in_gaps, entering, states, off, leave, enter):
     :param totals: of all blocks, of :func:`advance`.
     :param in_gaps: sums of so many states of a level between sessions, by level, (K,).
     """
-    sums = totals.sum(axis=0)
-    # likelihoods are 1 between sessions, and entering from off the map is no loss
-    lost = sums[1] + (in_gaps - entering * F(states)) / (1 - leave)
-    on_map = sums[2] - in_gaps
-    off[:] = off * (1 - enter) + (sums[0] - lost) * leave + lost
-    total = off.sum() + on_map.sum()
-    off /= total
-    return total
+    total_off = on_map = 0.0
+    for k in range(len(off)):
+        before = over_end = after = 0.0
+        for block in range(len(totals)):
+            before, over_end = before + totals[block, 0, k], over_end + totals[block, 1, k]
+            after += totals[block, 2, k]
+        # likelihoods are 1 between sessions, and entering from off the map is no loss
+        lost = over_end + (in_gaps[k] - entering[k] * F(states)) / (1 - leave)
+        off[k] = off[k] * (1 - enter) + (before - lost) * leave + lost
+        total_off, on_map = total_off + off[k], on_map + (after - in_gaps[k])
+    for k in range(len(off)):
+        off[k] /= total_off + on_map
+    return total_off + on_map
 
 
 @kernel
@@ -238,16 +243,20 @@ def speed_factors(weights, likelihoods, keep):
     """
     V = len(weights)
     near, far = (1 - keep) * 0.4, (1 - keep) * 0.2 / V
-    total, factors = keep * weights + far * weights.sum(), np.zeros((5, V), F)
-    total[1:] += near * weights[:-1]
-    total[:-1] += near * weights[1:]
-    factors[0], factors[3], factors[4] = keep * weights / total, weights, far / total
-    factors[1, 1:], factors[2, :-1] = (
-        near * weights[1:] / total[:-1],
-        near * weights[:-1] / total[1:],
-    )
-    for factor in factors[:4]:
-        factor[:] = factor * likelihoods
+    sum_of_weights, total, factors = 0.0, np.empty(V), np.zeros((5, V), F)
+    for v in range(V):
+        sum_of_weights += weights[v]
+    for v in range(V):
+        total[v] = keep * weights[v] + far * sum_of_weights
+        total[v] += near * weights[v - 1] if v else 0.0
+        total[v] += near * weights[v + 1] if v + 1 < V else 0.0
+    for v in range(V):
+        factors[0, v], factors[3, v] = keep * weights[v] / total[v], weights[v]
+        factors[1, v] = near * weights[v] / total[v - 1] if v else 0.0
+        factors[2, v] = near * weights[v] / total[v + 1] if v + 1 < V else 0.0
+        factors[4, v] = far / total[v]
+        for row in range(4):
+            factors[row, v] = factors[row, v] * likelihoods[v]
     return factors
 
 
@@ -273,12 +282,16 @@ def _inputs(level_changes, scale, off, enter, states, speeds, count, steps):
     """
     Return the changes of level of scaled states, and the probability to enter each, (K,).
 
-    In the parallel kernel, each of these operations on arrays would start threads.
-
     :param states: of a level; steps: (V,), written; others: of :func:`advance`.
     """
-    steps[:] = np.rint(speeds * (count + 1)) - np.rint(speeds * count)
-    return level_changes * F(scale), (off * enter / states).astype(F)
+    levels, entering = np.empty_like(level_changes), np.empty(len(off), F)
+    for v in range(len(steps)):
+        steps[v] = np.rint(speeds[v] * (count + 1)) - np.rint(speeds[v] * count)
+    for k in range(len(off)):
+        entering[k] = off[k] * enter / states
+        for j in range(len(off)):
+            levels[k, j] = level_changes[k, j] * F(scale)
+    return levels, entering
 
 
 @parallel_kernel
@@ -328,7 +341,7 @@ def advance(
             length, at = min(BLOCK, n - first), first // BLOCK
             whole = (length + LANES - 1) // LANES * LANES
             is_empty = weight != 0 and maxima[at] == 0 and first + length < n
-            if is_empty and not (z[first : first + length] < np.inf).any():
+            if is_empty and is_excluded(z, first, first + length):
                 totals[at] = 0
                 continue
             _likelihoods(z, first, length, weight, mu, likely)
@@ -385,5 +398,7 @@ def clear_gaps(a, gaps, by_place, maxima):
                 a[block, k, v, x] = 0
         by_place[gaps[i]] = 0
         if i + 1 == len(gaps) or gaps[i + 1] // BLOCK > block:
-            maxima[block] = by_place[block * BLOCK : (block + 1) * BLOCK].max()
+            maxima[block] = 0
+            for y in range(block * BLOCK, (block + 1) * BLOCK):
+                maxima[block] = max(maxima[block], by_place[y])
     return sums

@@ -299,9 +299,11 @@ def _excess(speed, changes, curve, decay):
     """Return the excess of changes, (m, 3), of images 1, 2, 3 apart; 0 of none."""
     if not len(changes):
         return 0.0
-    means, expected = np.empty(len(COMPARED)), np.empty(len(COMPARED))
+    means, expected = np.zeros(len(COMPARED)), np.empty(len(COMPARED))
     for i in range(len(COMPARED)):
-        means[i] = min(changes[:, i].mean(), 1.0)
+        for row in range(len(changes)):
+            means[i] += changes[row, i]
+        means[i] = min(means[i] / len(changes), 1.0)
         expected[i] = min(_expected_change(speed * COMPARED[i], curve, decay), 1.0)
     noise = (1 - means[0]) / max(1 - expected[0], MIN_SIMILARITY)
     noise, total = min(max(noise, MIN_SIMILARITY_RATIO), 1.0), 0.0
@@ -314,8 +316,11 @@ def _excess(speed, changes, curve, decay):
 @kernel
 def _speed_weights(change, expected, deviation):
     """Return the relative probability of each speed after a mean change, (V,)."""
-    off = (np.log(change + OFFSET) - expected[:, 0]) / deviation
-    return np.exp(-0.5 * off**2) + MIN_SPEED_WEIGHT
+    weights = np.empty(len(expected))
+    for v in range(len(expected)):
+        off = (np.log(change + OFFSET) - expected[v, 0]) / deviation
+        weights[v] = np.exp(-0.5 * off**2) + MIN_SPEED_WEIGHT
+    return weights
 
 
 @kernel
@@ -332,20 +337,27 @@ def _speed_likelihoods(
     :param expected, precisions: logarithm of the changes at each speed, (V, MAX_LAG), and their
         inverse covariance, (V, MAX_LAG, MAX_LAG).
     """
-    newest, off = moving[(moved - 1) % len(moving)], np.empty(MAX_LAG)
+    newest, off = moving[(moved - 1) % len(moving)], np.zeros(MAX_LAG)
     for rows in (by_apart, of_window):
         for i in range(len(rows) - 1):
-            rows[i] = rows[i + 1]
+            for apart in range(rows.shape[1]):
+                rows[i, apart] = rows[i + 1, apart]
     by_apart[-1, 0] = change
     for apart in range(2, MAX_LAG + 1):
         by_apart[-1, apart - 1] = change_between(newest, moving[(moved - 1 - apart) % len(moving)])
-    of_window[-1] = by_apart[-1, : len(COMPARED)]
+    for apart in range(len(COMPARED)):
+        of_window[-1, apart] = by_apart[-1, apart]
     for apart in range(MAX_LAG):
-        off[apart] = np.log(by_apart[len(by_apart) - count :, apart].mean() + OFFSET)
-    logs = np.zeros(len(expected))
+        for row in range(len(by_apart) - count, len(by_apart)):
+            off[apart] += by_apart[row, apart]
+        off[apart] = np.log(off[apart] / count + OFFSET)
+    logs, largest = np.zeros(len(expected)), -np.inf
     for v in range(len(expected)):
         for i in range(MAX_LAG):
             for j in range(MAX_LAG):
                 product = (off[i] - expected[v, i]) * precisions[v, i, j]
                 logs[v] -= 0.5 * product * (off[j] - expected[v, j])
-    return np.exp(exponent * np.maximum(logs - logs.max(), MIN_LOG_LIKELIHOOD))
+        largest = max(largest, logs[v])
+    for v in range(len(expected)):
+        logs[v] = np.exp(exponent * max(logs[v] - largest, MIN_LOG_LIKELIHOOD))
+    return logs

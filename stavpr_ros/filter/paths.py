@@ -68,6 +68,14 @@ def _before(k, v, y, origins, steps):
 
 
 @kernel
+def is_excluded(z, first, end):
+    """Return whether all distances from ``first`` to before ``end`` are infinite."""
+    while first < end and not z[first] < np.inf:
+        first += 1
+    return first >= end
+
+
+@kernel
 def trace_back(k, v, y, origins, steps, newest, count, places):
     """
     Write the most probable path to a state, newest place first.

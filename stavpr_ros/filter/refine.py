@@ -30,9 +30,9 @@ LONGEST = 4.0  # intervals between images: beyond, the camera stopped, or its sp
 
 
 @kernel
-def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+def image_times(stamps: np.ndarray, numbers: np.ndarray, usual: float) -> np.ndarray:
     """
-    Return the times of images, (m,), float64, ascending; the unit is the median interval.
+    Return the times of images, (m,), float64, ascending.
 
     A camera that loses images still advances evenly in time: the stamps of a window show where
     images are missing, the stamps of a map where places are. An interval is 1 where a stamp is
@@ -40,15 +40,29 @@ def image_times(stamps: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
     :param stamps: ns, (m,), int64; 0 = unknown.
     :param numbers: (m,), int64; equal ones are of a camera at rest, for which no time passes.
+    :param usual: interval that is the unit, ns.
     """
-    steps = np.diff(stamps).astype(np.float64)
-    is_known = (steps > 0) & (stamps[:-1] > 0)
-    usual = np.median(steps[is_known]) if is_known.any() else 1.0
     times = np.zeros(len(stamps))
-    for i in range(len(steps)):
-        step = min(steps[i] / usual, LONGEST) if is_known[i] else 1.0
+    for i in range(len(stamps) - 1):
+        is_known = stamps[i + 1] > stamps[i] > 0
+        step = min((stamps[i + 1] - stamps[i]) / usual, LONGEST) if is_known else 1.0
         times[i + 1] = times[i] + (step if numbers[i + 1] > numbers[i] else 0.0)
     return times
+
+
+@kernel
+def usual_interval(stamps: np.ndarray) -> float:
+    """Return the median of the known intervals of a few images, ns; 1 where none is known."""
+    steps, count = np.empty(len(stamps), np.int64), 0
+    for i in range(len(stamps) - 1):
+        if stamps[i + 1] > stamps[i] > 0:
+            at, step = count, stamps[i + 1] - stamps[i]
+            while at > 0 and steps[at - 1] > step:
+                steps[at] = steps[at - 1]
+                at -= 1
+            steps[at] = step
+            count += 1
+    return (steps[(count - 1) // 2] + steps[count // 2]) / 2 if count else 1.0
 
 
 # ------------------------------------------------ kernels
@@ -126,7 +140,7 @@ def refined(z, path, exponents, images, stamps, place_times, first, equal, passe
         column that is checked, (l,), and the probability of each offset, (l, S), 0 where it is
         not close to the estimated column.
     """
-    times, n = image_times(stamps, images), len(place_times)
+    times, n = image_times(stamps, images, usual_interval(stamps)), len(place_times)
     masses, means = refine(z, path, exponents, images, times, place_times)
     checked, placed = _ascending(path, means[0], first, n), _ascending(path, means[1], first, n)
     of_checked = np.empty(len(path), np.float32)
@@ -177,7 +191,9 @@ def _window_likelihoods(z, path, exponents, images, n, likelihoods, moves):
         for s in range(z.shape[1]):
             inside = 0 <= path[i] + s - BAND < n and np.isfinite(z[i, s])
             likelihoods[i, s] = np.exp(exponents[i] * z[i, s]) if inside else 0
-        largest = likelihoods[i].max()
+        largest = 0.0
+        for s in range(z.shape[1]):
+            largest = max(largest, likelihoods[i, s])
         for s in range(z.shape[1]):
             likelihoods[i, s] = likelihoods[i, s] / largest if largest > 0 else 1
         step = path[i] - path[i - 1] if i else 0
@@ -229,7 +245,9 @@ def smooth(likelihoods: np.ndarray, moves: np.ndarray, masses: np.ndarray) -> fl
 @kernel
 def _normalize(masses: np.ndarray) -> float:
     """Make a row's sum 1, evenly for a row of zeros, and return the sum before."""
-    total = masses.sum()
+    total = 0.0
+    for s in range(len(masses)):
+        total += masses[s]
     for s in range(len(masses)):
         masses[s] = masses[s] / total if total > 0 else 1 / len(masses)
     return total
@@ -255,8 +273,8 @@ def straight_offsets(
     """
     last, end_of_map = len(path) - 1, len(place_times) - 1
     offsets, passed = np.zeros(len(path)), np.ones(len(path))  # passed: share of the time
-    if times[last] > times[0]:
-        passed[:] = (times - times[0]) / (times[last] - times[0])
+    for i in range(len(path) if times[last] > times[0] else 0):
+        passed[i] = (times[i] - times[0]) / (times[last] - times[0])
     sum_of_weights, prior = 0.0, 0.0
     for from_first in ENDS:
         for from_last in ENDS:
@@ -280,8 +298,8 @@ def straight_offsets(
             sum_of_weights += weight
             for i in range(last + 1):
                 means[i] += weight * offsets[i]
-    if sum_of_weights > 0:
-        means /= sum_of_weights
+    for i in range(len(path) if sum_of_weights > 0 else 0):
+        means[i] /= sum_of_weights
     return sum_of_weights / prior
 
 

@@ -193,7 +193,8 @@ def image_distances(features, queries, weights, xi, out):
         lanes = np.empty(IMAGES, np.float32)
         for x in range(out.shape[0]):
             _align_block(features, queries, x, first, count, weights, xi, d, edge, lanes)
-            out[x, first : first + count] = lanes[:count]
+            for y in range(count):
+                out[x, first + y] = lanes[y]
 
 
 @parallel_kernel
