@@ -21,6 +21,7 @@ from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 import re
+from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import InputError
@@ -96,14 +97,13 @@ def update_map(
     roots = np.arange(n) if place_map.same_as is None else place_map.same_as.astype(np.int64)
     driven = _drive(place_map, drive)
     _require_certain(place_map, drive, driven, roots)
-    use, missed = _used(place_map, driven, roots, version)
-    changes, stretches = [], []
+    stretches, changes = _stretches(place_map, drive, driven, roots), []
+    use, missed = _used(place_map, driven, roots, version, stretches)
     images = _renewing(place_map, driven, roots, missed >= settings.max_age)
     if renewed := int((images >= 0).sum()):
         place_map, missed = _with_images(place_map, drive, images), np.where(images < 0, missed, 0)
         changes.append(f'renewed {renewed} places where {settings.max_age} drives matched nothing')
-    for stretch in _stretches(place_map, drive, driven, roots):
-        stretches.append(stretch)
+    for stretch in stretches:
         kind = 'a detour' if stretch.is_detour else 'an experience'
         first, last = (place_map.ids[stretch.places[i]] for i in (0, -1))
         text = f'added {kind} of {len(stretch.images)} images, from place {first} to {last}'
@@ -209,11 +209,11 @@ def _require_certain(
             f'{len(certain)} of {len(drive)} images are certain where they are: expected '
             f'{MIN_SESSION}, and {MIN_CERTAIN:.0%} of those in motion; the map stays as it is'
         )
-    drives = _drives(place_map)
+    drives, lap = _drives(place_map), _lap(place_map, roots)
     for a, b in pairwise(certain):
         p, q = roots[places[a]], roots[places[b]]
         allowed = FASTEST * (b - a) + SLACK
-        if drives[p] == drives[q] and not -SLACK <= q - p <= allowed:
+        if drives[p] == drives[q] and not -SLACK <= _ahead(p, q, lap) <= allowed:
             raise InputError(
                 f'images {a} and {b} are certain of places {p} and {q}, which they cannot both '
                 'be right about; the map stays as it is'
@@ -256,23 +256,62 @@ def _drives(place_map: PlaceMap) -> np.ndarray:
     return np.array([keys.index(key) for key in keys])[runs]
 
 
+def _again(place_map: PlaceMap, roots: np.ndarray) -> np.ndarray:
+    """Return which places, at the end of a closed route, show places of its start, (n,)."""
+    drives = _drives(place_map)
+    is_again: np.ndarray = (drives[roots] == drives) & (
+        np.arange(len(roots)) - roots > MIN_SESSION
+    )
+    return is_again
+
+
+def _lap(place_map: PlaceMap, roots: np.ndarray) -> int:
+    """Return the number of places of a closed route's lap, 0 of another route."""
+    again = np.flatnonzero(_again(place_map, roots))
+    return int(np.median(again - roots[again])) if len(again) else 0
+
+
+def _ahead(p: int | np.ndarray, q: int | np.ndarray, lap: int) -> Any:
+    """Return how far place q is ahead of p, on a closed route over its seam."""
+    return (q - p + SLACK) % lap - SLACK if lap else q - p
+
+
+def _unrolled(places: np.ndarray, lap: int) -> np.ndarray:
+    """Return places of a path, (m,), such that they go on behind the seam of a closed route."""
+    steps = _ahead(places[:-1], places[1:], lap)
+    return places[0] + np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+
+
 def _used(
-    place_map: PlaceMap, driven: _Driven, roots: np.ndarray, version: Version
+    place_map: PlaceMap,
+    driven: _Driven,
+    roots: np.ndarray,
+    version: Version,
+    stretches: list[_Stretch],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return use and missed drives of each place (:class:`Version`), after this drive."""
+    """
+    Return use and missed drives of each place (:class:`Version`), after this drive.
+
+    :param stretches: of the drive; where they are an experience of places, it passed these.
+    """
     n, runs = len(place_map), _runs(place_map)
     use, missed = np.array(version.use), np.array(version.missed, np.int64)
     use = use * DECAY if len(use) == n else np.full(n, DECAY)
     missed = missed if len(missed) == n else np.zeros(n, np.int64)
     helped, passed = np.zeros(n, bool), np.zeros(n, bool)
     places, certain = driven.of_windows, np.flatnonzero(driven.of_windows >= 0)
+    lap = _lap(place_map, roots)
     for a, b in pairwise(certain):
         p, q = places[a], places[b]
         if runs[p] == runs[q] and 0 <= q - p <= FASTEST * (b - a) + SLACK and b - a <= SLACK:
             helped[p : q + 1] = True
         p, q = roots[p], roots[q]
         if runs[p] == runs[q] and b - a < MIN_HARD:
-            passed[p : q + 1] = True
+            between = p + np.arange(_ahead(p, q, lap) + 1)
+            passed[between % lap if p < lap else between] = True
+    for stretch in stretches:
+        if not stretch.is_detour:
+            passed[roots[stretch.places]] = True
     helped[places[certain]] = True
     fits = np.zeros(n, bool)  # a place of the same session beside it was recognized
     for run in np.unique(runs):
@@ -288,16 +327,20 @@ def _stretches(
     """Return the stretches of a drive that are not recognized, between images that are."""
     runs, stretches, certain = _runs(place_map), [], driven.certain
     places, moves, count = driven.places, driven.moves, driven.driven
+    lap, is_root = _lap(place_map, roots), roots == np.arange(len(roots))
     for a, b in pairwise(certain.tolist()):
         inside = a + 1 + np.flatnonzero(moves[a + 1 : b])
         p, q = int(roots[places[a]]), int(roots[places[b]])
         if (~driven.is_matched[inside]).sum() < MIN_HARD:
             continue
-        line = p + (count - count[a]) * (q - p) / max(count[b] - count[a], 1)
+        line = p + (count - count[a]) * _ahead(p, q, lap) / max(count[b] - count[a], 1)
         is_same = bool(runs[p] == runs[q]) and _is_same_road(
-            driven, drive, roots, (a, b), line, runs == runs[p]
+            driven, drive, roots, (a, b), line, is_root & (runs == runs[p])
         )
-        of_gap = np.rint(line[inside]).astype(np.int64) if is_same else driven.of_windows[inside]
+        of_gap = driven.of_windows[inside]
+        if is_same:
+            of_gap = np.rint(line[inside]).astype(np.int64)
+            of_gap %= lap if p < lap else len(roots)
         margin = max(MARGIN, -(-(MIN_SESSION - len(inside)) // 2))
         before = certain[(certain <= a) & (certain > a - margin) & moves[certain]]
         after = certain[(certain >= b) & (certain < b + margin) & moves[certain]]
@@ -347,7 +390,7 @@ def _is_same_road(
         beside = driven.certain[(driven.certain >= low) & (driven.certain <= high)]
         at, images = roots[driven.places[beside]], driven.driven[beside]
         if len(beside) > NEAR // 4 and images[-1] > images[0]:
-            speeds.append((at[-1] - at[0]) / (images[-1] - images[0]))
+            speeds.append(_ahead(at[0], at[-1], count) / (images[-1] - images[0]))
     even = np.mean(speeds) * (driven.driven[b] - driven.driven[a]) if speeds else np.inf
     ratio = (line[b] - line[a]) / max(even, 1e-9)
     return 0.8 <= ratio <= 1.25 or (rank <= SAME_ROAD and 0.5 <= ratio <= 2)
@@ -421,14 +464,23 @@ def _renewing(
     """
     runs, of_windows, n = _runs(place_map), driven.of_windows, len(place_map)
     images, certain = np.full(n, -1), np.flatnonzero(driven.of_windows >= 0)
-    begins = (np.diff(is_missed, prepend=False) != 0) | (np.diff(runs, prepend=runs[0]) != 0)
-    for gone in np.split(np.arange(n), np.flatnonzero(begins)):
+    # of a closed route, its lap from a place that is not missed; its end gets what its start gets
+    lap, once = _lap(place_map, roots), np.where(_again(place_map, roots), roots, np.arange(n))
+    is_missed = is_missed & (once == np.arange(n))
+    turn = int(np.argmin(is_missed[:lap])) if lap else 0
+    order = np.r_[turn:lap, :turn, lap:n]
+    begins = np.diff(is_missed[order], prepend=False) != 0
+    begins |= np.diff(runs[order], prepend=runs[order[0]]) != 0
+    for gone in np.split(order, np.flatnonzero(begins)):
         if not len(gone) or not is_missed[gone[0]] or len(gone) < MIN_MISSED:
             continue
         low, high, run = gone[0], gone[-1], runs[gone[0]]
-        own = np.where(runs[of_windows[certain]] == run, of_windows[certain], -n - NEAR)
-        before = certain[(own < low) & (own >= low - NEAR)]
-        after = certain[(own > high) & (own <= high + NEAR)]
+        own = once[of_windows[certain]]
+        until, since = (
+            np.where(runs[own] == run, _ahead(*pair, lap), 0) for pair in ((own, low), (high, own))
+        )
+        before = certain[(until > 0) & (until <= NEAR)]
+        after = certain[(since > 0) & (since <= NEAR)]
         after = after[after > before[-1:].sum()]
         if not len(before) or not len(after):
             continue
@@ -438,12 +490,16 @@ def _renewing(
         if not is_route[(passing >= before[-1]) & (passing <= after[0])].all():
             continue  # it went around
         passing = passing[is_route]
-        passed = np.maximum.accumulate(roots[of_windows[passing]])
-        places = np.arange(max(low - WIDER, 0), min(high + WIDER + 1, n))
+        places = np.arange(low - WIDER, low + len(gone) + WIDER)
+        places = places % lap if low < lap else places[(places >= 0) & (places < n)]
         places = places[runs[places] == run]
-        if _is_near(np.isin(np.arange(n), passed), SLACK)[roots[places]].all():
-            images[places] = np.rint(np.interp(roots[places], passed, passing))
-    return images
+        passed, sought = (_unrolled(roots[each], lap) for each in (of_windows[passing], places))
+        at = passed[np.searchsorted(passing, before[-1])]
+        sought += round((at - sought[np.argmax(places == low)]) / (lap or 1)) * lap
+        passed = np.maximum.accumulate(passed)
+        if np.abs(passed[:, None] - sought).min(axis=0).max() <= SLACK:
+            images[places] = np.rint(np.interp(sought, passed, passing))
+    return images[once]
 
 
 def _with_images(place_map: PlaceMap, drive: PlaceMap, images: np.ndarray) -> PlaceMap:
