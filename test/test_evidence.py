@@ -57,13 +57,23 @@ def test_path_probability_by_hand():
     """Of odds 3, a lead of 1, and half a window; of a drive that rarely matched."""
     own = own_evidence(0.75, 2.0, 1.0, 10)
     assert own == pytest.approx(-7.01 + 0.62 * np.log(3) + 2.56 * np.log(11))
-    expected = 1 / (1 + np.exp(-own + 3.65 * np.log(3)))
+    expected = 1 / (1 + np.exp(((own - 3.65 * np.log(3)) / 5) ** 2))
     assert path_probability(own, 0.25) == pytest.approx(expected)
     assert path_probability(own, 0.5) == path_probability(own, 0.9) > expected
     sure = own_evidence(1.0, 4.0, 0.0, 20)
     assert sure == own_evidence(1 - 1e-9, 4.0, -8.0, 20) > 4
     assert own_evidence(0.5, -1.0, 0.0, 20) == own_evidence(0.5, 1.0, 2.0, 20)
     assert path_probability(own_evidence(0.0, 4.0, 0.0, 20), 0.9) == 0
+
+
+def test_log_odds_below_one_half_are_squared_and_keep_their_order():
+    owns = np.linspace(-20, 8, 300)
+    probabilities = np.array([path_probability(own, 0.5) for own in owns])
+    assert (np.diff(probabilities) > 0).all()
+    plain = 1 / (1 + np.exp(-owns))
+    np.testing.assert_allclose(probabilities[owns > 0], plain[owns > 0])
+    assert (probabilities[owns < 0] < 0.5).all()
+    assert path_probability(-5.0, 0.5) == pytest.approx(1 / (1 + np.e))
 
 
 def test_recent_windows_start_even_forget_and_trust_sure_ones_soon():

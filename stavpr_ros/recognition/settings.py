@@ -173,7 +173,7 @@ class RecognizerSettings:
         spatial, sequence = self.spatial, self.sequence
         mode = self.mode if self.robust_options is None else 'own options'
         return (
-            f'{mode} by evidence, length {sequence.length}, beta {sequence.beta:g}, '
+            f'{mode} by evidence, version 2, length {sequence.length}, beta {sequence.beta:g}, '
             f'{spatial.strategy}, sigma {spatial.sigma:g}, xi {spatial.xi}, '
             f'vertical {spatial.vertical}' + ', both directions' * self.moves_against
         )

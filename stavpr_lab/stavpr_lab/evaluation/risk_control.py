@@ -21,7 +21,7 @@ from stavpr_ros.mapping.place_map import ErrorRisks
 KINDS = ('same', '0.5x', '2x', 'varying')  # drives of the whole map
 DETOURS = 3  # drives, each without every third stretch of the map, of as many places as a block
 # above which images are matched, evenly spaced by the logarithm of their odds
-PROBABILITIES = np.round(1 / (1 + np.exp(-np.linspace(-1.75, 7, 36))), 4)
+PROBABILITIES = np.round(1 / (1 + np.exp(-np.linspace(-1, 7, 65))), 4)
 
 
 def made_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
