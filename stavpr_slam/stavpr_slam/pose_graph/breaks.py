@@ -12,21 +12,22 @@ EVIDENCE = 10.0  # so much more evidence
 SUPPORT = 32  # closures on each side of a break
 NEAR = 2.0  # meters, and deviations of two closures, that agreeing ones are apart
 PAUSE = 1.5  # times the usual time between keyframes: the robot was carried then
+TRIED = 2  # sets of closures that agree on another path
 MOST = 1500  # rejected closures of a session that are compared, evenly: 50 MB
 GAP = 15.0  # meters before and behind the closures at a break where it may be
 
 
 def find(
     chain: KeyframeChain, solved: np.ndarray, taken: np.ndarray, closures: ClosureArrays
-) -> int | None:
+) -> list[int]:
     """
-    Return the break that lets most rejected closures agree; None = none.
+    Return the breaks that let most rejected closures agree, and then most of the rest.
 
     :param solved: transforms of all nodes by the robust solution, (N, 4, 4).
     :param taken: whether each closure agrees with it, shape (n,).
     """
     query, place = closures.query, closures.place
-    best, before = np.zeros(0, int), np.zeros(0, int)
+    found: list[tuple[int, int | None]] = []
     for session in np.unique(chain.session[query]).tolist():
         here = chain.session[query] == session
         own = np.flatnonzero(~taken & here)
@@ -45,14 +46,18 @@ def find(
             result: np.ndarray = (agree[np.argmax(agree @ among * among)] > 0) & among
             return result
 
-        for node in np.unique(query[own])[:: SUPPORT // 4].tolist():
-            members = most(query[own] >= node)
-            if members.sum() > len(best):
-                best = own[members]
-                before = np.flatnonzero(taken & here & (query < query[best].min()))
-                if not len(before):
-                    before = own[most(query[own] < query[best].min())]
-    return _between(chain, query, before, best)
+        free = np.ones(len(own), bool)
+        for _ in range(TRIED):
+            nodes = np.unique(query[own])[:: SUPPORT // 4]
+            members = max((most((query[own] >= node) & free) for node in nodes), key=np.sum)
+            best, start = own[members], query[own[members]].min(initial=len(chain))
+            before = np.flatnonzero(taken & here & (query < start))
+            if not len(before):
+                before = own[most(query[own] < start)]
+            found.append((-len(best), _between(chain, query, before, best)))
+            free &= ~members
+    found = sorted(found, key=lambda each: each[0])[:TRIED]
+    return [node for _, node in found if node is not None]
 
 
 def strained(chain: KeyframeChain, taken: np.ndarray, query: np.ndarray, node: int) -> int | None:

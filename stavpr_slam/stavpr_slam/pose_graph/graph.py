@@ -235,7 +235,7 @@ class PoseGraph:
             node
             for solved, agreeing, strained in before.tried
             for node in (
-                breaks.find(self.chain, solved, agreeing, self._closures),
+                *breaks.find(self.chain, solved, agreeing, self._closures),
                 breaks.strained(self.chain, agreeing, self._closures.query, strained),
             )
             if node is not None
