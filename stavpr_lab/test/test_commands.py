@@ -197,7 +197,7 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
     assert load_map(output).ids == ('/image#2', '/image#5', '/image#8')
     result = run(build_map, *paths, '--odometry', '/other')
     assert result.code == 1
-    assert 'topics of that type are /odom' in result.err
+    assert 'expected one of /odom' in result.err
 
 
 @pytest.mark.parametrize(
