@@ -307,6 +307,19 @@ def test_stavpr_without_torch_names_its_extra(monkeypatch, capsys):
     assert "this needs torch, an extra: pip install '.[torch]'" in capsys.readouterr().err
 
 
+def test_script_of_setuptools_lets_pkg_resources_be_imported():
+    """Where Debian provides a requirement under another name: here one that is nowhere."""
+    script = (
+        "__requires__ = 'no-such-distribution==1'\n"
+        'from stavpr_ros.commands.stavpr import main\n'
+        "main(['--help'])\n"
+        'import pkg_resources\n'
+    )
+    command = [sys.executable, '-W', 'ignore', '-c', script]
+    result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+
+
 def test_stavpr_passes_arguments_and_exit_code(monkeypatch):
     received = []
     module = type(sys)('stavpr_ros.commands.build_map')

@@ -53,6 +53,16 @@ def usage() -> str:
     )
 
 
+def forget_requirements() -> None:
+    """
+    Keep ``pkg_resources`` from checking the requirements of this distribution.
+
+    It does so when a library imports it in a script that setuptools generated for colcon, and
+    fails where a Debian package provides a requirement under another distribution name.
+    """
+    vars(sys.modules['__main__']).pop('__requires__', None)
+
+
 def main(args: list[str] | None = None) -> int:
     """
     Run a command.
@@ -60,6 +70,7 @@ def main(args: list[str] | None = None) -> int:
     :param args: arguments without the program name; None takes the arguments of the process.
     :returns: the command's exit code; 2 for a usage error or a missing ROS installation.
     """
+    forget_requirements()
     try:
         return until_unread(lambda: _main(sys.argv[1:] if args is None else args))
     except ModuleNotFoundError as error:

@@ -16,18 +16,17 @@ from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
-from stavpr_ros.mapping.map_version2 import (
+from stavpr_ros.mapping.map_schema import (
     CAMERAS,
     Check,
-    ERROR_RISKS,
     identity_fields,
     INTRINSICS,
-    KNOWN_SECTIONS,
     number,
     record,
     RISKS,
     VALUE_RANGE,
 )
+from stavpr_ros.mapping.map_version2 import ERROR_RISKS, KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import ErrorRisks, PlaceMap, Session
 from stavpr_ros.mapping.stored_features import (
     CHANGES,

@@ -16,14 +16,12 @@ from stavpr_ros.checks import require_choice, require_type
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile, Part
 from stavpr_ros.mapping.map_content import map_content, PARTS, require_jpegs
+from stavpr_ros.mapping.map_schema import identity_fields, SESSION, SETTINGS
 from stavpr_ros.mapping.map_version2 import (
     copy_with,
     ERROR_RISKS,
-    identity_fields,
     MAX_HEADER,
     read_header,
-    SESSION,
-    SETTINGS,
     write_parts,
 )
 from stavpr_ros.mapping.place_map import ErrorRisks, PlaceMap

@@ -13,7 +13,8 @@ from typing import Any, overload
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping.map_container import DTYPES, errors_of, MapFile
-from stavpr_ros.mapping.map_version2 import features_key, record, SHA256, text
+from stavpr_ros.mapping.map_schema import record, SHA256, text
+from stavpr_ros.mapping.map_version2 import features_key
 from stavpr_ros.memory import aligned_empty
 
 STATISTICS = 'statistics'  # name of the section

@@ -17,7 +17,7 @@ import time
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.mapping.map_container import read_json
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.map_version2 import integer, list_of, number, record, text
+from stavpr_ros.mapping.map_schema import integer, list_of, number, record, text
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output

@@ -356,6 +356,7 @@ class Pattern:
         i, j = ends[active & (ends[:, 0] >= 0)].T
         graph = coo_array((np.full(len(i), -1.0), (i, j)), (count, count))
         graph = graph + graph.T
+        # a Laplacian and little: what fills its root does not vanish along a path
         graph = (graph + diags_array(1e-3 - graph.sum(axis=0))).tocsc()
         options = {'SymmetricMode': True}
         found = splu(graph, 'MMD_AT_PLUS_A', diag_pivot_thresh=0.0, relax=1, options=options)
