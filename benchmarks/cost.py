@@ -1,17 +1,18 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Processor time of an image: stages of the library, and a node beside an empty subscriber.
+Processor time of an image: stages of the library, and a node beside empty subscribers.
 
-The node and a subscriber of rclpy without a callback's work receive the same images at the same
-time. Run it where the package is built and sourced: ``make shell``, then
-``python benchmarks/cost.py``. With ``--sessions``, only the recognition of an image on maps of so
-many sessions of Nordland, summer and winter in turn with noise, with one thread.
+The node and two subscribers of rclpy receive the same images at the same time: one does nothing,
+one converts them to gray and publishes a match of the same size. Run it where the package is built
+and sourced: ``make shell``, then ``python benchmarks/cost.py``. With ``--sessions``, only the
+recognition of an image on maps of so many sessions of Nordland, summer and winter in turn with
+noise, with one thread.
 """
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, ExitStack, nullcontext
 import json
 import os
 from pathlib import Path
@@ -19,7 +20,6 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from textwrap import dedent
 import time
 from typing import Any
 
@@ -37,19 +37,35 @@ from soak import (
 
 WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
 TURN, SETTLED_TURNS = 50, 4  # images of each map in turn, and turns before times count
+PACE = 30  # images per second of stages that find their caches cold
 SETTLED = 5.0  # seconds after the first image, before times count
-SUBSCRIBER = dedent("""
-    import rclpy
-    from rclpy.qos import qos_profile_sensor_data
-    from sensor_msgs.msg import Image
-    rclpy.init()
-    node = rclpy.create_node('empty')
-    node.create_subscription(Image, 'image', lambda message: None, qos_profile_sensor_data)
-    try:
-        rclpy.spin(node)
-    except rclpy.executors.ExternalShutdownException:
-        pass
-""")
+SUBSCRIBER = """
+import sys
+import cv2, numpy as np, rclpy
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import Image
+from stavpr_msgs.msg import AlignedPair, PlaceMatch
+
+def publish(message):
+    image = np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
+    cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    match = PlaceMatch(header=message.header, status=PlaceMatch.MATCH)
+    match.path = [AlignedPair(query_index=i, place_index=i) for i in range(20)]
+    match.path_probabilities = [1.0] * 20
+    publisher.publish(match)
+
+rclpy.init()
+cv2.setNumThreads(1)
+node = rclpy.create_node(sys.argv[1])
+publisher = node.create_publisher(PlaceMatch, '~/match', QoSProfile(depth=50))
+work = publish if sys.argv[1] == 'publisher' else lambda message: None
+node.create_subscription(Image, 'image', work, qos_profile_sensor_data)
+try:
+    rclpy.spin(node)
+except rclpy.executors.ExternalShutdownException:
+    pass
+"""
+PROCESSES = 'node', 'publisher', 'subscriber'
 # owner and name of the function of each stage
 STAGES = {
     'decoding': ('operations', 'decode_message'),
@@ -77,8 +93,12 @@ def proportional_memory(pid: int) -> float:
 # ------------------------------------------------ stages
 
 
-def measure_stages(path: str, precision: str, threads: int) -> dict[str, float]:
-    """Return the median processor time of each stage of an image, and of all, microseconds."""
+def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[str, float]:
+    """
+    Return the median processor time of each stage of an image, and of all, microseconds.
+
+    :param rate: images per second, 0 = one after the other.
+    """
     import numpy as np
     from peaks import reader
     from stavpr_ros.pipeline import operations, Pipeline, PipelineSettings, read_map
@@ -114,6 +134,7 @@ def measure_stages(path: str, precision: str, threads: int) -> dict[str, float]:
                 setattr(target, name, timed(stage, getattr(target, name)))
         if number in (WARM, WARM + IMAGES):
             total = times.get('all', [])[-IMAGES:]
+        time.sleep(1 / rate if rate else 0)
         process(messages[number % VIEWS], (number + 1) * 10**8, list_candidates=False)
     assert recognizer is not None
     size = recognizer.places * 7 * 224 * (1 if precision == 'int8' else 4) // 4
@@ -127,14 +148,14 @@ def measure_stages(path: str, precision: str, threads: int) -> dict[str, float]:
     return {name: round(1e6 * value) for name, value in medians.items()}
 
 
-def stages(path: str, precision: str, threads: int) -> dict[str, float]:
-    """Measure the stages in a process of its own, with so many threads."""
+def stages(path: str, *case: Any) -> dict[str, float]:
+    """Measure the stages in a process of its own: precision, threads, rate."""
     environment = {
         **os.environ,
-        'NUMBA_NUM_THREADS': str(threads),
-        'OMP_NUM_THREADS': str(threads),
+        'NUMBA_NUM_THREADS': str(case[1]),
+        'OMP_NUM_THREADS': str(case[1]),
     }
-    command = [sys.executable, __file__, '--map', path, '--stages', precision, str(threads)]
+    command = [sys.executable, __file__, '--map', path, '--stages', *map(str, case)]
     output = subprocess.check_output(command, env=environment, text=True)
     result: dict[str, float] = json.loads(output.splitlines()[-1])
     return result
@@ -207,46 +228,50 @@ def process(command: list[str], *without: str) -> Iterator[int]:
 
 
 def node_cost(path: str, rate: float, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the percent of a core that the node and the empty subscriber take."""
+    """Return the percent of a core that the node and the subscribers take."""
     from rclpy.qos import qos_profile_sensor_data
     from stavpr_lab.demonstration.live import executable
     from stavpr_ros.ros.process import PROFILES_VARIABLE
 
     options = ['--ros-args', '-p', f'map_path:={path}', '--log-level', 'error']
-    arguments.rate, marks = rate, {}
+    arguments.rate, marks = rate, []
     images = [image_message(image) for image in texture_route(VIEWS)]
-    with (
+    peers = [[sys.executable, '-c', SUBSCRIBER, name] for name in PROCESSES[1:]]
+    with ExitStack() as stack:
         # the large segment of prepare_transport is for the publisher
-        process([executable('node'), *options], PROFILES_VARIABLE) as node,
-        process([sys.executable, '-c', SUBSCRIBER]) as subscriber,
-    ):
+        node, *others = (
+            stack.enter_context(process(command, PROFILES_VARIABLE))
+            for command in ([executable('node'), *options], *peers)
+        )
 
-        def mark(name: str) -> None:
-            marks[name] = time.monotonic(), seconds_of(node), seconds_of(subscriber)
+        def mark() -> None:
+            marks.append([time.monotonic(), *map(seconds_of, [node, *others])])
 
-        (figures,), _ = publish(
-            ['stavpr'], 'image', qos_profile_sensor_data, images, arguments,
-            after=(SETTLED, lambda: mark('first')), others=1,
+        (figures, floor), _ = publish(
+            ['stavpr', PROCESSES[1]], 'image', qos_profile_sensor_data, images, arguments,
+            after=(SETTLED, mark), others=1,
         )  # fmt: skip
-        mark('last')
+        mark()
         figures['pss_mb'], figures['rss_mb'] = proportional_memory(node), memory(node)
-    wall, own, empty = (last - first for first, last in zip(*marks.values(), strict=True))
-    figures |= {'rate': rate, 'node': 100 * own / wall, 'subscriber': 100 * empty / wall}
-    return figures | {'ratio': own / empty}
+    wall, *used = (last - first for first, last in zip(*marks, strict=True))
+    figures |= {name: 100 * own / wall for name, own in zip(PROCESSES, used, strict=True)}
+    return figures | {'rate': rate, 'publisher_latency_ms_p50': floor['latency_ms_p50']}
 
 
 def lines_of(report: dict[str, Any]) -> list[str]:
     """Return the tables of a report."""
     names = [*STAGES, 'rest', 'all', 'reading the map']
-    head = ['stage, us', *(f'{p}, {t} threads' for p, t in report['cases'])]
+    rates = {0: '', PACE: f', {PACE} images/s'}
+    head = ['stage, us', *(f'{p}, {t} threads{rates[r]}' for p, t, r in report['cases'])]
     rows = [[n, *(f'{one.get(n, 0):.0f}' for one in report['stages'])] for n in names]
-    lines = table(head, rows)
-    head = ['images/s', 'node, %', 'subscriber, %', 'ratio', 'p50 / p99, ms', 'PSS, MB']
+    lines = table(head, rows) if report['cases'] else []
+    head = ['images/s', *(f'{name}, %' for name in reversed(PROCESSES))]
+    head += ['node / subscriber', 'node / publisher', 'p50 / p99, ms', 'PSS, MB']
     rows = [
         [
-            f'{one["rate"]:g}', f'{one["node"]:.1f}', f'{one["subscriber"]:.1f}',
-            f'{one["ratio"]:.2f}', f'{one["latency_ms_p50"]:.1f} / {one["latency_ms_p99"]:.1f}',
-            f'{one["pss_mb"]:.0f}',
+            f'{one["rate"]:g}', *(f'{one[name]:.1f}' for name in reversed(PROCESSES)),
+            *(f'{one["node"] / one[name]:.2f}' for name in reversed(PROCESSES[1:])),
+            f'{one["latency_ms_p50"]:.1f} / {one["latency_ms_p99"]:.1f}', f'{one["pss_mb"]:.0f}',
         ]
         for one in report['nodes']
     ]  # fmt: skip
@@ -263,15 +288,15 @@ def main() -> None:
     parser.add_argument('--map', help='instead of one of 2000 synthetic places')
     parser.add_argument('--threads', type=int, nargs='*', default=[1, 2], help='of the stages')
     parser.add_argument('--sessions', type=int, nargs='*', help='on maps of so many sessions only')
-    parser.add_argument('--stages', nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument('--stages', nargs=3, help=argparse.SUPPRESS)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
     if arguments.stages:
-        precision, threads = arguments.stages
-        print(json.dumps(measure_stages(arguments.map, precision, int(threads))))
+        precision, *numbers = arguments.stages
+        print(json.dumps(measure_stages(arguments.map, precision, *map(int, numbers))))
         return
     if arguments.sessions:
         print('\n'.join(measure_sessions(arguments.sessions)))
@@ -282,7 +307,8 @@ def main() -> None:
     os.environ.update(private_domain())
     prepare_transport()
     load = os.getloadavg()[0]
-    cases = [(p, t) for t in arguments.threads for p in ('float32', 'int8')]
+    counts = [(t, r) for t in arguments.threads for r in ((0, PACE) if t == 1 else (0,))]
+    cases = [(p, t, r) for t, r in counts for p in ('float32', 'int8')]
     folder: Any = nullcontext('') if arguments.map else tempfile.TemporaryDirectory()
     with folder as name:
         path = str(Path(arguments.map or Path(name) / 'map.stavpr').resolve())

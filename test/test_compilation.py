@@ -76,10 +76,12 @@ def test_compilation_is_announced_once():
 
 
 DRIVE = """
+import array
 import gc
+from types import SimpleNamespace
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from stavpr_ros.mapping import build_map
+from stavpr_ros.mapping import build_map, KeyframeSettings
 from stavpr_ros.pipeline import PipelineSettings
 from stavpr_ros.pipeline.operations import Localizer, RouteCloser
 from stavpr_ros.pipeline.save_state import SaveState
@@ -89,7 +91,9 @@ def compiled():
     return {(f.__qualname__, tuple(f.signatures)) for f in gc.get_objects()
             if isinstance(f, Dispatcher) and f.signatures}
 
-settings = PipelineSettings(backend='cpu', max_places=110)
+settings = PipelineSettings(
+    backend='cpu', max_places=110, keyframes=KeyframeSettings(change=0.004)
+)
 extractor = settings.extractor()
 images = np.random.default_rng(0).integers(0, 256, (60, 96, 128, 3), np.uint8)
 route = build_map([Frame(image, i, str(i)) for i, image in enumerate(images)], extractor)
@@ -99,7 +103,9 @@ for operation in (
 ):
     before = compiled()
     for i, image in enumerate([*images, *images]):
-        operation.recognizer.update(extractor.extract([image]), (i + 1) * 10**8)
+        message = SimpleNamespace(height=96, width=128, encoding='rgb8', is_bigendian=0)
+        message.step, message.data = 384, array.array('B', image.tobytes())
+        assert operation.process(message, (i + 1) * 10**8).match is not None
     print(operation.name, sorted(compiled() - before))
 """
 

@@ -16,7 +16,7 @@ from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of, verify_map
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.mapping.keyframes import KeyframeSelector
+from stavpr_ros.mapping.keyframes import image_change, KeyframeSelector, small_gray
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.pipeline.result import GeometricCheck, ImageResult
@@ -97,6 +97,7 @@ class Operation(ABC):
         if self.extractor is not None:
             is_new, known = self.extractor.is_new, scale(self.extractor.settings.value_range)
             self._to_bytes = RangeFinder() if is_new else known
+        image_change(*[small_gray(BLANK_IMAGE)] * 2)  # compiles what keyframes need
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None
         self._last: ImageResult | None = None
