@@ -12,7 +12,7 @@ from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence, SequenceMatch
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.filter.choice import MIN_CANDIDATE
-from stavpr_ros.filter.paths import CLOSE
+from stavpr_ros.filter.paths import CLOSE, sum_close
 from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare import route_features
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
@@ -220,7 +220,7 @@ def test_late_matches_close_what_was_not_certain_at_first():
         oldest += 1
         window = closer._window
         belief = window.filter.belief(window.buffer.known, length - 1)
-        near, probabilities = belief.probabilities(window.buffer.known)
+        near, probabilities = sum_close(belief.places, belief.weights, window.buffer.known)
         best = near[np.argmax(probabilities)]
         share = window.match_oldest(settings.nms_radius, True).shares[0]
         of_path = of_sequence(belief, best)

@@ -82,10 +82,13 @@ def test_where_the_most_probable_path_is_refuted_the_next_one_is_matched(monkeyp
         map_of(features_of(route, 0.05)), RecognizerSettings(mode='robust', min_probability=1e-9)
     )
 
-    def refuted_first(path, z, part):
-        return 10.0 if path.mean() < 130 else 0.0
+    refined = choice.refined
 
-    monkeypatch.setattr(choice, 'unevenness', refuted_first)
+    def refuted_first(*arguments):
+        path, placed, z, masses, _, compared = refined(*arguments)
+        return path, placed, z, masses, 10.0 if path.mean() < 130 else 0.0, compared
+
+    monkeypatch.setattr(choice, 'refined', refuted_first)
     matches = [match for match in recognize_all(recognizer, query) if match.accepted]
     assert len(matches) > 50
     for match in matches:

@@ -19,18 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.compilation import kernel
-from stavpr_ros.filter.checks import (
-    least_at_rest,
-    NEWEST,
-    odds_factor,
-    unevenness,
-)
+from stavpr_ros.filter.checks import least_at_rest, NEWEST, odds_factor
 from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.evidence import changed_images
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
 from stavpr_ros.filter.protocol import Filter
-from stavpr_ros.filter.refine import BAND, columns_near, image_times, refined
+from stavpr_ros.filter.refine import BAND, image_times, refined
 
 CANDIDATES = 3  # paths that are checked, at most
 REFUTED = 0.01  # factor of the odds by the checks, below which another path is checked, too
@@ -160,9 +154,8 @@ class PathChoice:
         """Return the most probable column elsewhere, and its probability, 0 if none."""
         places, probabilities = chosen.places, chosen.probabilities
         near = self._layout.around(place, radius)
-        parts = [np.arange(max(0, low), min(n, end)) for low, end in near.tolist()]
-        now, faint = self._filter.most_probable(np.sort(np.concatenate([*parts, places])))
-        second = _best_beyond(places, probabilities, near)
+        second, excluded = _best_beyond(places, probabilities, near, n)
+        now, faint = self._filter.most_probable(excluded)
         if second >= 0 and probabilities[second] >= faint * NEGLIGIBLE:
             return int(places[second]), float(probabilities[second])
         return now, faint * NEGLIGIBLE
@@ -177,57 +170,65 @@ class PathChoice:
         of_path = max(float(probabilities[best]), min(float(belief.weights[low:high].sum()), 1.0))
         state = belief.states[first + belief.weights[first:end].argmax()]
         mean, numbers = self._filter.mean_z(state), images.numbers
-        path = self._path(state, images)
-        z = images.z(columns_near(path, images.n))
-        path, placed, z, masses = refined(
-            z, path, images.weights * mean, images.numbers, images.stamps,
+        path, columns = self._path(state, images)
+        path, placed, z, masses, uneven, compared = refined(
+            images.z(columns), path, images.weights * mean, numbers, images.stamps,
             self._place_times[: images.n], self._layout.first_column(path[-1]),
-            self._change.equal, self._passes,
+            self._change.equal, self._passes, 1.0 if images.is_whole else NEWEST,
         )  # fmt: skip
         moved = int(numbers[-1] - numbers[0])
         speed = float(path[-1] - path[0]) / max(moved, 1)
         excess = self._change.excess(speed) if moved and images.is_whole else 0.0
-        factor = odds_factor(unevenness(path, z, 1.0 if images.is_whole else NEWEST), excess)
+        factor = odds_factor(uneven, excess)
         least = 0.0
         if images.lag_at_rest is not None:
             at_rest = z[numbers == numbers[-1]]
             least = least_at_rest(at_rest, mean, self._filter.settings.weight)
-        compared = z[np.isfinite(z) & changed_images(numbers)]
         score = -float(compared.sum() / len(compared)) if len(compared) else 0.0
         shares = masses.sum(axis=1)
         return ChosenPath(placed, shares, of_path, least, factor, score, places, probabilities)
 
-    def _path(self, state: np.ndarray, images: WindowImages) -> np.ndarray:
-        """Return the column of each image, (l,); before the image at the position at one speed."""
+    def _path(self, state: np.ndarray, images: WindowImages) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the column of each image, before the image at the position at one speed.
+
+        :returns: of :func:`_extended`.
+        """
         numbers = images.numbers
         lag = numbers[-1] - numbers[images.position]
         if images.lag_at_rest is not None:  # images before the standstill as well
             lag = max(lag, min(numbers[-1] - numbers[0], images.lag_at_rest))
         places, speed = self._filter.path(state, int(lag)), self._filter.speed(state)
         first = self._layout.first_column(places[0])
-        path: np.ndarray = _extended(places, numbers, speed, first)
-        return path
+        path, columns = _extended(places, numbers, speed, first, images.n)
+        return path, columns
 
 
 # ------------------------------------------------ kernels
 
 
 @kernel
-def _extended(places: np.ndarray, numbers: np.ndarray, speed: float, first: int) -> np.ndarray:
+def _extended(
+    places: np.ndarray, numbers: np.ndarray, speed: float, first: int, n: int
+) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the column of each image, (l,), int64, at one speed before the path has entered the map.
+    Return the column of each image, at one speed before the path has entered the map.
 
-    :param places: of :meth:`Filter.path`; numbers: see :class:`WindowImages`.
+    :param places: of :meth:`Filter.path`; numbers, n: see :class:`WindowImages`.
     :param speed: of a path that entered with the newest image; first: least column.
+    :returns: columns, (l,), int64, and those within ``BAND`` of each, below n, (l, S).
     """
     lag = np.count_nonzero(places >= 0) - 1
     slope = (places[0] - places[lag]) / lag if lag else speed
     path = np.empty(len(numbers), np.int64)
+    near = np.empty((len(path), 2 * BAND + 1), np.int64)
     for i in range(len(path)):
         back = numbers[-1] - numbers[i]
         place = places[min(back, lag)] - int(np.rint(max(back - lag, 0) * slope))
         path[i] = max(place, first)
-    return path
+        for s in range(near.shape[1]):
+            near[i, s] = min(max(path[i] + s - BAND, 0), n - 1)
+    return path, near
 
 
 @kernel
@@ -245,14 +246,29 @@ def _check(
 
 
 @kernel
-def _best_beyond(places: np.ndarray, probabilities: np.ndarray, near: np.ndarray) -> int:
-    """Return the most probable of places outside of slices (m, 2), its index; -1 = none."""
-    best = -1
-    for i in range(len(places)):
-        is_more = best < 0 or probabilities[i] > probabilities[best]
-        is_near = False
-        for low, end in near:
-            is_near |= low <= places[i] < end
-        if is_more and not is_near:
-            best = i
-    return best
+def _best_beyond(
+    places: np.ndarray, probabilities: np.ndarray, near: np.ndarray, n: int
+) -> tuple[int, np.ndarray]:
+    """
+    Return the most probable of places outside of slices, its index; -1 = none.
+
+    :param places: ascending; near: slices, ascending, (m, 2).
+    :returns: also all places, and the columns below n in the slices, ascending.
+    """
+    size = len(places)
+    for low, end in near:
+        size += end - low
+    both, count, best, i = np.empty(size, np.int64), 0, -1, 0
+    for part in range(len(near) + 1):
+        low, end = (near[part, 0], near[part, 1]) if part < len(near) else (n, n)
+        while i < len(places) and places[i] < low:
+            if best < 0 or probabilities[i] > probabilities[best]:
+                best = i
+            both[count] = places[i]
+            count, i = count + 1, i + 1
+        while i < len(places) and places[i] < end:
+            i += 1
+        for column in range(max(low, 0), min(end, n)):
+            both[count] = column
+            count += 1
+    return best, both[:count]

@@ -209,15 +209,23 @@ class ColumnLayout:
             position.
         """
         if self.columns is None:
-            places, probabilities = belief.probabilities(n)
-            own_states = np.ones(len(places), bool)
-            return places, probabilities, own_states, int(np.argmax(probabilities))
+            places, probabilities, own, index = _of_one_session(belief.places, belief.weights, n)
+            return places, probabilities, own, index
         arguments = belief.places, belief.weights, self._shared, *self._sorted, self.lap
         columns, probabilities, own, index = _merged(*arguments)
         return columns, probabilities, own, index
 
 
 # ------------------------------------------------ kernels
+
+
+@kernel
+def _of_one_session(
+    places: np.ndarray, weights: np.ndarray, n: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return what :meth:`ColumnLayout.merge_sessions` does where each place is a position."""
+    near, sums = sum_close(places, weights, n)
+    return near, sums, np.ones(len(near), np.bool_), int(np.argmax(sums))
 
 
 @kernel

@@ -43,15 +43,6 @@ class Belief:
     weights: np.ndarray
     states: np.ndarray
 
-    def probabilities(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the places of n whose probability, close ones included, is not 0.
-
-        :returns: places, ascending, (m,), and their probabilities.
-        """
-        near, sums = sum_close(self.places, self.weights, n)
-        return near, sums
-
 
 # ------------------------------------------------ kernels
 

@@ -15,6 +15,7 @@ evenly in time (:func:`straight_offsets`). Each counts by the likelihood of the 
 
 import numpy as np
 from stavpr_ros.compilation import kernel
+from stavpr_ros.filter.checks import unevenness
 from stavpr_ros.filter.paths import CLOSE
 
 BAND = 5  # places to either side of the filter's path
@@ -69,16 +70,6 @@ def usual_interval(stamps: np.ndarray) -> float:
 
 
 @kernel
-def columns_near(path: np.ndarray, n: int) -> np.ndarray:
-    """Return the columns at each offset from a path (l,), none beyond the n columns, (l, S)."""
-    columns = np.empty((len(path), len(OFFSETS)), np.int64)
-    for i in range(len(path)):
-        for s in range(len(OFFSETS)):
-            columns[i, s] = min(max(path[i] + OFFSETS[s], 0), n - 1)
-    return columns
-
-
-@kernel
 def refine(z, path, exponents, images, times, place_times):
     """
     Return where the camera was beside a path, by all images of the window.
@@ -125,7 +116,7 @@ def refine(z, path, exponents, images, times, place_times):
 
 
 @kernel
-def refined(z, path, exponents, images, stamps, place_times, first, equal, passes):
+def refined(z, path, exponents, images, stamps, place_times, first, equal, passes, part):
     """
     Return the places near a path that explain the images of the window best.
 
@@ -136,25 +127,31 @@ def refined(z, path, exponents, images, stamps, place_times, first, equal, passe
     :param first: least place.
     :param equal: which passes equal the one before: such are as one.
     :param passes: of each place.
+    :param part: of :func:`unevenness`.
     :returns: columns that are checked, (l,), the estimated ones, (l,), z of each image at the
-        column that is checked, (l,), and the probability of each offset, (l, S), 0 where it is
-        not close to the estimated column.
+        column that is checked, (l,), the probability of each offset, (l, S), 0 where it is not
+        close to the estimated column, the unevenness, and the finite z of images that differ from
+        the one before, (m,).
     """
     times, n = image_times(stamps, images, usual_interval(stamps)), len(place_times)
     masses, means = refine(z, path, exponents, images, times, place_times)
     checked, placed = _ascending(path, means[0], first, n), _ascending(path, means[1], first, n)
-    of_checked = np.empty(len(path), np.float32)
-    begin, end = passes[max(path[0] - BAND, 0)], passes[min(path[-1] + BAND, n - 1)]
+    of_checked, compared = np.empty(len(path), np.float32), np.empty(len(path), np.float32)
+    count, begin, end = 0, passes[max(path[0] - BAND, 0)], passes[min(path[-1] + BAND, n - 1)]
     has_equal = equal[begin + 1 : end + 1].any()
     for i in range(len(path)):
         of_checked[i] = z[i, min(max(checked[i] - path[i], -BAND), BAND) + BAND]
+        if np.isfinite(of_checked[i]) and (i == 0 or images[i] != images[i - 1]):
+            compared[count] = of_checked[i]
+            count += 1
         for s in range(len(OFFSETS)):
             place = path[i] + OFFSETS[s]
             if abs(place - placed[i]) > CLOSE:
                 own, other = passes[min(max(place, 0), n - 1)], passes[placed[i]]
                 between = equal[min(own, other) + 1 : max(own, other) + 1]
                 masses[i, s] *= has_equal and between.all()
-    return checked, placed, of_checked, masses
+    uneven = unevenness(checked, of_checked, part)
+    return checked, placed, of_checked, masses, uneven, compared[:count]
 
 
 @kernel
