@@ -17,17 +17,34 @@ from typing import Any
 from accuracy import extractors, long_cases, short_cases
 from data import data_folder
 import numpy as np
-from off_map_page import DAY, HYBRID, JUMP, KINDS, LEVEL, markdown, NIGHT, Results, summary_section
+from off_map_page import (
+    DAY,
+    HYBRID,
+    JUMP,
+    KINDS,
+    LEVEL,
+    markdown,
+    NIGHT,
+    RATES,
+    Results,
+    summary_section,
+)
 from results import environment, options_parser, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.ground_truth import GroundTruth
-from stavpr_lab.evaluation.metrics import accepted_counts, published_matches, sweep
+from stavpr_lab.evaluation.metrics import (
+    accepted_counts,
+    ConfusionCounts,
+    published_matches,
+    sweep,
+)
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, PlaceMap, select_places
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.sources import open_source
 from tqdm import tqdm
 
@@ -101,9 +118,7 @@ class Outcome:
     def numbers(self) -> dict[str, Any]:
         """Return counts, precision and recall at the default threshold, best F1; F1 of images."""
         is_image = ~self.early
-        columns = self.accepted, self.correct, self.has_match
-        counts = accepted_counts(*columns)
-        of_images = accepted_counts(*(column[is_image] for column in columns))
+        counts, recall = self._precision_and_recall(self.accepted)
         curve = sweep(
             np.where(np.isfinite(self.probabilities), 1 - self.probabilities, np.inf)[is_image],
             self.correct[is_image],
@@ -117,13 +132,32 @@ class Outcome:
             'wrong': counts.false_positives,
             'sure': int(np.count_nonzero(self.sure)),
             'precision': counts.precision,
-            'recall': of_images.recall,
+            'recall': recall,
+            'rates': {rate: self._at(float(rate)) for rate in RATES},
             'f1': max(each.f1 for each in curve),
             'recall_at_100_precision': max(each.recall for each in curve if each.precision == 1),
             'unseen': int(np.count_nonzero(self.unseen & is_image)),
             'unseen_matched': int(np.count_nonzero(self.unseen & self.accepted)),
             'unseen_sure': int(np.count_nonzero(self.unseen & self.sure)),
         }
+
+    def _precision_and_recall(self, accepted: np.ndarray) -> tuple[ConfusionCounts, float]:
+        """Return the counts of all matches, and the recall of images."""
+        columns, is_image = (accepted, self.correct, self.has_match), ~self.early
+        of_images = accepted_counts(*(column[is_image] for column in columns))
+        return accepted_counts(*columns), of_images.recall
+
+    def _at(self, rate: float) -> tuple[float, float]:
+        """
+        Return precision and recall with ``max_error``, by the table.
+
+        Up to the default threshold, a camera at rest counts as one that moves.
+        """
+        above = self.probabilities > least_probability(rate)
+        counts, recall = self._precision_and_recall(
+            above & (self.accepted | (self.probabilities <= SETTINGS.min_probability))
+        )
+        return counts.precision, recall
 
     def calibration(self) -> dict[str, Any]:
         """Return declared probabilities beside the share of right matches."""

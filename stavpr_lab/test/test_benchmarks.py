@@ -81,6 +81,9 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     assert (found['sure'], found['unseen_sure']) == (0, 0)  # 0.6
     sure = replace(outcome, probabilities=np.array([1, 0.9, 0.95, 0.2, np.nan])).numbers()
     assert (sure['sure'], sure['unseen_sure']) == (1, 1)
+    assert found['rates']['0.05'] == (4 / 6, 4 / 8)  # the same, 0.2 is below the table's limit
+    lower = replace(outcome, probabilities=np.array([0.99, 0.8, 0.6, 0.4, np.nan])).numbers()
+    assert lower['rates'] == {'0.05': (3 / 4, 3 / 4), '0.01': (1.0, 1 / 4)}
     assert found['recall_at_100_precision'] == 0.5  # above 0.6
     assert found['f1'] == 3 / 4  # three of four right, one wrong
     bins = outcome.calibration()['bins']
