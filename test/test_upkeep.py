@@ -25,14 +25,14 @@ from stavpr_ros.mapping import (
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.versions import current_version, roll_back, save_version, Version
 from stavpr_ros.output_file import FileVersion
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, upkeep
 from stavpr_ros.recognition.same_places import with_seam
 from stavpr_ros.recognition.upkeep import MIN_MISSED, update_map, UpkeepSettings
 from stavpr_ros.sources.frame import Frame
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 ROUTE, OTHER, BYPASS = (route_images(count, seed) for count, seed in ((200, 0), (120, 5), (70, 9)))
-SETTINGS = UpkeepSettings(max_places=1000, max_age=3)
+SETTINGS = UpkeepSettings(max_places=350, max_age=3)  # no room for a whole drive
 
 
 def built(images, day=0, poses=None, thumbnails=False):
@@ -121,6 +121,23 @@ def test_detour_joins_the_map_as_a_stretch_of_its_own(first, around):
     np.testing.assert_allclose(poses[:, 0], poses[0, 0], atol=1e-6)
     np.testing.assert_allclose(np.diff(poses[:, 1]), 1, atol=1e-6)
     assert recall(place_map, built([*ROUTE[60:80], *BYPASS, *ROUTE[90:120]], 4)) > 0.8
+
+
+def test_drive_is_kept_whole_where_there_is_room(first, rebuilt):
+    room = UpkeepSettings(max_places=400)
+    place_map, version = updated(first, rebuilt, settings=room)
+    assert version.changes[1:] == ('added the drive, 200 images: there is room for it',)
+    assert len(place_map) == 400
+    assert [session.id for session in place_map.sessions] == ['first', 'drive']
+    shown = place_map.same_as[200:] < 200
+    np.testing.assert_allclose(place_map.same_as[200:][shown], np.flatnonzero(shown), atol=2)
+    assert shown[:80].all()
+    assert shown[145:].all()
+    assert not shown[95:125].any()  # looks otherwise: no place of the map
+    short = built(ROUTE[40:130], 4)  # less than half of the route
+    assert len(updated(first, short, settings=room)[0]) == 200
+    part = built(ROUTE[50:155], 4)  # no room for one more session of the route
+    assert len(updated(first, part, settings=UpkeepSettings(max_places=350))[0]) == 200
 
 
 def numbers_of(place_map):
@@ -223,12 +240,34 @@ def test_drive_that_may_be_wrong_teaches_nothing(first, images, reason):
             updated(place_map, built(images, 1))
 
 
+@pytest.mark.parametrize(
+    ('shift', 'is_possible'), [(9, True), (12, False), (-5, True), (-9, False)]
+)
+def test_certain_images_must_be_as_near_as_a_camera_moves(first, monkeypatch, shift, is_possible):
+    def drives(*arguments):
+        driven = drive_on(*arguments)
+        places = driven.places.copy()
+        places[100:] = np.where(places[100:] >= 0, places[100:] + shift, -1)
+        places[99] = -1  # so that there are two images from 98 to 100
+        return replace(driven, places=places)
+
+    drive_on = upkeep._drive
+    monkeypatch.setattr(upkeep, '_drive', drives)
+    if is_possible:
+        updated(first, built(ROUTE[:180], 1))
+    else:
+        with pytest.raises(InputError, match='images 98 and 100'):
+            updated(first, built(ROUTE[:180], 1))
+
+
 def test_drive_whose_thumbnails_fit_other_places_teaches_nothing():
     drive, place_map = built(ROUTE, 1, thumbnails=True), built(ROUTE, thumbnails=True)
     assert len(updated(place_map, drive)[0]) == 200
     shifted = drive.thumbnails[100:] + drive.thumbnails[:100]
-    with pytest.raises(InputError, match='thumbnails'):
-        updated(place_map, replace(drive, thumbnails=shifted))
+    mirrored = built([np.ascontiguousarray(image[:, ::-1]) for image in ROUTE], 1, thumbnails=True)
+    for wrong in (shifted, mirrored.thumbnails):
+        with pytest.raises(InputError, match='thumbnails'):
+            updated(place_map, replace(drive, thumbnails=wrong))
 
 
 def test_places_left_out_end_their_session(first):
@@ -272,7 +311,7 @@ def test_update_log_and_rollback(path, drives, capsys):
         assert main(['update', str(path), drive]) == 0
         ids.append(load_map(path).map_id)
     assert len(set(ids)) == 3
-    capsys.readouterr()
+    assert '\nadded a' in capsys.readouterr().out
     assert main(['log', str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line[:16] for line in lines if not line.startswith(' ')] == ids[::-1]

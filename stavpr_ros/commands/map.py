@@ -187,8 +187,8 @@ def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
         type=int,
         default=0,
         metavar='N',
-        help='places of the map, above which those that helped least to recognize are removed '
-        '(half more than before the first update)',
+        help='places of the map, above which those that helped least to recognize are removed; '
+        'a drive is kept whole where there is room (half more than before the first update)',
     )
     action.add_argument(
         '--max-age',
@@ -422,7 +422,8 @@ def _update(arguments: argparse.Namespace) -> None:
     name = Path(arguments.drive).stem[:40]
     with _drive(arguments, place_map) as drive:
         version = update_file(arguments.map, opened, place_map, drive, settings, name)
-    say('\n'.join(version.changes))
+    for change in version.changes:
+        say(change)
     places = len(version.use)
     say(f'{arguments.map}: {places} places, id {version.map_id}, was {place_map.map_id}')
 

@@ -78,7 +78,7 @@ def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
         if not len(earlier):
             continue
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
-        matched = _recognized(reference, place_map, places)
+        matched = recognized(reference, place_map, places)
         is_matched = matched >= 0
         same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
     return replace(place_map, same_as=same_as.astype(np.int32))
@@ -111,7 +111,7 @@ def with_seam(place_map: PlaceMap, is_closed: bool = False) -> PlaceMap:
         return place_map
     reference = select_places(place_map, np.arange(third))
     end = np.arange(n - min(third, AT_END), n)
-    matched = _recognized(reference, place_map, end)
+    matched = recognized(reference, place_map, end)
     last = int(np.flatnonzero(matched >= 0)[-1:].sum())
     is_found = matched[last] >= 0 and len(end) - last <= SequenceSettings().length
     if not is_found and not is_closed:
@@ -124,11 +124,11 @@ def with_seam(place_map: PlaceMap, is_closed: bool = False) -> PlaceMap:
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 
-def _recognized(reference: PlaceMap, place_map: PlaceMap, images: np.ndarray) -> np.ndarray:
-    """Return the place of a reference that each image shows, -1 = none, (m,)."""
+def recognized(reference: PlaceMap, drive: PlaceMap, images: np.ndarray) -> np.ndarray:
+    """Return the place of a reference that each image of a drive shows, -1 = none, (m,)."""
     settings = RecognizerSettings(min_probability=SURE)
     recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length
     same = SamePlaces(len(images))
     for i, image in enumerate(images.tolist()):
-        same.add(recognizer.update(place_map.features[image : image + 1]), i, length)
+        same.add(recognizer.update(drive.features[image : image + 1]), i, length)
     return same.places

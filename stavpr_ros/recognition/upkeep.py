@@ -12,8 +12,9 @@ An update has four steps; docs/upkeep.md describes them.
    were, gets the images of a drive that is certain of it by other sessions.
 4. Above ``max_places``, the places that helped least to recognize are removed.
 
-Every stretch is a session of the map, so that no path leads from one into the other. The root of a
-place is the place of an earlier session that shows the same, or itself.
+Where the budget has room for one more session of the route, a drive over half of it or more is
+kept whole. Every stretch is a session of the map, so that no path leads from one into the other.
+The root of a place is the place of an earlier session that shows the same, or itself.
 """
 
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.filter.model import MODEL
 from stavpr_ros.mapping import merge_maps, PlaceMap, Session
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
@@ -34,13 +36,13 @@ from stavpr_ros.output_file import FileVersion
 from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.recognizer import PlaceRecognizer
-from stavpr_ros.recognition.same_places import SamePlaces
+from stavpr_ros.recognition.same_places import recognized, SamePlaces
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.verification import GeometricSettings, PlaceVerifier
 
 MAX_ERROR = 0.01  # rate of wrong matches that a certain image keeps
 MIN_CERTAIN = 0.3  # share of the images of a drive
-FASTEST = 3.0  # places an image, and images a place: of the same road, driven at another speed
+FASTEST = max(MODEL.speeds)  # places an image, of a drive on the map
 SLACK = 4  # places by which two certain images may disagree
 MIN_HARD = 20  # images without a match, between two certain ones
 MARGIN = 10  # certain images beside a stretch that are part of it
@@ -74,6 +76,7 @@ class _Stretch:
 
     :param images: numbers in the drive, ascending, (m,).
     :param places: of the map that they show, (m,); -1 = none.
+    :param is_detour: it may show places that the map does not have.
     """
 
     images: np.ndarray
@@ -93,25 +96,34 @@ def update_map(
     :raises InputError: the drive is not certain where it is; it teaches nothing.
     """
     n = len(place_map)
-    place_map = replace(place_map, ids=_with_ids(place_map.ids))
+    # identifiers that stay when places come and go: their numbers where there is none
+    ids = tuple(each or str(i) for i, each in enumerate(place_map.ids))
+    place_map = replace(place_map, ids=ids)
     roots = np.arange(n) if place_map.same_as is None else place_map.same_as.astype(np.int64)
     driven = _drive(place_map, drive)
     _require_certain(place_map, drive, driven, roots)
-    stretches, changes = _stretches(place_map, drive, driven, roots), []
+    base, changes = version.base_places or n, []
+    limit = settings.max_places or round(1.5 * base)
+    is_long = np.ptp(roots[driven.of_windows[driven.of_windows >= 0]]) >= base / 2
+    if is_long and n + max(base, len(drive)) <= limit:
+        images = np.flatnonzero(driven.moves)
+        stretches = [_Stretch(images, recognized(place_map, drive, images), True)]
+        changes.append(f'added the drive, {len(images)} images: there is room for it')
+    else:
+        stretches = _stretches(place_map, drive, driven, roots)
+        for stretch in stretches:
+            kind = 'a detour' if stretch.is_detour else 'an experience'
+            first, last = (ids[stretch.places[i]] for i in (0, -1))
+            text = f'added {kind} of {len(stretch.images)} images, from place {first} to {last}'
+            changes.append(text)
     use, missed = _used(place_map, driven, roots, version, stretches)
     images = _renewing(place_map, driven, roots, missed >= settings.max_age)
     if renewed := int((images >= 0).sum()):
         place_map, missed = _with_images(place_map, drive, images), np.where(images < 0, missed, 0)
         changes.append(f'renewed {renewed} places where {settings.max_age} drives matched nothing')
-    for stretch in stretches:
-        kind = 'a detour' if stretch.is_detour else 'an experience'
-        first, last = (place_map.ids[stretch.places[i]] for i in (0, -1))
-        text = f'added {kind} of {len(stretch.images)} images, from place {first} to {last}'
-        changes.append(text)
     grown = _with_stretches(place_map, drive, name, stretches)
     use = np.concatenate([use, np.ones(len(grown) - n)])
     missed = np.concatenate([missed, np.zeros(len(grown) - n, np.int64)])
-    limit = settings.max_places or round(1.5 * (version.base_places or n))
     kept = np.flatnonzero(_within(grown, use, limit))
     if removed := len(grown) - len(kept):
         changes.append(f'removed {removed} places that helped least, above {limit} places')
@@ -145,11 +157,6 @@ def update_file(
     before = current_version(path)
     updated, version = update_map(place_map, drive, name, before, settings)
     return save_version(path, opened, updated, before, version, statistics_of_map(updated))
-
-
-def _with_ids(ids: tuple[str, ...]) -> tuple[str, ...]:
-    """Return identifiers that stay when places come and go: their numbers where there is none."""
-    return tuple(each or str(i) for i, each in enumerate(ids))
 
 
 @dataclass(frozen=True)
@@ -220,18 +227,20 @@ def _require_certain(
             )
     if not (len(place_map.thumbnails) and len(drive.thumbnails)):
         return
-    verifier, score, decided = PlaceVerifier(GeometricSettings('orb')), 0, 0
+    verifier, signs = PlaceVerifier(GeometricSettings('orb')), []
     for image in certain[np.linspace(0, len(certain) - 1, PROBES).astype(int)].tolist():
         query, place = drive.thumbnail(image), int(places[image])
         if query is None:
             continue
         other = (place + max(FAR, len(place_map) // 2)) % len(place_map)
-        right, wrong = (verifier.inliers(query, place_map, each) or 0 for each in (place, other))
-        score += int(right > wrong) - int(right < wrong)
-        decided += int(right != wrong)
-    if score < -2 * decided**0.5:
+        flipped = np.ascontiguousarray(np.fliplr(query))
+        views = (query, place), (query, other), (flipped, place)
+        right, *wrong = (verifier.inliers(image, place_map, each) or 0 for image, each in views)
+        signs.append(np.sign(right - np.array(wrong)))
+    if (np.sum(signs, axis=0) < -2 * np.abs(signs).sum(axis=0) ** 0.5).any():
         raise InputError(
-            'the thumbnails of the certain images fit other places better; the map stays as it is'
+            'the thumbnails of the certain images fit other places, or mirrored, better; the map '
+            'stays as it is'
         )
 
 
@@ -316,7 +325,8 @@ def _used(
     fits = np.zeros(n, bool)  # a place of the same session beside it was recognized
     for run in np.unique(runs):
         own = np.flatnonzero(runs == run)
-        fits[own] = _is_near(helped[own], NEAR)
+        near = np.convolve(helped[own], np.ones(2 * NEAR + 1))[NEAR : NEAR + len(own)]
+        fits[own] = near > 0.5
     missed = np.where(helped, 0, missed + (passed[roots] & fits))
     return use + helped, missed
 
@@ -374,11 +384,7 @@ def _is_same_road(
     inside, run = np.arange(a + 1, b), np.flatnonzero(is_run)
     d = driven.recognizer.distances(drive.features[inside])[:, run]
     z = (d - d.mean(axis=1, keepdims=True)) / d.std(axis=1, keepdims=True).clip(1e-9)
-    path, count, rows = (
-        np.rint(line[inside] - run[0]).astype(int),
-        len(run),
-        np.arange(len(inside)),
-    )
+    path, rows, count = np.rint(line[inside] - run[0]).astype(int), np.arange(len(z)), len(run)
     near = [
         np.mean([z[rows, (path + shift + k) % count] for k in range(-2, 3)], axis=0).mean()
         for shift in range(count)
@@ -513,12 +519,6 @@ def _with_images(place_map: PlaceMap, drive: PlaceMap, images: np.ndarray) -> Pl
         stamps=np.concatenate([place_map.stamps, drive.stamps])[order],
         thumbnails=tuple(thumbnails[i] for i in order) if place_map.thumbnails else (),
     )
-
-
-def _is_near(mask: np.ndarray, reach: int) -> np.ndarray:
-    """Return which places are within some places of one that a mask has, (n,)."""
-    near = np.convolve(mask, np.ones(2 * reach + 1), 'full')[reach : reach + len(mask)]
-    return np.asarray(near > 0.5)
 
 
 def _within(grown: PlaceMap, use: np.ndarray, limit: int) -> np.ndarray:
