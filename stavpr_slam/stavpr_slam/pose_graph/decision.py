@@ -203,12 +203,15 @@ class Decider:
                     taken, values, evidence, changed = other, moved, found, True
         return taken, values
 
-    def at(self, scales: np.ndarray, thorough: bool = False) -> Decision:
+    def at(
+        self, scales: np.ndarray, thorough: bool = False, tighter: Decision | None = None
+    ) -> Decision:
         """
         Decide with an odometry.
 
         :param scales: factors on its errors, of each robot.
         :param thorough: closures of a measured graph are added and left out one by one.
+        :param tighter: decision with a tighter odometry, near which a solution is tried as well.
         """
         network = self._network
         information = network.odometry(scales[self._chain.robot])
@@ -218,6 +221,8 @@ class Decider:
             tried, evidence = [], self._evidence(information, taken, values)
             if taken.any():  # closures beside them may agree by now
                 tried.append(network.robust(information, values, AGAIN))
+            if tighter:
+                tried.append(network.robust(information, tighter.values, AGAIN))
             if thorough:
                 begins = *tried, (none, start)
                 tried += [self._improved(information, *each, True) for each in begins]
@@ -250,7 +255,8 @@ class Decider:
             best = better(best, self.at(np.full(robots, PRECISE)))
         for scale in SCALES[1 : 4 if self._measured else None]:
             thorough = self._measured and scale >= 1
-            tried.append(self.at(np.full(robots, scale), thorough))
+            tighter = tried[-1] if self._measured else None
+            tried.append(self.at(np.full(robots, scale), thorough, tighter))
             best = better(best, tried[-1])
             if best.is_published and all(
                 each.evidence < best.evidence - LOOSENED for each in tried[-2:]
