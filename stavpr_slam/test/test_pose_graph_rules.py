@@ -269,3 +269,21 @@ def test_recorded_drive_in_groups_of_ten_is_never_above_its_odometry(data_folder
             before = error(poses[:at], truth[:at])
             assert error(found, truth[:at]) < max(1.02 * before, before + 0.2)
     assert error(found, truth[:at]) < 0.75 * before
+
+
+def test_factor_without_a_solution_is_not_tried_again(monkeypatch):
+    """The estimate stays at the factor before, and the update ends."""
+    truth = circle(3)
+    closures = [closure(truth, query, query - LAP) for query in range(LAP, 3 * LAP, 2)]
+    expected, _ = ratio(truth, slight(truth, 0.3), closures)
+    fit, scales = decision.Decider.fit, []
+
+    def failing(decider, information, counted, values):
+        scales.append(np.linalg.slogdet(information[1])[1])
+        if scales[-1] > scales[0] + 3:  # of an odometry that is trusted more
+            raise np.linalg.LinAlgError
+        return fit(decider, information, counted, values)
+
+    monkeypatch.setattr(decision.Decider, 'fit', failing)
+    assert ratio(truth, slight(truth, 0.3), closures)[0] == pytest.approx(expected, rel=0.5)
+    assert max(scales) > scales[0] + 3

@@ -292,7 +292,10 @@ class Decider:
 
         def fitted(factor: float) -> tuple[float, float, np.ndarray]:
             information = self.information(factor * decision.scales)
-            values, evidence = self.fit(information, counted, decision.values)
+            try:
+                values, evidence = self.fit(information, counted, decision.values)
+            except np.linalg.LinAlgError:
+                return -math.inf, factor, decision.values
             return evidence, factor, values
 
         best, least = fitted(1.0), PRECISE / decision.scales.min()

@@ -13,7 +13,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import breaks
 from stavpr_slam.pose_graph.closures import between_nodes, Closure, ClosureArrays
-from stavpr_slam.pose_graph.decision import TIGHT
+from stavpr_slam.pose_graph.decision import events, TIGHT
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.sessions import extended
@@ -244,12 +244,27 @@ class PoseGraph:
             self._split(node, True)
             after = self._decided()
             if (
-                after.accepted.sum() - before.accepted.sum() >= breaks.GAIN
+                self._more(before, after) >= breaks.GAIN
                 or after.decision.gain - before.decision.gain > breaks.EVIDENCE
             ):
                 return after
             self._split(node, False)
         return None
+
+    def _more(self, before: Solution, after: Solution) -> int:
+        """
+        Return how many closures more agree after a break.
+
+        A break explains any false run behind it: where closures agreed before, those of the
+        largest event that is new do not count.
+        """
+        agreed, agree = before.accepted, after.accepted
+        more = int(agree.sum() - agreed.sum())
+        if not agreed.any():
+            return more
+        numbers = events(self.chain, self._closures.query, self._closures.place)
+        new = numbers[agree & ~np.isin(numbers, numbers[agreed])]
+        return more - int(np.bincount(new).max(initial=0))
 
     # results
 
