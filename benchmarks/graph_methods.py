@@ -69,6 +69,7 @@ ODOMETRIES = {  # twists: deviation per square root of a meter, and bias per met
     'stereo': ([0.004, 0.004, 0.004, 0.03, 0.03, 0.03], [0, 0.0002, 0, 0, 0, 0]),
     'legs': ([0.004, 0.004, 0.012, 0.06, 0.04, 0.03], [0, 0, 0, -0.03, 0, 0]),
 }
+FALSE_RUNS = (8, 40), (4, 60)  # added to KITTI: runs, and closures of each
 FACTORS, FALSE_IN_RUNS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0), (0.0, 0.3, 0.5, 1.0)
 
 
@@ -113,6 +114,37 @@ def kitti(name: str, alpha: str) -> Drive:
     return Drive(
         'KITTI', f'{name} {alpha}', stamps, truth, planar_poses(odometry), closures, right
     )
+
+
+def backwards(drive: Drive) -> Drive:
+    """Return a drive from its end to its start."""
+    T = matrices(drive.odometry)[::-1]
+    mirrored = dict(zip(drive.stamps.tolist(), drive.stamps[::-1].tolist(), strict=True))
+    closures = [
+        replace(each, query_stamp=mirrored[each.place_stamp],
+                place_stamp=mirrored[each.query_stamp])
+        for each in drive.closures
+    ]  # fmt: skip
+    odometry = to_poses(inverse(T[:1]) @ T)
+    name = f'{drive.name} backwards'
+    return replace(drive, name=name, truth=drive.truth[::-1], odometry=odometry, closures=closures)
+
+
+def with_false_runs(drive: Drive, runs: int, length: int, seed: int) -> Drive:
+    """Return a drive with runs of false closures of each second image, each at one wrong place."""
+    dice, closures = np.random.default_rng(seed), list(drive.closures)
+    count = len(drive.stamps)
+    for _ in range(runs):
+        query = int(dice.integers(400, count - 5 * length))
+        place = int(dice.integers(0, query - 300))
+        step = 2 if dice.random() < 0.7 else -2
+        for k in range(length):
+            ends = query + 2 * k, place + step * k
+            if 0 <= ends[1] < ends[0] - 100:
+                closures.append(Closure(*drive.stamps[list(ends)].tolist(), SAME, NEARBY))
+    right = np.append(drive.right, np.zeros(len(closures) - len(drive.closures), bool))
+    name = f'{drive.name}, {runs} false runs of {length}, draw {seed}'
+    return replace(drive, name=name, closures=closures, right=right)
 
 
 def worlds(seed: int, draw: int, folder: Path) -> Iterator[Drive]:
@@ -329,6 +361,7 @@ def main() -> None:
     parser.add_argument('--folder', type=Path, help='keeps images and pairs')
     parser.add_argument('--gnc', action='store_true', help='GNC on worlds as well: 20 s a drive')
     parser.add_argument('--drives', action='store_true', help='KITTI in groups alone')
+    parser.add_argument('--runs', action='store_true', help='KITTI with false runs alone')
     parser.add_argument('--noise', action='store_true', help='odometries of other errors alone')
     options = parser.parse_args()
     if options.noise:
@@ -346,6 +379,15 @@ def main() -> None:
             print(rows[-1], flush=True)
         text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
         (RESULTS / 'graph_drives.json').write_text(text + '\n')
+        return
+    if options.runs:
+        rows = []
+        for name, (runs, length), seed in product(KITTI, FALSE_RUNS, range(4)):
+            for drive in (kitti(name, '0.00'), backwards(kitti(name, '0.00'))):
+                rows.append(driven(with_false_runs(drive, runs, length, seed), 10))
+                print(rows[-1], flush=True)
+        text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
+        (RESULTS / 'graph_runs.json').write_text(text + '\n')
         return
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder or Path(scratch)
