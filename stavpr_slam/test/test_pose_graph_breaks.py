@@ -39,8 +39,9 @@ def test_merge_session_restores_the_chain():
 def test_update_one_false_run_proves_no_break(monkeypatch, counted):
     """Forty closures in a row are of one wrong place: as if the robot was carried."""
     if counted:
-        more = lambda _, before, after: after.accepted.sum() - before.accepted.sum()
-        monkeypatch.setattr(PoseGraph, '_more', more)
+        monkeypatch.setattr(
+            PoseGraph, '_more', lambda _, before, after: sum(after.accepted) - sum(before.accepted)
+        )
     truth = circle(3)
     graph, splits = PoseGraph(), []
     for i, pose in enumerate(odometry_of(truth)):
