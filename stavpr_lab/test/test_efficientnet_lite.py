@@ -14,7 +14,7 @@ from stavpr_lab.features.efficientnet_lite import convert, EPSILON, HALVING, mak
 from stavpr_ros.commands import build_map
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, FILE, find_file, POOLED
+from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, FILE, POOLED, recommendation
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -181,11 +181,13 @@ def test_missing_file_is_an_error_that_names_the_command(folders, kind):
         FeatureExtractor(kind)
 
 
-def test_file_is_found_in_both_folders(network, folders):
+def test_file_is_found_in_both_folders_and_recommends_hybrid(network, folders):
+    assert recommendation('gradient') == ''
     for folder in reversed(folders):
         folder.mkdir(parents=True)
         (folder / FILE).write_bytes(network.read_bytes())
-        assert find_file() == folder / FILE
+        assert f'since {folder / FILE} is there' in recommendation('gradient')
+    assert recommendation('hybrid') == ''
 
 
 def test_command_without_the_wheel_names_the_extra(folders, monkeypatch, capsys):
