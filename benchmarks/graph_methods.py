@@ -25,7 +25,7 @@ from unittest.mock import patch
 
 import gtsam
 import numpy as np
-from results import environment, RESULTS
+from results import environment, RESULTS, write_json
 from slam import render
 from slam_pairs import recognized, SharedViews, with_edges
 from stavpr_lab.demonstration import false_places
@@ -367,8 +367,7 @@ def main() -> None:
     if options.noise:
         jobs = product(ODOMETRIES, FALSE_IN_RUNS, FACTORS)
         rows = [driven(circle(kind, factor, share), 10) for kind, share, factor in jobs]
-        text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
-        (RESULTS / 'graph_noise.json').write_text(text + '\n')
+        write_json(RESULTS / 'graph_noise.json', {'about': environment(), 'rows': rows})
         print('\n'.join(f'{row["drive"]}: {row["odometry"]} -> {row["error"]}' for row in rows))
         print('most above the odometry on the way:', max(row['above'] for row in rows), 'm')
         return
@@ -377,8 +376,7 @@ def main() -> None:
         for name, alpha, group in product(KITTI, ('0.00', '0.30'), GROUPS):
             rows.append(driven(kitti(name, alpha), group))
             print(rows[-1], flush=True)
-        text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
-        (RESULTS / 'graph_drives.json').write_text(text + '\n')
+        write_json(RESULTS / 'graph_drives.json', {'about': environment(), 'rows': rows})
         return
     if options.runs:
         rows = []
@@ -386,8 +384,7 @@ def main() -> None:
             for drive in (kitti(name, '0.00'), backwards(kitti(name, '0.00'))):
                 rows.append(driven(with_false_runs(drive, runs, length, seed), 10))
                 print(rows[-1], flush=True)
-        text = json.dumps({'about': environment(), 'rows': rows}, indent=1)
-        (RESULTS / 'graph_runs.json').write_text(text + '\n')
+        write_json(RESULTS / 'graph_runs.json', {'about': environment(), 'rows': rows})
         return
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder or Path(scratch)

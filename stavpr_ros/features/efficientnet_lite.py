@@ -51,15 +51,16 @@ class EfficientNetLite1:
 
 def recommendation(kind: str) -> str:
     """Return a sentence for users of gradient who have the file of the network, '' = none."""
+    if kind != 'gradient':
+        return ''
     try:
-        path = find_file() if kind == 'gradient' else None
+        path = find_file()
     except UnavailableError:
-        path = None
-    if path is None:
         return ''
     return (
         f'recommended, since {path} is there: a map with features hybrid, with min_probability '
-        '0.9; it has more matches in other light and seasons, as precise as those of gradient'
+        '0.9; it has more matches in other light and seasons, as precise on its route as gradient, '
+        'but more wrong ones off the map, between floors that look alike'
     )
 
 

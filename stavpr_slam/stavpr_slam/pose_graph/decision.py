@@ -211,7 +211,7 @@ class Decider:
 
         :param scales: factors on its errors, of each robot.
         :param thorough: closures of a measured graph are added and left out one by one.
-        :param tighter: decision with a tighter odometry, near which a solution is tried as well.
+        :param tighter: decision with a tighter odometry, at which a solution begins as well.
         """
         network = self._network
         information = network.odometry(scales[self._chain.robot])

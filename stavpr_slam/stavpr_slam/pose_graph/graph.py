@@ -255,8 +255,8 @@ class PoseGraph:
         """
         Return how many closures more agree after a break.
 
-        A break explains any false run behind it: where closures agreed before, those of the
-        largest event that is new do not count.
+        A break explains any false run behind it: where closures agreed before, the closures of
+        the largest new event do not count.
         """
         agreed, agree = before.accepted, after.accepted
         more = int(agree.sum() - agreed.sum())
