@@ -59,8 +59,8 @@ def recommendation(kind: str) -> str:
         return ''
     return (
         f'recommended, since {path} is there: a map with features hybrid, with min_probability '
-        '0.9; it has more matches in other light and seasons, as precise on its route as gradient, '
-        'but more wrong ones off the map, between floors that look alike'
+        '0.9; more matches in other light and seasons, as precise on the route as gradient; more '
+        'wrong ones between floors that look alike'
     )
 
 
