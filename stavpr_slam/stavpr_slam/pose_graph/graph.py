@@ -220,12 +220,16 @@ class PoseGraph:
         return decided(self.chain, self._closures, self.settings.measured)
 
     def _split(self, node: int, begins: bool) -> None:
+        """Begin a session at a node, or end it; closures between it and the one before change."""
         if begins:
+            before = int(self.chain.previous[node])
             self.chain.split(node)
         else:
+            before = self.chain.before(node)
             self.chain.merge_session(node)
-        for number, closure in enumerate(self._known):
-            resolved = self._resolved(closure)
+        beside = np.isin((self._closures.query, self._closures.place), (before, node)).any(axis=0)
+        for number in np.flatnonzero(beside):
+            resolved = self._resolved(self._known[number])
             if resolved is not None:
                 self._closures[number] = resolved
 
