@@ -11,7 +11,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import decision
 from stavpr_slam.pose_graph import graph as graph_module
-from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges
+from stavpr_slam.pose_graph.g2o import _reversed, g2o_text, graph_of, read_edges
 from test_pose_graph import error
 
 SIDE, LAPS = 12, 3
@@ -45,7 +45,8 @@ def write(path, freedom, false=0.0, stated=1.0):
     deviations = np.array([0.017] * 3 + [0.05] * 3)
     if freedom == 3:
         deviations[[0, 1, 5]] = 0
-    lines, information = ['FIX 0'], np.array(INFORMATION[freedom]) / stated**2
+    lines = ['PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1', 'FIX 0']
+    information = np.array(INFORMATION[freedom]) / stated**2
     for start, end in pairs:
         place = end
         if end - start > 1 and dice.random() < false:
@@ -127,6 +128,20 @@ def test_written_graph_is_read_again(tmp_path, freedom, stated):
     found = again.update(final=True)
     assert (again.accepted, again.rejected) == (graph.accepted, 0)
     np.testing.assert_allclose(found[:, :3, 3], graph.solved[:, :3, 3], atol=0.05)
+
+
+@pytest.mark.parametrize('freedom', [3, 6])
+def test_vertices_with_gaps_and_edges_to_the_one_before(tmp_path, freedom):
+    """As RTAB-Map exports its nodes."""
+    edges = read_edges(write(tmp_path / 'a.g2o', freedom, 0.3))
+    expected = graph_of(edges).update(final=True)
+    changed = [
+        _reversed(*edge) if number % 3 == 0 else edge for number, edge in enumerate(edges)
+    ]
+    numbers = np.cumsum(1 + np.arange(COUNT) % 4)
+    renamed = [(int(numbers[i]), int(numbers[j]), *rest) for i, j, *rest in changed]
+    found = graph_of(renamed).update(final=True)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(

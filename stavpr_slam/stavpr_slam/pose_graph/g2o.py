@@ -70,7 +70,7 @@ def read_edges(path: str) -> list[Edge]:
         raise InputError(f'{path}: {error}') from error
     for number, line in enumerate(lines, 1):
         tag, *fields = line.split() or ['#']
-        if tag.startswith(('VERTEX_SE', 'FIX', '#')):
+        if tag.startswith(('VERTEX_SE', 'FIX', 'PARAMS', '#')):
             continue
         try:
             edges.append(_edge(tag, fields))
@@ -103,33 +103,42 @@ def _edge(tag: str, fields: list[str]) -> Edge:
     return start, end, matrices(values[:7]), half @ own @ half
 
 
+def _reversed(start: int, end: int, motion: np.ndarray, information: np.ndarray) -> Edge:
+    """Return the same edge from its end to its start."""
+    turn = adjoints(inverse(motion)[None])[0][np.ix_(ORDER, ORDER)]
+    return end, start, inverse(motion), turn.T @ information @ turn
+
+
 def graph_of(edges: list[Edge]) -> PoseGraph:
     """
     Return a pose graph of edges; it is not solved yet.
 
-    Edges from a vertex to the next one are its odometry, with their information as given; all
-    others, and second ones, are closures. A node is at a second of its own.
+    Edges between a vertex and the next larger number are its odometry, with their information as
+    given; all others, and second ones, are closures. A node is at a second of its own.
 
     :raises InputError: two successive vertices have no edge, or a value is not finite.
     """
+    numbers = sorted({number for edge in edges for number in edge[:2]})
+    node = {number: i for i, number in enumerate(numbers)}
     odometry: dict[int, Edge] = {}
     closures = []
-    for edge in edges:
-        is_next = edge[1] == edge[0] + 1 and edge[0] not in odometry
-        if is_next:
+    for start, end, motion, information in edges:
+        edge = node[start], node[end], motion, information
+        if edge[1] == edge[0] - 1 and edge[1] not in odometry:
+            edge = _reversed(*edge)
+        if edge[1] == edge[0] + 1 and edge[0] not in odometry:
             odometry[edge[0]] = edge
         else:
             closures.append(edge)
-    first, count = min(odometry, default=0), len(odometry)
-    missing = [i for i in range(first, first + count) if i not in odometry]
-    if missing or not count:
+    missing = [numbers[i] for i in range(len(numbers) - 1) if i not in odometry]
+    if missing or not odometry:
         raise InputError(
             f'no edge between the vertices {min(missing, default=0)} and the next one: expected '
             'an odometry of successive vertices'
         )
     infinite = ChainSettings(distance=0.0, angle=0.0, max_gap=np.inf, max_speed=np.inf)
     graph = PoseGraph(GraphSettings(infinite, measured=True))
-    _, _, motions, given = zip(*(odometry[i] for i in range(first, first + count)), strict=True)
+    _, _, motions, given = zip(*(odometry[i] for i in range(len(odometry))), strict=True)
     poses = np.array(list(accumulate(motions, np.matmul, initial=np.eye(4))))
     for number, pose in enumerate(to_poses(poses), 1):
         graph.add_odometry(number * SECOND, pose)
@@ -138,6 +147,6 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
     for start, end, motion, information in closures:
         turn = np.kron(np.eye(2), motion[:3, :3])  # to the axes of the start
         covariance = turn @ np.linalg.inv(information) @ turn.T
-        stamps = [(node - first + 1) * SECOND for node in (end, start)]
+        stamps = [(i + 1) * SECOND for i in (end, start)]
         graph.add_closure(Closure(stamps[0], stamps[1], to_poses(motion), covariance))
     return graph
