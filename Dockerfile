@@ -45,7 +45,6 @@ USER 1000:1000
 FROM development AS runtime
 COPY --chown=1000:1000 . src/stavpr_ros
 RUN . "/opt/ros/$ROS_DISTRO/setup.bash" \
-    && python3 -m colcon build \
-    && . install/setup.bash && stavpr warm
+    && python3 -m colcon build
 ENTRYPOINT ["/bin/bash", "-c", ". /ros_ws/install/setup.bash && exec \"$@\"", "--"]
 CMD ["ros2", "run", "stavpr_ros", "node"]

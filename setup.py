@@ -17,6 +17,7 @@ from configparser import ConfigParser
 from glob import glob
 import os
 from pathlib import Path
+import subprocess
 import sys
 from xml.etree import ElementTree
 
@@ -63,6 +64,15 @@ def files_in(folder: str) -> list[str]:
     return sorted(path for path in glob(f'{folder}/*') if Path(path).is_file())
 
 
+def compile_kernels(folder: str) -> None:
+    """Fill the cache of the package in a folder, as its first start would; never fail."""
+    call = 'import sys; from stavpr_ros.commands.warm import main; sys.exit(main([]))'
+    command = [sys.executable, '-c', call]  # finds the package in its folder
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    lines = (done.stdout if done.returncode == 0 else done.stderr).splitlines() or ['']
+    print(lines[-1] if done.returncode == 0 else f'kernels are not compiled: {lines[-1]}')
+
+
 prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
 if BY_COLCON and not any(Path(prefix, MESSAGES).is_file() for prefix in prefixes):
     sys.exit(NO_MESSAGES)
@@ -77,7 +87,7 @@ for sibling in SIBLINGS if WHEEL else ():
     for group, lines in configuration['options.entry_points'].items():
         entry_points.setdefault(group, []).extend(lines.split('\n'))
 
-setup(
+distribution = setup(
     name=NAME,
     version=MANIFEST.findtext('version'),
     description='STA-VPR place recognition by spatio-temporal alignment, as a ROS 2 node.',
@@ -129,3 +139,6 @@ setup(
     zip_safe=False,
     entry_points=entry_points,
 )
+if BY_COLCON and '--uninstall' not in sys.argv:
+    links = 'develop' in sys.argv
+    compile_kernels('.' if links else distribution.get_command_obj('install').install_lib)

@@ -21,6 +21,7 @@ import setuptools
 import stavpr_ros
 from stavpr_ros import plugins
 from stavpr_ros.commands import COMMANDS, stavpr
+from stavpr_ros.compilation import CACHE
 
 ROOT = Path(__file__).resolve().parents[1]
 SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
@@ -168,13 +169,14 @@ def sources(tmp_path_factory) -> Path:
     return root
 
 
-def run_setup(folder: Path, *arguments: str, prefix: str | None = None) -> None:
+def run_setup(folder: Path, *arguments: str, prefix: str | None = None, **variables: str) -> str:
     command = [sys.executable, '-W', 'ignore', 'setup.py', '--quiet', *arguments]
-    environment = os.environ if prefix is None else os.environ | {'AMENT_PREFIX_PATH': prefix}
+    environment = os.environ | ({'AMENT_PREFIX_PATH': prefix} if prefix else {}) | variables
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
 
 
 def colcon_arguments(folder: Path) -> list[str]:
@@ -188,6 +190,20 @@ def test_build_by_colcon_without_messages_names_the_links(sources, tmp_path):
     with pytest.raises(AssertionError, match=links):
         run_setup(sources, *colcon_arguments(tmp_path), prefix='/opt/ros/jazzy')
     assert not list(tmp_path.iterdir())
+
+
+def test_build_by_colcon_fills_the_cache_of_kernels(sources, tmp_path):
+    assert CACHE is not None
+    cache = CACHE.parent  # a filled one; by default, it would be in the installed package
+    printed = run_setup(sources, *colcon_arguments(tmp_path), NUMBA_CACHE_DIR=str(cache))
+    assert printed.splitlines()[-1] == f'the kernels are in {CACHE}'
+
+
+def test_build_by_colcon_goes_on_where_kernels_cannot_be_compiled(sources, tmp_path):
+    (tmp_path / 'llvmlite.py').write_text('raise ImportError("no compiler here")')
+    path = f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}'
+    printed = run_setup(sources, *colcon_arguments(tmp_path / 'built'), PYTHONPATH=path)
+    assert printed.endswith('kernels are not compiled: ImportError: no compiler here\n')
 
 
 @pytest.fixture(scope='module')

@@ -232,9 +232,9 @@ def install(extras: list, torch_index: str) -> None:
 
 
 def build() -> None:
-    """Build each package from nothing, unless it was built from the same sources; compile."""
+    """Build each package from nothing, unless it was built from the same sources."""
     python = ROOT / '.venv' / 'bin' / 'python3'
-    requirements, rebuilt = ['requirements/locked/base.txt'], set()
+    requirements = ['requirements/locked/base.txt']
     for package, sources in SOURCES.items():
         stamp = ROOT / 'install' / package / '.setup.sha256'
         # pyvenv.cfg names the Python and the folder of .venv; extras have no effect on a build.
@@ -254,10 +254,6 @@ def build() -> None:
         command += [f'-DPython3_EXECUTABLE={python}']
         run_logged(package, f'Building {package}', command)
         stamp.write_text(inputs)
-        rebuilt.add(package)
-    if 'stavpr_ros' in rebuilt:  # or the first start of the node would compile them
-        warm = f'source {shlex.quote(str(ROOT))}/install/local_setup.bash && stavpr warm'
-        run_logged('kernels', 'Compiling the kernels', ['bash', '--norc', '-c', warm])
 
 
 def run(command: list) -> None:

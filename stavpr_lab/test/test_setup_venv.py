@@ -109,7 +109,7 @@ def test_machine_without_tools_lists_all_of_them(tmp_path, monkeypatch):
 
 
 def test_extras_are_added_and_kept(recorder):
-    assert recorder.run('build', '--with', 'onnx')[-1] == 'kernels'
+    assert recorder.run('build', '--with', 'onnx')[-1] == 'stavpr_lab'
     assert recorder.run('build', '--with', 'dev') == ['torch', 'pip']
     assert '--require-hashes --no-deps' in recorder.commands['pip']
     installed = re.findall(r'locked/(\w+)\.txt', recorder.commands['pip'])

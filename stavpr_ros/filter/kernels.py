@@ -62,26 +62,25 @@ def exp(x):
 
 @kernel
 def _likelihoods(z, first, count, weight, mu, likely):
-    """Write the likelihood of each level and place, (K, BLOCK); 0 from ``count`` on."""
+    """Write the likelihood of each level and place, flat (K, BLOCK); 0 from ``count`` on."""
     K = len(mu)
-    flat = likely.reshape(-1)
     for x in range(BLOCK):
-        flat[x] = z[first + x] if x < count else F(0)
+        likely[x] = z[first + x] if x < count else F(0)
     if weight == 0:
         likely[:] = 1
     else:
         factor = splat(weight)
         for x in range(0, BLOCK, LANES):
-            distance = load(flat, x)
+            distance = load(likely, x)
             for k in range(K):
                 level = load_splat(mu, k)
                 off = level * distance - level * level * splat(F(0.5))
                 likelihood = exp(factor * off)
                 gap = distance < splat(F(NEAR_INFINITY))
-                store(flat, k * BLOCK + x, select(gap, splat(F(1)), likelihood))
+                store(likely, k * BLOCK + x, select(gap, splat(F(1)), likelihood))
     for k in range(K):
         for x in range(count, BLOCK):
-            likely[k, x] = 0
+            likely[k * BLOCK + x] = 0
 
 
 @kernel
@@ -90,24 +89,23 @@ def _mix(source, at, pitch, count, levels, speeds, b, mixed, to, width, sums):
     Let level and speed change, for ``count`` neighboring places, whole vectors.
 
     :param source, at, pitch: flat states; level j, speed v begin at + (j V + v) pitch.
-    :param levels: factor by the level before and after, (K, K), neighbors only.
+    :param levels: factor by the level before and after, flat (K, K), neighbors only.
     :param speeds: factors of the speed to stay, of the one below, of the one above, after any, and
         of any before, flat (5, V).
     :param b: (V + 1) LANES, scratch, zero at the end.
     :param mixed: flat, (K, V, width), written from column ``to`` on.
     :param sums: K LANES; sums after the change of level are added.
     """
-    K = len(levels)
     V = len(b) // LANES - 1
-    changes = levels.reshape(-1)
+    K = len(sums) // LANES
     mask = splat(INT(-4))
     for x in range(0, count, LANES):
         for k in range(K):
             lower, upper = max(k - 1, 0), min(k + 1, K - 1)
             # at the ends, a missing neighbor is the level itself, with the factor 0
-            from_lower = load_splat(changes, lower * K + k) if k else splat(F(0))
-            from_upper = load_splat(changes, upper * K + k) if k + 1 < K else splat(F(0))
-            from_same = load_splat(changes, k * K + k)
+            from_lower = load_splat(levels, lower * K + k) if k else splat(F(0))
+            from_upper = load_splat(levels, upper * K + k) if k + 1 < K else splat(F(0))
+            from_same = load_splat(levels, k * K + k)
             at_lower, at_same = at + lower * V * pitch + x, at + k * V * pitch + x
             at_upper = at + upper * V * pitch + x
             anywhere = total = splat(F(0))
@@ -280,17 +278,18 @@ def _copy_halo(states, part, rows, reach, halos):
 @kernel
 def _inputs(level_changes, scale, off, enter, states, speeds, count, steps):
     """
-    Return the changes of level of scaled states, and the probability to enter each, (K,).
+    Return the changes of level of scaled states, flat, and the probability to enter each, (K,).
 
     :param states: of a level; steps: (V,), written; others: of :func:`advance`.
     """
-    levels, entering = np.empty_like(level_changes), np.empty(len(off), F)
+    K = len(off)
+    levels, entering = np.empty(K * K, F), np.empty(K, F)
     for v in range(len(steps)):
         steps[v] = np.rint(speeds[v] * (count + 1)) - np.rint(speeds[v] * count)
-    for k in range(len(off)):
+    for k in range(K):
         entering[k] = off[k] * enter / states
-        for j in range(len(off)):
-            levels[k, j] = level_changes[k, j] * F(scale)
+        for j in range(K):
+            levels[k * K + j] = level_changes[k, j] * F(scale)
     return levels, entering
 
 
@@ -333,7 +332,7 @@ def advance(
         _copy_halo(states, part, K * V, reach, flat_halos)
     for part in nb.prange(parts):
         mixed, places = _scratch(K * V * width), _scratch(BLOCK)
-        likely, b = _scratch(K * BLOCK).reshape(K, BLOCK), _scratch((V + 1) * LANES)
+        likely, b = _scratch(K * BLOCK), _scratch((V + 1) * LANES)
         sums, lanes = _scratch(K * LANES), np.empty(LANES, np.float32)
         blocks = (min(n - part * PLACES, PLACES) + BLOCK - 1) // BLOCK
         for block in range(blocks - 1, -1, -1):
@@ -369,7 +368,7 @@ def advance(
                         totals[at, 1, k] += _lost(ending, step, F(spread))
                     total = total + _move(
                         mixed, row + reach - step, 1 if step > 0 else 0, whole, F(spread), stay_on,
-                        entering[k], likely.reshape(-1), k * BLOCK, states,
+                        entering[k], likely, k * BLOCK, states,
                         at * size + (k * V + v) * BLOCK, flat_origins,
                         ((at * K + k) * halves + v // 2) * BLOCK, v % 2, places,
                     )  # fmt: skip

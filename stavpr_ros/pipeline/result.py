@@ -8,6 +8,7 @@ The geometric check compares the thumbnails of query and place, by keypoints.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
 
 import numpy as np
@@ -89,7 +90,7 @@ class ImageResult:
         """Return the matched place; -1 unless matched."""
         return self.nearest_index if self.accepted else -1
 
-    @property
+    @cached_property
     def newest_index(self) -> int:
         """Return the place aligned with the newest image; -1 unless matched."""
         if self.match is None or not self.accepted:

@@ -234,6 +234,8 @@ class StampWatch:
             return 0
         # a short interval, since long ones have losses, but not the shortest: it has most jitter
         guess = intervals[len(intervals) // 5]
+        if interval < 1.1 * guess:  # the period is at least three quarters of it
+            return 0
         period = median(each / max(round(each / guess), 1) for each in intervals)
         multiples = [each / period for each in intervals]
         near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)

@@ -41,16 +41,19 @@ def z_normalized(
 def _z_normalize(row: np.ndarray, counted: np.ndarray, firsts: np.ndarray, z: np.ndarray) -> None:
     """Write parts with mean 0 and deviation 1 of finite entries, in float64 until then."""
     for part in range(len(firsts)):
-        first, end = firsts[part], firsts[part + 1] if part + 1 < len(firsts) else len(row)
+        end = firsts[part + 1] if part + 1 < len(firsts) else len(row)
+        # slices: loops over them are vectorized
+        x, own = row[firsts[part] : end], counted[firsts[part] : end]
         total, squares, count = 0.0, 0.0, 0
-        for i in range(first, end):
-            counts = counted[i] & np.isfinite(row[i])
-            total += row[i] if counts else 0.0
+        for i in range(len(x)):
+            counts = own[i] & np.isfinite(x[i])
+            total += x[i] if counts else 0.0
             count += counts
         mean = total / max(count, 1)
-        for i in range(first, end):
-            off = row[i] - mean
-            squares += off * off if counted[i] & np.isfinite(row[i]) else 0.0
+        for i in range(len(x)):
+            off = x[i] - mean
+            squares += off * off if own[i] & np.isfinite(x[i]) else 0.0
         scale = np.float32(1 / max(np.sqrt(squares / max(count, 1)), MIN_DEVIATION))
-        for i in range(first, end):
-            z[i] = (row[i] - np.float32(mean)) * scale
+        out = z[firsts[part] : end]
+        for i in range(len(x)):
+            out[i] = (x[i] - np.float32(mean)) * scale

@@ -102,7 +102,9 @@ class SequenceBuffer:
 
     def _add(self, row: Any) -> None:
         slot, m = self._slots[self._count % self.length], len(row)
-        slot[:, :m], slot[:, m:] = row, np.inf
+        slot[:, :m] = row
+        if m < self.places:
+            slot[:, m:] = np.inf
         self.known = max(self.known, m)
         self._count += 1
 
@@ -179,7 +181,8 @@ class QueryWindow(ABC):
         around: int = 0,
     ) -> None:
         self.buffer, self.layout = buffer, layout
-        self._images = np.empty(buffer.length, WINDOW_IMAGE)  # the latest are the last
+        # one behind the other; at the end, the window moves to the front
+        self._images, self._end = np.empty(2 * buffer.length, WINDOW_IMAGE), 0
         self.images = self._images[:0]
         self._normalizes, self._around = normalizes, around
 
@@ -207,10 +210,12 @@ class QueryWindow(ABC):
     def _append(
         self, stamp: int, change: float = 0.0, weight: float = 0.0, number: int = 0
     ) -> None:
-        rows = self._images
-        rows[:-1] = rows[1:]
-        rows[-1] = stamp, change, weight, number, False
-        self.images = rows[max(0, len(rows) - len(self.images) - 1) :]
+        rows, before = self._images, min(len(self.images), self.buffer.length - 1)
+        if self._end == len(rows):
+            rows[:before], self._end = rows[self._end - before :], before
+        rows[self._end] = stamp, change, weight, number, False
+        self._end += 1
+        self.images = rows[self._end - before - 1 : self._end]
 
     def _as_columns(self, row: Any) -> Any:
         """Return distances to the places, normalized, as a row of the buffer."""
@@ -253,7 +258,7 @@ class QueryWindow(ABC):
     def reset(self) -> None:
         """Drop all images."""
         self.buffer.clear()
-        self.images = self.images[:0]
+        self.images, self._end = self._images[:0], 0
 
     def grow(self, places: int) -> None:
         """Make room for more places."""

@@ -11,7 +11,12 @@ from pathlib import Path
 import re
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    Pose,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+)
 from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
@@ -243,20 +248,15 @@ def relative_pose_message(
     edge: Edge, pair: AlignedPlaces | LoopClosure, frame: str
 ) -> RelativePose:
     """Return an edge as a message, with the indices and stamps of a pair; frame: of the base."""
-    message = RelativePose(
-        source=edge.source,
-        reason=edge.reason,
-        query_index=pair.query_index,
-        query_stamp=pair.query_stamp,
-        place_index=pair.place_index,
-        place_stamp=pair.place_stamp,
-        frame=frame,
-        is_independent=edge.independent,
-        inliers=edge.inliers,
-        reprojection_error=edge.error,
-    )
-    message.pose.pose = pose_message(edge.pose)
-    message.pose.covariance = edge.covariance.ravel()
+    message = copy(NO_EDGE)
+    message.source, message.reason, message.frame = edge.source, edge.reason, frame
+    message.query_index, message.query_stamp = pair.query_index, pair.query_stamp
+    message.place_index, message.place_stamp = pair.place_index, pair.place_stamp
+    message.is_independent, message.inliers = edge.independent, edge.inliers
+    message.reprojection_error = edge.error
+    if edge.has_pose or edge.pose[6] != 1:  # the mountings may turn one without a pose
+        covariance = edge.covariance.ravel()
+        message.pose = PoseWithCovariance(pose=pose_message(edge.pose), covariance=covariance)
     return message
 
 
