@@ -37,6 +37,7 @@ from soak import (
 
 WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
 TURN, SETTLED_TURNS = 50, 4  # images of each map in turn, and turns before times count
+DRIVEN, NEAR, FEWER = 700, 3, 128  # images on sessions, places from the right one, dimensions
 PACE = 30  # images per second of stages that find their caches cold
 SETTLED = 5.0  # seconds after the first image, before times count
 SUBSCRIBER = """
@@ -162,11 +163,13 @@ def stages(path: str, *case: Any) -> dict[str, float]:
 
 
 def measure_sessions(counts: list[int]) -> list[str]:
-    """Return a table of the processor time of an image, of Nordland driven so many times."""
+    """Return a table of the time of an image, and of the features, of Nordland so many times."""
     from dataclasses import replace
 
     from data import data_folder
+    from lower_bounds import ITEM_BYTES
     import numpy as np
+    from projection import projected
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -188,25 +191,43 @@ def measure_sessions(counts: list[int]) -> list[str]:
         strips /= np.linalg.norm(strips, axis=2, keepdims=True)
         return replace(route, features=replace(route.features, strips=strips))
 
-    query, rows = drive(1000).features, []
-    for precision in ('float32', 'int8'):
-        recognizers, medians = [], []
+    raw, rows, one_session = drive(1000).features, [], ()
+    for precision, dimension in (('float32', 0), ('int8', 0), ('int8', FEWER)):
+        recognizers, queries, sizes, medians = [], [], [], []
         for count in counts:
             one = merge_maps([drive(seed) for seed in range(count)], list(map(str, range(count))))
             same_as = np.tile(np.arange(places, dtype=np.int32), count)
             one = replace(one, same_as=same_as) if count > 1 else one
+            one, query = projected(one, raw, 'pca' if dimension else '', dimension)
             recognizers.append(PlaceRecognizer(one, RecognizerSettings(), precision=precision))
-        for first in range(0, 700, TURN):
+            queries.append(query)
+            sizes.append(len(one) * one.settings.strips * one.dimension * ITEM_BYTES[precision])
+        right = [0] * len(counts)
+        for first in range(0, DRIVEN, TURN):
             times: list[list[float]] = [[] for _ in counts]
-            for own, recognizer in zip(times, recognizers, strict=True):
+            for number, recognizer in enumerate(recognizers):
                 for i in range(first, first + TURN):
+                    image = queries[number][i : i + 1]
                     began = time.thread_time()
-                    recognizer.update(query[i : i + 1])
-                    own.append(time.thread_time() - began)
+                    match = recognizer.update(image)
+                    times[number].append(time.thread_time() - began)
+                    if match.accepted:
+                        shown = i - len(match.window_stamps) + 1 + match.position
+                        right[number] += abs(match.place_index % places - shown) <= NEAR
             medians.append([1e3 * statistics.median(own) for own in times])
         each = [statistics.median(turns) for turns in zip(*medians[SETTLED_TURNS:], strict=True)]
-        rows.append([precision, *(f'{ms:.2f} ({ms / each[0]:.2f})' for ms in each)])
-    return table(['ms (times the first)', *map(str, counts)], rows)
+        one_session = one_session or (each[0], sizes[0])
+        rows.append(
+            [
+                f'{precision}, {dimension} dimensions' if dimension else precision,
+                *(
+                    f'{ms:.2f} ms ({ms / one_session[0]:.2f}), {size / 1e6:.1f} MB '
+                    f'({size / one_session[1]:.2f}), {count / DRIVEN:.3f}'
+                    for ms, size, count in zip(each, sizes, right, strict=True)
+                ),
+            ]
+        )
+    return table(['(times the first), share right', *map(str, counts)], rows)
 
 
 # ------------------------------------------------ node and subscriber

@@ -14,7 +14,7 @@ from pathlib import Path
 from data import data_folder
 import numpy as np
 from results import RESULTS, table
-from stavpr_lab.demonstration.days import MAPS
+from stavpr_lab.demonstration.days import MAPS, PRECISIONS
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, merge_maps, PlaceMap, select_places
@@ -29,13 +29,12 @@ TEXT = """
 last one is matched on it; sums of the orders. Nordland and the track have two sessions: the even
 images of the second update the map, the odd ones are matched. The office is driven in two laps on
 two days, each lap is a session. Truth of the office and of the track: the best path of a whole
-session. Poisoned drives (images of another route, mirrored ones, the second half before the
-first, which is right on the closed laps of the office): those that change a map, of all. The last
-of the maps is updated with room for six times the places of the first session, in int8 the memory
-of 1.5 sessions in float32.
+session. Poisoned drives (images of another route, mirrored ones, but for the closed laps of the
+office the second half before the first): those that change a map, of all. The last
+of the maps is updated and matched in int8, with room for six times the places of the first session
+in the memory of 1.5 sessions in float32.
 """
 LAP = 207  # images of the office
-ROOMS = 0, 6  # times the places of the first session; 0 = the default budget
 
 
 @dataclass(frozen=True)
@@ -129,10 +128,15 @@ def routes(folder: Path) -> Iterator[Route]:
 
 
 def measure(
-    place_map: PlaceMap, positions: dict[int, float], query: Session, route: Route
+    place_map: PlaceMap,
+    positions: dict[int, float],
+    query: Session,
+    route: Route,
+    precision: str,
 ) -> np.ndarray:
     """Return right and wrong matches of a query; positions by the stamps of the map."""
-    one, counts = PlaceRecognizer(place_map, RecognizerSettings()), np.zeros(2, int)
+    one = PlaceRecognizer(place_map, RecognizerSettings(), precision=precision)
+    counts = np.zeros(2, int)
     for i in range(len(query.drive)):
         match = one.update(query.drive.features[i : i + 1], int(query.drive.stamps[i]))
         if match.accepted:
@@ -142,12 +146,13 @@ def measure(
     return counts
 
 
-def poisoned(session: Session, other: PlaceMap) -> Iterator[PlaceMap]:
+def poisoned(session: Session, other: PlaceMap, is_closed: bool) -> Iterator[PlaceMap]:
     """Yield drives that must not change a map: another route, mirrored, the wrong start."""
     yield other
     yield session.mirrored
     n = len(session.drive)
-    yield select_places(session.drive, np.r_[n // 2 : n, : n // 2])
+    if not is_closed:  # a lap may begin anywhere
+        yield select_places(session.drive, np.r_[n // 2 : n, : n // 2])
 
 
 def drive_route(route: Route, other: PlaceMap) -> list[str]:
@@ -165,18 +170,20 @@ def drive_route(route: Route, other: PlaceMap) -> list[str]:
         for number, drive in enumerate(drives[1:], 1):
             everything = with_last_related(merge_maps([everything, drive], ['', str(number)]))
         maps = [first, everything]
-        for room in ROOMS:
+        for precision in PRECISIONS:
             updated, version = drives[0], Version('', base_places=len(first))
-            settings = upkeep.UpkeepSettings(room * len(first))
+            settings = upkeep.UpkeepSettings(precision=precision)
             for number, drive in enumerate(drives[1:], 1):
-                for bad in poisoned(order[number], other):
+                for bad in poisoned(order[number], other, np.isfinite(route.period)):
                     after, _, _ = update(updated, bad, version, 'poisoned', settings)
                     poisons, changed = poisons + 1, changed + (len(after) != len(updated))
                 updated, version, text = update(updated, drive, version, str(number), settings)
                 changes.append(text)
             maps.append(updated)
-        for row, each in enumerate(maps):
-            counts[row] += measure(each, positions, order[-1], route)
+        for row, (each, precision) in enumerate(
+            zip(maps, ('float32', 'float32', *PRECISIONS), strict=True)
+        ):
+            counts[row] += measure(each, positions, order[-1], route, precision)
             places[row] += len(each)
         images += len(order[-1].drive)
     recall = ' '.join(f'{right / images:.3f}' for right, _ in counts)
@@ -204,7 +211,7 @@ def main() -> None:
     """Write the rows, with each route those so far."""
     listed = list(routes(data_folder()))
     others = [route.orders[0][0].drive for route in [*listed[2:], *listed[:2]]]
-    maps = ', '.join((*MAPS, 'with room'))
+    maps = ', '.join(MAPS)
     columns = ['route', 'images', f'recall: {maps}', 'wrong', 'places', 'poisoned']
     target, rows = RESULTS / 'days.md', []
     for route, other in zip(listed, others, strict=True):

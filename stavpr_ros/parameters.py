@@ -262,7 +262,8 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             False,
             'Localization: what drives show that are certain where they are becomes part of the '
             'map, as by `stavpr map update`: in its file, by ~/save_map without a path, and on '
-            'deactivation or shutdown. Of max_places images at most.',
+            'deactivation or shutdown. Of max_places images at most. With precision int8, '
+            'six drives are kept.',
         ),
         NodeParameter(
             'maps_folder',

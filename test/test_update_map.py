@@ -59,3 +59,9 @@ def test_images_of_drives_are_kept_up_to_max_places(robot, start, path, updates)
     node = start(map_path=path, update_map=updates, max_places=100)
     robot.drive(ROUTE[:110])
     assert [len(each) for each in node.runtime.pipeline.operation.take_drives()] == [100] * updates
+
+
+def test_drive_is_kept_whole_in_int8(robot, start, path):
+    start(map_path=path, update_map=True, sequence_length=20, precision='int8')
+    robot.drive(REBUILT)
+    assert robot.does(SaveMap, 'save_map').places == 2 * len(ROUTE)

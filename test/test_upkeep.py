@@ -5,6 +5,9 @@
 from dataclasses import replace
 import os
 from pathlib import Path
+import signal
+import subprocess
+import sys
 
 from evaluation_commands import write_images
 from fixtures import route_images
@@ -32,6 +35,7 @@ from stavpr_ros.sources.frame import Frame
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 ROUTE, OTHER, BYPASS = (route_images(count, seed) for count, seed in ((200, 0), (120, 5), (70, 9)))
+BYPASS_STAMPS = 20_081 * 10**9, 20_150 * 10**9
 SETTINGS = UpkeepSettings(max_places=350, max_age=3)  # no room for a whole drive
 
 
@@ -126,7 +130,7 @@ def test_detour_joins_the_map_as_a_stretch_of_its_own(first, around):
 def test_drive_is_kept_whole_where_there_is_room(first, rebuilt):
     room = UpkeepSettings(max_places=400)
     place_map, version = updated(first, rebuilt, settings=room)
-    assert version.changes[1:] == ('added the drive, 200 images: there is room for it',)
+    assert version.changes[1:] == ('added the drive, 200 images',)
     assert len(place_map) == 400
     assert [session.id for session in place_map.sessions] == ['first', 'drive']
     shown = place_map.same_as[200:] < 200
@@ -134,10 +138,27 @@ def test_drive_is_kept_whole_where_there_is_room(first, rebuilt):
     assert shown[:80].all()
     assert shown[145:].all()
     assert not shown[95:125].any()  # looks otherwise: no place of the map
+    assert len(updated(first, rebuilt, settings=UpkeepSettings(precision='int8'))[0]) == 400
+    assert len(updated(first, rebuilt, settings=UpkeepSettings())[0]) < 300  # in float32
     short = built(ROUTE[40:130], 4)  # less than half of the route
     assert len(updated(first, short, settings=room)[0]) == 200
     part = built(ROUTE[50:155], 4)  # no room for one more session of the route
     assert len(updated(first, part, settings=UpkeepSettings(max_places=350))[0]) == 200
+
+
+def test_first_and_last_drives_stay_where_there_is_room(first, rebuilt, around):
+    room, place_map, version = UpkeepSettings(max_places=600), first, None
+    for day, drive in enumerate((rebuilt, built(ROUTE, 3), around, built(ROUTE, 4)), 1):
+        place_map, version = updated(place_map, drive, version, f'day {day}', room)
+        assert len(place_map) <= 600
+    starts = [int(stamp) // 10**13 for stamp in place_map.stamps]
+    assert starts.count(0) == 200
+    assert starts.count(4) == 200
+    assert starts.count(3) == 0  # the oldest one but the first
+    bypass = [BYPASS_STAMPS[0] <= stamp <= BYPASS_STAMPS[1] for stamp in place_map.stamps]
+    assert sum(bypass) > 50  # there are no other places of it
+    last = np.flatnonzero(np.array(starts) == 4)
+    np.testing.assert_allclose(place_map.same_as[last], np.arange(200), atol=2)
 
 
 def numbers_of(place_map):
@@ -365,6 +386,38 @@ def test_update_that_ends_early_leaves_the_map(path, drives, monkeypatch, step, 
         assert path.read_bytes() == before
         assert main(['update', str(path), drives[0]]) == 0
     assert current_version(path).drive == 'rebuilt'
+    assert roll_back(path).map_id
+    assert path.read_bytes() == before
+
+
+KILLED = """
+import os, signal, sys
+from stavpr_ros.commands.map import main
+path, drive, left = *sys.argv[1:3], int(sys.argv[3])
+def hook(event, arguments):
+    global left
+    writes = event == 'open' and arguments[2] & os.O_CREAT
+    changes = writes or event in ('os.rename', 'os.remove', 'os.mkdir', 'os.link')
+    if changes and os.path.dirname(path) in str(arguments):
+        left -= 1
+        if not left:
+            os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(hook)
+sys.exit(main(['update', path, drive]))
+"""
+
+
+def test_killed_update_loses_nothing(path, drives):
+    before, was_killed = path.read_bytes(), []
+    for call in (3, 4, 6, 8, 99):  # files written, renamed and deleted until then
+        command = [sys.executable, '-c', KILLED, path, drives[0], str(call)]
+        ended = subprocess.run(command, check=False)
+        was_killed.append(ended.returncode == -signal.SIGKILL)
+        version, place_map = current_version(path), load_map(path)  # complete, at any time
+        assert place_map.map_id == version.map_id
+        assert path.read_bytes() == before or version.drive == 'rebuilt'
+    assert sum(was_killed) >= 4
+    assert not was_killed[-1]
     assert roll_back(path).map_id
     assert path.read_bytes() == before
 

@@ -7,7 +7,6 @@ from PIL import Image
 import pytest
 from stavpr_lab.demonstration.days import plot, run, table
 from stavpr_lab.demonstration.street.days import Days
-from stavpr_ros.recognition.upkeep import UpkeepSettings
 
 DAYS = Days(
     images=200, size=(96, 72), length=300.0, closed=(2, 4, 160.0, 200.0), built=(5, 20, 40)
@@ -16,19 +15,21 @@ DAYS = Days(
 
 @pytest.fixture(scope='module')
 def results():
-    return list(run(DAYS, 5, UpkeepSettings()))
+    return list(run(DAYS, 5))
 
 
 def test_updated_map_knows_the_detour_and_stays_small(results):
-    first, everything, updated = np.array([day.recall for day in results]).T
-    assert 'added' in ' '.join(results[1].changes)
+    first, everything, updated, int8 = np.array([day.recall for day in results]).T
+    assert 'added' in ' '.join(results[1].changes[0])
     for day in (2, 3):  # the second and third day on which the road is closed
         assert updated[day] > first[day] + 0.05
     assert updated[4] >= first[4] - 0.03
     assert results[-1].places[2] <= 1.5 * results[-1].places[0]
     assert results[-1].places[1] == 6 * results[-1].places[0]
     assert everything.min() > 0.5
-    assert [day.vanished for day in results] == [0, 0, 0, 0, 13]
+    assert [day.vanished[0] for day in results] == [0, 0, 0, 0, 13]
+    assert (int8 >= everything - 0.02).all()
+    assert results[-1].places[3] <= 6 * results[-1].places[0]  # in the memory of 1.5 in float32
 
 
 def test_results_are_a_table_and_a_plot(results, tmp_path):

@@ -188,7 +188,14 @@ def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
         default=0,
         metavar='N',
         help='places of the map, above which those that helped least to recognize are removed; '
-        'a drive is kept whole where there is room (half more than before the first update)',
+        'with room for two drives or more, the first and the last ones are kept whole (the memory '
+        'of one and a half sessions in float32)',
+    )
+    action.add_argument(
+        '--precision',
+        choices=('float32', 'int8'),
+        default='float32',
+        help='of the node that loads the map; int8 has room for six sessions (%(default)s)',
     )
     action.add_argument(
         '--max-age',
@@ -417,7 +424,7 @@ def _update(arguments: argparse.Namespace) -> None:
     from stavpr_ros.output_file import FileVersion
     from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
 
-    settings = UpkeepSettings(arguments.max_places, arguments.max_age)
+    settings = UpkeepSettings(arguments.max_places, arguments.max_age, arguments.precision)
     opened, place_map = FileVersion.of(arguments.map), _verified(arguments.map)
     name = Path(arguments.drive).stem[:40]
     with _drive(arguments, place_map) as drive:

@@ -46,13 +46,14 @@ def update_own_map(pipeline: Pipeline, on_worker: OnWorker, log: 'Logger | Any')
     :raises StavprError: a file that cannot be read or written; it stays as it is.
     """
     state, places = pipeline.save_state, 0
+    settings = UpkeepSettings(precision=pipeline.settings.precision)
     for drive in on_worker(pipeline.operation.take_drives):
         start = int(drive.stamps[0])  # the drive of a simulation is named by the present time
         seconds = start / SECOND if start >= DATED else time.time()
         name = time.strftime('drive %Y-%m-%d %H:%M:%S', time.gmtime(seconds))
         opened, place_map = FileVersion.of(state.path), load_map(state.path)
         try:
-            version = update_file(state.path, opened, place_map, drive, UpkeepSettings(), name)
+            version = update_file(state.path, opened, place_map, drive, settings, name)
         except InputError as error:
             log.warning(f'{name} does not update {state.path}: {error}')
             continue

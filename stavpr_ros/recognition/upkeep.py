@@ -12,8 +12,9 @@ An update has four steps; docs/upkeep.md describes them.
    were, gets the images of a drive that is certain of it by other sessions.
 4. Above ``max_places``, the places that helped least to recognize are removed.
 
-Where the budget has room for one more session of the route, a drive over half of it or more is
-kept whole. Every stretch is a session of the map, so that no path leads from one into the other.
+Where the budget has room for two sessions of the route or more, a drive over half of it or more
+is kept whole, beside the first one, and the oldest ones go. Every stretch is a session of the
+map, so that no path leads from one into the other.
 The root of a place is the place of an earlier session that shows the same, or itself.
 """
 
@@ -28,7 +29,7 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.model import MODEL
-from stavpr_ros.mapping import merge_maps, PlaceMap, Session
+from stavpr_ros.mapping import merge_maps, PlaceMap, select_places, Session
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.mapping.versions import current_version, save_version, Version
@@ -53,6 +54,7 @@ MIN_MISSED = 10  # places in a row that are renewed as one stretch
 PIECE = 20  # places that are removed together
 DECAY = 0.9  # of the use, a drive
 PROBES, FAR = 24, 25  # images of the geometric check; places to where another one is
+SESSIONS = {'float32': 1.5, 'int8': 6.0}  # in the memory of one and a half in float32
 SAME_ROAD = 0.05  # rank of the straight path among shifted ones, of the same road
 
 
@@ -61,12 +63,15 @@ class UpkeepSettings:
     """
     Settings of the upkeep.
 
-    :param max_places: of the map; 0 = half more than before the first update.
+    :param max_places: of the map; 0 = the memory of one and a half sessions in float32: half more
+        than before the first update, in int8 six times as many.
     :param max_age: drives in a row that pass a stretch unrecognized until it is renewed.
+    :param precision: in which the map is loaded, ``float32`` or ``int8``.
     """
 
     max_places: int = 0
     max_age: int = 5
+    precision: str = 'float32'
 
 
 @dataclass(frozen=True)
@@ -103,12 +108,13 @@ def update_map(
     driven = _drive(place_map, drive)
     _require_certain(place_map, drive, driven, roots)
     base, changes = version.base_places or n, []
-    limit = settings.max_places or round(1.5 * base)
+    limit = settings.max_places or round(SESSIONS[settings.precision] * base)
     is_long = np.ptp(roots[driven.of_windows[driven.of_windows >= 0]]) >= base / 2
-    if is_long and n + max(base, len(drive)) <= limit:
+    keeps_drives = limit >= 2 * base
+    if is_long and keeps_drives:
         images = np.flatnonzero(driven.moves)
-        stretches = [_Stretch(images, recognized(place_map, drive, images), True)]
-        changes.append(f'added the drive, {len(images)} images: there is room for it')
+        stretches = [_Stretch(images, _on_first_drive(place_map, drive, images), True)]
+        changes.append(f'added the drive, {len(images)} images')
     else:
         stretches = _stretches(place_map, drive, driven, roots)
         for stretch in stretches:
@@ -124,9 +130,11 @@ def update_map(
     grown = _with_stretches(place_map, drive, name, stretches)
     use = np.concatenate([use, np.ones(len(grown) - n)])
     missed = np.concatenate([missed, np.zeros(len(grown) - n, np.int64)])
-    kept = np.flatnonzero(_within(grown, use, limit))
+    value = _newness(grown) if keeps_drives else use
+    kept = np.flatnonzero(_within(grown, value, limit))
     if removed := len(grown) - len(kept):
-        changes.append(f'removed {removed} places that helped least, above {limit} places')
+        which = 'of the oldest drives' if keeps_drives else 'that helped least'
+        changes.append(f'removed {removed} places {which}, above {limit} places')
     certain = (driven.of_windows >= 0).mean()
     changes.insert(0, f'certain of {certain:.0%} of {len(drive)} images')
     return keep_places(grown, kept), replace(
@@ -200,6 +208,23 @@ def _drive(place_map: PlaceMap, drive: PlaceMap) -> _Driven:
         moves[i] = not recognizer.is_standstill
     is_matched, driven = matched.middles >= 0, np.cumsum(moves)
     return _Driven(certain.middles, certain.places, is_matched, driven, recognizer)
+
+
+def _on_first_drive(place_map: PlaceMap, drive: PlaceMap, images: np.ndarray) -> np.ndarray:
+    """
+    Return the place of the map that each image of a drive shows, (m,); -1 = none.
+
+    It is one of the first drive where that is recognized: errors would add up over the drives.
+    """
+    own = np.flatnonzero(_drives(place_map) == 0)
+    first = recognized(select_places(place_map, own), drive, images)
+    return np.where(first >= 0, own[first], recognized(place_map, drive, images))
+
+
+def _newness(place_map: PlaceMap) -> np.ndarray:
+    """Return a number of each place, (n,), the lower the older, of the first drive the highest."""
+    drives, runs = _drives(place_map), _runs(place_map)
+    return np.where(drives == 0, len(place_map), runs)
 
 
 def _require_certain(
@@ -521,8 +546,8 @@ def _with_images(place_map: PlaceMap, drive: PlaceMap, images: np.ndarray) -> Pl
     )
 
 
-def _within(grown: PlaceMap, use: np.ndarray, limit: int) -> np.ndarray:
-    """Return which places stay, (n,): whole pieces that helped least go, the only ones last."""
+def _within(grown: PlaceMap, value: np.ndarray, limit: int) -> np.ndarray:
+    """Return which places stay, (n,): whole pieces of least value go, the only ones last."""
     is_kept, runs = np.ones(len(grown), bool), _runs(grown)
     roots = np.arange(len(grown)) if grown.same_as is None else grown.same_as
     pieces = [
@@ -531,7 +556,7 @@ def _within(grown: PlaceMap, use: np.ndarray, limit: int) -> np.ndarray:
         for own in [np.flatnonzero(runs == run)]
         for piece in np.array_split(own, max(1, round(len(own) / PIECE)))
     ]
-    order = sorted(pieces, key=lambda piece: float(use[piece].mean()))
+    order = sorted(pieces, key=lambda piece: float(value[piece].mean()))
     for spares_the_only_ones in (True, False):
         for piece in order:
             if is_kept.sum() <= limit:

@@ -27,7 +27,8 @@ from stavpr_ros.recognition.upkeep import update_map, UpkeepSettings
 
 TOLERANCE = 8.0  # meters from the right position
 DETOUR = -1000.0  # meters, of positions in the detour
-MAPS = ('first session', 'all sessions', 'updated map')
+MAPS = ('first session', 'all sessions', 'updated map', 'updated map in int8')
+PRECISIONS = 'float32', 'int8'  # of the updated maps
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,16 @@ class Day:
     :param recall: share of the images that are rightly matched.
     :param wrong: number of wrong matches.
     :param places: of the map after the day.
-    :param vanished: places of the updated map after the day that show replaced buildings.
-    :param changes: of the update.
+    :param vanished: places of the updated maps after the day that show replaced buildings.
+    :param changes: of the updates.
     """
 
     number: int
     recall: tuple[float, ...]
     wrong: tuple[int, ...]
     places: tuple[int, ...]
-    vanished: int
-    changes: tuple[str, ...]
+    vanished: tuple[int, ...]
+    changes: tuple[tuple[str, ...], ...]
 
 
 def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
@@ -63,10 +64,10 @@ def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
 
 
 def measure(
-    place_map: PlaceMap, drive: PlaceMap, positions: dict[int, float]
+    place_map: PlaceMap, drive: PlaceMap, positions: dict[int, float], precision: str = 'float32'
 ) -> tuple[float, int]:
     """Return the share of the images that are rightly matched, and the number of wrong ones."""
-    recognizer = PlaceRecognizer(place_map, RecognizerSettings())
+    recognizer = PlaceRecognizer(place_map, RecognizerSettings(), precision=precision)
     right = wrong = 0
     for i in range(len(drive)):
         match = recognizer.update(drive.features[i : i + 1], int(drive.stamps[i]))
@@ -78,43 +79,49 @@ def measure(
     return right / len(drive), wrong
 
 
-def run(days: Days, count: int, settings: UpkeepSettings) -> Iterator[Day]:
+def run(days: Days, count: int) -> Iterator[Day]:
     """Yield the results of days 1 to ``count``; the drive of day 0 is the map."""
     positions: dict[int, float] = {}
     first = drive_of(days, 0, positions)
-    updated, version = first, Version('', base_places=len(first))
+    updated = dict.fromkeys(PRECISIONS, (first, Version('', base_places=len(first))))
     everything = merge_maps([first], ['day 0'])
     for number in range(1, count + 1):
-        drive = drive_of(days, number, positions)
-        measured = [measure(each, drive, positions) for each in (first, everything, updated)]
-        try:
-            updated, version = update_map(updated, drive, f'day {number}', version, settings)
-            changes = version.changes
-        except InputError as error:
-            changes = (str(error),)
+        drive, changes = drive_of(days, number, positions), []
+        measured = [measure(each, drive, positions) for each in (first, everything)]
+        for precision, (place_map, version) in updated.items():
+            measured.append(measure(place_map, drive, positions, precision))
+            settings, name = UpkeepSettings(precision=precision), f'day {number}'
+            try:
+                updated[precision] = update_map(place_map, drive, name, version, settings)
+                changes.append(updated[precision][1].changes)
+            except InputError as error:
+                changes.append((str(error),))
         everything = with_last_related(merge_maps([everything, drive], ['', f'day {number}']))
         recall, wrong = zip(*measured, strict=True)
-        places = len(first), len(everything), len(updated)
+        maps = [place_map for place_map, _ in updated.values()]
         begin, low, high = days.built
-        rebuilt, stamps = EPOCH + begin * DAY if number >= begin else 0, updated.stamps.tolist()
-        vanished = sum(each < rebuilt and low <= positions[each] < high for each in stamps)
-        yield Day(number, recall, wrong, places, vanished, changes)
+        rebuilt = EPOCH + begin * DAY if number >= begin else 0
+        vanished = tuple(
+            sum(each < rebuilt and low <= positions[each] < high for each in one.stamps.tolist())
+            for one in maps
+        )
+        places = tuple(map(len, (first, everything, *maps)))
+        yield Day(number, recall, wrong, places, vanished, tuple(changes))
 
 
 def table(results: list[Day]) -> str:
     """Return the results as a table in Markdown."""
     lines = [
-        f'| day | recall: {" | ".join(MAPS)} | wrong: {" | ".join(MAPS)} | places: updated map | '
-        'of them vanished | update |',
-        '|' + '---|' * 10,
+        f'| day | recall: {", ".join(MAPS)} | wrong | places of the updated maps | '
+        'of them vanished | update | in int8 |',
+        '|' + '---|' * 7,
     ]
     for day in results:
-        recall = ' | '.join(f'{value:.3f}' for value in day.recall)
-        wrong = ' | '.join(map(str, day.wrong))
-        text = '; '.join(day.changes)
-        lines.append(
-            f'| {day.number} | {recall} | {wrong} | {day.places[-1]} | {day.vanished} | {text} |'
-        )
+        recall = ' '.join(f'{value:.3f}' for value in day.recall)
+        numbers = (day.wrong, day.places[2:], day.vanished)
+        wrong, places, vanished = (' '.join(map(str, each)) for each in numbers)
+        text = ' | '.join('; '.join(each) for each in day.changes)
+        lines.append(f'| {day.number} | {recall} | {wrong} | {places} | {vanished} | {text} |')
     return '\n'.join(lines)
 
 
@@ -151,7 +158,7 @@ matched before the map learns from them.
 ![recall and places]({target.name}.png)
 """
     days = Days(int(sys.argv[3])) if sys.argv[3:] else Days()
-    for day in run(days, count, UpkeepSettings()):
+    for day in run(days, count):
         results.append(day)
         page.write_text(f'{text}\n{table(results)}\n{heading}{others}')
         plot(results, target.with_suffix('.png'))
