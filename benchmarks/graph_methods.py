@@ -380,9 +380,9 @@ def main() -> None:
         return
     if options.runs:
         rows = []
-        for name, (runs, length), seed in product(KITTI, FALSE_RUNS, range(4)):
+        for name, (count, length), seed in product(KITTI, FALSE_RUNS, range(4)):
             for drive in (kitti(name, '0.00'), backwards(kitti(name, '0.00'))):
-                rows.append(driven(with_false_runs(drive, runs, length, seed), 10))
+                rows.append(driven(with_false_runs(drive, count, length, seed), 10))
                 print(rows[-1], flush=True)
         write_json(RESULTS / 'graph_runs.json', {'about': environment(), 'rows': rows})
         return

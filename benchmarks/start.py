@@ -3,7 +3,7 @@
 """
 Start of the node by its causes: imports, kernels to compile, and what is left.
 
-Cold: the folder of kernels is empty. Built: ``stavpr warm`` has filled it, as ``make build`` does.
+Cold: the folder of kernels is empty. Built: ``stavpr warm`` has filled it, as in ``colcon build``.
 Warm: a second start. Run it where the package is built and sourced: ``make shell``, then
 ``python benchmarks/start.py``.
 """
