@@ -15,8 +15,8 @@ import numpy as np
 from stavpr_lab.demonstration.repeat import CONDITIONS, teach, View
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
-from stavpr_nav.expansion import Expansion
-from stavpr_nav.offset import describe_columns, OffsetFilter
+from stavpr_ros.relative_pose.expansion import Expansion
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from tqdm import tqdm
 
 SEEDS = (7, 21, 33)

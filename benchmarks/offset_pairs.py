@@ -12,7 +12,7 @@ import sys
 
 from data import data_folder
 import numpy as np
-from stavpr_nav.offset import describe_columns, OffsetFilter
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources import open_source
 
 PIXELS = 1024  # width that the shifts are of

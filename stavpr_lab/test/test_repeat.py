@@ -19,8 +19,8 @@ from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
 from stavpr_lab.demonstration.street.street import CELL
 from stavpr_lab.demonstration.street.traverses import GOOD_LIGHT, RAINY_DUSK, Traverse, World
-from stavpr_nav.expansion import Expansion
-from stavpr_nav.offset import describe_columns, OffsetFilter
+from stavpr_ros.relative_pose.expansion import Expansion
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 
 COVERED = 18.0  # seconds
 

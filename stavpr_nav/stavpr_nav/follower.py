@@ -9,7 +9,7 @@ the speed that falls with the probability of the place, and steers against the o
     v' = c v        w' = c w - gain v' (e + 1 / D integral e ds)        e = shift + weight parallax
 
 shift is the heading error and parallax the lateral offset, in parts of the image's width (see
-``stavpr_nav.offset``). Both errors converge, without a calibrated camera, as the
+``stavpr_ros.relative_pose.offset``). Both errors converge, without a calibrated camera, as the
 bearing-only law of Krajnik et al. (Navigation without localisation, 2018) does, whose one shift of
 all features is the sum of the two. The weighted parallax is limited: far beside the path the robot
 returns at a small angle, and does not swing beyond it. The integral over the path takes out a
@@ -22,8 +22,8 @@ from functools import cached_property
 import math
 
 import numpy as np
-from stavpr_nav.offset import Offset
 from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.relative_pose.offset import Offset
 
 UNCERTAIN, CERTAIN = 0.5, 0.9  # probabilities of the slowest and of the full speed
 SLOWEST = 0.3  # share of the taught speed

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from stavpr_nav import follower
 from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
-from stavpr_nav.offset import Offset
 from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.relative_pose.offset import Offset
 
 STEP = 0.05
 STRAIGHT = Offset(0.0, 0.01, 0.0, 1e6, 0.6)

@@ -21,13 +21,13 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, Image
 from stavpr_msgs.action import Repeat
 from stavpr_msgs.msg import Offset, PlaceMatch
-from stavpr_nav.offset import DISTANT
 from stavpr_nav.ros.repeat_node import RepeatNode
 from stavpr_nav.ros.teach_node import TeachNode
 from stavpr_nav.taught_run import read_velocities
 from stavpr_ros.errors import InputError, OutputError, SettingsError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.merging import select_places
+from stavpr_ros.relative_pose.offset import DISTANT
 from stavpr_ros.ros.messages import image_message
 from std_msgs.msg import Bool, Header
 

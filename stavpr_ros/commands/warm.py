@@ -29,6 +29,7 @@ def _run(_: object) -> None:
     from stavpr_ros.pipeline import PipelineSettings
     from stavpr_ros.pipeline.operations import Localizer, RouteCloser
     from stavpr_ros.pipeline.save_state import SaveState
+    from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
     from stavpr_ros.sources.frame import Frame
 
     if CACHE is None:
@@ -42,4 +43,5 @@ def _run(_: object) -> None:
             route = build_map(frames, extractor, progress=False)
             Localizer(settings, route, extractor, SaveState())
             RouteCloser(settings, None, extractor, SaveState())
+    OffsetFilter().update(*[describe_columns(images[0])] * 2)
     say(f'the kernels are in {CACHE}')

@@ -34,10 +34,10 @@ from stavpr_lab.demonstration.street.traverses import (
     Traverse,
 )
 from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
-from stavpr_nav.offset import describe_columns, OffsetFilter
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
 from tqdm import tqdm
 

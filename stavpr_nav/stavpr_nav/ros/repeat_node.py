@@ -25,14 +25,14 @@ from stavpr_msgs.action import Repeat
 from stavpr_msgs.msg import Offset as OffsetMessage
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_nav.driver import Driver, Goal, Outcome
-from stavpr_nav.expansion import Expansion
 from stavpr_nav.follower import Command, FollowerSettings, Observation
-from stavpr_nav.offset import describe_columns, Offset, OffsetFilter
 from stavpr_nav.parameters import REPEAT
 from stavpr_nav.taught_run import read_velocities, taught_run
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.mapping import open_map
 from stavpr_ros.mapping.camera import FORWARD
+from stavpr_ros.relative_pose.expansion import Expansion
+from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
 from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.messages import camera_of, nanoseconds
 from stavpr_ros.ros.rclpy_workarounds import log_failure

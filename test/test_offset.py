@@ -5,9 +5,11 @@
 import cv2
 import numpy as np
 import pytest
-from stavpr_nav import offset as module
-from stavpr_nav.expansion import Expansion
-from stavpr_nav.offset import (
+from stavpr_ros.errors import ImageError, InputError
+from stavpr_ros.mapping import thumbnail_of
+from stavpr_ros.relative_pose import offset as module
+from stavpr_ros.relative_pose.expansion import Expansion
+from stavpr_ros.relative_pose.offset import (
     A,
     B,
     BLOCKS,
@@ -23,8 +25,6 @@ from stavpr_nav.offset import (
     SHIFTS,
     STEP,
 )
-from stavpr_ros.errors import ImageError, InputError
-from stavpr_ros.mapping import thumbnail_of
 from stavpr_ros.sources import open_source
 
 WIDTH, HEIGHT, PANORAMA = 192, 144, 400

@@ -15,7 +15,8 @@ from functools import lru_cache
 import math
 
 import numpy as np
-from stavpr_nav.offset import (
+from stavpr_ros.errors import ImageError
+from stavpr_ros.relative_pose.offset import (
     BLOCK_CENTERS,
     block_evidence,
     DISTANT,
@@ -24,7 +25,6 @@ from stavpr_nav.offset import (
     SHIFTS,
     WIDTH,
 )  # fmt: skip
-from stavpr_ros.errors import ImageError
 
 # Chosen on street 7; what half and double do on streets 21 and 33: benchmarks/results/repeat.md.
 RATES = np.geomspace(0.004, 1.0, 24)  # expansions, half widths per meter
