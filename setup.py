@@ -91,7 +91,8 @@ distribution = setup(
     name=NAME,
     version=MANIFEST.findtext('version'),
     description='STA-VPR place recognition by spatio-temporal alignment, as a ROS 2 node.',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    # of the sources: colcon build --symlink-install runs a link to this file elsewhere
+    long_description=Path('setup.py').resolve().with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     project_urls={url.get('type'): url.text for url in MANIFEST.iter('url')},
     license='Apache-2.0',

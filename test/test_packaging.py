@@ -192,6 +192,13 @@ def test_build_by_colcon_without_messages_names_the_links(sources, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_setup_runs_where_links_to_it_are(sources, tmp_path):
+    """``colcon build --symlink-install`` makes such a folder."""
+    for name in ('setup.py', 'package.xml'):
+        (tmp_path / name).symlink_to(sources / name)
+    assert run_setup(tmp_path, '--version').strip() == stavpr_ros.__version__
+
+
 def test_build_by_colcon_fills_the_cache_of_kernels(sources, tmp_path):
     assert CACHE is not None
     cache = CACHE.parent  # a filled one; by default, it would be in the installed package

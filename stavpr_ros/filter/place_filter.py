@@ -206,7 +206,7 @@ class PlaceFilter(Filter):
         """See :meth:`Filter.path`; a state is level, speed, place, speed then."""
         places = np.empty(images + 1, np.int32)
         trace_back(
-            *(int(i) for i in state[:3]), self._origins, self._steps,
+            *state[:3].tolist(), self._origins, self._steps,
             (self.count - 1) % len(self._steps), images, places,
         )  # fmt: skip
         return places
