@@ -140,6 +140,8 @@ def test_drive_is_kept_whole_where_there_is_room(first, rebuilt):
     assert not shown[95:125].any()  # looks otherwise: no place of the map
     assert len(updated(first, rebuilt, settings=UpkeepSettings(precision='int8'))[0]) == 400
     assert len(updated(first, rebuilt, settings=UpkeepSettings())[0]) < 300  # in float32
+    dense = Version('', base_places=90)  # of a route with less than half as many places as images
+    assert len(updated(first, rebuilt, dense, settings=room)[0]) < 300
     short = built(ROUTE[40:130], 4)  # less than half of the route
     assert len(updated(first, short, settings=room)[0]) == 200
     part = built(ROUTE[50:155], 4)  # no room for one more session of the route
@@ -345,6 +347,11 @@ def test_update_log_and_rollback(path, drives, capsys):
     assert main(['rollback', str(path)]) == 1
     assert main(['update', str(path), drives[0]]) == 0
     assert load_map(path).map_id == ids[1]  # the same again, to the last bit
+
+
+def test_update_in_int8_keeps_the_drive(path, drives):
+    assert main(['update', str(path), drives[0], '--precision', 'int8']) == 0
+    assert len(load_map(path)) == 400
 
 
 def test_update_without_other_places_keeps_the_version_before(path, first):

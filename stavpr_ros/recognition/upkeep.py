@@ -111,7 +111,7 @@ def update_map(
     limit = settings.max_places or round(SESSIONS[settings.precision] * base)
     is_long = np.ptp(roots[driven.of_windows[driven.of_windows >= 0]]) >= base / 2
     keeps_drives = limit >= 2 * base
-    if is_long and keeps_drives:
+    if is_long and keeps_drives and len(drive) <= 2 * base:
         images = np.flatnonzero(driven.moves)
         stretches = [_Stretch(images, _on_first_drive(place_map, drive, images), True)]
         changes.append(f'added the drive, {len(images)} images')
