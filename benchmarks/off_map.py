@@ -14,12 +14,11 @@ import sys
 import time
 from typing import Any
 
-from accuracy import extractors, long_cases, short_cases
+from accuracy import extractors, FEATURES, long_cases, short_cases
 from data import data_folder
 import numpy as np
 from off_map_page import (
     DAY,
-    HYBRID,
     JUMP,
     KINDS,
     LEVEL,
@@ -342,6 +341,7 @@ class Measurement:
         each_third = sparse(pair)
         self.add('sparse', pair.name, each_third.numbers())
         self.driven += [*pooled, each_third]
+        self.add('set_calibration', pair.name, Outcome.pooled([*pooled, each_third]).calibration())
         if not pair.long:
             self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
         outcomes = list(detours(pair, self.coarser))
@@ -390,6 +390,17 @@ class Measurement:
         return self.rows
 
 
+def extractor(feature: str, folder: Path) -> FeatureExtractor:
+    """
+    Return the extractor of a kind of features.
+
+    :raises UnavailableError: its extra or its model is missing.
+    """
+    if feature in FEATURES:
+        return extractors(feature, folder)['robust']
+    return FeatureExtractor(KINDS[feature])
+
+
 def extracted(source: Any, making: FeatureExtractor) -> PlaceMap:
     """Return a map of all images of a source."""
     return build_map(source, making, thumbnails=False, progress=False)
@@ -416,11 +427,7 @@ def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
     results: Results = {}
     for feature in features:
         try:
-            making = (
-                FeatureExtractor(KINDS[HYBRID])
-                if feature == HYBRID
-                else extractors(feature, folder)['robust']
-            )
+            making = extractor(feature, folder)
         except UnavailableError as error:
             print(f'left out: {KINDS[feature]}: {error}', file=sys.stderr)
             continue

@@ -9,8 +9,8 @@ from accuracy import FEATURES
 import numpy as np
 from results import heading, table
 
-HYBRID = 'h'
-KINDS = FEATURES | {HYBRID: 'hybrid'}  # of features
+LEARNED, HYBRID = 'l', 'h'
+KINDS = FEATURES | {LEARNED: 'efficientnet_lite1', HYBRID: 'hybrid'}  # of features
 DAY, NIGHT = 'gardens_point', 'walk_night'
 JUMP = 'after a jump'  # from half of the query away
 LEVEL = 0.95  # declared probability whose precision the summary gives
@@ -103,6 +103,9 @@ def summary(results: Results, feature: str) -> dict[str, tuple[str, str]]:
     best(f'{label}, by day', [f'{DAY}/all'], 0.9 if g else 0.95, value)
     best(f'{label}, day / night', [f'{NIGHT}/all'], 0.7 if g else 0.9, value)
     cells |= _starts(of('start'), g)
+    if errors := of('set_calibration'):
+        text = ', '.join(f'{k} {v["expected_calibration_error"]:.3f}' for k, v in errors.items())
+        cells['calibration: expected error, drives of a data set'] = text, '<= 0.05'
     for name, row in of('calibration').items():
         if row['images']:
             text = f'{row["expected_calibration_error"]:.3f}'

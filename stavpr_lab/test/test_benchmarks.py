@@ -18,11 +18,16 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
 import accuracy
+import constants
 from lower_bounds import Peaks
 import matching
 import off_map
+import off_map_page
 import peaks
 import report
+from stavpr_ros.errors import InputError
+from stavpr_ros.filter import checks, choice
+from stavpr_ros.filter.model import MODEL
 
 PEAKS = Peaks(1e9, 1e10)
 
@@ -88,6 +93,48 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     assert found['f1'] == 3 / 4  # three of four right, one wrong
     bins = outcome.calibration()['bins']
     assert [(row['images'], row['right']) for row in bins] == [(1, 1), (1, 0), (1, 1), (1, 1)]
+
+
+def test_summary_of_off_map_has_the_calibration_of_each_data_set():
+    rows = {
+        f'set_calibration/{feature}/{name}': {'expected_calibration_error': error}
+        for feature, name, error in (('g', 'b', 0.1), ('g', 'a', 0.02), ('h', 'a', 0.5))
+    }
+    label = 'calibration: expected error, drives of a data set'
+    assert off_map_page.summary(rows, 'g') == {label: ('b 0.100, a 0.020', '<= 0.05')}
+    assert off_map_page.summary(rows, 'l') == {}
+
+
+def test_constants_are_set_everywhere_and_restored():
+    """Also where a module has imported the value by its name."""
+    before = MODEL.start, choice.NEWEST
+    with constants.constant('start', 0.5), constants.constant('NEWEST', 0.3):
+        assert (MODEL.start, choice.NEWEST, checks.NEWEST) == (0.5, 0.3, 0.3)
+    assert (MODEL.start, choice.NEWEST) == (constants.value_of('start'), checks.NEWEST) == before
+    with pytest.raises(InputError, match='no constant'):
+        constants.value_of('NEVEST')
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'half', 'double'),
+    [
+        ('weight', 0.3, 0.15, 0.6),
+        ('levels', (-1.0, -3.0), (-0.5, -1.5), (-2.0, -6.0)),
+        ('keep_speed', 0.75, 0.875, 0.5),  # of changing it
+        ('APART', 21, 10, 42),
+        ('speeds', (0.0, 1.0, 4.0, 16.0), (0.0, 1.0, 16.0), (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)),
+    ],
+)
+def test_half_and_double_of_constants(name, value, half, double):
+    with constants.constant(name, value):
+        found = constants.half_and_double(name)
+    assert found == (pytest.approx(half), pytest.approx(double))
+
+
+def test_every_constant_is_named_where_it_is():
+    for name in constants.CONSTANTS:
+        half, double = constants.half_and_double(name)
+        assert constants.value_of(name) not in (half, double)
 
 
 def test_public_graphs_go_on_where_they_were_ended(tmp_path, monkeypatch, capsys):
