@@ -131,6 +131,28 @@ def test_half_and_double_of_constants(name, value, half, double):
     assert found == (pytest.approx(half), pytest.approx(double))
 
 
+def test_constants_are_measured_beside_the_present_ones(tmp_path, monkeypatch):
+    """On floors and unrelated routes, each match is wrong."""
+
+    class Routes:
+        def outcomes(self, is_quick):
+            right = np.arange(4) < 4 * MODEL.start
+            for name in (*constants.NEW, *constants.OLD):
+                yield name, off_map.Outcome(right, right * 0.9, right, ~none, right, none)
+            for name in ('floors', 'unrelated'):
+                yield name, off_map.Outcome(right, right * 0.9, none, none, none, none)
+
+    none = np.zeros(4, bool)
+    monkeypatch.setattr(constants.Routes, 'read', lambda *_: Routes())
+    monkeypatch.setattr(constants, 'data_folder', Path)
+    words = 'start=0.5 start=0.25 --features g --commit a --output'
+    assert constants.main([*words.split(), str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / 'constants.json').read_text())['results']
+    assert list(rows) == ['g/now', 'g/start=0.5', 'g/start=0.25']
+    cell = '1.000 0.250, 1.000 0.250, 25.0 25.0 100.0, 0 of 0'
+    assert constants.cell(rows['g/start=0.25']) == cell
+
+
 def test_every_constant_is_named_where_it_is():
     for name in constants.CONSTANTS:
         half, double = constants.half_and_double(name)
