@@ -50,7 +50,6 @@ CONSTANTS = {
     'change_deviation': 'deviation of the logarithm of the change at one speed',
     'speed_weight': 'exponent of the likelihood of a speed',
     'UNEVEN_WEIGHT': 'log odds by the deviation of z beyond the limit',
-    'NEWEST': 'share of the allowed deviation of z that the newest images may have',
     'EXCESS': 'logarithm of the change of a path over that of the map',
     'EXCESS_WEIGHT': 'log odds by the change beyond it',
     'SURE_AT_REST': 'probability that a camera at rest needs (1 less it)',

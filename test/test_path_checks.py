@@ -13,7 +13,6 @@ from stavpr_ros.filter.checks import (
     EXCESS,
     EXCESS_WEIGHT,
     least_at_rest,
-    NEWEST,
     odds_factor,
     SURE_AT_REST,
     UNEVEN_WEIGHT,
@@ -28,8 +27,6 @@ def test_unevenness_is_deviation_beyond_the_limit():
     path = np.arange(4)
     assert unevenness(path, np.array([-2.0, -3.0, -2.0, -3.0])) == 0
     assert unevenness(path, np.array([-4.0, 0.0, -4.0, 0.0])) == pytest.approx(2 - EVEN)
-    found = unevenness(path, np.array([-4.0, 0.0, -4.0, 0.0]), NEWEST)
-    assert found == pytest.approx(2 - NEWEST * EVEN)
 
 
 def test_unevenness_allows_a_share_of_the_mean():

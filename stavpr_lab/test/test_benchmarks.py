@@ -26,8 +26,9 @@ import off_map_page
 import peaks
 import report
 from stavpr_ros.errors import InputError
-from stavpr_ros.filter import checks, choice
+from stavpr_ros.filter import evidence
 from stavpr_ros.filter.model import MODEL
+from stavpr_ros.recognition import filter_window
 
 PEAKS = Peaks(1e9, 1e10)
 
@@ -107,10 +108,11 @@ def test_summary_of_off_map_has_the_calibration_of_each_data_set():
 
 def test_constants_are_set_everywhere_and_restored():
     """Also where a module has imported the value by its name."""
-    before = MODEL.start, choice.NEWEST
-    with constants.constant('start', 0.5), constants.constant('NEWEST', 0.3):
-        assert (MODEL.start, choice.NEWEST, checks.NEWEST) == (0.5, 0.3, 0.3)
-    assert (MODEL.start, choice.NEWEST) == (constants.value_of('start'), checks.NEWEST) == before
+    before = MODEL.start, filter_window.APART
+    with constants.constant('start', 0.5), constants.constant('APART', 3):
+        assert (MODEL.start, filter_window.APART, evidence.APART) == (0.5, 3, 3)
+    assert (MODEL.start, evidence.APART) == (constants.value_of('start'), filter_window.APART)
+    assert (MODEL.start, evidence.APART) == before
     with pytest.raises(InputError, match='no constant'):
         constants.value_of('NEVEST')
 

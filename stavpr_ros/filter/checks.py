@@ -31,14 +31,13 @@ from stavpr_ros.compilation import kernel
 
 EVEN, EVEN_SHARE = 1.4, 0.45  # deviation of z at right places, and as a share of its mean
 UNEVEN_WEIGHT = 10.0  # logarithm of the odds, by the deviation beyond
-NEWEST = 0.7  # share of both that the newest images of a window may have
 MIN_PLACES = 3  # of a path whose deviation is meaningful
 SURE_AT_REST = 0.9  # probability that a path needs where the camera is at rest and z is not near
 EXCESS, EXCESS_WEIGHT = 0.04, 25.0  # of right paths at most, and its weight in the odds beyond
 
 
 @kernel
-def unevenness(path: np.ndarray, z: np.ndarray, part: float = 1.0) -> float:
+def unevenness(path: np.ndarray, z: np.ndarray) -> float:
     """
     Return by how much z varies more along a path than it may at right places, 0 if it does not.
 
@@ -47,7 +46,6 @@ def unevenness(path: np.ndarray, z: np.ndarray, part: float = 1.0) -> float:
     :param path: place of each image, ascending, (l,), int64.
     :param z: z-normalized distance of each image to its place, (l,), float32; infinite ones do
         not count.
-    :param part: of the limit: ``NEWEST`` for the newest images of a window alone.
     """
     nearest, count, place = np.empty(len(path)), 0, path[0]
     for i in range(len(path)):
@@ -61,7 +59,7 @@ def unevenness(path: np.ndarray, z: np.ndarray, part: float = 1.0) -> float:
     nearest = nearest[:count]
     mean = nearest.sum() / count
     deviation = np.sqrt(((nearest - mean) ** 2).sum() / count)
-    return max(deviation - part * max(EVEN, -EVEN_SHARE * mean), 0.0)
+    return max(deviation - max(EVEN, -EVEN_SHARE * mean), 0.0)
 
 
 def odds_factor(uneven: float, excess: float) -> float:

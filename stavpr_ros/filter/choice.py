@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.compilation import kernel
-from stavpr_ros.filter.checks import least_at_rest, NEWEST, odds_factor
+from stavpr_ros.filter.checks import least_at_rest, odds_factor
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.motion import ImageChange
 from stavpr_ros.filter.paths import Belief, CLOSE, NEGLIGIBLE
@@ -174,7 +174,7 @@ class PathChoice:
         path, placed, z, masses, uneven, compared = refined(
             images.z(columns), path, images.weights * mean, numbers, images.stamps,
             self._place_times[: images.n], self._layout.first_column(path[-1]),
-            self._change.equal, self._passes, 1.0 if images.is_whole else NEWEST,
+            self._change.equal, self._passes,
         )  # fmt: skip
         moved = int(numbers[-1] - numbers[0])
         speed = float(path[-1] - path[0]) / max(moved, 1)

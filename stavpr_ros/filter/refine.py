@@ -116,7 +116,7 @@ def refine(z, path, exponents, images, times, place_times):
 
 
 @kernel
-def refined(z, path, exponents, images, stamps, place_times, first, equal, passes, part):
+def refined(z, path, exponents, images, stamps, place_times, first, equal, passes):
     """
     Return the places near a path that explain the images of the window best.
 
@@ -127,7 +127,6 @@ def refined(z, path, exponents, images, stamps, place_times, first, equal, passe
     :param first: least place.
     :param equal: which passes equal the one before: such are as one.
     :param passes: of each place.
-    :param part: of :func:`unevenness`.
     :returns: columns that are checked, (l,), the estimated ones, (l,), z of each image at the
         column that is checked, (l,), the probability of each offset, (l, S), 0 where it is not
         close to the estimated column, the unevenness, and the finite z of images that differ from
@@ -150,7 +149,7 @@ def refined(z, path, exponents, images, stamps, place_times, first, equal, passe
                 own, other = passes[min(max(place, 0), n - 1)], passes[placed[i]]
                 between = equal[min(own, other) + 1 : max(own, other) + 1]
                 masses[i, s] *= has_equal and between.all()
-    uneven = unevenness(checked, of_checked, part)
+    uneven = unevenness(checked, of_checked)
     return checked, placed, of_checked, masses, uneven, compared[:count]
 
 
