@@ -173,7 +173,8 @@ def value_of(name: str) -> Any:
 
 def _modules(name: str) -> list[dict[str, Any]]:
     """Return the contents of the modules that know a constant of the checks or the evidence."""
-    modules = [vars(m) for key, m in sys.modules.items() if key.startswith('stavpr_ros.')]
+    packages = 'stavpr_ros.filter.', 'stavpr_ros.recognition.'
+    modules = [vars(m) for key, m in sys.modules.items() if key.startswith(packages)]
     return [each for each in modules if name in each]
 
 

@@ -29,6 +29,8 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.filter import evidence
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.recognition import filter_window
+from stavpr_ros.relative_pose import estimator
+from stavpr_ros.relative_pose.pair import Source
 
 PEAKS = Peaks(1e9, 1e10)
 
@@ -111,6 +113,7 @@ def test_constants_are_set_everywhere_and_restored():
     before = MODEL.start, filter_window.APART
     with constants.constant('start', 0.5), constants.constant('APART', 3):
         assert (MODEL.start, filter_window.APART, evidence.APART) == (0.5, 3, 3)
+        assert estimator.APART[Source.PNP] == 5  # another constant of this name
     assert (MODEL.start, evidence.APART) == (constants.value_of('start'), filter_window.APART)
     assert (MODEL.start, evidence.APART) == before
     with pytest.raises(InputError, match='no constant'):
