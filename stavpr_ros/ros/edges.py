@@ -30,7 +30,7 @@ from std_msgs.msg import Header
 
 MAX_WAITING = 40  # closures; while there are more, the oldest goes without a relative pose
 UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
-NO_EDGE = Edge(Source.NONE, 'the place has no pose: record maps and routes with odometry')
+NO_POSE = Edge(Source.NONE, 'the place has no pose: record maps and routes with odometry')
 FLUSH_TIME = 2.0  # seconds of PnP at deactivation, less than the end of the node waits
 
 
@@ -118,7 +118,7 @@ class EdgePublisher:
         if self._estimator.method == 'none':
             return Edge(Source.NONE, 'parameter relative_pose is none')
         if pair is None:
-            return NO_EDGE
+            return NO_POSE
         if self._estimator.verifier is not None:
             return Edge(Source.NONE, 'the loop closure of this header has it, verified')
         edge = self._estimator.without_pnp(pair, query_camera, place_camera)
