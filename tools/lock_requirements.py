@@ -5,9 +5,9 @@ Write requirements/locked/NAME.txt: every package with its version and the hashe
 
 Usage: ``python3 tools/lock_requirements.py python3.11 python3.12 python3.13``
 
-Each Python resolves requirements/NAME.txt for itself. torch is not locked: its builds
-depend on the package index. ``base.txt`` is always installed; the files of the extras list the
-additional packages.
+Each Python resolves requirements/NAME.txt for the first release of its version (3.11.0, ...), so
+that all of its releases can install them. torch is not locked: its builds depend on the package
+index. ``base.txt`` is always installed; the files of the extras list the additional packages.
 """
 
 import json
@@ -22,12 +22,20 @@ from setup_venv import BASE, LOCKED_EXTRAS
 
 FOLDER = Path(__file__).resolve().parent.parent / 'requirements'
 HEAD = '# Written by tools/lock_requirements.py.\n'
+# pip with the Python X.Y.0. Its --python-version excludes packages that have no wheel.
+PIP_OF_FIRST_RELEASE = """
+import collections, platform, runpy, sys
+version = collections.namedtuple('version_info', 'major minor micro releaselevel serial')
+sys.version_info = version(*sys.version_info[:2], 0, 'final', 0)
+platform.python_version = lambda: '{}.{}.0'.format(*sys.version_info)
+runpy.run_module('pip', run_name='__main__')
+"""
 
 
 def resolve(python: str) -> dict[str, Any]:
     """Return pip's report of a dry run of all requirements."""
-    command = [python, '-m', 'pip', 'install', '--dry-run', '--quiet', '--ignore-installed']
-    command += ['--report', '-', '-c', str(FOLDER / 'constraints.txt')]
+    command = [python, '-c', PIP_OF_FIRST_RELEASE, 'install', '--dry-run', '--quiet']
+    command += ['--ignore-installed', '--report', '-', '-c', str(FOLDER / 'constraints.txt')]
     for name in (*BASE, *LOCKED_EXTRAS):
         command += ['-r', str(FOLDER / f'{name}.txt')]
     report: dict[str, Any] = json.loads(subprocess.check_output(command))

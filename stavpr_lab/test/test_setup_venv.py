@@ -3,12 +3,14 @@
 """Tests of the set-up behind the Makefile; none of them needs a network."""
 
 import ast
+from importlib import metadata
 import os
 from pathlib import Path
 import platform
 import re
 import sys
 
+from packaging.specifiers import SpecifierSet
 import pytest
 import setup_venv
 
@@ -133,6 +135,22 @@ def test_lock_has_every_requirement_of_every_python_with_a_hash():
     assert {name: found[name] for name in pins if name in found} == {
         name: version for name, version in pins.items() if name in found
     }
+
+
+def test_pins_are_for_the_first_release_of_this_python():
+    texts = [(ROOT / 'requirements' / f'{name}.txt').read_text() for name in GROUPS]
+    first = f'{setup_venv.PYTHON_VERSION}.0'
+    compared = 0
+    for name, version in {pin for text in texts for pin in EXACT.findall(text)}:
+        try:
+            package = metadata.metadata(name)
+        except metadata.PackageNotFoundError:
+            continue  # of an extra that is not installed
+        if package['Version'] == version:  # the pin of this Python
+            needs = package.get('Requires-Python', '')
+            assert SpecifierSet(needs).contains(first), f'{name} {version} needs Python {needs}'
+            compared += 1
+    assert compared > 200
 
 
 @pytest.mark.parametrize('step', ['venv', 'pip'])
