@@ -145,6 +145,7 @@ pose-graphs: build ## measure the pose graph on KITTI in groups, and on public g
 	@$(RUN) python benchmarks/graph_methods.py --drives
 	@$(RUN) python benchmarks/graph_files.py $(ARGS)
 
+shell: override EXTRAS += evaluation
 shell: build ## open a bash in which the built packages are found
 	@echo 'The executables are in $(EXECUTABLES)/ and $(LAB)/. Leave with exit.'
 	@$(RUN) env PS1='(stavpr_ros) \w\$$ ' bash --norc -i || true

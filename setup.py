@@ -111,6 +111,7 @@ distribution = setup(
     ],
     python_requires='>=3.11',
     install_requires=[
+        'av>=18',
         'llvmlite',  # the version that numba pins
         'numba>=0.59',
         'numpy>=1.26',
@@ -135,7 +136,7 @@ distribution = setup(
         'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,
         'torch': ['torch>=2.10'],
-        'video': ['av>=18'],
+        'video': [],  # PyAV is installed by default; the name stays for older instructions
     },
     zip_safe=False,
     entry_points=entry_points,

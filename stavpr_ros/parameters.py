@@ -156,7 +156,7 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             'raw',
             'raw: sensor_msgs/Image on the topic image; compressed: sensor_msgs/CompressedImage '
             'on the topic image/compressed (follows a remapping of image); ffmpeg, foxglove: '
-            'video on image/ffmpeg, image/foxglove, of the extra video (docs/integration.md).',
+            'video on image/ffmpeg, image/foxglove, decoded by PyAV (docs/integration.md).',
             choices=('raw', 'compressed', 'ffmpeg', 'foxglove'),
         ),
         NodeParameter(
