@@ -14,10 +14,12 @@ import platform
 import shutil
 import sys
 import tempfile
+from typing import Any
 
 from llvmlite import binding
 import numba as nb
 from numba.core import event
+from stavpr_ros.kernel_cache import KernelCache
 from tqdm import tqdm
 
 AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hwcap.h
@@ -65,10 +67,13 @@ def _temporary_folder(template: Path | None) -> Path | None:
         folder = Path(tempfile.gettempdir()) / f'stavpr_kernels_{os.getuid()}'
         if not folder.exists():
             copy = Path(tempfile.mkdtemp())
-            if template is not None:
-                shutil.copytree(template, copy, dirs_exist_ok=True)
-            copy.chmod(0o700)
-            copy.rename(folder)
+            try:
+                if template is not None:
+                    shutil.copytree(template, copy, dirs_exist_ok=True)
+                copy.chmod(0o700)
+                copy.rename(folder)
+            finally:  # of a full disk
+                shutil.rmtree(copy, ignore_errors=True)
         status = folder.lstat()
     except (OSError, shutil.Error):
         return None
@@ -162,12 +167,23 @@ if CACHE is not None:
         shutil.rmtree(CACHE, ignore_errors=True)  # of an earlier version of the package
     CACHE = of_version
     nb.config.CACHE_DIR = str(CACHE)
-_can_cache = CACHE is not None
 
-kernel = nb.njit(cache=_can_cache, nogil=True, error_model='numpy')
-parallel_kernel = nb.njit(cache=_can_cache, nogil=True, parallel=True, error_model='numpy')
+
+def _decorator(**options: Any) -> Any:
+    """Return a decorator of kernels, which are kept in the cache if there is one."""
+    compiled = nb.njit(nogil=True, error_model='numpy', **options)
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = compiled(function)
+        if CACHE is not None:
+            dispatcher._cache = KernelCache(function)
+        return dispatcher
+
+    return decorate
+
+
+kernel = _decorator()
+parallel_kernel = _decorator(parallel=True)
 # Sums in any order, products fused into them: dot products over lanes. Infinities and NaN stay as
 # they are.
-reassociating_kernel = nb.njit(
-    cache=_can_cache, nogil=True, error_model='numpy', fastmath={'reassoc', 'contract', 'nsz'}
-)
+reassociating_kernel = _decorator(fastmath={'reassoc', 'contract', 'nsz'})
