@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
@@ -22,6 +23,13 @@ from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
 HALF = np.diag([1.0, 1, 1, 2, 2, 2])
 OUT_OF_PLANE = 1e4  # information of z, roll and pitch that a plane's edges are given
 ORDER = [3, 4, 5, 0, 1, 2]  # rotation first, or translation
+SIZES = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}  # numbers of a pose, of its information
+BOMS = b'\xff\xfe', b'\xfe\xff'  # of UTF-16
+MAX_ANGLE = 100.0  # rad, of many turns
+NO_MOTION = 1e-6  # m, or of a quaternion
+NORM_ERROR = 0.1  # of a quaternion in text, of a few digits
+ROUNDING = 1e-12  # of an eigenvalue, in parts of the greatest
+INFORMATION = 1e-11, 1e15  # least and greatest eigenvalue: of 3e5 and 3e-8 m
 Edge = tuple[int, int, np.ndarray, np.ndarray]  # start, end, motion (4, 4), information (6, 6)
 
 
@@ -61,24 +69,29 @@ def read_edges(path: str) -> list[Edge]:
     Read the edges of a file; those in the plane (SE2) become rigid motions.
 
     :returns: the information has the translation first, and whole rotations.
-    :raises InputError: it cannot be read, or a line is neither a vertex nor an edge of poses.
+    :raises InputError: it cannot be read, has no edge, or a line is neither a vertex nor an edge
+        of poses with numbers that can be computed with.
     """
     edges = []
     try:
-        lines = Path(path).read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        content = Path(path).read_bytes()
+        lines = content.decode('utf-16' if content[:2] in BOMS else 'utf-8-sig').splitlines()
+    except OSError as error:
         raise InputError(f'{path}: {error}') from error
+    except UnicodeDecodeError as error:
+        raise InputError(f'{path} is no text ({error}): decompress or convert it') from error
     for number, line in enumerate(lines, 1):
         tag, *fields = line.split() or ['#']
         if tag.startswith(('VERTEX_SE', 'FIX', 'PARAMS', '#')):
             continue
         try:
             edges.append(_edge(tag, fields))
-        except (ValueError, KeyError, np.linalg.LinAlgError):
+        except (ValueError, InputError) as error:
             raise InputError(
-                f'{path}, line {number}: expected VERTEX_SE2, VERTEX_SE3:QUAT, EDGE_SE2 or '
-                f'EDGE_SE3:QUAT with its numbers, found {line[:60]!r}'
-            ) from None
+                f'{path}, line {number}: {error}, found {line.strip()[:60]!r}'
+            ) from error
+    if not edges:
+        raise InputError(f'{path} has no edge: expected lines of {" or ".join(SIZES)}')
     return edges
 
 
@@ -86,21 +99,67 @@ def _edge(tag: str, fields: list[str]) -> Edge:
     """
     Return the edge of a line.
 
-    :raises ValueError, KeyError, LinAlgError: it is none.
+    :raises ValueError, InputError: it is none, or its numbers cannot be computed with.
     """
-    pose, freedom = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}[tag]
+    if tag not in SIZES:
+        raise ValueError(
+            f'{tag} is not read: expected VERTEX_SE2, VERTEX_SE3:QUAT, {" or ".join(SIZES)}'
+        )
+    pose, freedom = SIZES[tag]
+    count = 2 + pose + freedom * (freedom + 1) // 2
+    if len(fields) != count:
+        raise ValueError(f'{tag} has {len(fields)} numbers: expected {count}')
+    numbers = np.array([*map(_number, fields)])
     start, end = int(fields[0]), int(fields[1])
-    values = np.array(fields[2:], np.float64)
     upper = np.zeros((freedom, freedom))
-    upper[np.triu_indices(freedom)] = values[pose:]
+    upper[np.triu_indices(freedom)] = numbers[2 + pose :]
     own = upper + np.triu(upper, 1).T
-    np.linalg.cholesky(own)
+    _require_invertible(own)
     if freedom == 3:
         information, at = np.eye(6) * OUT_OF_PLANE, [0, 1, 5]
         information[np.ix_(at, at)] = own
-        return start, end, matrices(planar_poses(values[None, :3])[0]), information
-    half = np.linalg.inv(HALF)
-    return start, end, matrices(values[:7]), half @ own @ half
+        if abs(numbers[4]) > MAX_ANGLE:
+            raise ValueError(f'an angle of {numbers[4]:g} rad: expected -pi to pi')
+        motion = planar_poses(numbers[None, 2:5])[0]
+    else:
+        information, motion = np.linalg.inv(HALF) @ own @ np.linalg.inv(HALF), numbers[2:9]
+        norm = float(np.linalg.norm(motion[3:]))
+        if abs(norm - 1) > NORM_ERROR:
+            raise ValueError(f'a quaternion of norm {norm:.3g}: expected qx qy qz qw of norm 1')
+    if start == end and abs(motion[:6]).max() > NO_MOTION:
+        raise ValueError(f'an edge with a motion from vertex {start} to itself')
+    return start, end, matrices(checked_pose(motion)), information
+
+
+def _number(field: str) -> float:
+    """
+    Return the number of a field.
+
+    :raises ValueError: it is none, or not finite.
+    """
+    try:
+        value = float(field.replace('_', '?'))  # Python reads 1_0 as 10
+    except ValueError:
+        raise ValueError(f'{field!r} is no number: expected one such as 1.25e-3') from None
+    if not np.isfinite(value):
+        raise ValueError(f'the number {field} is not finite: correct it or remove the line')
+    return value
+
+
+def _require_invertible(information: np.ndarray) -> None:
+    """Raise ValueError where an information matrix states no errors of its edge."""
+    least, *_, most = np.linalg.eigvalsh(information).tolist()
+    if least < -ROUNDING * most or most <= 0:
+        raise ValueError(
+            f'the information matrix is indefinite, with an eigenvalue of {least:.3g}: expected '
+            'the inverse of a covariance, upper triangle by rows'
+        )
+    if least <= max(ROUNDING * most, INFORMATION[0]) or most > INFORMATION[1]:
+        raise ValueError(
+            f'the information matrix has eigenvalues of {least:.3g} to {most:.3g}, without an '
+            'inverse (semidefinite) or nearly so: expected a positive definite one; give '
+            'directions of which nothing is known (0) a small information, such as 1e-3'
+        )
 
 
 def _reversed(start: int, end: int, motion: np.ndarray, information: np.ndarray) -> Edge:
@@ -114,10 +173,12 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
     Return a pose graph of edges; it is not solved yet.
 
     Edges between a vertex and the next larger number are its odometry, with their information as
-    given; all others, and second ones, are closures. A node is at a second of its own.
+    given; all others, and second ones, are closures. Those from a vertex to itself, which state
+    nothing, are left out. A node is at a second of its own.
 
     :raises InputError: two successive vertices have no edge, or a value is not finite.
     """
+    edges = [edge for edge in edges if edge[0] != edge[1]]
     numbers = sorted({number for edge in edges for number in edge[:2]})
     node = {number: i for i, number in enumerate(numbers)}
     odometry: dict[int, Edge] = {}
