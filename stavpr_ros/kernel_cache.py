@@ -55,12 +55,12 @@ class _Files(IndexDataCacheFile):
     digest of the rest, without which nothing is unpickled.
     """
 
-    def _path(self, key: tuple) -> Path:
+    def _path(self, key: object) -> Path:
         text = f'{self._version} {self._source_stamp} {key}'
         name = hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
         return Path(self._index_path).with_suffix(f'.{name}.nbc')
 
-    def load(self, key: tuple) -> Any:
+    def load(self, key: object) -> Any:
         """
         Return what was saved, None = nothing.
 
@@ -76,7 +76,7 @@ class _Files(IndexDataCacheFile):
             raise ValueError(f'{self._path(key).name} is not as it was written')
         return pickle.loads(rest)
 
-    def save(self, key: tuple, data: Any) -> None:
+    def save(self, key: object, data: Any) -> None:
         """Write a file in one step."""
         path, rest = self._path(key), self._dump(data)
         if path.is_dir() and not path.is_symlink():
