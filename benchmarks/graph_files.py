@@ -32,10 +32,10 @@ from results import environment, RESULTS, ROOT, table, write_json
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from stavpr_ros.mapping.transforms import inverse, to_poses
+from stavpr_ros.progress import Progress
 from stavpr_slam.pose_graph import g2o, PoseGraph
 from stavpr_slam.pose_graph.g2o import Edge, graph_of, read_edges
 from stavpr_slam.pose_graph.transforms import adjoints
-from tqdm import tqdm
 
 FILES = 'MIT', 'intel', 'manhattan', 'smallGrid3D', 'sphere2500', 'parking-garage'
 KINDS = {'random': (1, 0), 'grouped': (10, 0), 'locally grouped': (10, 40)}
@@ -274,7 +274,7 @@ def main() -> None:
     jobs = product(options.files, options.methods, options.kinds, options.shares)
     for name, group in groupby(jobs, key=lambda job: job[0]):
         solved: list[tuple[list[Edge], np.ndarray]] = []
-        for _, method, kind, share in tqdm(list(group), desc=name):
+        for _, method, kind, share in Progress(list(group), desc=name):
             key = {'file': name, 'method': method, 'kind': kind, 'share': share}
             before = next((row for row in rows if key.items() <= row.items()), {})
             code = version(method)

@@ -32,6 +32,7 @@ from stavpr_lab.demonstration import false_places
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import drive_laps
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.progress import Progress
 from stavpr_slam.pose_graph import (
     breaks,
     Closure,
@@ -43,7 +44,6 @@ from stavpr_slam.pose_graph import (
     runs,
 )
 from stavpr_slam.pose_graph.transforms import body_covariance, planar_poses
-from tqdm import tqdm
 
 SAME = np.array([0, 0, 0, 0, 0, 0, 1.0])
 NEARBY = np.diag([3.0] * 3 + [np.radians(20)] * 3) ** 2  # of KITTI's closures
@@ -401,8 +401,8 @@ def main() -> None:
     ]
     context = multiprocessing.get_context('spawn')
     with ProcessPoolExecutor(options.jobs, context) as pool:
-        right = list(tqdm(pool.map(reference, drives), total=len(drives), unit='drive'))
-        rows = list(tqdm(pool.map(measure, jobs), total=len(jobs), unit='solution'))
+        right = list(Progress(pool.map(reference, drives), total=len(drives), unit='drive'))
+        rows = list(Progress(pool.map(measure, jobs), total=len(jobs), unit='solution'))
     lines = table(rows, right)
     about = environment()
     result = {'about': about, 'table': lines, 'right closures alone': right, 'rows': rows}

@@ -42,10 +42,10 @@ from stavpr_lab.evaluation.metrics import (
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, PlaceMap, select_places
+from stavpr_ros.progress import Progress
 from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.sources import open_source
-from tqdm import tqdm
 
 SETTINGS = RecognizerSettings(mode='robust')
 LONG = 1000  # places from which a route is driven only around the removed stretch
@@ -364,7 +364,7 @@ class Measurement:
     ) -> list[Outcome]:
         pairs = [(a, b) for a in floors for b in floors if a != b][:: self.coarser]
         shares, outcomes = {}, []
-        for map_name, query_name in tqdm(pairs, desc='floors', leave=False):
+        for map_name, query_name in Progress(pairs, desc='floors', leave=False):
             place_map, query = maps[map_name], floors[query_name]
             nothing = GroundTruth(len(query), len(place_map), np.zeros(0, np.int64))
             one = outcome(place_map, query.features, nothing)

@@ -10,21 +10,22 @@ up to 3 degrees, and its distance from the path changes by 0.15 m.
 
 import math
 import sys
+from typing import Any
 
 import numpy as np
 from stavpr_lab.demonstration.repeat import CONDITIONS, teach, View
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
+from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
-from tqdm import tqdm
 
 SEEDS = (7, 21, 33)
 LEFT = (-1.0, 0.0, 0.5, 1.0, 2.0)  # meters from the path
 WITHIN, SWAY, TURNED = range(10, 110), 0.15, math.radians(3)
 
 
-def rows(seed: int, progress: tqdm) -> list[str]:
+def rows(seed: int, progress: Any) -> list[str]:
     """Return the rows of a street."""
     taught, lines = teach(RingWorld(seed), 0.0, 60.0), []
     images = [taught.place_map.thumbnail(k) for k in range(len(taught.poses))]
@@ -59,7 +60,7 @@ def main() -> int:
     """Run the command."""
     seeds = [int(each) for each in sys.argv[1:]] or SEEDS
     total = len(seeds) * len(LEFT) * len(CONDITIONS) * len(WITHIN)
-    with tqdm(total=total, unit='image') as progress:
+    with Progress(total=total, unit='image') as progress:
         lines = [line for seed in seeds for line in rows(seed, progress)]
     print('| street | left of the path | valid | mean | RMS | within 2 deviations | heading |')
     print('|---|---|---|---|---|---|---|')

@@ -28,11 +28,11 @@ from stavpr_lab.demonstration.false_places import FalsePlaces
 from stavpr_lab.demonstration.slam import trajectory_errors
 from stavpr_lab.demonstration.street.laps import CARRIED, drive_laps, LapDrive
 from stavpr_ros.mapping.transforms import inverse, matrices
+from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.pair import Source
 from stavpr_slam.pose_graph import Closure, optimize, PoseGraph
 from stavpr_slam.pose_graph.transforms import planar_poses
-from tqdm import tqdm
 
 DRIFTS = {'large': 1.0, 'small': 0.06}  # factors on the errors of the odometry
 FALSE = {'random 30': (0.3, False), 'coherent 30': (0.3, True), 'coherent 50': (0.5, True)}
@@ -277,7 +277,7 @@ def main() -> None:
                 pool.submit(measure_world, seed, options.draws, folder, folder)
                 for seed in options.seeds
             ]
-            for future in tqdm(as_completed(running), total=len(running), unit='world'):
+            for future in Progress(as_completed(running), total=len(running), unit='world'):
                 future.result()
         rows = [
             json.loads((folder / f'slam-{seed}-{draw}.json').read_text())

@@ -25,11 +25,11 @@ from stavpr_lab.demonstration.street.laps import LapDrive, RingWorld
 from stavpr_lab.demonstration.street.traverses import LENGTH
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.plots import page
+from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.sources import open_source
 from stavpr_slam.pose_graph import optimize
 from stavpr_slam.pose_graph.transforms import planar_poses
-from tqdm import tqdm
 
 HALLWAY_LENGTH = 40.0  # meters of a lap; laps of Gardens Point get the length of the street
 HALLWAY_EXCLUDED = 20  # latest images, as the ground truth has them
@@ -110,7 +110,7 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     drawn: dict[str, tuple[LapDrive, np.ndarray]] = {}
     cases = list(product(sets, DRIFTS, options.seeds, range(options.draws)))
-    for name, drift, seed, draw in tqdm(cases, unit='drive'):
+    for name, drift, seed, draw in Progress(cases, unit='drive'):
         (images, at, length), exclude = sets[name]
         drive = drive_of(at, length, seed, draw, DRIFTS[drift])
         row, poses = measure(images, drive, exclude)

@@ -20,6 +20,7 @@ from llvmlite import binding
 import numba as nb
 from numba.core import event
 from stavpr_ros.kernel_cache import KernelCache
+from stavpr_ros.progress import shows_bars
 from tqdm import tqdm
 
 AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hwcap.h
@@ -117,7 +118,7 @@ class _Progress(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         """Show a progress bar, or announce the first kernel, on a terminal or not."""
-        if self.announce is None and not sys.stderr.isatty():
+        if self.announce is None and not shows_bars():
             self.announce = partial(print, file=sys.stderr, flush=True)
         if self._depth == 0 and self.announce is None:
             self._bar = tqdm(

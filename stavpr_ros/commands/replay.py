@@ -16,6 +16,7 @@ from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run
 from stavpr_ros.commands.record import Recorder
 from stavpr_ros.errors import ImageError, left_out, SourceError, StavprError, UnavailableError
 from stavpr_ros.output_file import atomic_output, RECORDING
+from stavpr_ros.progress import shows_bars
 from stavpr_ros.ros.messages import message_class
 from stavpr_ros.ros.process import own_arguments, prepare_transport, ros_node
 from stavpr_ros.ros.replay import (
@@ -100,7 +101,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
     whole = options.duration == math.inf and not (options.start_offset or options.loop)
     # no bar without a terminal
     with tqdm(
-        total=len(source) if whole else None, unit='image', desc='replay', disable=None
+        total=len(source) if whole else None, unit='image', desc='replay', disable=not shows_bars()
     ) as bar:
         prepare_transport()
         with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:

@@ -41,9 +41,11 @@ def all_commands() -> dict[str, Command]:
 
 def usage() -> str:
     """Return the help text."""
+    commands = all_commands()
+    width = max(map(len, commands)) + 2
     rows = ''.join(
-        f'  {name:<14}{row.summary}{" (ROS 2)" * row.needs_ros}\n'
-        for name, row in all_commands().items()
+        f'  {name:<{width}}{row.summary}{" (ROS 2)" * row.needs_ros}\n'
+        for name, row in commands.items()
     )
     return (
         'usage: stavpr COMMAND [OPTION ...]\n'

@@ -36,6 +36,7 @@ from stavpr_lab.demonstration.street.traverses import (
 from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.progress import Progress
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
@@ -369,7 +370,7 @@ def main() -> None:
         '| mean | RMS |',
         '|---|---|---|---|---|---|---|---|---|---|',
     ]
-    for seed, lap in enumerate(tqdm(LAPS[: arguments.laps], unit='lap')):
+    for seed, lap in enumerate(Progress(LAPS[: arguments.laps], desc='repeat', unit='lap')):
 
         def keep(image: np.ndarray, _: float) -> np.ndarray:
             if arguments.laps == 1:
