@@ -3,6 +3,7 @@
 """``ros2 run stavpr_lab demo``: from two traverses to matches, numbers and plots, over ROS."""
 
 import argparse
+import fcntl
 from pathlib import Path
 import shutil
 import sys
@@ -173,8 +174,12 @@ def _run(arguments: argparse.Namespace) -> None:
             raise SettingsError(f'--{name} {input_path} is in {folder}: give another --output')
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / WRITTEN).open('a')
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         _remove_earlier(folder)
         others = set(folder.iterdir())
+    except BlockingIOError as error:
+        raise SettingsError(f'another demo writes to {folder}: give another --output') from error
     except OSError as error:
         raise SourceError(f'folder {folder} cannot be made or emptied: {error}') from error
     try:
@@ -187,6 +192,7 @@ def _run(arguments: argparse.Namespace) -> None:
     finally:
         names = sorted(path.name for path in set(folder.iterdir()) - others)
         (folder / WRITTEN).write_text('\n'.join(names))
+        lock.close()
     _print(f'   {time.monotonic() - began:.0f} s in all')
 
 

@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 import random
 import signal
+import socket
 import subprocess
 import time
 from typing import Any
@@ -23,6 +24,10 @@ from stavpr_ros.signals import signals_deferred
 START_TIMEOUT = 180.0  # seconds for the node to load the map and to compile
 END_TIMEOUT = 20.0  # seconds for a process to end, or for the next record
 POLL_SECONDS = 0.05
+# Of DDS: the port at which the first participant of domain 0 is discovered, and ports of a domain
+FIRST_PORT, PORTS, DOMAINS = 7410, 250, range(1, 102)
+SETTINGS_OF_ROS = 'ROS_', 'RMW_', 'RCUTILS_', 'FASTRTPS_', 'FASTDDS_', 'CYCLONEDDS_', 'ZENOH_'
+KEPT = 'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_LOG_DIR', 'ROS_HOME'
 REFUSED = 'cannot configure: '  # in the log of the node
 
 Process = subprocess.Popen[bytes]
@@ -44,12 +49,32 @@ def executable(name: str, package: str = 'stavpr_ros') -> str:
         ) from error
 
 
+def free_domain() -> int:
+    """Return a ROS domain in which this machine has no DDS participant."""
+    for domain in random.sample(DOMAINS, 20):
+        try:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(('', FIRST_PORT + PORTS * domain))
+        except OSError:
+            continue
+        break
+    return domain
+
+
 def private_domain() -> dict[str, str]:
-    """Return an environment with a ROS domain of its own, unless the user has chosen one."""
-    environment = dict(os.environ)
-    environment.setdefault('ROS_DOMAIN_ID', str(random.randrange(1, 100)))
-    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    return environment
+    """
+    Return an environment with a ROS domain of its own, on this machine.
+
+    Without the user's settings of transport, discovery, security and log format, which could let
+    other cameras in, or nothing at all.
+    """
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name in KEPT or not name.startswith(SETTINGS_OF_ROS)
+    }
+    own = {'ROS_DOMAIN_ID': str(free_domain()), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    return environment | own
 
 
 def run_live(
@@ -76,6 +101,8 @@ def run_live(
     :raises StavprError: a process failed; names its log.
     """
     environment = private_domain()
+    domain = environment['ROS_DOMAIN_ID']
+    print(f'   the ROS domain is {domain}, of this demonstration alone', flush=True)
     parameters = [f'{name}:={value}' for name, value in node_parameters.items()]
     node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
     replay = [executable('replay'), query.path, '--lossless', '--wait', '120', *replay_options]
@@ -96,6 +123,17 @@ def run_live(
         enough = len(recorders) == 1 or len(_records(closures)) >= accepted
         return len(records) >= images and enough
 
+    def has_ended(player: Process) -> bool:
+        """Return whether the replay has ended; reject matches of images of others."""
+        count = matches.read_bytes().count(b'\n') if matches.exists() else 0
+        if count > images:
+            raise StavprError(
+                f'{count} matches of {images} images: another program publishes images in the '
+                f'ROS domain {domain} as well; stop it, or start the demonstration again, which '
+                'takes another domain'
+            )
+        return player.poll() is not None
+
     def size() -> int:
         return sum(file.stat().st_size for file in (matches, closures) if file.exists())
 
@@ -115,17 +153,35 @@ def run_live(
         with ExitStack() as replaying:
             with signals_deferred():
                 player = replaying.enter_context(_running(replay, None, environment))
-            wait_until(lambda: player.poll() is not None, math.inf, 'the end of the replay')
+            wait_until(partial(has_ended, player), math.inf, 'the end of the replay')
         if player.returncode != 0:
-            raise StavprError(f'the replay ended with {player.returncode}, see {folder}/node.log')
+            raise StavprError(
+                f'the replay ended with {player.returncode}, its reason is above; see also '
+                f'{folder}/node.log'
+            )
+        has_ended(player)
         while not complete():  # a slow processor still completes loop closures
             grown = partial(lambda last_size: complete() or size() > last_size, size())
             wait_until(grown, END_TIMEOUT, 'the last record')
-        at_end(_records(closures), environment)
+        with _applied(environment):
+            at_end(_records(closures), environment)
     records = _records(matches)
     if len(records) != images:
         raise StavprError(f'{len(records)} matches of {images} images, see the logs in {folder}')
     return records, _records(closures)
+
+
+@contextmanager
+def _applied(environment: dict[str, str]) -> Iterator[None]:
+    """Give this process an environment while the block runs."""
+    own = dict(os.environ)
+    os.environ.clear()
+    os.environ.update(environment)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(own)
 
 
 @contextmanager
