@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
 
+import subprocess
+import sys
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
@@ -12,7 +14,7 @@ EXECUTABLES = (
     'build_descriptor_map', 'demo', 'evaluate', 'experiments', 'export_model', 'monitor', 'weights'
 )  # fmt: skip
 
-setup(
+distribution = setup(
     name=NAME,
     version=MANIFEST.findtext('version'),
     description='Evaluation, baselines and demonstration of stavpr_ros.',
@@ -49,3 +51,13 @@ setup(
     },
     zip_safe=False,
 )
+by_colcon = not {'--build-base', '--build-directory'}.isdisjoint(sys.argv)
+if by_colcon and '--uninstall' not in sys.argv:
+    # fill the cache of compiled kernels, as the first start would; never fail
+    install = distribution.get_command_obj('install').install_lib
+    call = 'import sys; from stavpr_ros.commands.warm import main; sys.exit(main([]))'
+    command = [sys.executable, '-c', call]
+    folder = '.' if 'develop' in sys.argv else install  # in which Python finds the package
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    lines = (done.stdout if done.returncode == 0 else done.stderr).splitlines() or ['']
+    print(lines[-1] if done.returncode == 0 else f'kernels are not compiled: {lines[-1]}')

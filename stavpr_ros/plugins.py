@@ -20,6 +20,9 @@ FEATURES = 'stavpr.features'
 STORES = 'stavpr.stores'
 """Schemes of addresses of maps; see :class:`stavpr_ros.mapping.stores.Store`."""
 
+KERNELS = 'stavpr.kernels'
+"""Functions that compile the kernels of their package, for ``stavpr warm``."""
+
 
 def resolve(target: str) -> Any:
     """Import and return the object that ``package.module:name`` names."""

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package description for ``colcon build``; the setup.py of stavpr_ros has that for pip."""
 
+import subprocess
+import sys
 from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
@@ -9,7 +11,7 @@ from setuptools import find_packages, setup
 MANIFEST = ElementTree.parse('package.xml')
 NAME = 'stavpr_slam'
 
-setup(
+distribution = setup(
     name=NAME,
     version=MANIFEST.findtext('version'),
     description='SLAM with the loop closures of stavpr_ros: pose graph and bridges.',
@@ -36,3 +38,13 @@ setup(
     ],
     zip_safe=False,
 )
+by_colcon = not {'--build-base', '--build-directory'}.isdisjoint(sys.argv)
+if by_colcon and '--uninstall' not in sys.argv:
+    # fill the cache of compiled kernels, as the first start would; never fail
+    install = distribution.get_command_obj('install').install_lib
+    call = 'import sys; from stavpr_ros.commands.warm import main; sys.exit(main([]))'
+    command = [sys.executable, '-c', call]
+    folder = '.' if 'develop' in sys.argv else install  # in which Python finds the package
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    lines = (done.stdout if done.returncode == 0 else done.stderr).splitlines() or ['']
+    print(lines[-1] if done.returncode == 0 else f'kernels are not compiled: {lines[-1]}')

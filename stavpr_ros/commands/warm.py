@@ -9,13 +9,13 @@ from stavpr_ros.commands.program import make_parser, run_program, say
 EPILOG = """The folder is NUMBA_CACHE_DIR, or else the package's or, if it cannot be
 written, ~/.cache/stavpr.
 
-exit codes: 0 done; 1 no folder can be written; 2 usage error; 130 interrupted
+exit codes: 0 done; 1 the folder cannot be written; 2 usage error; 130 interrupted
 """
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
-    text = 'Compile the kernels of all operations into the cache, where they are missing.'
+    text = 'Compile the kernels of all packages into the cache, where they are missing.'
     parser = make_parser('warm', text, EPILOG)
     args = sys.argv[1:] if arguments is None else arguments
     return run_program('warm', lambda: _run(parser.parse_args(args)))
@@ -23,9 +23,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(_: object) -> None:
     import numpy as np
+    from stavpr_ros import kernel_cache, plugins
     from stavpr_ros.compilation import CACHE
     from stavpr_ros.errors import OutputError
-    from stavpr_ros.mapping import build_map
+    from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.pipeline import PipelineSettings
     from stavpr_ros.pipeline.operations import Localizer, RouteCloser
     from stavpr_ros.pipeline.save_state import SaveState
@@ -43,5 +44,14 @@ def _run(_: object) -> None:
             route = build_map(frames, extractor, progress=False)
             Localizer(settings, route, extractor, SaveState())
             RouteCloser(settings, None, extractor, SaveState())
+            if mode == 'robust':  # maps of several sessions, and the first stage
+                both = merge_maps([route, route], ['a', 'b'])
+                Localizer(settings, both, extractor, SaveState())
+    settings = PipelineSettings(backend='cpu', time_budget_ms=1e-3)
+    Localizer(settings, route, extractor, SaveState())
     OffsetFilter().update(*[describe_columns(images[0])] * 2)
+    for compile_kernels in plugins.load(plugins.KERNELS).values():
+        compile_kernels()
+    if reason := kernel_cache.failures.get(kernel_cache.WRITE_FAILED):
+        raise OutputError(f'{CACHE} cannot be written: {reason}')
     say(f'the kernels are in {CACHE}')

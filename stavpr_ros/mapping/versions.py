@@ -14,7 +14,7 @@ from pathlib import Path
 import shutil
 import time
 
-from stavpr_ros.errors import InputError, MapFileError
+from stavpr_ros.errors import InputError, MapFileError, OutputError
 from stavpr_ros.mapping.map_container import read_json
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.map_schema import integer, list_of, number, record, text
@@ -110,14 +110,22 @@ def save_version(
     :raises OutputError: it cannot be written, or the file has changed; the map stays as it is.
     """
     folder = history_of(path)
-    folder.mkdir(exist_ok=True)
-    if not (old := folder / f'{before.map_id}.stavpr').exists():
-        _copy(Path(path), old, False)
+    old = folder / f'{before.map_id}.stavpr'
+    try:
+        folder.mkdir(exist_ok=True)
+        if not _is_sound(old, before.map_id):
+            old.unlink(missing_ok=True)
+            _copy(Path(path), old, False)
+    except OSError as error:
+        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
     features = open_map(path).features
     storage = features.storage if isinstance(features, StoredFeatures) else ''
     new = folder / 'new.stavpr'
     map_id = save_map(place_map, new, storage, force=True, statistics=statistics)
-    new.replace(folder / f'{map_id}.stavpr')
+    try:
+        new.replace(folder / f'{map_id}.stavpr')
+    except OSError as error:
+        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
     version = replace(
         version,
         map_id=map_id,
@@ -153,6 +161,14 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
         raise MapFileError(f'{file} is another map than its name states')
     _copy(file, Path(path), opened or False)
     return current_version(path)
+
+
+def _is_sound(file: Path, map_id: str) -> bool:
+    """Return whether a file is a version, undamaged."""
+    try:
+        return load_map(file).map_id == map_id
+    except MapFileError:
+        return False
 
 
 def _file(path: str | Path, version: Version) -> Path:

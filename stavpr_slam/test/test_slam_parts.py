@@ -3,6 +3,7 @@
 """Parts around the pose graph: sources of closures, stamps that jump back, tf."""
 
 import math
+import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -94,3 +95,24 @@ def test_camera_transform_of_tf_is_looked_up(context, monkeypatch):
     camera.close()
     assert ended == [True]
     node.destroy_node()
+
+
+OPTIMIZED = """
+import importlib, pkgutil, sys
+import stavpr_ros.alignment.cpu, stavpr_ros.filter, stavpr_slam
+for package in (stavpr_ros.alignment.cpu, stavpr_ros.filter, stavpr_slam):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):
+        importlib.import_module(module.name)
+from stavpr_ros.commands.stavpr import main
+assert __doc__ is None
+sys.exit(main(['bridge', '--help']) or main(['pose_graph', '--help']) or main(sys.argv[1:]))
+"""
+
+
+def test_package_runs_without_its_docstrings(tmp_path):
+    """As ``python -OO`` does."""
+    (tmp_path / 'a.g2o').write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n')
+    call = [sys.executable, '-OO', '-c', OPTIMIZED, 'optimize_graph', str(tmp_path / 'a.g2o')]
+    text = subprocess.check_output(call, text=True)
+    assert 'Publishes loop closures by PnP' in text
+    assert '2 poses, 0 closures' in text

@@ -9,13 +9,18 @@ from typing import Any
 from stavpr_ros.signals import run_until_signal
 
 TARGETS = {
-    'rtabmap': ('rtabmap', 'RtabmapBridge'),
-    'rtabmap_global_pose': ('rtabmap', 'GlobalPoseBridge'),
-    'hydra': ('pose_graph_tools', 'HydraBridge'),
-    'kimera': ('pose_graph_tools', 'KimeraBridge'),
-    'swarm_slam': ('swarm_slam', 'SwarmSlamBridge'),
-    'robot_localization': ('poses', 'RobotLocalizationBridge'),
-}
+    'rtabmap': ('rtabmap', 'RtabmapBridge', 'Adds loop closures to RTAB-Map as user closures.'),
+    'rtabmap_global_pose': ('rtabmap', 'GlobalPoseBridge', 'Publishes the pose on a map as '
+                            '``global_pose``, a prior of RTAB-Map; without its messages.'),
+    'hydra': ('pose_graph_tools', 'HydraBridge', 'Publishes loop closures on '
+              '``external_loop_closures`` of Hydra.'),
+    'kimera': ('pose_graph_tools', 'KimeraBridge', 'Publishes loop closures on '
+               '``pose_graph_incremental`` of Kimera-PGMO and Kimera-Distributed.'),
+    'swarm_slam': ('swarm_slam', 'SwarmSlamBridge', 'Publishes loop closures by PnP for '
+                   'Swarm-SLAM.'),
+    'robot_localization': ('poses', 'RobotLocalizationBridge', 'Publishes ``~/pose`` for a '
+                           '``poseN`` of robot_localization, once per relocalization.'),
+}  # fmt: skip
 HELP = """usage: bridge TARGET [--ros-args -p NAME:=VALUE ... -r stavpr/loop_closure:=TOPIC]
        bridge --help
 
@@ -46,14 +51,13 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _class(target: str) -> Any:
-    module, name = TARGETS[target]
+    module, name, _ = TARGETS[target]
     return getattr(importlib.import_module(f'stavpr_slam.ros.bridges.{module}'), name)
 
 
 def _describe(target: str) -> str:
     kind = _class(target)
-    summary = kind.__doc__.strip().splitlines()[0]
-    rows = [f'  {target}: {summary}\n']
+    rows = [f'  {target}: {TARGETS[target][-1]}\n']
     for name, (default, sentence) in kind.PARAMETERS.items():
         rows.append(f'      {name} (default {default!r}): {sentence}\n')
     return ''.join(rows)

@@ -444,3 +444,13 @@ class Solver:
                 return each
         self._patterns = [Pattern.of(self.ends, count, active), *self._patterns[: PATTERNS - 1]]
         return self._patterns[0]
+
+
+def compile_kernels() -> None:
+    """Compile all kernels, by a step of two poses, for ``stavpr warm``."""
+    ends, count = np.array([[-1, 0], [0, 1]]), 2
+    poses, weights = np.tile(np.eye(4), (count, 1, 1)), np.ones(count)
+    solver = Solver(ends, poses.copy(), np.arange(6))
+    solver.squared(poses, np.tile(np.eye(6), (count, 1, 1)))
+    solver.step(poses, weights)
+    solver.deviations(count, weights, np.array([1]))

@@ -21,6 +21,7 @@ from stavpr_lab.demonstration.street.traverses import (
     DETOUR_FROM,
     DETOUR_TO,
     EPOCH,
+    first_traverse,
     GOOD_LIGHT,
     LANE,
     LENGTH,
@@ -216,3 +217,11 @@ def drive_laps(
         own = session == number
         odometry[own] = relative_poses(odometry[own][0], odometry[own])
     return LapDrive(truth, odometry, stamps + session * NEXT_DAY, laps, images, session)
+
+
+def compile_kernels() -> None:
+    """Compile the renderer, by an image of each kind of drive, for ``stavpr warm``."""
+    world = World()
+    first_traverse(world)[0]
+    second_traverse(world)[0]
+    drive_laps().frame(0)

@@ -1,0 +1,84 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""``stavpr warm`` compiles what the documented commands use, and says where it cannot."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+from processes import environment, TIMEOUT
+import pytest
+from stavpr_ros import kernel_cache, plugins
+from stavpr_ros.commands import warm
+from stavpr_ros.compilation import KERNELS
+
+LISTENER = """
+import sys
+from numba.core import event
+names = []
+
+class Listener(event.Listener):
+    def on_start(self, event):
+        names.append(event.data['dispatcher'].py_func.__qualname__)
+
+    def on_end(self, event):
+        pass
+
+event.register('numba:compile', Listener())
+from stavpr_ros.commands.stavpr import main
+"""
+WARM = f"""{LISTENER}
+assert main(['warm']) == 0
+print(len(names))
+"""
+COMMANDS = f"""{LISTENER}
+for line in '''
+build_map --input monday --output monday.stavpr
+build_map --input tuesday --output tuesday.stavpr
+map merge both.stavpr monday.stavpr tuesday.stavpr
+map close monday.stavpr closed.stavpr
+map compact both.stavpr small.stavpr --pca 16 --storage float16
+evaluate --map both.stavpr --query tuesday --output report_both
+evaluate --map small.stavpr --query tuesday --output report_small --precision int8
+evaluate --map closed.stavpr --query tuesday --output report_closed --direction both
+evaluate --map monday.stavpr --query tuesday --json paper.json --mode paper --truth identity
+map update monday.stavpr tuesday
+optimize_graph graph.g2o --output solved.tum
+'''.strip().splitlines():
+    assert main(line.split()) == 0, line
+from stavpr_lab.demonstration.street.traverses import first_traverse, second_traverse, World
+first_traverse(World(3))[10], second_traverse(World(3))[70]
+print('compiled:', names)
+"""
+
+
+def test_nothing_is_compiled_after_warm(tmp_path):
+    """In an empty cache folder, by operations on maps of one and several sessions, and graphs."""
+    dice = np.random.default_rng(0)
+    route = [cv2.resize(i, (128, 96)) for i in dice.integers(0, 256, (60, 12, 16, 3), np.uint8)]
+    for day in ('monday', 'tuesday'):
+        (tmp_path / day).mkdir()
+        for number, image in enumerate(route):
+            noise = dice.integers(0, 20, image.shape).astype(np.uint8)
+            cv2.imwrite(str(tmp_path / day / f'{number:02}.png'), cv2.add(image, noise))
+    edges = [(i, i + 1) for i in range(39)] + [(i, i + 20) for i in range(20)]
+    lines = [f'EDGE_SE2 {i} {j} {i % 2} 0 0 9 0 0 9 0 9' for i, j in edges]
+    (tmp_path / 'graph.g2o').write_text('\n'.join(lines))
+    variables = environment() | {'NUMBA_CACHE_DIR': str(tmp_path / 'kernels')}
+    options = {'cwd': tmp_path, 'env': variables, 'text': True, 'timeout': 5 * TIMEOUT}
+    done = subprocess.check_output([sys.executable, '-c', WARM], **options)
+    assert int(done.splitlines()[-1]) == pytest.approx(KERNELS, rel=0.05)  # of any processor
+    done = subprocess.check_output([sys.executable, '-c', COMMANDS], **options)
+    assert done.splitlines()[-1] == 'compiled: []'
+
+
+def test_packages_with_kernels_compile_them():
+    assert plugins.load(plugins.KERNELS).keys() == {'stavpr_lab', 'stavpr_slam'}
+
+
+def test_warm_fails_where_the_cache_cannot_be_written(monkeypatch, capsys):
+    failures = {kernel_cache.WRITE_FAILED: '[Errno 28] No space left on device'}
+    monkeypatch.setattr(kernel_cache, 'failures', failures)
+    assert warm.main([]) == 1
+    assert 'cannot be written: [Errno 28] No space left' in capsys.readouterr().err
