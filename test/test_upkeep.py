@@ -328,6 +328,32 @@ def drives(rebuilt, around, tmp_path):
     return [str(file) for file in files]
 
 
+@pytest.mark.parametrize('length', [0, 1, 1000])
+def test_damaged_version_is_kept_anew_from_the_map(first, path, length):
+    """A battery that was pulled cut the copy of the present version, which the map still is."""
+    before, history = current_version(path), Path(f'{path}.history')
+    history.mkdir()
+    old = history / f'{before.map_id}.stavpr'
+    old.write_bytes(path.read_bytes()[:length])
+    smaller = keep_places(first, np.arange(20))
+    save_version(path, FileVersion.of(path), smaller, before, before, None)
+    assert len(load_map(path)) == 20
+    assert len(load_map(old)) == len(first)
+
+
+@pytest.mark.parametrize('name', ['', '/{}.stavpr'])
+def test_history_that_cannot_be_written_leaves_the_map(first, path, name):
+    before, content = current_version(path), path.read_bytes()
+    blocked = Path(f'{path}.history{name.format(before.map_id)}')
+    if name:
+        (blocked / 'file').mkdir(parents=True)
+    else:
+        blocked.write_text('')
+    with pytest.raises(OutputError, match=r'history cannot be written .*: .* is untouched'):
+        save_version(path, FileVersion.of(path), first, before, before, None)
+    assert path.read_bytes() == content
+
+
 def test_update_log_and_rollback(path, drives, capsys):
     ids = [load_map(path).map_id]
     for drive in drives:
