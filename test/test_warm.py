@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``stavpr warm`` compiles what the documented commands use, and says where it cannot."""
+"""``stavpr warm`` compiles what the documented commands use, and fails where it cannot."""
 
 import subprocess
 import sys
