@@ -64,7 +64,6 @@ ifneq ($(LEARNED),)
 demo: override EXTRAS += learned
 endif
 demo: build ## run the node on the synthetic street, or on your images (MAP= QUERY= LOOP= ARGS=)
-	@$(if $(LEARNED),$(RUN) $(LAB)/weights efficientnet_lite1)
 ifdef REPEAT
 	@$(RUN) python -m stavpr_lab.demonstration.repeat demo_output/repeat --length 150 --laps 1
 else

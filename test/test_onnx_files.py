@@ -18,6 +18,7 @@ import torch
 from torch import nn
 
 onnx = pytest.importorskip('onnx', reason='the extra onnx is not installed')
+onnxruntime = pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
 helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
 WEIGHTS = np.random.default_rng(0).standard_normal((8, 3, 8, 8)).astype(np.float32) / 50
 IMAGES = list(np.random.default_rng(1).integers(0, 256, (4, 48, 64, 3), np.uint8))
@@ -280,16 +281,17 @@ def providers(monkeypatch):
             used.extend(name for name in providers if name in (*loaded, CPU))
             return SimpleNamespace(
                 get_providers=lambda: used,
-                get_inputs=lambda: [SimpleNamespace(type='tensor(float)')],
+                get_inputs=lambda: [SimpleNamespace(type='tensor(float)', name='x')],
+                run=lambda outputs, inputs: [np.zeros((1, 4), np.float32)],
             )
 
         runtime = SimpleNamespace(
             get_available_providers=lambda: [*offered, CPU],
-            SessionOptions=SimpleNamespace,
+            SessionOptions=onnxruntime.SessionOptions,
             InferenceSession=session,
         )
         module = 'stavpr_ros.features.onnx'
-        monkeypatch.setattr(f'{module}.import_onnx', lambda: (onnx, runtime))
+        monkeypatch.setattr(f'{module}.import_onnxruntime', lambda: runtime)
         monkeypatch.setattr(f'{module}.choose_device', lambda name: name.replace('auto', 'cuda'))
         return used
 

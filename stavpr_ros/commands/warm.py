@@ -1,7 +1,8 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""``stavpr warm``: fill the cache of compiled kernels, for installations that are read-only."""
+"""``stavpr warm``: compile the kernels and make the network's file now, not at the first use."""
 
+from contextlib import suppress
 import sys
 
 from stavpr_ros.commands.program import make_parser, run_program, say
@@ -25,7 +26,8 @@ def _run(_: object) -> None:
     import numpy as np
     from stavpr_ros import kernel_cache, plugins
     from stavpr_ros.compilation import CACHE
-    from stavpr_ros.errors import OutputError
+    from stavpr_ros.errors import OutputError, UnavailableError
+    from stavpr_ros.features.efficientnet_lite import find_file
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.pipeline import PipelineSettings
     from stavpr_ros.pipeline.operations import Localizer, RouteCloser
@@ -54,4 +56,6 @@ def _run(_: object) -> None:
         compile_kernels()
     if reason := kernel_cache.failures.get(kernel_cache.WRITE_FAILED):
         raise OutputError(f'{CACHE} cannot be written: {reason}')
+    with suppress(UnavailableError):  # the extra learned is not installed
+        say(f'the network of features hybrid is {find_file()}')
     say(f'the kernels are in {CACHE}')

