@@ -31,7 +31,7 @@ def random_distances(seed, shape, levels=None):
     return np.float32(1) - products
 
 
-@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window'])
+@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'rigid', 'sliding_window'])
 @pytest.mark.parametrize(
     ('strips', 'xi', 'n', 'sigma', 'levels'),
     [
@@ -142,7 +142,15 @@ def expected_row(reference, query, i, settings, precision):
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
 @pytest.mark.parametrize(
     ('strategy', 'xi'),
-    [('adaptive', None), ('adaptive', 2), ('vanilla', 2), ('sliding_window', 2), ('none', None)],
+    [
+        ('adaptive', None),
+        ('adaptive', 2),
+        ('vanilla', 2),
+        ('rigid', None),
+        ('rigid', 2),
+        ('sliding_window', 2),
+        ('none', None),
+    ],
 )
 def test_distances_of_every_strategy_equal_oracle(device, monkeypatch, strategy, xi, precision):
     monkeypatch.setattr('stavpr_ros.prepare.device_matcher.WIDENED', 3 * W * D)

@@ -121,7 +121,7 @@ def test_rounding_moves_distances_little(d):
     )
 
 
-@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
+@pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'rigid', 'sliding_window', 'none'])
 def test_matcher_in_int8_equals_functions_of_its_strip_distances(strategy):
     reference, queries = features_of(random_strips(7, 300, 20)), random_strips(7, 3, 20, seed=1)
     spatial = SpatialSettings(strategy)

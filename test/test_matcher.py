@@ -42,7 +42,7 @@ def random_features(W, n, d, seed=0):
     W=st.integers(1, 15),
     n=st.sampled_from([0, 1, 15, 16, 17, 255, 256, 257]),
     d=st.sampled_from([1, 5, 16, 100]),
-    strategy=st.sampled_from(['adaptive', 'vanilla']),
+    strategy=st.sampled_from(['adaptive', 'vanilla', 'rigid']),
     data=st.data(),
 )
 def test_fused_distances_equal_separate_functions(W, n, d, strategy, data):
@@ -98,7 +98,7 @@ def test_kernels_of_one_and_two_threads_return_same_bits():
             make_matcher(features, SpatialSettings(strategy), 'cpu', precision).distance_matrix(
                 queries.strips, queries.weights
             )
-            for strategy in ('adaptive', 'vanilla', 'sliding_window')
+            for strategy in ('adaptive', 'vanilla', 'rigid', 'sliding_window')
             for precision in PRECISIONS
         ]
         sequences = match_sequence(matrices[0], SequenceSettings())

@@ -126,6 +126,16 @@ def test_sliding_window_by_hand():
     assert one(d, WINDOW) == 3
 
 
+def test_rigid_shift_by_hand():
+    d = np.ones((3, 3))
+    d[0, 1], d[1, 2] = 0.25, 0.5  # the place is one strip to the right
+    assert one(d, SpatialSettings('rigid')) == 0.375
+    assert one(d, SpatialSettings('rigid', xi=1)) == 1
+    d[2, 0] = 0.125  # two strips to the left
+    assert one(d, SpatialSettings('rigid')) == 0.125
+    assert one(d, SpatialSettings('rigid', xi=2)) == 0.375
+
+
 def check(d, strategy, sigma=1.0, xi=None):
     """Compare the kernel with the oracle."""
     dtype = d.dtype.type
@@ -142,7 +152,7 @@ def check(d, strategy, sigma=1.0, xi=None):
     n=st.sampled_from([0, 1, 2, 5, 9]),
     dtype=st.sampled_from(DTYPES),
     levels=st.sampled_from([0, 1, 2, 4, 10]),
-    strategy=st.sampled_from(['adaptive', 'vanilla', 'sliding_window']),
+    strategy=st.sampled_from(['adaptive', 'vanilla', 'rigid', 'sliding_window']),
     sigma=st.sampled_from([1.0, 0.0, 0.5, 0.3, 7.0]),
     restriction=st.integers(0, 9),
     banned=st.sampled_from([0.0, 0.0, 0.1, 0.5]),

@@ -77,7 +77,7 @@ def spatial_alignment(
     """
     Return the distance of one image to n others, as a function of those of strips (section 2).
 
-    :param settings: strategy ``adaptive``, ``vanilla`` or ``sliding_window``.
+    :param settings: any strategy but ``none``.
     :returns: function of d, (W, W, n), float32, that returns (n,).
     """
     band, c = settings.band(W), (W + 1) // 2 - 1
@@ -98,6 +98,16 @@ def spatial_alignment(
             total = total + d[t : t + windows, t : t + windows]
         return (total / WINDOW).masked_fill(banned, torch.inf).amin(dim=(0, 1))
 
+    def rigid(d: torch.Tensor) -> torch.Tensor:
+        best = torch.full_like(d[0, 0], torch.inf)
+        for s in range(1 - band, band):
+            pairs = d.diagonal(s)  # (n, W - |s|)
+            total = pairs[:, 0]
+            for i in range(1, W - abs(s)):
+                total = total + pairs[:, i]
+            best = torch.minimum(best, total / (W - abs(s)))
+        return best
+
     def warped(d: torch.Tensor) -> torch.Tensor:
         a = None
         if settings.strategy == 'adaptive':
@@ -107,7 +117,7 @@ def spatial_alignment(
         D = F[W] + (W - 1)
         return S[W] / ((-1 if a is None else a - 2) * D + (2 * W - 1))
 
-    return sliding_window if settings.strategy == 'sliding_window' else warped
+    return {'sliding_window': sliding_window, 'rigid': rigid}.get(settings.strategy, warped)
 
 
 def lm_dtw(window: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,7 +8,8 @@ import math
 from stavpr_ros.checks import require_above, require_at_least, require_choice, require_whole
 from stavpr_ros.errors import SettingsError
 
-STRATEGIES = ('adaptive', 'vanilla', 'sliding_window', 'none')
+STRATEGIES = ('adaptive', 'vanilla', 'rigid', 'sliding_window', 'none')
+MAX_SHIFT = 2  # strips that ``rigid`` shifts an image without xi
 
 
 @dataclass(frozen=True)
@@ -17,10 +18,11 @@ class SpatialSettings:
     How the distance of two images is made from the distances of their strips.
 
     :param strategy: ``adaptive`` (weight a on diagonal steps), ``vanilla`` DTW (a = 1),
-        ``sliding_window`` (the best four strips in a row), ``none`` (whole images, no alignment).
+        ``rigid`` (the best shift of the whole image, by whole strips), ``sliding_window`` (the
+        best four strips in a row), ``none`` (whole images, no alignment).
     :param sigma: how strongly the viewpoint change raises ``a = sqrt(1 + sigma |I_c - c|)``; >= 0.
     :param xi: restricted alignment: strips i and j with ``|i - j| >= xi`` are never aligned;
-        1 <= xi <= W, None = no restriction.
+        1 <= xi <= W, None = no restriction, in ``rigid`` 3: shifts by two strips at most.
     :param vertical: the distance of two strips is the distance of their cells, aligned from top to
         bottom by the same alignment (the paper's remark on drones), instead of their cosine
         distance; ``adaptive``, ``vanilla``.
@@ -43,13 +45,13 @@ class SpatialSettings:
 
     @property
     def aligns_strips(self) -> bool:
-        """Whether strips are aligned as they are, by DTW."""
-        return self.strategy in ('adaptive', 'vanilla') and not self.vertical
+        """Whether strips are aligned as they are, in one go with their distances."""
+        return self.strategy in ('adaptive', 'vanilla', 'rigid') and not self.vertical
 
     def band(self, W: int) -> int:
         """Return the half width of the allowed band, xi or W; refuse xi > W."""
         if self.xi is None:
-            return W
+            return min(W, MAX_SHIFT + 1) if self.strategy == 'rigid' else W
         if self.xi > W:
             raise SettingsError(
                 f'xi = {self.xi} exceeds the number of strips W = {W}: choose 1 <= xi <= {W}'

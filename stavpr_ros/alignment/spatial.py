@@ -56,8 +56,8 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
 
     :param d: strip distances, shape (W, W, n), float32 or float64; row = query strip. +inf bans a
         pair.
-    :param settings: strategy ``adaptive``, ``vanilla`` or ``sliding_window``. ``none``, of
-        whole images, is no function of d.
+    :param settings: any strategy but ``none``, which compares whole images: it is no
+        function of d.
     :returns: shape (n,), of d's type.
     :raises InputError: wrong shape or type, NaN, fewer strips than the sliding window has.
     :raises SettingsError: xi > W, or the strategy ``none``.
@@ -81,5 +81,6 @@ def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
         padded[:, :, :n] = d
         d = padded
     out = np.empty(d.shape[2], d.dtype)
-    dtw.spatial_dtw(d, adaptive_weights(W, settings, d.dtype), band, out)
+    weights = adaptive_weights(W, settings, d.dtype)
+    dtw.spatial_dtw(d, weights, band, settings.strategy == 'rigid', out)
     return out[:n]

@@ -71,7 +71,7 @@ class CpuMatcher:
 
     def _prepare(self, W: int, spatial: SpatialSettings) -> None:
         self._spatial = spatial
-        self._band = spatial.band(W)
+        self._band, self._is_rigid = spatial.band(W), spatial.strategy == 'rigid'
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -93,8 +93,8 @@ class CpuMatcher:
             dot.vertical_image_distances(
                 self._map, queries, self._cell_a, self._a, self._band, out
             )
-        elif self._spatial.strategy in ('adaptive', 'vanilla'):
-            dot.image_distances(self._map, queries, self._a, self._band, out)
+        elif self._spatial.aligns_strips:
+            dot.image_distances(self._map, queries, self._a, self._band, self._is_rigid, out)
         else:
             for x in range(len(out)):
                 out[x] = self._without_dtw(queries, x, weights[:, x])
@@ -102,7 +102,7 @@ class CpuMatcher:
 
     def distances_at(self, strips: np.ndarray, firsts: np.ndarray, size: int) -> np.ndarray:
         """
-        Return the distances of one image to chunks of places, strategies with DTW only.
+        Return the distances of one image to chunks of places, where strips are aligned.
 
         :param firsts: first place of each chunk, multiples of the kernels' lanes, (m,).
         :returns: shape (m, size), float32; +inf behind the last place.
@@ -110,12 +110,13 @@ class CpuMatcher:
         out = np.full((len(firsts), size), np.inf, np.float32)
         tiled = int8.tiled if isinstance(self._map, tuple) else dot.tiled
         dot.image_distances_at(
-            self._map, tiled(strips[:, None]), self._a, self._band, self.places, firsts, out
-        )
+            self._map, tiled(strips[:, None]), self._a, self._band, self._is_rigid,
+            self.places, firsts, out,
+        )  # fmt: skip
         return out
 
     def _without_dtw(self, queries: Any, x: int, weights: np.ndarray) -> np.ndarray:
-        """Return the distances of image x without DTW, (n,)."""
+        """Return the distances of image x by the other strategies, (n,)."""
         W, n = self._weights.shape
         d = np.empty((-(-W // dot.TILE) * dot.TILE, W, n), np.float32)
         if isinstance(self._map, tuple):
@@ -133,7 +134,7 @@ class CpuRouteMatcher(CpuMatcher):
     Compares an image with the oldest places of a route that grows.
 
     :param W: strips of an image.
-    :param spatial: strategies ``adaptive`` and ``vanilla``.
+    :param spatial: strategies that align strips.
     :raises SettingsError: xi > W.
     """
 

@@ -279,8 +279,8 @@ def _require_fitting(
                 f'limit = {limit} places leaves too few beyond exclude = {exclude} and windows of '
                 f'{settings.sequence.length} images: take at least {least}'
             )
-    if settings.spatial.strategy not in ('adaptive', 'vanilla') or settings.spatial.vertical:
+    if not settings.spatial.aligns_strips:
         raise SettingsError(
             f'strategy {settings.spatial.strategy!r}, vertical {settings.spatial.vertical}: '
-            'take adaptive or vanilla, without vertical alignment'
+            'take adaptive, vanilla or rigid, without vertical alignment'
         )

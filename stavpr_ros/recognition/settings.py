@@ -135,7 +135,7 @@ class RecognizerSettings:
         if self.time_budget_ms and not (self.has_probability and self.spatial.aligns_strips):
             raise SettingsError(
                 f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
-                'strategy adaptive or vanilla, without vertical alignment; take 0'
+                'strategy adaptive, vanilla or rigid, without vertical alignment; take 0'
             )
 
     @property

@@ -223,6 +223,20 @@ def sliding_window(d: Array, xi: int | None = None, dtype: type = np.float64) ->
     return best
 
 
+def rigid(d: Array, xi: int | None = None, dtype: type = np.float64) -> Any:
+    """Min over |s| < xi of the mean of d[i, i+s]; without xi, over |s| <= 2."""
+    d, W = d.astype(dtype), len(d)
+    best = dtype(np.inf)
+    for s in range(1 - W, W):
+        if abs(s) < (3 if xi is None else xi):
+            total, count = dtype(0), 0
+            for i in range(W):
+                if 0 <= i + s < W:
+                    total, count = total + d[i, i + s], count + 1
+            best = min(best, total / dtype(count))
+    return best
+
+
 def image_distances(
     d: Array,
     strategy: str = 'adaptive',
@@ -235,6 +249,8 @@ def image_distances(
     for y in range(d.shape[2]):
         if strategy == 'sliding_window':
             result[y] = sliding_window(d[:, :, y], xi, dtype)
+        elif strategy == 'rigid':
+            result[y] = rigid(d[:, :, y], xi, dtype)
         else:
             result[y] = align_images(d[:, :, y], strategy, sigma, xi, dtype)
     return result

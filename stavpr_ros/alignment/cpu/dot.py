@@ -13,7 +13,7 @@ from numba.core import types
 from numba.extending import overload
 import numpy as np
 from stavpr_ros.alignment.cpu import int8
-from stavpr_ros.alignment.cpu.dtw import align_lanes, SLOT
+from stavpr_ros.alignment.cpu.dtw import align_lanes, shift_lanes, SLOT
 from stavpr_ros.compilation import kernel, parallel_kernel, reassociating_kernel
 from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.simd import LANES, LINE, load, prefetch, splat, store, store_sums
@@ -163,25 +163,28 @@ def strip_distances(features, query, d):
 
 
 @kernel
-def _align_block(features, queries, x, first, count, weights, xi, d, edge, lanes):
+def _align_block(features, queries, x, first, count, weights, xi, is_rigid, d, edge, lanes):
     """Write the image distances of query x to ``count`` map images from ``first`` into lanes."""
     W, stride = d.shape[1], d.shape[2]
     _block_distances(features, queries, x, first, count, d)
     for at in range(0, count, LANES):
-        distances = align_lanes(d.reshape(-1), at, W * stride, stride, weights, xi, edge)
+        if is_rigid:
+            distances = shift_lanes(d.reshape(-1), at, W * stride, stride, W, xi)
+        else:
+            distances = align_lanes(d.reshape(-1), at, W * stride, stride, weights, xi, edge)
         store(lanes, at, distances)
 
 
 @parallel_kernel
-def image_distances(features, queries, weights, xi, out):
+def image_distances(features, queries, weights, xi, is_rigid, out):
     """
-    Image distances S[W,W] / C[W,W] of Q images to all map images, from the features in one go.
+    Image distances of Q images to all map images, aligned or shifted, from the features in one go.
 
     :param features: as in :func:`strip_distances`, or in int8, of
         :meth:`stavpr_ros.alignment.cpu.int8.Int8Strips.kernel_arguments`.
     :param queries: features of Q images, shape (Q, R, d), likewise; or int8, of
         :func:`stavpr_ros.alignment.cpu.int8.tiled`.
-    :param weights, xi: as in :func:`stavpr_ros.alignment.cpu.dtw.align_lanes`.
+    :param weights, xi, is_rigid: as in :func:`stavpr_ros.alignment.cpu.dtw.spatial_dtw`.
     :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
     """
     W, n = weights.shape[0], out.shape[1]
@@ -192,13 +195,13 @@ def image_distances(features, queries, weights, xi, out):
         edge = np.empty((W + 1) * SLOT, np.float32)
         lanes = np.empty(IMAGES, np.float32)
         for x in range(out.shape[0]):
-            _align_block(features, queries, x, first, count, weights, xi, d, edge, lanes)
+            _align_block(features, queries, x, first, count, weights, xi, is_rigid, d, edge, lanes)
             for y in range(count):
                 out[x, first + y] = lanes[y]
 
 
 @parallel_kernel
-def image_distances_at(features, queries, weights, xi, n, firsts, out):
+def image_distances_at(features, queries, weights, xi, is_rigid, n, firsts, out):
     """
     Image distances of one image to a part of the map images, as :func:`image_distances`.
 
@@ -212,7 +215,7 @@ def image_distances_at(features, queries, weights, xi, n, firsts, out):
         d = np.empty(((W + TILE - 1) // TILE * TILE, W, size), np.float32)
         edge = np.empty((W + 1) * SLOT, np.float32)
         lanes = np.empty(size, np.float32)
-        _align_block(features, queries, 0, firsts[i], count, weights, xi, d, edge, lanes)
+        _align_block(features, queries, 0, firsts[i], count, weights, xi, is_rigid, d, edge, lanes)
         out[i, :count] = lanes[:count]
 
 

@@ -127,13 +127,31 @@ def align_lanes(d, at, row, column, weights, xi, edge):
     return load(edge, W * SLOT) / load(edge, W * SLOT + LANES)
 
 
+@kernel
+def shift_lanes(d, at, row, column, W, xi):
+    """
+    Smallest mean distance of strips i and i + s, |s| < xi, of LANES map images, as a vector.
+
+    :param d, at, row, column: as in :func:`align_lanes`.
+    """
+    best = splat(d.dtype.type(np.inf))
+    for s in range(1 - xi, xi):
+        total = splat(d.dtype.type(0))
+        for i in range(max(0, -s), W - max(0, s)):
+            total = total + load(d, at + i * row + (i + s) * column)
+        mean = total / splat(d.dtype.type(W - abs(s)))
+        best = select(mean < best, mean, best)
+    return best
+
+
 @parallel_kernel
-def spatial_dtw(d, weights, xi, out):
+def spatial_dtw(d, weights, xi, is_rigid, out):
     """
     Image distances of one query image to n >= LANES map images.
 
     :param d: strip distances, shape (W, W, n), C-contiguous.
     :param weights, xi: as in :func:`align_lanes`.
+    :param is_rigid: whether the image is shifted (:func:`shift_lanes`) instead of aligned.
     :param out: shape (n,), written.
     """
     W, _, n = d.shape
@@ -143,7 +161,10 @@ def spatial_dtw(d, weights, xi, out):
         edge = np.empty((W + 1) * SLOT, d.dtype)
         for block in range(part * BLOCKS, min(blocks, (part + 1) * BLOCKS)):
             first = min(block * LANES, n - LANES)  # the last block overlaps the one before
-            store(out, first, align_lanes(flat, first, W * n, n, weights, xi, edge))
+            if is_rigid:
+                store(out, first, shift_lanes(flat, first, W * n, n, W, xi))
+            else:
+                store(out, first, align_lanes(flat, first, W * n, n, weights, xi, edge))
 
 
 @parallel_kernel
