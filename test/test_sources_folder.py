@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.folder import FolderSource, natural_key
+from stavpr_ros.sources.folder import FolderSource
+from stavpr_ros.sources.order import natural_key
 
 
 def fill(folder, names):

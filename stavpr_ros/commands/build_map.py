@@ -13,7 +13,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
-from stavpr_ros.commands.program import add_fps, make_parser, run_program, say
+from stavpr_ros.commands.program import add_camera, add_fps, make_parser, run_program, say
 from stavpr_ros.errors import ImageError, left_out, SettingsError, SourceError
 from stavpr_ros.output_file import MAP, require_replaceable
 
@@ -73,6 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--force', action='store_true', help='replace an existing map')
     parser.add_argument('--topic', help='image topic of the bag, if it has several')
+    add_camera(parser)
     add_fps(parser)
     parser.add_argument(
         '--every', type=int, default=1, metavar='N', help='take every N-th image (%(default)s)'
@@ -230,7 +231,8 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     _check(arguments)
     keyframes = KeyframeSettings(*(getattr(arguments, f'keyframe_{rule}') for rule in RULES))
     extractor = make_extractor(arguments)
-    source = open_source(arguments.input, arguments.topic, bad_image, arguments.fps)
+    options = arguments.topic, bad_image, arguments.fps, arguments.camera
+    source = open_source(arguments.input, *options)
     fit_value_range(source, extractor)
     images = _Images(source, arguments.every, arguments.panorama_yaw)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width

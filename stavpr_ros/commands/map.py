@@ -12,7 +12,7 @@ import sys
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros import plugins
-from stavpr_ros.commands.program import make_parser, run_program, say
+from stavpr_ros.commands.program import add_camera, make_parser, run_program, say
 from stavpr_ros.errors import MapFileError, printable, SettingsError, SourceError, UnavailableError
 from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import DATED, SECOND
@@ -112,6 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         help='folder of images or bag of each session, in their order; without it, thumbnails',
     )
     action.add_argument('--topic', help="the bags' image topic, if there are several")
+    add_camera(action)
     action.add_argument(
         '--closures',
         default='',
@@ -182,6 +183,7 @@ def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
         'drive', metavar='DRIVE', help='folder of images, bag or video, or the map of the drive'
     )
     action.add_argument('--topic', help="the bag's image topic, if there are several")
+    add_camera(action)
     action.add_argument(
         '--max-places',
         type=int,
@@ -401,7 +403,7 @@ def _colmap(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import load_map
 
     export, place_map = _tool('colmap'), load_map(arguments.map)
-    options = arguments.images, arguments.topic, arguments.closures
+    options = arguments.images, arguments.topic, arguments.closures, arguments.camera
     say(export(place_map, arguments.folder, *options))
 
 
@@ -453,8 +455,8 @@ def _drive(arguments: argparse.Namespace, place_map: 'PlaceMap') -> 'Iterator[Pl
         return
     folder, extractor = history_of(arguments.map), place_map.extractor()
     folder.mkdir(exist_ok=True)
-    source = f'{Path(arguments.drive).resolve()} {arguments.topic or ""}'
-    images = open_source(arguments.drive, arguments.topic)
+    source = f'{Path(arguments.drive).resolve()} {arguments.topic or arguments.camera or ""}'
+    images = open_source(arguments.drive, arguments.topic, camera=arguments.camera)
     journal = build_journal(
         images, extractor, folder / 'drive', source, thumbnails=bool(len(place_map.thumbnails))
     )

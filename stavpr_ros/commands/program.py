@@ -112,6 +112,12 @@ def add_fps(group: Any) -> None:
     group.add_argument('--fps', type=positive, metavar='HZ', help=text)
 
 
+def add_camera(group: Any) -> None:
+    """Add the option ``--camera`` of folders of images."""
+    text = 'the one to read of several cameras in a folder of images: cam0, image_2, left ...'
+    group.add_argument('--camera', metavar='NAME', help=text)
+
+
 def say(line: str, file: TextIO | None = None) -> None:
     """Print a line, whatever characters its names have."""
     print(printable(line), file=file)

@@ -12,7 +12,15 @@ import sys
 import time
 
 import rclpy
-from stavpr_ros.commands.program import DONE, FAILED, make_parser, positive, run_program, say
+from stavpr_ros.commands.program import (
+    add_camera,
+    DONE,
+    FAILED,
+    make_parser,
+    positive,
+    run_program,
+    say,
+)
 from stavpr_ros.commands.record import Recorder
 from stavpr_ros.errors import ImageError, left_out, SourceError, StavprError, UnavailableError
 from stavpr_ros.output_file import atomic_output, RECORDING
@@ -96,7 +104,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
     def notify(text: str) -> None:
         tqdm.write(f'replay: {text}', file=sys.stderr)
 
-    source = open_source(options.bag, options.topic, skip, options.fps)
+    source = open_source(options.bag, options.topic, skip, options.fps, options.camera)
     others = _others(options, source, notify)
     whole = options.duration == math.inf and not (options.start_offset or options.loop)
     # no bar without a terminal
@@ -228,6 +236,7 @@ def _parser() -> argparse.ArgumentParser:
         'images',
     )
     parser.add_argument('--topic', help='image topic in the bag; needed if it has several')
+    add_camera(parser)
     parser.add_argument(
         '--odometry',
         nargs='?',

@@ -20,6 +20,7 @@ def open_source(
     topic: str | None = None,
     on_error: Callable[[ImageError], None] | None = None,
     fps: float | None = None,
+    camera: str | None = None,
 ) -> 'FolderSource | VideoSource | BagSource':
     """
     Open a folder of images, a video or a bag, whichever it is.
@@ -31,8 +32,9 @@ def open_source(
         skipped; without it the error is raised.
     :param fps: images per second that are taken of a video, 5 if not given; all images of the
         others are.
+    :param camera: the camera to read of a folder with the images of several. Of folders only.
     :raises SettingsError: ``fps`` is not above 0.
-    :raises SourceError: it cannot be read, or the topic is ambiguous.
+    :raises SourceError: it cannot be read, or the topic or the camera is ambiguous.
     """
     # imported on use: rosbags and OpenCV load slowly
     from stavpr_ros.sources.bag_path import is_bag, reading
@@ -45,6 +47,8 @@ def open_source(
         exists = path.exists()
     if not exists:
         raise SourceError(f'{path} does not exist: expected a folder of images, a video or a bag')
+    if camera is not None and not is_folder(path):
+        raise SourceError(f'camera {camera!r} was given, but {path} is no folder of images')
     if is_bag(path):
         from stavpr_ros.sources.bag import BagSource
 
@@ -58,4 +62,12 @@ def open_source(
             f'{path} is no folder, video or bag: expected images, a video (.mp4, .mov ...), a '
             'ROS 2 bag (folder, .db3, .mcap) or a ROS 1 .bag'
         )
-    return FolderSource(path, on_error)
+    return FolderSource(path, on_error, camera)
+
+
+def is_folder(path: str | Path) -> bool:
+    """Return whether a path is a folder of images, by names only."""
+    from stavpr_ros.sources.bag_path import is_bag
+    from stavpr_ros.sources.video import is_video
+
+    return Path(path).is_dir() and not is_bag(Path(path)) and not is_video(path)

@@ -11,8 +11,10 @@ import re
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
+from stavpr_ros.sources.cameras import of_one_camera
 from stavpr_ros.sources.files import decode_file, ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.sources.order import in_order
 from stavpr_ros.units import SECOND
 
 HEIF = frozenset({'.heic', '.heif', '.hif'})
@@ -38,16 +40,6 @@ FOREIGN = re.compile(
 """Names of sub-folders that a NAS, an archive program or a viewer adds."""
 FEW = 5  # times as many images in sub-folders: images beside these are not the drive
 
-NaturalKey = tuple[list[str | int], list[str | int], str]
-
-
-def natural_key(name: str) -> NaturalKey:
-    """Return a sort key: ``01.jpg``, ``1.jpg``, ``2.jpg``, ``2 (1).jpg``, ``10.jpg``."""
-    # the parts alternate between text and number: equal positions have equal types
-    stem, suffix = (re.split(r'(\d+)', part.casefold()) for part in os.path.splitext(name))
-    stem[1::2], suffix[1::2] = map(int, stem[1::2]), map(int, suffix[1::2])
-    return stem, suffix, name
-
 
 def text_of(path: str | Path) -> str:
     """Return a path or name as printable text; bytes that are no UTF-8 are replaced."""
@@ -67,11 +59,16 @@ class FolderSource:
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
-    :raises SourceError: there is no such folder, or no image in it and its sub-folders.
+    :param camera: of the cameras in the folder, the one to read, as the error names it.
+    :raises SourceError: there is no such folder, or no image in it and its sub-folders, or several
+        cameras.
     """
 
     def __init__(
-        self, path: str | Path, on_error: Callable[[ImageError], None] | None = None
+        self,
+        path: str | Path,
+        on_error: Callable[[ImageError], None] | None = None,
+        camera: str | None = None,
     ) -> None:
         self.path = Path(path)
         self.on_error = on_error
@@ -89,7 +86,7 @@ class FolderSource:
                 f'{self.path} has no images: expected files ending in {expected}, there or in '
                 f'sub-folders. {left_out(self.left_out)}'.rstrip('. ')
             )
-        self.files: list[Path] = sorted(files, key=self._order)
+        self.files = in_order(of_one_camera(files, self.path, camera), self.path)
 
     def __len__(self) -> int:
         """Return the number of image files, readable or not."""
@@ -120,9 +117,6 @@ class FolderSource:
         )
         for i, frame in self._numbered(max(first, 0), last):
             yield ImageRecord.of_image(frame.image, round((i + 1) * SECOND / frames_per_second))
-
-    def _order(self, file: Path) -> list[NaturalKey]:
-        return [natural_key(part) for part in file.relative_to(self.path).parts]
 
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):

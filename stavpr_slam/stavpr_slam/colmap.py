@@ -27,6 +27,7 @@ def export(
     images: Sequence[str] = (),
     topic: str | None = None,
     closures: str = '',
+    camera: str | None = None,
 ) -> str:
     """
     Write a folder of a map: ``images/``, ``pairs.txt``, and with poses and a camera ``sparse/``.
@@ -38,6 +39,7 @@ def export(
     :param images: folder of images or bag of each session, from which the images are taken, in
         full size; empty = thumbnails.
     :param topic: image topic of the bags.
+    :param camera: of the folders with several.
     :param closures: file of ``record --loop-closures``, '' = none.
     :returns: what was written, one line.
     :raises StavprError: a source cannot be read or does not fit, or the folder exists.
@@ -45,7 +47,7 @@ def export(
     with atomic_folder(folder) as made:
         (made / 'images').mkdir(parents=True)
         sizes = {}
-        for place, image in _images(place_map, images, topic):
+        for place, image in _images(place_map, images, topic, camera):
             height, width = image.shape[:2]
             sizes[place] = width, height
             encoded = cv2.imencode('.jpg', image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[
@@ -77,7 +79,7 @@ def _name(place: int) -> str:
 
 
 def _images(
-    place_map: PlaceMap, paths: Sequence[str], topic: str | None
+    place_map: PlaceMap, paths: Sequence[str], topic: str | None, camera: str | None
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield places and their images, RGB (h, w, 3)."""
     if not paths:
@@ -94,7 +96,7 @@ def _images(
         own = np.arange(len(place_map)) if index is None else np.flatnonzero(index == number)
         ids = {place_map.ids[place]: place for place in own.tolist()}
         stamps = {int(place_map.stamps[place]): place for place in own.tolist()}
-        for frame in open_source(path, topic, fps=ALL):
+        for frame in open_source(path, topic, fps=ALL, camera=camera):
             known = stamps.get(frame.stamp) if frame.stamp else ids.get(frame.identifier)
             if known is not None:
                 yield known, frame.image

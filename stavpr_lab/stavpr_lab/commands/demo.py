@@ -10,7 +10,13 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
-from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program
+from stavpr_ros.commands.program import (
+    add_camera,
+    add_fps,
+    add_parameter,
+    make_parser,
+    run_program,
+)
 from stavpr_ros.errors import InputError, SettingsError, SourceError, StavprError
 from stavpr_ros.parameters import BY_NAME, default
 
@@ -64,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--loop', nargs='?', const=SYNTHETIC, metavar='FOLDER|VIDEO|BAG|synthetic', help=loop)
     add('--slam', choices=('world',), help='three laps with a drifting odometry, and a pose graph')
     add('--topic', help='image topic of the bags, if they have several')
+    add_camera(parser)
     add_fps(parser)
     truth = (
         'identity: image i of the query shows place i of the map; with --loop a FILE: pairs of '
@@ -217,7 +224,7 @@ def _traverse_pair(arguments: argparse.Namespace, folder: Path) -> 'TraversePair
     identity = arguments.truth == 'identity'
     length = arguments.sequence_length
     paths = [arguments.map, arguments.query]
-    reference, query = own_recordings(paths, arguments.topic, arguments.fps)
+    reference, query = own_recordings(paths, arguments.topic, arguments.fps, arguments.camera)
     return own_pair(reference, query, identity, length)
 
 
@@ -285,7 +292,8 @@ def _loop_traverse(arguments: argparse.Namespace, folder: Path, exclude: int) ->
                'a detour')  # fmt: skip
         return synthetic_loop(folder, exclude, tolerance)
     _print(f'1. Your traverse: {arguments.loop}')
-    (recording,) = own_recordings([arguments.loop], arguments.topic, arguments.fps)
+    options = arguments.topic, arguments.fps, arguments.camera
+    (recording,) = own_recordings([arguments.loop], *options)
     return own_loop(recording, arguments.truth, exclude, tolerance)
 
 

@@ -10,7 +10,14 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
-from stavpr_ros.commands.program import add_fps, add_parameter, make_parser, run_program, say
+from stavpr_ros.commands.program import (
+    add_camera,
+    add_fps,
+    add_parameter,
+    make_parser,
+    run_program,
+    say,
+)
 from stavpr_ros.errors import SourceError
 from stavpr_ros.output_file import HTML, JSON, require_replaceable
 from stavpr_ros.parameters import default
@@ -90,6 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--query', nargs='+', metavar='FOLDER|VIDEO|BAG|MAP|ARRAY', help=query)
     add('--dataset', metavar='NAME=FOLDER', help='map, query and ground truth of a known data set')
     add('--topic', help='image topic of the bags, if they have several')
+    add_camera(sequences)
     add_fps(sequences)
     unknown = 'a traverse of places that are not in the map, for the rate of false alarms'
     add('--unknown', metavar='FOLDER|VIDEO|BAG|MAP|ARRAY', help=unknown)

@@ -22,7 +22,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.mapping.builder import fit_value_range
 from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.sources import open_source
+from stavpr_ros.sources import is_folder, open_source
 from stavpr_ros.sources.bag_path import is_bag
 from stavpr_ros.sources.folder import text_of
 from stavpr_ros.sources.pose_file import read_poses
@@ -105,8 +105,8 @@ def settings_json(arguments: argparse.Namespace, sequences: Sequences) -> dict[s
     """Return everything that decides the numbers."""
     poses = ('query_poses', 'map_poses', 'meters', 'degrees') if arguments.truth == 'poses' else ()
     names = [
-        *('map', 'query', 'dataset', 'topic', 'fps', 'unknown', 'loop_closure', 'exclude_places'),
-        *('remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
+        *('map', 'query', 'dataset', 'topic', 'fps', 'camera', 'unknown', 'loop_closure'),
+        *('exclude_places', 'remove_from_map', 'reverse', 'speed', 'stop', 'drop', 'drop_seed'),
         *('crop_map', 'crop_query', 'truth', *poses),
         *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta', 'nms_radius'),
         'direction',
@@ -154,7 +154,8 @@ class _Loader:
         if Path(path).suffix == '.stavpr':
             return load_map(path)  # raises the reason why it is none
         topic = self._arguments.topic if is_bag(Path(path)) else None
-        source = open_source(path, topic, fps=self._arguments.fps)
+        camera = self._arguments.camera if is_folder(path) else None
+        source = open_source(path, topic, fps=self._arguments.fps, camera=camera)
         self.left_out.update(getattr(source, 'left_out', {}))
         return self.extract(name, source)
 

@@ -107,6 +107,7 @@ def run_live(
     node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
     replay = [executable('replay'), query.path, '--lossless', '--wait', '120', *replay_options]
     replay += [] if query.topic is None else ['--topic', query.topic]
+    replay += [] if query.camera is None else ['--camera', query.camera]
     replay += [] if query.fps is None else ['--fps', str(query.fps)]
     record = [executable('record'), '--output']
     matches, closures = folder / 'matches.jsonl', folder / 'loop_closures.jsonl'

@@ -22,7 +22,7 @@ from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, save_map
 from stavpr_ros.progress import Progress
-from stavpr_ros.sources import open_source
+from stavpr_ros.sources import is_folder, open_source
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_path import is_bag, METADATA
 from stavpr_ros.sources.bag_writer import write_bag
@@ -41,15 +41,17 @@ class Recording:
 
     :param topic: image topic of a bag; None = the only one, or no bag.
     :param fps: images per second that are taken of a video; None = the default, or no video.
+    :param camera: of a folder of several; None = the only one, or no folder.
     """
 
     path: str
     topic: str | None = None
     fps: float | None = None
+    camera: str | None = None
 
     def open(self, on_error: OnError | None = None) -> FolderSource | VideoSource | BagSource:
         """Open its images; see :func:`stavpr_ros.sources.open_source`."""
-        return open_source(self.path, self.topic, on_error, self.fps)
+        return open_source(self.path, self.topic, on_error, self.fps, self.camera)
 
     def save_feature_settings(self, extractor: FeatureExtractor, path: Path) -> None:
         """Write a map of one image, which sets the features of a node that closes loops."""
@@ -126,12 +128,15 @@ def synthetic_loop(folder: Path, exclude: int, tolerance: int) -> LoopTraverse:
     return LoopTraverse(Recording(str(bag), TOPIC), N, truth, 'A synthetic street, twice')
 
 
-def own_recordings(paths: Sequence[str], topic: str | None, fps: float | None) -> list[Recording]:
+def own_recordings(
+    paths: Sequence[str], topic: str | None, fps: float | None, camera: str | None = None
+) -> list[Recording]:
     """
     Name the user's traverses, each with the options that are for its kind.
 
     :param topic: image topic of the bags, if they have several.
     :param fps: images per second that are taken of the videos.
+    :param camera: of the folders, if they have several.
     :raises SettingsError: an option is for none of them.
     """
     require_video(fps, paths)
@@ -139,7 +144,12 @@ def own_recordings(paths: Sequence[str], topic: str | None, fps: float | None) -
     if topic is not None and not any(bags):
         raise SettingsError(f'--topic {topic}: no recording is a bag; leave it out')
     return [
-        Recording(path, topic if bag else None, fps if is_video(path) else None)
+        Recording(
+            path,
+            topic if bag else None,
+            fps if is_video(path) else None,
+            camera if is_folder(path) else None,
+        )
         for path, bag in zip(paths, bags, strict=True)
     ]
 

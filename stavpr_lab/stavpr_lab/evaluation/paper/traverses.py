@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 from stavpr_lab.evaluation.drive import FrameSource
 from stavpr_ros.errors import SourceError
-from stavpr_ros.sources.folder import FolderSource, natural_key
+from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import Frame
+from stavpr_ros.sources.order import natural_key
 
 SPACING = 2.0  # meters between images of RobotCar, which has 16 a second
 

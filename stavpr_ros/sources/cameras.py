@@ -1,0 +1,134 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which camera the image files of a folder are of, by their names."""
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+import logging
+import os
+from pathlib import Path
+import re
+
+from stavpr_ros.errors import SourceError
+
+WORDS = re.compile(
+    'left|right|cent(er|re)|middle|front|rear|back(ward)?|forward|top|bottom|side|[lr]|[fbr][lr]|'
+    'rgb|colou?r|gr[ae]y|mono|depth|disparity|confidence|infra(red)?|n?ir|thermal|fisheye|wide|'
+    'tele|masks?|seg(mentation)?|semantics?|labels?|instance|annotations?|normals?|flow|lidar|'
+    'velodyne|radar|raw|rect(ified)?|undistorted|resized|small|previews?',
+    re.IGNORECASE,
+)
+"""Parts of the names of cameras, and of images that are made of theirs."""
+NUMBERED = re.compile(
+    r'(cam|camera|image|img|infra|ir|fisheye|lens|sensor|view|stereo|eye|port)[ _-]?\d\d?(?!\d)',
+    re.IGNORECASE,
+)
+SINGLE = re.compile(r'(?<![^\W_])[a-fA-F](?![^\W_])')  # else they are hexadecimal digits
+TOKEN = re.compile(r'[A-Z]?[a-z]+|[A-Z]+')
+WORD = re.compile(r'(?<![^\W_])[a-f]+(?![^\W_])|[^\W\d_]*[^\W\d_a-f][^\W\d_]*')
+"""Letters that are no hexadecimal digits."""
+MIN_SHARE = 0.05  # of all images, of a camera
+SAME = 0.95  # share of the same numbers, of cameras in one folder
+STAMPS = 10**7  # stamps and dates are not below
+
+Numbers = tuple[int, ...]
+Groups = dict[str, dict[Path, Numbers]]
+"""The files of each camera with the numbers in their names."""
+_log = logging.getLogger(__name__)
+
+
+def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -> list[Path]:
+    """
+    Return the files of one camera.
+
+    :param files: of the folder ``top`` and its sub-folders.
+    :param camera: its name as the error lists it; None = there is one.
+    :raises SourceError: several cameras passed the same places, or none has the name.
+    """
+    roles, streams = (_groups(files, top, split) for split in (_role, _stream))
+    if camera is not None:
+        by_name = {name.casefold(): group for name, group in (streams | roles).items()}
+        if group := by_name.get(camera.strip('/').casefold()):
+            return list(group)
+        names = roles if len(roles) > 1 else streams
+        choice = f'expected one of {_listed(names)}' if len(names) > 1 else 'leave it out'
+        raise SourceError(f'{top} has no camera {camera!r}: {choice}')
+    stamped = {
+        name: {file: own for file, own in group.items() if own and own[0] >= STAMPS}
+        for name, group in streams.items()
+    }
+    if several := _parallel(roles, len(files)) or _parallel(stamped, len(files)):
+        raise SourceError(
+            f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
+            'choose it, --camera NAME; parts of one drive need other names'
+        )
+    if several := _parallel(streams, len(files)):
+        _log.warning(
+            '%s has images of the same numbers, %s: they are taken for parts of one drive; if '
+            'they are of several cameras or drives, choose one, --camera NAME',
+            top, _listed(several),
+        )  # fmt: skip
+    return list(files)
+
+
+def _groups(files: Sequence[Path], top: Path, split: Callable[[Path], tuple[str, str]]) -> Groups:
+    groups: Groups = {}
+    for file in files:
+        name, rest = split(file.relative_to(top))
+        groups.setdefault(name, {})[file] = tuple(map(int, re.findall(r'\d+', rest)))
+    if len(groups) > 1 and '' in groups:  # images without a name are of their folder
+        own = groups.pop('')
+        groups[os.path.relpath(os.path.commonpath([file.parent for file in own]), top)] = own
+    return groups
+
+
+def _role(path: Path) -> tuple[str, str]:
+    """Return the camera that a path names, and the path without it."""
+    folders = [part for part in path.parts[:-1] if _words(part)]
+    known = {word for part in folders for word in _words(part)}
+    words = [word for word in _words(path.stem, is_file=True) if word not in known]
+    rest = path.stem
+    for word in words:
+        rest = rest.replace(word, ' ')
+    others = [part for part in path.parts[:-1] if part not in folders]
+    return '/'.join([*folders, *(['_'.join(words)] if words else [])]), '/'.join([*others, rest])
+
+
+def _words(name: str, is_file: bool = False) -> list[str]:
+    """Return the words for cameras in a name; the only number of a file is a counter."""
+    words = [word for word in TOKEN.findall(name) if WORDS.fullmatch(word)]
+    words += SINGLE.findall(name) if is_file else []
+    numbered = NUMBERED.search(name)
+    return words + ([numbered[0]] if numbered and len(re.findall(r'\d+', name)) > is_file else [])
+
+
+def _stream(path: Path) -> tuple[str, str]:
+    """Return the folder and the words of a name, and its numbers."""
+    words = [word for word in WORD.findall(path.stem.casefold()) if word not in ('am', 'pm')]
+    numbers = path.stem if _first(path.stem) >= STAMPS else str(path.with_suffix(''))
+    return '/'.join(filter(None, [*path.parts[:-1], '_'.join(words)])), numbers
+
+
+def _first(stem: str) -> int:
+    number = re.search(r'\d+', stem)
+    return int(number[0]) if number else 0
+
+
+def _parallel(groups: Groups, count: int) -> Groups:
+    """Return the groups whose numbers, or times, are among another group's."""
+    large = {name: own for name, own in groups.items() if len(own) >= max(2, MIN_SHARE * count)}
+    several: Groups = {}
+    for a, b in combinations(large, 2):
+        small, other = sorted((large[a], large[b]), key=len)
+        first, last = min(other.values()), max(other.values())
+        within, least = sum(first <= own <= last for own in small.values()), len(small) / 2
+        folders = [{file.parent for file in group} for group in (small, other)]
+        if folders[0] == folders[1] and last < (STAMPS,):  # words of a scene may be the same
+            within, least = len({*small.values()} & {*other.values()}), SAME * len(other)
+        if within >= least:
+            several |= {a: large[a], b: large[b]}
+    return several
+
+
+def _listed(groups: Groups) -> str:
+    return ', '.join(f'{name} ({len(group)})' for name, group in sorted(groups.items()))
