@@ -3,6 +3,7 @@
 """Ground truth: accepted places by hand, and every kind of file."""
 
 import pickle
+import re
 import zipfile
 
 import cv2
@@ -262,3 +263,24 @@ def test_from_poses_never_accepts_places_with_unknown_pose():
         assert truth.n == 3
     with pytest.raises(InputError, match=r'2 of 3 query images have no pose \(0, 2\)'):
         GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'query,place\nb.jpg,2.png\na.jpg,0.png\n',
+        'b.jpg,x/2.png\na.jpg,x/0.png\n',
+        'place;query\n2;b\n0;a\n',
+        'b.jpg,2\na.jpg,0\nc.jpg,-1\n',
+    ],
+)
+def test_from_text_of_names_is_of_the_images_that_it_names(tmp_path, text):
+    names = ['a.jpg', 'b.jpg', 'c.jpg'], [f'x/{i}.png' for i in range(4)]
+    path = tmp_path / 'truth.csv'
+    path.write_text(text)
+    truth = GroundTruth.from_file(path, 3, 4, names=names)
+    assert truth.pairs.tolist() == [[0, 0], [1, 2]]
+    assert truth.is_stated.tolist() == [True, True, '-1' in text]
+    path.write_text(re.sub(r'\ba\b', 'z', text))
+    with pytest.raises(SourceError, match=r'z.* is the name of no image'):
+        GroundTruth.from_file(path, 3, 4, names=names)

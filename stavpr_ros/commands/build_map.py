@@ -81,7 +81,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--poses',
         metavar='CSV',
-        help='one line an image: x y z, x y z qx qy qz qw, TUM or KITTI (meters, quaternion)',
+        help='one line an image, in their order or with their names: x y z, '
+        'x y z qx qy qz qw, TUM or KITTI (meters, quaternion)',
     )
     parser.add_argument(
         '--odometry',
@@ -184,7 +185,9 @@ def _check(arguments: argparse.Namespace) -> None:
     require_replaceable(arguments.output, MAP, arguments.force)
 
 
-def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajectory | None':
+def _poses(
+    arguments: argparse.Namespace, source: 'FolderSource | VideoSource | BagSource'
+) -> 'np.ndarray | Trajectory | None':
     """Read the poses of all images of the source, or the odometry."""
     from stavpr_ros.mapping import Trajectory
     from stavpr_ros.sources.pose_file import read_poses
@@ -196,7 +199,8 @@ def _poses(arguments: argparse.Namespace, images: int) -> 'np.ndarray | Trajecto
         return Trajectory.from_arrays(*read_odometry(arguments.input, arguments.odometry))
     if not arguments.poses:
         return None
-    poses, has_orientations = read_poses(Path(arguments.poses))
+    names, images = getattr(source, 'names', ()), len(source)
+    poses, has_orientations = read_poses(Path(arguments.poses), names)
     if len(poses) != images and not is_video(arguments.input):  # whose number is an estimate
         raise SourceError(
             f'poses {arguments.poses} has {len(poses)} lines for {images} images: give one each'
@@ -236,7 +240,7 @@ def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
     fit_value_range(source, extractor)
     images = _Images(source, arguments.every, arguments.panorama_yaw)
     width = THUMBNAIL_WIDTH if arguments.thumbnail_width is None else arguments.thumbnail_width
-    poses = _poses(arguments, len(source))
+    poses = _poses(arguments, source)
     journal = build_journal(
         images,
         extractor,

@@ -97,6 +97,11 @@ class FolderSource:
         for _, frame in self._numbered():
             yield frame
 
+    @property
+    def names(self) -> list[str]:
+        """Return the identifiers of all images, readable or not."""
+        return [text_of(file.relative_to(self.path)) for file in self.files]
+
     def records(
         self, frames_per_second: float, start: float = 0.0, duration: float = math.inf
     ) -> Iterator[ImageRecord]:

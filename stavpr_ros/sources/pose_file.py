@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of poses: a line an image."""
 
-from pathlib import Path
+from collections.abc import Sequence
+import logging
+from pathlib import Path, PureWindowsPath
 import re
 
 import numpy as np
-from stavpr_ros.sources.table import is_counted, is_stamps, Table
+from stavpr_ros.sources.table import by_name, FILE, is_counted, is_stamps, Table
 
+_log = logging.getLogger(__name__)
 EXPECTED = (
     'a line an image, in meters: x y z; x y z qx qy qz qw; stamp x y z qx qy qz qw (TUM); or a '
     '3x4 matrix in rows, 12 numbers (KITTI)'
@@ -18,16 +21,25 @@ ROTATION = re.compile(r'(.*[._])?(orientation|quaternion|quat|rotation|rot|q)(_.
 DEGREES = re.compile(
     r'(.*[._])?((lat|lon|lng|long)(itude)?|yaw|pitch|roll|theta|heading|bearing)(_.*)?'
 )
+KEY = re.compile(
+    r'(.*[._])?(image|img|frame|file|name|id|idx|index|number|seq|stamp|time|t)[a-z]*(_.*)?'
+)
+NUMBER = re.compile(r'\d+(?:\.\d+)?')
+LISTED = 3  # names that an error lists
+STEPS, MIN_MOVES, ALIKE = (0.004, 40.0), 9, 0.9  # meters an image; images; cosine
 NORMS = 0.9, 1.1  # of a quaternion in text, of a few digits
 MAX_STEP, MAX_EXTENT = 3e-4, 0.5  # of positions in degrees, median and sum; too small in meters
 
 
-def read_poses(path: Path) -> tuple[np.ndarray, bool]:
+def read_poses(path: Path, images: Sequence[str] = ()) -> tuple[np.ndarray, bool]:
     """
     Read the poses of images from a table, :data:`EXPECTED` a line, or with names of its columns.
 
+    :param images: names of the images. Where the table names them, by files, numbers or stamps,
+        the poses are in their order; lines of no image are left out, with a warning.
     :returns: shape (images, 7), float64, and whether the file has orientations.
-    :raises SourceError: the file cannot be read, or has numbers of another unit or kind.
+    :raises SourceError: the file cannot be read, has numbers of another unit or kind, or names
+        images, but not all of ``images``.
     """
     table = Table(path, 'poses', EXPECTED)
     names = [re.sub(r'\s*[\[(].*', '', name).replace(' ', '_').casefold() for name in table.names]
@@ -38,12 +50,14 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
             '(UTM), and convert angles to a quaternion'
         )
     rows = table.numbers(columns)
+    rows_of = _rows_of(table, names, columns, images)
     if not np.isfinite(rows).all():
         raise table.error('a number is not finite', int(np.argmin(np.isfinite(rows).all(axis=1))))
     if columns is None:
         first, width = rows[:, 0], rows.shape[1]
-        numbered = is_stamps(first) or is_counted(first)
-        if width == 8 and (np.diff(first) < 0).any():
+        by_number = rows_of is not None and not table.labels
+        numbered = by_number or is_stamps(first) or is_counted(first)
+        if width == 8 and not by_number and (np.diff(first) < 0).any():
             raise table.error('it has 8 columns, but the first one falls and is no stamp')
         if width - 1 in NUMBERS and (numbered or width == 8):
             rows = rows[:, 1:]
@@ -58,15 +72,70 @@ def read_poses(path: Path) -> tuple[np.ndarray, bool]:
             'its positions move by fractions of a millimeter an image, as latitudes and '
             'longitudes do, project them to meters (UTM); if they are meters, subtract the first'
         )
+    oriented = rows.shape[1] > 3
     if rows.shape[1] == 12:
-        return _of_matrices(table, rows.reshape(-1, 3, 4)), True
-    if rows.shape[1] == 3:
-        return np.hstack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))]), False
+        rows = _of_matrices(table, rows.reshape(-1, 3, 4))
+    elif not oriented:
+        rows = np.hstack([rows, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1))])
     norms = np.linalg.norm(rows[:, 3:], axis=1)
     if ((norms < NORMS[0]) | (norms > NORMS[1])).any():
         row = int(np.argmax(abs(norms - 1)))
         raise table.error(f'a quaternion of norm {norms[row]:.3g} instead of 1', row)
-    return rows, True
+    rows = rows if rows_of is None else rows[rows_of]
+    if doubt := _doubt(rows, oriented):
+        _log.warning('poses %s: %s', path, doubt)
+    return rows, oriented
+
+
+def _rows_of(
+    table: Table, names: list[str], columns: list[int] | None, images: Sequence[str]
+) -> np.ndarray | None:
+    """Return the row of each image by its name, number or stamp; None = they are not named."""
+    keys, wanted = table.labels, list(images)
+    if not keys:
+        own = [0] if columns is None and table.width - 1 in NUMBERS else []
+        if columns is not None:
+            own = [i for i, name in enumerate(names) if i not in columns and KEY.fullmatch(name)]
+        if not own:
+            return None
+        keys = [str(key) for key in table.numbers(own[:1])[:, 0].tolist()]
+        numbers = [NUMBER.findall(PureWindowsPath(image).stem) for image in images]
+        wanted = [str(float(number[-1])) if number else '' for number in numbers]
+    rows = by_name(wanted, keys)
+    missing = [image for image, row in zip(images, rows, strict=True) if row < 0]
+    is_text = table.labels and (len(missing) < len(images) or FILE.fullmatch(keys[0]))
+    if not images or len({*wanted}) < len({*images}) or (missing and not is_text):
+        return None
+    if missing:
+        raise table.error(
+            f'it names {_listed(keys)}, but {len(missing)} images not, {_listed(missing)}'
+        )
+    if others := [keys[row] for row in sorted({*range(len(keys))} - {*rows.tolist()})]:
+        text = 'poses %s: %d lines are of no image: %s'
+        _log.warning(text, table.path, len(others), _listed(others))
+    return rows
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ', '.join(names[:LISTED]) + (' ...' if len(names) > LISTED else '')
+
+
+def _doubt(poses: np.ndarray, oriented: bool) -> str:
+    """Return what is seldom true of poses in meters with quaternions x y z w; '' = nothing."""
+    moves = np.diff(poses[:, :3], axis=0)
+    steps = np.linalg.norm(moves, axis=1)
+    if len(moves) < MIN_MOVES or not steps.any():
+        return 'all positions are equal: are they of this drive?' if len(moves) else ''
+    step = float(np.median(steps[steps > 0]))
+    if not STEPS[0] <= step <= STEPS[1]:
+        return f'the positions move by {step:.3g} m an image: are they in another unit?'
+    heading, yaw = np.arctan2(moves[:, 1], moves[:, 0]), poses[:-1, 2]
+    for unit, name in ((1.0, 'radians'), (np.pi / 180, 'degrees')):
+        if np.mean(np.cos(unit * yaw - heading)) > ALIKE and np.ptp(unit * yaw) > 1 - ALIKE:
+            return f'z follows the direction of travel: is it a yaw in {name}?'
+    if oriented and abs(poses[:, 4:6]).max() < 1 - ALIKE and np.mean(poses[:, 3] ** 2) > 0.5:
+        return 'the quaternions turn about x, upside down: are they w x y z?'
+    return ''
 
 
 def _columns(names: list[str]) -> list[int] | None:

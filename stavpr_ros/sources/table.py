@@ -4,7 +4,9 @@
 
 from collections.abc import Iterator, Sequence
 from itertools import islice
-from pathlib import Path
+from operator import attrgetter
+from pathlib import Path, PureWindowsPath
+import re
 
 import numpy as np
 from stavpr_ros.errors import SourceError
@@ -14,13 +16,15 @@ SEPARATORS = ';\t,'  # else blanks
 COMMENTS = ('#', '%', 'sep=')  # a spreadsheet writes the last one
 MIN_STAMP = 1e8  # seconds of 1973; no meters on Earth, and no number of an image
 LONGEST_REASON = 120  # characters
+FILE = re.compile(r'.*\.[a-z]\w{2,4}', re.IGNORECASE)  # the name of one
+DECIMAL_COMMAS = re.compile(r'\s*-?\d+,\d+(\s+-?\d+,\d+)+')
 
 
 class Table:
     """
     The lines of a text file, each with the same columns.
 
-    Encoding, separator, decimal comma, a line and a first column of names, comments, blank lines
+    Encoding, separator, decimal comma, a line and a column of names, comments, blank lines
     and separators at the ends of lines are recognized by the first lines of the file. A comment
     above the numbers may name their columns.
 
@@ -31,12 +35,13 @@ class Table:
     :raises SourceError: the file cannot be read, or has no line of numbers.
 
     ``names`` are empty where the file names no columns, ``width`` is the number of columns; a
-    first column of names, such as of image files, does not count.
+    column of names, such as of image files, does not count.
     """
 
     def __init__(self, path: Path, what: str, expected: str, counted: bool = False) -> None:
         self.path, self._what, self._expected = path, f'{what} {path}', expected
         self.lines: list[int] = []  # number of each line that :meth:`numbers` has read
+        self.labels: list[str] = []  # the names in these lines, if there are
         self._comment = ''
         try:
             require_regular(path)
@@ -47,21 +52,26 @@ class Table:
             raise self.error('it is empty')
         self._separator = next((mark for mark in SEPARATORS if mark in first), None)
         in_spreadsheet = self._separator in (';', '\t') and '.' not in (second or first)
-        self._point = ',' if in_spreadsheet else '.'  # as German programs write numbers
+        if has_commas := bool(DECIMAL_COMMAS.fullmatch(second or first)):
+            self._separator = None
+        # as German programs write numbers
+        self._point = ',' if in_spreadsheet or has_commas else '.'
         names, cells = self._cells(first), self._cells(second or first)
         self._ended = len(cells) > 1 and not cells[-1]  # a separator ends each line
         width = len(cells) - self._ended
-        unnamed = not names[0] or len(names) < width
-        self._labels = _is_name(cells[0]) or (unnamed and _is_header(names[1:], width - 1, True))
-        self.width = width - self._labels
-        self._header = _is_header(names[self._labels :], self.width, counted or unnamed)
+        names = [''] * (width - len(names)) + names
+        unnamed = not names[0]
+        is_labeled = is_name(cells[0]) or (unnamed and _is_header(names[1:], width - 1, True))
+        files = [i for i, cell in enumerate(cells) if FILE.fullmatch(cell)]
+        self._label = 0 if is_labeled else files[0] if files else None
+        self.width = width - (self._label is not None)
+        self._header = _is_header(self._unlabeled(names), self.width, counted or unnamed)
         if self._header and not second:
             raise self.error('it has names, but no line of numbers')
-        names = names[-self.width :] if len(names) < width else names[self._labels :][: self.width]
         comment = self._cells(self._comment)
         if not self._header:
-            names = comment[self._labels :] if len(comment) == width else []
-        self.names = names
+            names = comment if len(comment) == width else []
+        self.names = self._unlabeled(names)[: self.width]
 
     def error(self, reason: str, row: int | None = None) -> SourceError:
         """Return the error of the table, or of a row of :meth:`numbers`, and what it expected."""
@@ -83,14 +93,25 @@ class Table:
             reason = str(error).partition(' at row ')[0][:LONGEST_REASON]
             raise self.error(reason, -1 if self.lines else None) from error
 
+    def cells(self) -> list[list[str]]:
+        """Return the text of all lines, a first one of names included."""
+        return [self._cells(line) for _, line in self._lines()]
+
     def _rows(self) -> Iterator[str]:
         """Yield the lines of numbers, without labels, as NumPy reads them."""
-        self.lines = []
+        self.lines, self.labels = [], []
         for number, line in islice(self._lines(), int(self._header), None):
             self.lines.append(number)
             row = line.replace(self._point, '.')
             row = row.removesuffix(self._separator or '') if self._ended else row
-            yield row.split(self._separator, 1)[-1] if self._labels else row
+            if self._label is not None:
+                cells = row.split(self._separator)
+                self.labels += [cell.strip(' "') for cell in cells[self._label :][:1]]
+                row = (self._separator or ' ').join(self._unlabeled(cells))
+            yield row
+
+    def _unlabeled(self, cells: list[str]) -> list[str]:
+        return [cell for i, cell in enumerate(cells) if i != self._label]
 
     def _lines(self) -> Iterator[tuple[int, str]]:
         """Yield the lines that are neither empty nor comments, and their numbers from 1."""
@@ -108,6 +129,24 @@ class Table:
         return [cell.strip(' "').replace(self._point, '.') for cell in line.split(self._separator)]
 
 
+def by_name(names: Sequence[str], keys: Sequence[str]) -> np.ndarray:
+    """
+    Find names of files among others: by path, else by file name, else without suffix.
+
+    :returns: the last key that names the same file as each name, shape (names,); -1 = none.
+    """
+    best = np.full(len(names), -1)
+    paths, others = (list(map(PureWindowsPath, each)) for each in (names, keys))
+    for form in (PureWindowsPath.as_posix, attrgetter('name'), attrgetter('stem')):
+        own, named = [*map(form, paths)], [*map(form, others)]
+        if len({*own}) < len({*names}) or len({*named}) < len({*keys}):
+            break  # several files of this name
+        rows = {key: row for row, key in enumerate(named)}
+        found = np.array([rows.get(name, -1) for name in own])
+        best = max(best, found, key=lambda each: np.count_nonzero(each >= 0))
+    return best
+
+
 def is_stamps(column: np.ndarray) -> bool:
     """Return whether numbers are stamps: of seconds or less, since 1970, that do not fall."""
     values = np.asarray(column, np.float64)
@@ -122,10 +161,10 @@ def is_counted(column: np.ndarray) -> bool:
 def _is_header(cells: list[str], width: int, counted: bool) -> bool:
     """Return whether cells are names, or the numbers of more than two columns."""
     numbers = counted and width > 2 and cells == [str(i) for i in range(width)]
-    return numbers or any(map(_is_name, cells[:width]))
+    return numbers or any(map(is_name, cells[:width]))
 
 
-def _is_name(cell: str) -> bool:
+def is_name(cell: str) -> bool:
     """Return whether a cell is neither empty nor a number."""
     try:
         float(cell.strip() or 0)

@@ -95,9 +95,13 @@ def _positions(arguments: argparse.Namespace, report: 'Report') -> list[np.ndarr
         (arguments.map_poses, arguments.query_poses),
         (report.reference, report.query),
     )
+    read = [
+        read_poses(Path(path), traverse.ids)[0] if path else np.asarray(traverse.poses)
+        for path, traverse in zip(paths, traverses, strict=True)
+    ]
     return [
-        (read_poses(Path(path))[0][index] if path else np.asarray(traverse.poses))[:, :2]
-        for path, traverse, index in zip(paths, traverses, indices, strict=True)
+        (poses if len(poses) == len(traverse) else poses[index])[:, :2]
+        for poses, traverse, index in zip(read, traverses, indices, strict=True)
     ]
 
 

@@ -286,7 +286,8 @@ def _ground_truth(
     if arguments.truth == 'identity':
         return GroundTruth.identity(N, n, tolerance)
     if arguments.truth != 'poses':
-        return GroundTruth.from_file(arguments.truth, N, n, tolerance)
+        names = query.ids, reference.ids
+        return GroundTruth.from_file(arguments.truth, N, n, tolerance, names)
     same = reference is query
     queries = poses_of(arguments.query_poses, query, 'query', arguments.degrees)
     path = arguments.query_poses if same else arguments.map_poses
@@ -303,7 +304,7 @@ def poses_of(
         if place_map.poses is None or not place_map.has_poses:
             raise SettingsError(f'the {name} has no poses: give --{name}-poses')
         return place_map.poses
-    poses, oriented = read_poses(Path(path))
+    poses, oriented = read_poses(Path(path), place_map.ids)
     if len(poses) != len(place_map):
         raise SourceError(
             f'{path} has {len(poses)} poses for {len(place_map)} images: give one each'

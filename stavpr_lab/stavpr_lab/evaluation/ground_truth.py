@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 from scipy.spatial import KDTree
-from stavpr_lab.evaluation.ground_truth_files import read_pairs
+from stavpr_lab.evaluation.ground_truth_files import Names, read_pairs
 from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.sources.folder import text_of
@@ -88,7 +88,9 @@ class GroundTruth:
         )
 
     @classmethod
-    def from_file(cls, path: str | Path, N: int, n: int, tolerance: int = 0) -> Self:
+    def from_file(
+        cls, path: str | Path, N: int, n: int, tolerance: int = 0, names: Names = ((), ())
+    ) -> Self:
         """
         Read accepted pairs; queries and places are counted from 0.
 
@@ -96,6 +98,7 @@ class GroundTruth:
 
         * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
           single column is the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
+          Files of ``names``, of queries and places, may stand for their numbers.
         * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
           shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none. ``GTsoft`` of an
           .npz, as VPR_Tutorial publishes it, has the shape (n, N).
@@ -105,7 +108,7 @@ class GroundTruth:
         :raises SourceError: the file cannot be read, or contains objects (pickles).
         :raises InputError: it is of other images: wrong size, or indices outside.
         """
-        queries, places = read_pairs(Path(path), N, n)
+        queries, places = read_pairs(Path(path), N, n, names)
         try:
             truth = cls.from_pairs(queries, places, N, n, tolerance)
         except InputError as error:

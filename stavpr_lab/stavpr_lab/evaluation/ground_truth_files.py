@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of ground truth: text, arrays, black and white images."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.files import checked_header, MAX_PIXELS
 from stavpr_ros.sources.folder import SUFFIXES
-from stavpr_ros.sources.table import is_stamps, Table
+from stavpr_ros.sources.table import by_name, is_name, is_stamps, Table
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
 NAME = 'truth'  # of the array to read from an .npz with several
@@ -20,10 +21,12 @@ PLACE_WORDS = ('place', 'ref', 'map', 'database', 'historical')
 BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and white
 
 Pairs = tuple[np.ndarray, np.ndarray]
+Names = tuple[Sequence[str], Sequence[str]]
+"""Of the queries and of the places."""
 LARGEST = 2**53  # whole numbers below it are exact as floating-point numbers
 
 
-def read_pairs(path: Path, N: int, n: int) -> Pairs:
+def read_pairs(path: Path, N: int, n: int, names: Names = ((), ())) -> Pairs:
     """
     Read accepted pairs; see :meth:`stavpr_lab.evaluation.ground_truth.GroundTruth.from_file`.
 
@@ -34,7 +37,7 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
     """
     suffix = path.suffix.lower()
     if suffix in TEXT:
-        queries, places = _from_text(path, N)
+        queries, places = _from_text(path, N, names)
     elif suffix in ARRAYS:
         queries, places = _from_array(_load(path), path, N, n)
     elif suffix in SUFFIXES:
@@ -52,9 +55,9 @@ def read_pairs(path: Path, N: int, n: int) -> Pairs:
 # ------------------------------------------------------------------------------------------ text
 
 
-def _columns(table: Table) -> tuple[int | None, int]:
+def _columns(table: Table, names: list[str], width: int) -> tuple[int | None, int]:
     """Return the columns of query and place; None = the query is the line's number."""
-    if names := table.names:
+    if names:
         positions = []
         for words in (QUERY_WORDS, PLACE_WORDS):
             columns = [
@@ -64,16 +67,43 @@ def _columns(table: Table) -> tuple[int | None, int]:
         query, place = positions
         if place is not None and query != place:
             return query, place
-    if table.width == 1:
+    if width == 1:
         return None, 0
-    if table.width == 2:
+    if width == 2:
         return 0, 1
-    raise table.error(f'it has {table.width} columns, without a header of these names')
+    raise table.error(f'it has {width} columns, without a header of these names')
 
 
-def _from_text(path: Path, N: int) -> Pairs:
+def _of_names(table: Table, names: Names, N: int) -> Pairs | None:
+    """Return the pairs of a table that names files; None = it has numbers."""
+    first, *rows = table.cells()
+    ids = [*names[0], *names[1]]
+    if not any(map(is_name, (rows or [first])[0])):
+        return None
+    is_header = any(map(is_name, first)) and not any(by_name([cell], ids)[0] >= 0 for cell in first)
+    columns = _columns(table, first if is_header else [], len(first))
+    rows = rows if is_header else [first, *rows]
+    pairs = [np.arange(N), np.arange(N)]
+    if not any(is_name(rows[0][column]) for column in columns if column is not None):
+        return None
+    for i, column in enumerate(columns):
+        cells = [] if column is None else [row[column] for row in rows]
+        values = by_name(cells, names[i])
+        for row, cell in enumerate(cells):
+            if values[row] < 0 and not is_name(cell):
+                values[row] = float(cell)
+            elif values[row] < 0:
+                raise table.error(f'{cell} is the name of no image')
+        pairs[i] = values if cells else pairs[i]
+    return pairs[0], pairs[1]
+
+
+def _from_text(path: Path, N: int, names: Names) -> Pairs:
     table = Table(path, 'ground truth', 'two columns, query and place, whole numbers from 0')
-    query_column, place_column = _columns(table)
+    named = _of_names(table, names, N)
+    if named is not None:
+        return named
+    query_column, place_column = _columns(table, table.names, table.width)
     columns = [place_column] if query_column is None else [query_column, place_column]
     rows = table.numbers(columns)
     for column, values in zip(columns, rows.T, strict=True):
