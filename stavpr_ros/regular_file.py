@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a file by name without ever waiting for it or reading a device."""
+"""Opening a file by name: no device, nothing that waits, and no pointer to its content."""
 
 import errno
 import io
@@ -15,13 +15,44 @@ _KINDS = {
     stat.S_IFCHR: 'a device',
     stat.S_IFBLK: 'a device',
 }
+POINTERS = {
+    b'version https://git-lfs': 'a pointer of Git LFS instead of the content: run `git lfs pull`',
+    b'/annex/objects/': 'a pointer of git-annex instead of the content: run `git annex get`',
+}
+"""The first bytes of files that stand for others, and what to do."""
+MAX_POINTER, LONGEST_TARGET = 1024, 60  # bytes, characters
+TOOLS = {'/annex/': 'run `git annex get`', 'dvc': 'run `dvc pull`', 'files/md5': 'run `dvc pull`'}
+
+
+class ElsewhereError(OSError):
+    """A file stands for content that is not on this machine."""
+
+
+def elsewhere(path: str | Path) -> str:
+    """Return what stands for the content of a file, and what to do; '' = it is here or unknown."""
+    path = Path(path)
+    if not path.exists():
+        if path.is_symlink():
+            target = os.readlink(path)
+            tool = next((tool for part, tool in TOOLS.items() if part in target), 'copy the file')
+            return f'a link into nothing, {target[-LONGEST_TARGET:]}: {tool}'
+        if path.with_name(f'{path.name}.dvc').exists():
+            return 'of DVC, and its content not here: run `dvc pull`'
+        if path.with_name(f'.{path.name}.icloud').exists():
+            return 'in iCloud only: download it in the Finder'
+        return ''
+    if path.is_file() and path.stat().st_size <= MAX_POINTER:
+        content = path.read_bytes()
+        return next((text for first, text in POINTERS.items() if content.startswith(first)), '')
+    return ''
 
 
 def open_regular(path: str | Path) -> io.FileIO:
     """
     Open a regular file for reading, unbuffered; symbolic links are followed.
 
-    :raises OSError: it does not exist, cannot be read, or is a pipe, a device, a folder.
+    :raises OSError: it does not exist, cannot be read, or is a pipe, a device, a folder; an
+        :class:`ElsewhereError` if its content is not on this machine.
     """
     require_regular(path)  # before it is opened: opening alone can have an effect on devices
     file = io.FileIO(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), 'rb')
@@ -40,6 +71,8 @@ def require_regular(path: str | Path) -> None:
     :raises OSError: as :func:`open_regular`.
     """
     try:
+        if text := elsewhere(path):
+            raise ElsewhereError(errno.ENOENT, f'it is {text}')
         _require_regular(os.stat(path).st_mode)
     except ValueError as error:  # a NUL in the name
         raise OSError(errno.EINVAL, str(error)) from error

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The order of image files: kinds of numbers in names, counters that begin again, EXIF."""
 
-from pathlib import Path
 import random
 
 import numpy as np
@@ -54,11 +53,10 @@ GUESSED = {
     ('names', 'guesses'), [*((n, 0) for n in SURE.values()), *((n, 1) for n in GUESSED.values())]
 )
 @pytest.mark.parametrize('folder', [False, True])
-def test_names_are_in_the_order_of_their_kind_of_number(names, guesses, folder, caplog):
-    expected = [
-        Path('top', name, '1.jpg') if folder else Path('top', f'{name}.jpg') for name in names
-    ]
-    assert in_order(random.Random(0).sample(expected, len(expected)), Path('top')) == expected
+def test_names_are_in_the_order_of_their_kind_of_number(tmp_path, names, guesses, folder, caplog):
+    form = '{}/1.jpg' if folder else '{}.jpg'
+    expected = [tmp_path / form.format(name) for name in names]
+    assert in_order(random.Random(0).sample(expected, len(expected)), tmp_path) == expected
     assert len(caplog.records) == guesses
 
 

@@ -134,9 +134,15 @@ def test_poses_are_of_the_images_that_the_table_names(tmp_path, text, images, ca
     path.write_text(text)
     assert read_poses(path, images)[0][:, 0].tolist() == [i / 2 for i in range(12)]
     assert ('11 lines are of no image' in caplog.text) == ('-003' in text or '\n-3,' in text)
+
+
+def test_poses_that_lack_an_image_name_it(tmp_path):
+    path = tmp_path / 'poses.csv'
+    path.write_text('name,x,y,z\n' + lines('{:04d}.jpg,{x},0,0\n'))
     with pytest.raises(SourceError, match=r'names .*, but 2 images not, b/9998.jpg, b/9999.jpg'):
-        path.write_text('name,x,y,z\n' + lines('{:04d}.jpg,{x},0,0\n'))
         read_poses(path, [*IMAGES, 'b/9998.jpg', 'b/9999.jpg'])
+    with pytest.raises(SourceError, match=r'names 0011.jpg, .*, but 1 images not, a.jpg'):
+        read_poses(path, ['a.jpg'])
 
 
 @pytest.mark.parametrize(

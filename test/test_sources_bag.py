@@ -146,6 +146,14 @@ def test_bag_without_images_lists_topics(tmp_path):
         open_source(tmp_path / 'bag')
 
 
+def test_bag_beside_images_is_read_and_the_images_are_named(tmp_path, caplog):
+    write_bag(tmp_path / 'bag', '/camera', records())
+    for name in ('a.png', 'b.png'):
+        cv2.imwrite(str(tmp_path / 'bag' / name), np.zeros((4, 4), np.uint8))
+    assert len(open_source(tmp_path / 'bag')) == 5
+    assert 'is a bag beside 2 images: the bag is read; to read the images, move' in caplog.text
+
+
 @pytest.mark.parametrize('ros1', [False, True])
 def test_bag_with_damaged_image_fails_or_skips(tmp_path, ros1):
     path = write_mixed(tmp_path / 'mixed.bag', ros1, bad={1, 3})

@@ -159,4 +159,88 @@ def test_photos_of_a_telephone_with_a_video_each_are_the_drive(tmp_path):
         (tmp_path / f'{number}.MOV').write_bytes(b'of the same moment')
     source = open_source(tmp_path)
     assert len(source) == 3
-    assert left_out(source.left_out) == 'left out: 3 videos among images'
+    assert left_out(source.left_out) == 'left out: 3 videos among images (to read one, name it)'
+
+
+LFS = b'version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 48213\n'
+
+
+@pytest.mark.parametrize(
+    ('content', 'reason'),
+    [
+        (LFS, 'a pointer of Git LFS instead of the content: run `git lfs pull`'),
+        (b'/annex/objects/SHA256E-s48213--00.jpg\n', 'run `git annex get`'),
+        ('../.git/annex/objects/Xj/q5/00.jpg', 'a link into nothing, .*: run `git annex get`'),
+        ('/home/me/.cache/dvc/files/md5/00', 'a link into nothing, .*: run `dvc pull`'),
+        ('/mnt/disk/2.png', 'a link into nothing, /mnt/disk/2.png: copy the file'),
+        (b'', '0 bytes: a placeholder of a cloud'),
+    ],
+)
+def test_images_whose_content_is_elsewhere_are_named(tmp_path, content, reason):
+    """Not called damaged, nor left out in silence."""
+    fill(tmp_path, ['1.png', '3.png'])
+    if isinstance(content, bytes):
+        (tmp_path / '2.png').write_bytes(content)
+    else:
+        (tmp_path / '2.png').symlink_to(content)
+    with pytest.raises(ImageError, match=rf'2\.png: .*{reason}') as caught:
+        list(open_source(tmp_path))
+    assert left_out({caught.value.kind: 1}) == (
+        'left out: 1 files whose content is not here or not complete'
+    )
+    assert len(list(open_source(tmp_path, on_error=lambda _: None))) == 2
+
+
+@pytest.mark.parametrize('name', ['drive.mp4', 'drive.mcap', 'drive.db3', 'drive.bag', 'drive'])
+def test_sources_whose_content_is_elsewhere_are_named(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(LFS)
+    with pytest.raises(SourceError, match=r'is a pointer of Git LFS .*: run `git lfs pull`'):
+        open_source(path)
+    path.unlink()
+    (tmp_path / f'{name}.dvc').write_text('outs:\n')
+    with pytest.raises(SourceError, match=r'is of DVC, .*: run `dvc pull`'):
+        open_source(path)
+    (tmp_path / f'{name}.dvc').unlink()
+    (tmp_path / f'.{name}.icloud').write_bytes(b'bplist00')
+    with pytest.raises(SourceError, match='is in iCloud only: download it'):
+        open_source(path)
+
+
+def test_folder_counts_stand_ins_of_images(tmp_path):
+    fill(tmp_path, ['1.png', '2.png'])
+    stubs = ('.3.png.icloud', '4.png.dvc', '5.png - Shortcut.lnk', '6.url', '7.png.part')
+    for name in (*stubs, '8.png.crdownload', '._1.png'):
+        (tmp_path / name).write_bytes(b'content')
+    source = open_source(tmp_path)
+    assert len(source) == 2
+    assert source.left_out == {'elsewhere': 6}
+
+
+@pytest.mark.parametrize('text', ['camera: front\nfps: 10\n', '', 'nerfstudio: {}\n'])
+def test_images_with_metadata_of_another_program_are_images(tmp_path, text):
+    fill(tmp_path, ['1.png', '2.png'])
+    (tmp_path / 'metadata.yaml').write_text(text)
+    assert len(open_source(tmp_path)) == 2
+
+
+@pytest.mark.parametrize('name', ['notes.bag', 'drive_0.db3', 'drive_0.mcap'])
+def test_more_images_than_bags_are_the_drive(tmp_path, name):
+    fill(tmp_path, ['1.png', '2.png'])
+    (tmp_path / name).write_bytes(b'cut off')
+    source = open_source(tmp_path)
+    assert [frame.identifier for frame in source] == ['1.png', '2.png']
+    assert left_out(source.left_out) == (
+        'left out: 1 files of bags among images (to read one, name it)'
+    )
+    (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  version: 5\n')
+    with pytest.raises(SourceError, match=f'{tmp_path}.* is damaged, cut off or no bag'):
+        open_source(tmp_path)
+
+
+def test_folders_named_like_files_are_folders(tmp_path):
+    for name in ('1.bag', '2.mp4', '3.jpg'):
+        (tmp_path / name).mkdir()
+        fill(tmp_path, [f'{name}/a.png', f'{name}/b.png'])
+    assert len(open_source(tmp_path)) == 6
+    assert len(open_source(tmp_path / '1.bag')) == 2

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from stavpr_ros.checks import require_type
 from stavpr_ros.errors import ImageError, SourceError
+from stavpr_ros.regular_file import elsewhere
 
 if TYPE_CHECKING:
     from stavpr_ros.sources.bag import BagSource
@@ -38,13 +39,16 @@ def open_source(
     """
     # imported on use: rosbags and OpenCV load slowly
     from stavpr_ros.sources.bag_path import is_bag, reading
-    from stavpr_ros.sources.folder import FolderSource
+    from stavpr_ros.sources.folder import FolderSource, SUFFIXES
+    from stavpr_ros.sources.notes import note_once
     from stavpr_ros.sources.video import FPS, is_video, VideoSource
 
     require_type('path', path, (str, Path), 'the path of a folder of images, a video or a bag')
     path = Path(path)
     with reading(path):
-        exists = path.exists()
+        exists, reason = path.exists(), elsewhere(path)
+    if reason:
+        raise SourceError(f'{path} is {reason}')
     if not exists:
         raise SourceError(f'{path} does not exist: expected a folder of images, a video or a bag')
     if camera is not None and not is_folder(path):
@@ -52,6 +56,12 @@ def open_source(
     if is_bag(path):
         from stavpr_ros.sources.bag import BagSource
 
+        images = path.is_dir() and sum(each.suffix.lower() in SUFFIXES for each in path.iterdir())
+        if images > 1:
+            note_once(
+                f'{path} is a bag beside {images} images: the bag is read; to read the images, '
+                'move them to a folder of their own'
+            )
         return BagSource(path, topic, on_error)
     if topic is not None:
         raise SourceError(f'topic {topic!r} was given, but {path} is no bag: leave the topic out')

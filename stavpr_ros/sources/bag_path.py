@@ -9,6 +9,7 @@ from pathlib import Path
 from stavpr_ros.errors import SourceError, StavprError
 
 METADATA = 'metadata.yaml'
+IN_METADATA = b'rosbag2_bagfile_information'  # not in those of other programs
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap', '.bag'})
 
 
@@ -20,7 +21,7 @@ def is_bag(path: Path) -> bool:
     """
     with reading(path):
         if path.is_dir():
-            return (path / METADATA).exists() or bool(storage_files(path))
+            return _is_folder_of_bag(path)
         return path.suffix.lower() in STORAGE_SUFFIXES
 
 
@@ -46,3 +47,17 @@ def reading(path: Path) -> Iterator[None]:
 def storage_files(folder: Path) -> list[Path]:
     """Return the files of a folder that bags store messages in."""
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in STORAGE_SUFFIXES)
+
+
+def _is_folder_of_bag(folder: Path) -> bool:
+    """Return whether a folder is a bag, by its metadata, or since it has few images."""
+    metadata = folder / METADATA
+    if metadata.is_file() and IN_METADATA in metadata.read_bytes():
+        return True
+    bags = sum(not file.is_dir() for file in storage_files(folder))
+    if not bags:
+        return False
+    from stavpr_ros.sources.folder import SUFFIXES  # loads OpenCV
+
+    images = sum(file.suffix.lower() in SUFFIXES for file in folder.glob('[!.]*'))
+    return images < max(bags, 2)

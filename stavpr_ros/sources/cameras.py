@@ -4,12 +4,12 @@
 
 from collections.abc import Callable, Sequence
 from itertools import combinations
-import logging
 import os
 from pathlib import Path
 import re
 
 from stavpr_ros.errors import SourceError
+from stavpr_ros.sources.notes import note_once
 
 WORDS = re.compile(
     'left|right|cent(er|re)|middle|front|rear|back(ward)?|forward|top|bottom|side|[lr]|[fbr][lr]|'
@@ -34,7 +34,6 @@ STAMPS = 10**7  # stamps and dates are not below
 Numbers = tuple[int, ...]
 Groups = dict[str, dict[Path, Numbers]]
 """The files of each camera with the numbers in their names."""
-_log = logging.getLogger(__name__)
 
 
 def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -> list[Path]:
@@ -63,11 +62,10 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
             'choose it, --camera NAME; parts of one drive need other names'
         )
     if several := _parallel(streams, len(files)):
-        _log.warning(
-            '%s has images of the same numbers, %s: they are taken for parts of one drive; if '
-            'they are of several cameras or drives, choose one, --camera NAME',
-            top, _listed(several),
-        )  # fmt: skip
+        note_once(
+            f'{top} has images of the same numbers, {_listed(several)}: they are taken for parts '
+            'of one drive; if they are of several cameras or drives, choose one, --camera NAME'
+        )
     return list(files)
 
 
@@ -97,9 +95,9 @@ def _role(path: Path) -> tuple[str, str]:
 def _words(name: str, is_file: bool = False) -> list[str]:
     """Return the words for cameras in a name; the only number of a file is a counter."""
     words = [word for word in TOKEN.findall(name) if WORDS.fullmatch(word)]
-    words += SINGLE.findall(name) if is_file else []
-    numbered = NUMBERED.search(name)
-    return words + ([numbered[0]] if numbered and len(re.findall(r'\d+', name)) > is_file else [])
+    numbers, numbered = len(re.findall(r'\d+', name)), NUMBERED.search(name)
+    words += SINGLE.findall(name) if is_file and numbers else []
+    return words + ([numbered[0]] if numbered and numbers > is_file else [])
 
 
 def _stream(path: Path) -> tuple[str, str]:

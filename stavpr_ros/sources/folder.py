@@ -11,6 +11,8 @@ import re
 
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
+from stavpr_ros.regular_file import ElsewhereError, open_regular
+from stavpr_ros.sources.bag_path import STORAGE_SUFFIXES
 from stavpr_ros.sources.cameras import of_one_camera
 from stavpr_ros.sources.files import decode_file, ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
@@ -38,6 +40,10 @@ FOREIGN = re.compile(
     re.IGNORECASE,
 )
 """Names of sub-folders that a NAS, an archive program or a viewer adds."""
+STUB = re.compile(
+    r'.*\.(dvc|icloud|lnk|url|webloc|part|partial|crdownload|download|opdownload)', re.IGNORECASE
+)
+"""Names of files that stand for others, or are not complete."""
 FEW = 5  # times as many images in sub-folders: images beside these are not the drive
 
 
@@ -151,13 +157,15 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         folders[:] = [each for each in visible if not FOREIGN.fullmatch(each)]
         unread['foreign'] += len(visible) - len(folders)
         paths = [Path(name, each) for each in files if not each.startswith('.')]
-        images = [path for path in paths if path.suffix.lower() in SUFFIXES and path.is_file()]
+        images = [path for path in paths if path.suffix.lower() in SUFFIXES and _is_file(path)]
         # of an image in two formats, the one that every program reads
         names = {path.stem for path in images if path.suffix.lower() not in HEIF}
         images = [p for p in images if p.suffix.lower() not in HEIF or p.stem not in names]
         names |= {path.stem for path in images}
         others = (path for path in paths if path.suffix.lower() in OTHER_IMAGES)
         unread['format'] += sum(path.stem not in names for path in others)
+        unread['elsewhere'] += sum(map(bool, map(STUB.fullmatch, files)))
+        unread['bag'] += sum(path.suffix.lower() in STORAGE_SUFFIXES for path in paths)
         unread['video'] += sum(path.suffix.lower() in VIDEOS for path in paths)
         (own if Path(name) == top else below).extend(images)
     is_drive = len(own) * FEW > len(below)
@@ -165,9 +173,22 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
     return own if is_drive else below, +unread
 
 
+def _is_file(path: Path) -> bool:
+    return path.is_file() or not path.exists()  # a link into nothing is an image that is missing
+
+
 def _read(file: Path, least: tuple[int, int] | None, to_bytes: ToBytes | None) -> np.ndarray:
     try:
-        return decode_file(file.read_bytes(), None, least, to_bytes)
+        with open_regular(file) as content:
+            data = content.readall()
+        if not data:
+            raise ImageError(
+                '0 bytes: a placeholder of a cloud, or an interrupted copy; download it again',
+                kind='elsewhere',
+            )
+        return decode_file(data, None, least, to_bytes)
+    except ElsewhereError as error:
+        raise ImageError(f'{text_of(file)}: {error.strerror}', kind='elsewhere') from error
     except OSError as error:
         raise ImageError(
             f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',

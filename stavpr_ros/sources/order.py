@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from decimal import Decimal
 from itertools import pairwise
-import logging
 import os
 from pathlib import Path
 import re
 from typing import Any
 import warnings
+
+from stavpr_ros.sources.notes import note_once
 
 NaturalKey = tuple[list[str | int], list[str | int], str]
 Sorted = tuple[list[Any], str] | None
@@ -30,8 +31,6 @@ DIGITS = 7  # of a fraction of seconds since 1970, as a float; more are nanoseco
 SAMPLE = 100  # files whose times are compared with their order
 EXIF, TAKEN, FRACTION, CHANGED = 0x8769, 0x9003, 0x9291, 0x0132  # tags
 TIME = re.compile(r'\d{4}:\d\d:\d\d \d\d:\d\d:\d\d')
-
-_log = logging.getLogger(__name__)
 
 
 def natural_key(name: str) -> NaturalKey:
@@ -64,7 +63,7 @@ def in_order(files: Sequence[Path], top: Path) -> list[Path]:
     )
     result, guesses = _by_times(result, guesses)
     if guesses:
-        _log.warning('%s: %s', top, '; '.join(dict.fromkeys(guesses)))
+        note_once(f'{top}: {"; ".join(dict.fromkeys(guesses))}')
     return result
 
 

@@ -3,14 +3,13 @@
 """Files of poses: a line an image."""
 
 from collections.abc import Sequence
-import logging
 from pathlib import Path, PureWindowsPath
 import re
 
 import numpy as np
+from stavpr_ros.sources.notes import note_once
 from stavpr_ros.sources.table import by_name, FILE, is_counted, is_stamps, Table
 
-_log = logging.getLogger(__name__)
 EXPECTED = (
     'a line an image, in meters: x y z; x y z qx qy qz qw; stamp x y z qx qy qz qw (TUM); or a '
     '3x4 matrix in rows, 12 numbers (KITTI)'
@@ -83,7 +82,7 @@ def read_poses(path: Path, images: Sequence[str] = ()) -> tuple[np.ndarray, bool
         raise table.error(f'a quaternion of norm {norms[row]:.3g} instead of 1', row)
     rows = rows if rows_of is None else rows[rows_of]
     if doubt := _doubt(rows, oriented):
-        _log.warning('poses %s: %s', path, doubt)
+        note_once(f'poses {path}: {doubt}')
     return rows, oriented
 
 
@@ -111,8 +110,7 @@ def _rows_of(
             f'it names {_listed(keys)}, but {len(missing)} images not, {_listed(missing)}'
         )
     if others := [keys[row] for row in sorted({*range(len(keys))} - {*rows.tolist()})]:
-        text = 'poses %s: %d lines are of no image: %s'
-        _log.warning(text, table.path, len(others), _listed(others))
+        note_once(f'poses {table.path}: {len(others)} lines are of no image: {_listed(others)}')
     return rows
 
 

@@ -80,7 +80,9 @@ def _of_names(table: Table, names: Names, N: int) -> Pairs | None:
     ids = [*names[0], *names[1]]
     if not any(map(is_name, (rows or [first])[0])):
         return None
-    is_header = any(map(is_name, first)) and not any(by_name([cell], ids)[0] >= 0 for cell in first)
+    is_header = any(map(is_name, first)) and not any(
+        by_name([cell], ids)[0] >= 0 for cell in first
+    )
     columns = _columns(table, first if is_header else [], len(first))
     rows = rows if is_header else [first, *rows]
     pairs = [np.arange(N), np.arange(N)]
