@@ -18,6 +18,7 @@ CAUSES = {
     'image': 'images that cannot be decoded',
     'elsewhere': 'files whose content is not here or not complete',
     'format': 'images of a format that is not read (convert them to JPEG)',
+    'pages': 'pages, frames or views behind the first one of a file (to read them, split it)',
     'video': 'videos among images (to read one, name it)',
     'bag': 'files of bags among images (to read one, name it)',
     'beside': 'images beside the sub-folders of the drive',

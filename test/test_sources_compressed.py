@@ -3,6 +3,7 @@
 """Image files and compressed messages to RGB: formats, mosaics, depth, damage, garbage."""
 
 from io import BytesIO
+import re
 import struct
 import sys
 from types import SimpleNamespace
@@ -136,6 +137,47 @@ def test_decode_compressed_of_16_bits_takes_the_upper_byte_as_opencv_does(suffix
     np.testing.assert_array_equal(decode_compressed(data), expected)
 
 
+RAMP = np.tile(np.linspace(0, 1, 160), (120, 1))
+COLORS = np.dstack([RAMP, RAMP**2, 1 - RAMP])
+
+
+@pytest.mark.parametrize('maximum', [1, 4, 100, 255, 1023, 4095, 65535])
+@pytest.mark.parametrize('kind', ['P5', 'P6', 'P2'])
+def test_decode_compressed_of_pnm_scales_its_largest_value_to_white(kind, maximum):
+    values = np.round((COLORS if kind == 'P6' else RAMP) * maximum).astype(np.uint16)
+    head = f'{kind}\n# by hand\n160 120\n{maximum}\n'.encode()
+    if kind == 'P2':
+        pixels = ' '.join(map(str, values.ravel())).encode() + b'\n'
+    else:
+        pixels = values.astype('>u2' if maximum > 255 else np.uint8).tobytes()
+    image = decode_compressed(head + pixels)
+    expected = np.broadcast_to(values.T, (3, 160, 120)).T if kind != 'P6' else values
+    assert np.abs(image - expected * (255 / maximum)).max() <= 1
+    with pytest.raises(ImageError, match='is damaged or cut off'):
+        decode_compressed(head + pixels[:-300])
+
+
+@pytest.mark.parametrize(
+    ('mode', 'kinds'),
+    [
+        ('1', ('PNG', 'TIFF', 'BMP', 'PPM')),
+        ('L', ('PNG', 'TIFF', 'WEBP', 'JPEG')),
+        ('LA', ('PNG',)),
+        ('P', ('PNG', 'TIFF', 'BMP')),
+        ('RGBA', ('PNG', 'WEBP')),
+        ('CMYK', ('JPEG', 'TIFF')),
+        ('YCbCr', ('JPEG', 'TIFF')),
+    ],
+)
+def test_decode_compressed_of_all_modes_is_as_pillow_decodes_them(mode, kinds):
+    image = Image.fromarray(np.round(COLORS * 255).astype(np.uint8)).convert(mode)
+    for kind in kinds:
+        file, options = BytesIO(), {'transparency': 3} if (mode, kind) == ('P', 'PNG') else {}
+        image.save(file, kind, quality=98, lossless=True, **options)
+        difference = decode_compressed(file.getvalue()).astype(int) - image.convert('RGB')
+        assert np.abs(difference).max() <= (16 if kind == 'JPEG' else 4), kind
+
+
 @pytest.mark.parametrize('compression', [None, 'tiff_lzw', 'tiff_deflate', 'packbits'])
 def test_decode_compressed_of_sound_tiff_that_opencv_does_not_read(compression):
     """Of 32 bits; what has no range of its own is not called damaged."""
@@ -222,7 +264,9 @@ def test_decode_compressed_of_cut_off_jpeg_fails():
     data = data[:2] + segment + data[2:]
     # cameras fill up with zeros
     assert np.abs(decode_compressed(data + bytes(50)).astype(int) - rgb).max() <= 4
-    for missing in (1, 2, 20, 60):
+    for missing in (1, 2):  # of the end alone: some cameras write none
+        np.testing.assert_array_equal(decode_compressed(data[:-missing]), decode_compressed(data))
+    for missing in (20, 60):
         with pytest.raises(ImageError, match='is cut off: expected the end of a JPEG') as caught:
             decode_compressed(data[:-missing])
         assert caught.value.kind == 'cut off'
@@ -238,7 +282,10 @@ def test_decode_compressed_of_jpeg_with_video_ignores_it(options):
     expected = decode_compressed(data)
     for video in (b'\xff\xda ftyp \xff\xd9', b'\xff\xd9 ftyp \xff\xda'):
         np.testing.assert_array_equal(decode_compressed(data + video), expected)
-    for missing in (1, 2, 20, len(data) // 2):
+    for missing in (1, 2):
+        np.testing.assert_array_equal(decode_compressed(data[:-missing]), expected)
+    restarts = [len(data) - mark.end() for mark in re.finditer(b'\xff[\xd0-\xd7]', data)]
+    for missing in (4, 20, len(data) // 2, *restarts):
         with pytest.raises(ImageError, match='is cut off'):
             decode_compressed(data[:-missing])
 
@@ -250,7 +297,7 @@ def test_decode_compressed_of_mpo_reads_first_image():
     data = file.getvalue()
     assert np.abs(decode_compressed(data)[0, 0].astype(int) - (200, 100, 30)).max() <= 4
     with pytest.raises(ImageError, match='is cut off'):
-        decode_compressed(data[: data.index(b'\xff\xd9')])
+        decode_compressed(data[: data.index(b'\xff\xd9') - 20])
 
 
 @pytest.mark.parametrize(

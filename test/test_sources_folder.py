@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 import pytest
 from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
 from stavpr_ros.sources import open_source
@@ -244,3 +245,27 @@ def test_folders_named_like_files_are_folders(tmp_path):
         fill(tmp_path, [f'{name}/a.png', f'{name}/b.png'])
     assert len(open_source(tmp_path)) == 6
     assert len(open_source(tmp_path / '1.bag')) == 2
+
+
+@pytest.mark.parametrize(('kind', 'name'), [
+    ('TIFF', '1.tif'), ('PNG', '1.png'), ('PNG', '1.apng'), ('WEBP', '1.webp'),
+    ('MPO', '1.jpg'), ('MPO', '1.mpo'),
+])  # fmt: skip
+def test_pages_behind_the_first_one_are_counted_once(tmp_path, kind, name):
+    pages = [Image.new('RGB', (8, 8), (80 * i, 0, 0)) for i in range(3)]
+    pages[0].save(tmp_path / name, kind, save_all=True, append_images=pages[1:])
+    fill(tmp_path, ['2.png', '3.jpg', '4.tiff', '5.webp'])
+    source = open_source(tmp_path)
+    assert [len(list(source)) for _ in range(2)] == [5, 5]
+    assert next(iter(source)).image.max() < 8
+    assert left_out(source.left_out) == (
+        'left out: 2 pages, frames or views behind the first one of a file (to read them, '
+        'split it)'
+    )
+
+
+def test_animations_and_icons_are_of_another_format(tmp_path):
+    fill(tmp_path, ['1.png'])
+    for name in ('a.gif', 'b.ico', 'c.avifs', 'd.heics', 'e.pam', 'f.dng'):
+        (tmp_path / name).write_bytes(b'content')
+    assert open_source(tmp_path).left_out == {'format': 6}

@@ -13,7 +13,14 @@ from typing import Any, TYPE_CHECKING
 
 from stavpr_ros import plugins
 from stavpr_ros.commands.program import add_camera, make_parser, run_program, say
-from stavpr_ros.errors import MapFileError, printable, SettingsError, SourceError, UnavailableError
+from stavpr_ros.errors import (
+    left_out,
+    MapFileError,
+    printable,
+    SettingsError,
+    SourceError,
+    UnavailableError,
+)
 from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import DATED, SECOND
 
@@ -460,6 +467,8 @@ def _drive(arguments: argparse.Namespace, place_map: 'PlaceMap') -> 'Iterator[Pl
     journal = build_journal(
         images, extractor, folder / 'drive', source, thumbnails=bool(len(place_map.thumbnails))
     )
+    if unread := left_out(getattr(images, 'left_out', {})):
+        say(unread, sys.stderr)
     try:
         yield journal_map(journal)
     finally:

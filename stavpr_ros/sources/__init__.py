@@ -39,8 +39,9 @@ def open_source(
     """
     # imported on use: rosbags and OpenCV load slowly
     from stavpr_ros.sources.bag_path import is_bag, reading
-    from stavpr_ros.sources.folder import FolderSource, SUFFIXES
+    from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.notes import note_once
+    from stavpr_ros.sources.suffixes import SUFFIXES
     from stavpr_ros.sources.video import FPS, is_video, VideoSource
 
     require_type('path', path, (str, Path), 'the path of a folder of images, a video or a bag')

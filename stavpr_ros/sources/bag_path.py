@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from stavpr_ros.errors import SourceError, StavprError
+from stavpr_ros.sources.suffixes import SUFFIXES
 
 METADATA = 'metadata.yaml'
 IN_METADATA = b'rosbag2_bagfile_information'  # not in those of other programs
@@ -55,9 +56,5 @@ def _is_folder_of_bag(folder: Path) -> bool:
     if metadata.is_file() and IN_METADATA in metadata.read_bytes():
         return True
     bags = sum(not file.is_dir() for file in storage_files(folder))
-    if not bags:
-        return False
-    from stavpr_ros.sources.folder import SUFFIXES  # loads OpenCV
-
     images = sum(file.suffix.lower() in SUFFIXES for file in folder.glob('[!.]*'))
-    return images < max(bags, 2)
+    return bags > 0 and images < max(bags, 2)

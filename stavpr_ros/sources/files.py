@@ -3,6 +3,7 @@
 """Image files to RGB, uint8, shape (height, width, 3), C-contiguous."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from io import BytesIO
 import re
 from typing import Any, TYPE_CHECKING
@@ -20,6 +21,8 @@ MAX_PIXELS = frame.MAX_PIXELS
 JPEG_MARKER = re.compile(rb'\xff[\xc0-\xcf\xd9-\xfe]')
 """Markers before a segment (length and bytes), and the end; never within compressed pixels."""
 END_OF_JPEG = b'\xff\xd9'
+MORE_JPEG = b'\xaa' * 64 + b''.join(b'\xff%c' % i + b'\xaa' * 64 for i in range(0xD0, 0xD8))
+"""Pixels, also behind each of the eight marks of a restart."""
 PNG_SIGNATURE, PNG_CHUNK = 8, 12  # bytes before the first chunk; of a chunk without its data
 END_OF_PNG = b'IEND'
 TIFF_ROWS, TIFF_TILE = 278, (322, 323)  # tags: rows of a strip; width and height of a tile
@@ -44,6 +47,8 @@ RANGE_IMAGES, PERCENTILES = 20, (0.5, 99.5)
 """The first images of a map, and the shares of their values, that decide the range in use."""
 ORIENTATION = 0x0112  # tag of EXIF
 HEIF = re.compile(rb'....ftyp(hei[cfmsx]|hev[cmsx]|mif1|msf1)', re.DOTALL)
+PAGED = re.compile(rb'\A(II[*+]|MM\0[*+]|....ftyp)|acTL|ANIM|MPF\0', re.DOTALL)
+LONGEST_HEAD = 2**16  # bytes of a file that may state several images
 TIFF = b'II*\0', b'MM\0*', b'II+\0', b'MM\0+'  # the last two are of more than 4 GB
 WIDE_TIFF = ('TIFF', 'F'), ('TIFF', 'I')  # Pillow's modes of 32 bits, which OpenCV does not read
 
@@ -146,6 +151,7 @@ def decode_file(
     header, turn = checked_header(flat, MAX_PIXELS)
     flag = cv2.IMREAD_COLOR  # OpenCV rounds color TIFF of 16 bits, and takes the upper byte else
     if header.format in JPEG_FORMATS:
+        flat = _complete_jpeg(flat)
         flag = REDUCED_JPEG[min(8, reduction(header.height, header.width, least))]
     # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
     if is_mosaic := demosaic is not None and (header.mode == 'L' or header.mode.startswith('I')):
@@ -166,7 +172,8 @@ def decode_file(
 
 def _unpack(flat: np.ndarray, flag: int, header: 'Image.Image') -> np.ndarray | None:
     """Return gray or BGR, uint8 or uint16, as stored; None = it cannot be decoded."""
-    if header.format != 'HEIF' and (header.format, header.mode) not in WIDE_TIFF:
+    is_pillows = header.format == 'HEIF' or (header.format, header.mode) in WIDE_TIFF
+    if not (is_pillows or _has_own_maximum(header)):
         try:
             image = cv2.imdecode(flat, flag | cv2.IMREAD_IGNORE_ORIENTATION)
         except cv2.error:  # beyond a limit of OpenCV
@@ -190,6 +197,12 @@ def _unpack(flat: np.ndarray, flag: int, header: 'Image.Image') -> np.ndarray | 
             kind='depth',
         )
     return np.round(values * (65535 / limit)).astype(np.uint16)
+
+
+def _has_own_maximum(header: 'Image.Image') -> bool:
+    """Return whether a PNM has another largest value than OpenCV expects, which does not scale."""
+    decoder = [tile.args for tile in getattr(header, 'tile', ()) if header.format == 'PPM']
+    return bool(decoder) and isinstance(decoder[0], tuple) and decoder[0][1] not in (255, 65535)
 
 
 def _turned(image: np.ndarray, turn: int) -> np.ndarray:
@@ -250,11 +263,22 @@ def checked_header(flat: np.ndarray, max_pixels: int) -> tuple['Image.Image', in
     for width, height in sizes:
         if width * height > max_pixels:
             raise too_large(width, height)
-    if header.format in JPEG_FORMATS:
-        _check_end_of_jpeg(flat.tobytes())
     if header.format == 'PNG':
         _check_chunks_of_png(flat.data)
     return header, turn
+
+
+def more_images(data: bytes) -> int:
+    """Return how many pages, frames or views a file has behind its first one, which is decoded."""
+    if not PAGED.search(data[:LONGEST_HEAD]):
+        return 0
+    from PIL import Image
+
+    try:
+        with Image.open(BytesIO(data)) as header:
+            return int(getattr(header, 'n_frames', 1)) - 1
+    except Exception:  # damage raises errors of any type
+        return 0
 
 
 def _turn_of(header: 'Image.Image', flat: np.ndarray) -> int:
@@ -278,15 +302,25 @@ def _part_of_tiff(header: 'Image.Image') -> tuple[int, int]:
     return header.width, rows if rows < ALL_ROWS else 0
 
 
-def _check_end_of_jpeg(data: bytes) -> None:
-    """Reject an incomplete image: OpenCV before version 5 fills the rest with gray."""
+def _complete_jpeg(flat: np.ndarray) -> np.ndarray:
+    """Add the end if only this is missing; OpenCV before version 5 fills the rest with gray."""
+    data = flat.tobytes()
     # segment by segment: a thumbnail or a video in the file may contain the same two bytes
     at = 2
     while marker := JPEG_MARKER.search(data, at):
         at = marker.end()
         if marker[0] == END_OF_JPEG:
-            return
+            return flat
         at += int.from_bytes(data[at : at + 2], 'big')
+    from PIL import Image  # prints no warnings
+
+    pixels, images = data.rstrip(b'\xff'), []
+    with suppress(Exception):  # damage raises errors of any type
+        for more in (b'', MORE_JPEG):  # what follows the last pixel changes none
+            with Image.open(BytesIO(pixels + more + END_OF_JPEG)) as image:
+                images.append(image.tobytes())
+        if images[0] == images[1]:
+            return np.frombuffer(pixels + END_OF_JPEG, np.uint8)
     raise ImageError(
         f'compressed image of {len(data)} bytes is cut off: expected the end of a JPEG; copy it '
         'again',

@@ -14,20 +14,12 @@ from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
 from stavpr_ros.regular_file import ElsewhereError, open_regular
 from stavpr_ros.sources.bag_path import STORAGE_SUFFIXES
 from stavpr_ros.sources.cameras import of_one_camera
-from stavpr_ros.sources.files import decode_file, ToBytes
+from stavpr_ros.sources.files import decode_file, more_images, ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.sources.order import in_order
+from stavpr_ros.sources.suffixes import HEIF, OTHER_IMAGES, SUFFIXES
 from stavpr_ros.units import SECOND
 
-HEIF = frozenset({'.heic', '.heif', '.hif'})
-SUFFIXES = HEIF | {
-    '.jpg', '.jpeg', '.jpe', '.jfif', '.png', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.pnm',
-    '.webp',
-}  # fmt: skip
-OTHER_IMAGES = frozenset({
-    '.arw', '.avif', '.cr2', '.cr3', '.dng', '.exr', '.gif', '.hdr', '.jp2', '.jxl', '.nef',
-    '.orf', '.raf', '.raw', '.rw2',
-})  # fmt: skip
 VIDEOS = frozenset({
     '.264', '.265', '.3g2', '.3gp', '.asf', '.avi', '.divx', '.dv', '.f4v', '.flv', '.h264',
     '.h265', '.hevc', '.ivf', '.m2t', '.m2ts', '.m2v', '.m4v', '.mjpeg', '.mjpg', '.mkv', '.mod',
@@ -80,6 +72,7 @@ class FolderSource:
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
         self.least: tuple[int, int] | None = None
+        self._paged: set[Path] = set()
         try:
             files, self.left_out = _images_of(self.path)
         except OSError as error:
@@ -132,7 +125,10 @@ class FolderSource:
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):
             try:
-                image = _read(file, self.least, self.to_bytes)
+                image, more = _read(file, self.least, self.to_bytes)
+                if more and file not in self._paged:
+                    self._paged.add(file)
+                    self.left_out['pages'] += more
                 frame = Frame(image, 0, text_of(file.relative_to(self.path)))
             except ImageError as error:
                 if self.on_error is None:
@@ -177,7 +173,9 @@ def _is_file(path: Path) -> bool:
     return path.is_file() or not path.exists()  # a link into nothing is an image that is missing
 
 
-def _read(file: Path, least: tuple[int, int] | None, to_bytes: ToBytes | None) -> np.ndarray:
+def _read(
+    file: Path, least: tuple[int, int] | None, to_bytes: ToBytes | None
+) -> tuple[np.ndarray, int]:
     try:
         with open_regular(file) as content:
             data = content.readall()
@@ -186,7 +184,7 @@ def _read(file: Path, least: tuple[int, int] | None, to_bytes: ToBytes | None) -
                 '0 bytes: a placeholder of a cloud, or an interrupted copy; download it again',
                 kind='elsewhere',
             )
-        return decode_file(data, None, least, to_bytes)
+        return decode_file(data, None, least, to_bytes), more_images(data)
     except ElsewhereError as error:
         raise ImageError(f'{text_of(file)}: {error.strerror}', kind='elsewhere') from error
     except OSError as error:

@@ -18,10 +18,10 @@ from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import reading
 from stavpr_ros.sources.files import reduce
-from stavpr_ros.sources.folder import SUFFIXES as IMAGES
 from stavpr_ros.sources.folder import VIDEOS
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.sources.order import natural_key
+from stavpr_ros.sources.suffixes import SUFFIXES as IMAGES
 from stavpr_ros.sources.video_decoder import CUT_OFF, EARLY, FACTS, FRAME, REASONS, REMEDY
 from stavpr_ros.units import SECOND
 

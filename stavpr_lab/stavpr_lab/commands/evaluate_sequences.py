@@ -156,8 +156,9 @@ class _Loader:
         topic = self._arguments.topic if is_bag(Path(path)) else None
         camera = self._arguments.camera if is_folder(path) else None
         source = open_source(path, topic, fps=self._arguments.fps, camera=camera)
+        extracted = self.extract(name, source)
         self.left_out.update(getattr(source, 'left_out', {}))
-        return self.extract(name, source)
+        return extracted
 
     def extract(self, name: str, source: FrameSource) -> PlaceMap:
         """Extract the features of a source, cropped as the options state."""

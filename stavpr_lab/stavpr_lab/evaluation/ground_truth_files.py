@@ -10,7 +10,7 @@ import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.files import checked_header, MAX_PIXELS
-from stavpr_ros.sources.folder import SUFFIXES
+from stavpr_ros.sources.suffixes import SUFFIXES
 from stavpr_ros.sources.table import by_name, is_name, is_stamps, Table
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')

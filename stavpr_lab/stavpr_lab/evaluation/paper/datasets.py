@@ -11,7 +11,8 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.ground_truth_files import ARRAYS, TEXT
 from stavpr_lab.evaluation.paper.traverses import msls, read_traverse, Reader, robotcar, utm_names
 from stavpr_ros.errors import SettingsError, SourceError
-from stavpr_ros.sources.folder import FolderSource, SUFFIXES
+from stavpr_ros.sources.folder import FolderSource
+from stavpr_ros.sources.suffixes import SUFFIXES
 
 SYNTH = 'synth_'  # before a name: the same with both traverses cropped
 CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query image (synth-Nord)
