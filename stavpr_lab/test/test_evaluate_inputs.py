@@ -49,6 +49,16 @@ def test_evaluate_of_descriptors_and_of_exported_ones_are_equal(run, pair, tmp_p
     assert (code, 'exists already' in errors) == (1, True)
 
 
+def test_evaluate_names_a_result_that_cannot_be_wrong(run, pair, tmp_path):
+    output = ['--json', tmp_path / 'a.json', '--force']
+    code, _, errors = run(*pair, '--tolerance', 40, *output)
+    assert (code, 'accepts 100% of the 40 places' in errors) == (0, True)
+    code, _, errors = run(*pair[:3], pair[1], *pair[4:], *output)
+    assert (code, 'map and query are the same images' in errors) == (0, True)
+    code, _, errors = run(*pair, *output)
+    assert (code, 'accepts' in errors, 'same images' in errors) == (0, False, False)
+
+
 def test_evaluate_exports_strips_of_images(run, route, tmp_path):
     folder = write_images(tmp_path / 'images', route[:24])
     both = ['--map', folder, '--query', folder, '--sequence-length', 5]

@@ -284,3 +284,21 @@ def test_from_text_of_names_is_of_the_images_that_it_names(tmp_path, text):
     path.write_text(re.sub(r'\ba\b', 'z', text))
     with pytest.raises(SourceError, match=r'z.* is the name of no image'):
         GroundTruth.from_file(path, 3, 4, names=names)
+
+
+@pytest.mark.parametrize(
+    ('truth', 'doubt'),
+    [
+        (GroundTruth.identity(20, 20, 20), '100% of the 20 places for an image'),
+        (GroundTruth.identity(20, 20, 10), '78% of the 20 places'),
+        (GroundTruth.identity(20, 20, 3), ''),
+        (GroundTruth.unknown(20, 20), ''),
+        (by_hand([(0, i) for i in range(5)]), '100% of the 5 places'),
+        (by_hand([(0, -1), (1, -1), (2, -1)]), 'no place for any of 3 images'),
+        (GroundTruth.from_poses(*[[pose(i) for i in range(9)]] * 2, 100), '100% of the 9 places'),
+        (GroundTruth.from_poses([pose(900)], [pose(0), pose(1)], 5), 'no place for any of 1 im'),
+    ],
+)
+def test_truth_that_cannot_be_wrong_or_right_is_named(truth, doubt):
+    assert truth.doubt().startswith(doubt)
+    assert bool(truth.doubt()) == bool(doubt)

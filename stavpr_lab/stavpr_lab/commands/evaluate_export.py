@@ -83,6 +83,7 @@ def _image_files(arguments: argparse.Namespace, report: 'Report') -> list[list[P
 
 def _positions(arguments: argparse.Namespace, report: 'Report') -> list[np.ndarray | None]:
     """Return x and y of places and images that express the ground truth; None = unknown."""
+    from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.pose_file import read_poses
 
     indices = report.drive.places, report.drive.images
@@ -91,17 +92,15 @@ def _positions(arguments: argparse.Namespace, report: 'Report') -> list[np.ndarr
         return [np.outer(index, (0, spacing)) for index in indices]
     if arguments.truth != 'poses':
         return [None, None]
-    paths, traverses = (
-        (arguments.map_poses, arguments.query_poses),
-        (report.reference, report.query),
-    )
-    read = [
-        read_poses(Path(path), traverse.ids)[0] if path else np.asarray(traverse.poses)
-        for path, traverse in zip(paths, traverses, strict=True)
-    ]
+    files = (arguments.map, arguments.map_poses), (arguments.query, arguments.query_poses)
+    traverses = report.reference, report.query
     return [
-        (poses if len(poses) == len(traverse) else poses[index])[:, :2]
-        for poses, traverse, index in zip(read, traverses, indices, strict=True)
+        (
+            read_poses(Path(path), FolderSource(folder, camera=arguments.camera).names)[0][index]
+            if path
+            else np.asarray(traverse.poses)
+        )[:, :2]
+        for (folder, path), traverse, index in zip(files, traverses, indices, strict=True)
     ]
 
 

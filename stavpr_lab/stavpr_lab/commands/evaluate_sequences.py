@@ -256,6 +256,10 @@ def _of_paths(
     if tolerance is None:
         tolerance = IDENTITY_TOLERANCE if arguments.truth == 'identity' else 0
     ground_truth = _ground_truth(arguments, query, reference or query, tolerance)
+    if doubt := ground_truth.doubt():
+        print(f'the ground truth accepts {doubt}', file=sys.stderr)
+    if reference is not None and np.array_equal(reference.features.strips, query.features.strips):
+        print('map and query are the same images: each is recognized by itself', file=sys.stderr)
     if reference is None:
         # places are ``exclude_places`` images before the query and earlier
         ground_truth = ground_truth.loop_closures(arguments.exclude_places - 1)

@@ -15,6 +15,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.sources.folder import text_of
 
 LISTED = 10  # images that an error names
+MAX_SHARE = 0.5  # of the places, accepted for an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +156,20 @@ class GroundTruth:
         truth = cls.from_pairs(queries, places, len(query), len(place))
         limit = '' if degrees is None else f' and {degrees:g} degrees'
         return replace(truth, kind=f'poses within {meters:g} m{limit}')
+
+    def doubt(self) -> str:
+        """Return what is accepted if that can hardly be wrong, or right; '' = neither."""
+        if not self.kind or self.N * self.n == 1:
+            return ''
+        if not len(self.keys):
+            return f'no place for any of {self.N} images: are both numbered and posed alike?'
+        share = len(self.keys) / (np.count_nonzero(self.has_match) * self.n)
+        if share <= MAX_SHARE:
+            return ''
+        return (
+            f'{share:.0%} of the {self.n} places for an image: a guess is right as often; '
+            'is the tolerance too large?'
+        )
 
     @property
     def pairs(self) -> np.ndarray:
