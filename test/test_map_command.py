@@ -219,6 +219,14 @@ def test_merged_drives_are_sessions_that_can_be_taken_out_again(folder, drive, c
     assert main(['sessions', 'both.stavpr', 'x', '--keep', 'dusk']) == 1
 
 
+def test_maps_of_names_that_are_no_utf8_are_merged(folder):
+    name = os.fsdecode(b'caf\xe9')
+    os.rename('day.stavpr', f'{name}.stavpr')
+    assert main(['merge', f'{name}2.stavpr', f'{name}.stavpr', 'night.stavpr']) == 0
+    sessions = load_map(f'{name}2.stavpr').sessions
+    assert [session.name for session in sessions] == ['caf\ufffd', 'night']
+
+
 def test_maps_of_several_cameras_are_one(folder, capsys):
     merge = ['merge', 'both.stavpr', 'day.stavpr', 'night.stavpr', '--different-routes']
     for text in ('front:x', ':90', 'front:inf', 'x' * 65):

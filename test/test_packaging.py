@@ -357,3 +357,19 @@ def test_stavpr_without_ros_names_missing_modules(monkeypatch, capsys):
     for name in ('node', 'replay', 'record'):
         assert stavpr.main([name]) == 2
         assert re.search(r'rclpy.*setup\.bash', capsys.readouterr().err, re.DOTALL)
+
+
+@pytest.mark.parametrize('name', ['record', 'replay', 'monitor', 'bridge', 'build_map', 'map'])
+def test_command_without_docstrings_and_letters_explains_itself(name):
+    """Python -OO removes docstrings; a terminal of LC_ALL=C has ASCII only."""
+    code = f'import sys; from stavpr_ros.commands import stavpr; sys.exit(stavpr.main(["{name}", '
+    env = os.environ | {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
+    for words, expected in (('"--help"', 0), ('"caf\\u00e9", "--none"', 2)):
+        done = subprocess.run(
+            [sys.executable, '-OO', '-c', f'{code}{words}]))'],
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, 'Traceback' in done.stderr) == (expected, False), done.stderr

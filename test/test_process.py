@@ -11,7 +11,7 @@ import pytest
 from stavpr_ros.errors import SettingsError, UnavailableError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.ros.parameters import transport_remedy
-from stavpr_ros.ros.process import require_ros_arguments
+from stavpr_ros.ros.process import own_arguments, require_ros_arguments
 from stavpr_ros.ros.rclpy_workarounds import rclpy_implementation, ros_arguments_checked
 
 
@@ -34,6 +34,11 @@ def test_arguments_that_nothing_reads_are_rejected_with_the_right_line(arguments
 def test_arguments_like_no_parameter_are_rejected_without_a_guess():
     with pytest.raises(SettingsError, match='write --ros-args -p NAME:=VALUE with a NAME that'):
         require_ros_arguments(['--map=x'], ['map_frame', 'robots', 'keyframe_distance'])
+
+
+def test_arguments_that_are_no_utf8_stay_as_they_are():
+    words = ['caf\udce9/', '--also', '/a', '--also', '/a']
+    assert own_arguments([*words, '--ros-args', '-r', 'image:=/cafe']) == words
 
 
 @pytest.mark.parametrize('arguments', ['', '--ros-args -p map_path:=x', 'image:=/camera'])

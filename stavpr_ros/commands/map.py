@@ -354,13 +354,14 @@ def _compact(arguments: argparse.Namespace) -> None:
 def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import merge_maps
     from stavpr_ros.recognition.same_places import with_same_places
+    from stavpr_ros.sources.folder import text_of
 
     maps = [_verified(path) for path in arguments.maps]
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
     cameras = [_camera(text) for text in arguments.cameras]
-    merged = merge_maps(maps, [Path(path).stem for path in arguments.maps], cameras)
+    merged = merge_maps(maps, [text_of(Path(path).stem) for path in arguments.maps], cameras)
     if not arguments.different_routes:
         merged = with_same_places(merged)
     _write(merged, arguments)
@@ -432,10 +433,11 @@ def _recover(arguments: argparse.Namespace) -> int:
 def _update(arguments: argparse.Namespace) -> None:
     from stavpr_ros.output_file import FileVersion
     from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
+    from stavpr_ros.sources.folder import text_of
 
     settings = UpkeepSettings(arguments.max_places, arguments.max_age, arguments.precision)
     opened, place_map = FileVersion.of(arguments.map), _verified(arguments.map)
-    name = Path(arguments.drive).stem[:40]
+    name = text_of(Path(arguments.drive).stem)[:40]
     with _drive(arguments, place_map) as drive:
         version = update_file(arguments.map, opened, place_map, drive, settings, name)
     for change in version.changes:

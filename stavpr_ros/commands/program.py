@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import difflib
 from importlib import import_module
+from io import TextIOWrapper
 import math
 import os
 from pathlib import Path
@@ -151,6 +152,9 @@ def run_program(
     """
     obey_signals()
     wait_passively()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors='backslashreplace')  # a terminal may lack the letters
     try:
         return until_unread(work) or DONE
     except StavprError as error:

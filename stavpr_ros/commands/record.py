@@ -85,7 +85,9 @@ def _run(args: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('record', __doc__.partition(': ')[2], EPILOG)
+    parser = make_parser(
+        'record', 'Write matches, or loop closures, to a file, one JSON object per line.', EPILOG
+    )
     parser.add_argument(
         '--output', required=True, metavar='FILE', help='the file to write (JSON lines)'
     )

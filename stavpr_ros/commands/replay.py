@@ -228,7 +228,11 @@ def _records(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('replay', __doc__.partition(': ')[2], EPILOG)
+    parser = make_parser(
+        'replay',
+        'Publish images of a bag, video or folder, at a pace or after the last result.',
+        EPILOG,
+    )
     parser.add_argument(
         'bag',
         metavar='BAG',

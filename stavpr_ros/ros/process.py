@@ -75,7 +75,16 @@ def own_arguments(arguments: Sequence[str]) -> list[str]:
     :raises SettingsError: arguments after ``--ros-args`` are invalid.
     """
     with ros_arguments_checked():
-        return list(remove_ros_args(arguments))
+        texts = _texts(arguments)
+        originals = dict(zip(texts, arguments, strict=True))
+        return [originals[text] for text in remove_ros_args(texts)]
+
+
+def _texts(arguments: Sequence[str]) -> list[str]:
+    """Return arguments as ROS takes them; bytes that are no UTF-8 are replaced."""
+    return [
+        word.encode('utf-8', 'surrogateescape').decode('utf-8', 'replace') for word in arguments
+    ]
 
 
 @contextmanager
@@ -90,7 +99,8 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """
     with ros_arguments_checked():
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        texts = _texts(sys.argv[1:] if arguments is None else arguments)
+        rclpy.init(args=texts, signal_handler_options=SignalHandlerOptions.NO)
     left_behind = False
     try:
         node = make()

@@ -55,7 +55,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = make_parser('monitor', __doc__.partition(': ')[2], EPILOG)
+    parser = make_parser('monitor', 'A live view of the node in a web browser.', EPILOG)
     parser.add_argument('--port', type=_port, default=8080, help='0 = any free one (%(default)d)')
     parser.add_argument(
         '--host',
