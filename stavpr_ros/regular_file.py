@@ -19,17 +19,17 @@ POINTERS = {
     b'version https://git-lfs': 'a pointer of Git LFS instead of the content: run `git lfs pull`',
     b'/annex/objects/': 'a pointer of git-annex instead of the content: run `git annex get`',
 }
-"""The first bytes of files that stand for others, and what to do."""
+"""The first bytes of files that replace others, and what to do."""
 MAX_POINTER, LONGEST_TARGET = 1024, 60  # bytes, characters
 TOOLS = {'/annex/': 'run `git annex get`', 'dvc': 'run `dvc pull`', 'files/md5': 'run `dvc pull`'}
 
 
 class ElsewhereError(OSError):
-    """A file stands for content that is not on this machine."""
+    """The content of a file is not on this machine."""
 
 
 def elsewhere(path: str | Path) -> str:
-    """Return what stands for the content of a file, and what to do; '' = it is here or unknown."""
+    """Return what replaces the content of a file, and what to do; '' = it is here or unknown."""
     path = Path(path)
     if not path.exists():
         if path.is_symlink():

@@ -71,7 +71,7 @@ def test_cameras_of_one_drive_are_listed_and_chosen(name):
     ],
 )
 def test_parts_of_one_drive_are_no_cameras(drive, warnings, caplog):
-    """Two kinds of names with the same numbers may be two drives: a line says so."""
+    """Two kinds of names with the same numbers may be two drives: a line states it."""
     assert of_one_camera(drive, TOP) == drive
     assert len(caplog.records) == warnings
     assert all('of the same numbers' in record.getMessage() for record in caplog.records)

@@ -264,7 +264,7 @@ def test_decode_compressed_of_cut_off_jpeg_fails():
     data = data[:2] + segment + data[2:]
     # cameras fill up with zeros
     assert np.abs(decode_compressed(data + bytes(50)).astype(int) - rgb).max() <= 4
-    for missing in (1, 2):  # of the end alone: some cameras write none
+    for missing in (1, 2):  # of the end alone, which not all cameras write
         np.testing.assert_array_equal(decode_compressed(data[:-missing]), decode_compressed(data))
     for missing in (20, 60):
         with pytest.raises(ImageError, match='is cut off: expected the end of a JPEG') as caught:

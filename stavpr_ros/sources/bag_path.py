@@ -10,7 +10,7 @@ from stavpr_ros.errors import SourceError, StavprError
 from stavpr_ros.sources.suffixes import SUFFIXES
 
 METADATA = 'metadata.yaml'
-IN_METADATA = b'rosbag2_bagfile_information'  # not in those of other programs
+IN_METADATA = b'rosbag2_bagfile_information'  # not in files of other programs
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap', '.bag'})
 
 

@@ -35,7 +35,7 @@ FOREIGN = re.compile(
 STUB = re.compile(
     r'.*\.(dvc|icloud|lnk|url|webloc|part|partial|crdownload|download|opdownload)', re.IGNORECASE
 )
-"""Names of files that stand for others, or are not complete."""
+"""Names of files that replace others, or are not complete."""
 FEW = 5  # times as many images in sub-folders: images beside these are not the drive
 
 

@@ -191,7 +191,7 @@ def _by_times(files: list[Path], guesses: list[str]) -> tuple[list[Path], list[s
     times = [*map(_taken, files)]
     falls = [i for i in range(1, len(files)) if times[i] < times[i - 1]]
     if not all(times) or all(_follows(files[i - 1], files[i]) for i in falls):
-        where = files[falls[0]].name if falls else 'some'
+        where = files[falls[0]].name if falls else 'several'
         return files, [*guesses, f'the times in EXIF go back at {where}: the names count']
     order = sorted(range(len(files)), key=lambda i: (times[i], i))
     return [files[i] for i in order], ['the names contradict the times in EXIF, which count']

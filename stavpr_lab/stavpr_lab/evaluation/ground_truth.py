@@ -99,7 +99,7 @@ class GroundTruth:
 
         * Text (.csv, .tsv, .txt): a line a pair, query and place, with or without a header. A
           single column is the place of query 0, 1, 2 and so on. A place of -1 = not in the map.
-          Files of ``names``, of queries and places, may stand for their numbers.
+          Files of ``names``, of queries and places, may replace their numbers.
         * Array (.npy, .npz with one array or one called ``truth``): shape (N, n), 0 or 1; else
           shape (M, 2), pairs; or shape (N,), the place of each query, -1 = none. ``GTsoft`` of an
           .npz, as VPR_Tutorial publishes it, has the shape (n, N).
