@@ -106,9 +106,8 @@ def run_live(
     parameters = [f'{name}:={value}' for name, value in node_parameters.items()]
     node = [executable('node'), '--ros-args', *(word for p in parameters for word in ('-p', p))]
     replay = [executable('replay'), query.path, '--lossless', '--wait', '120', *replay_options]
-    replay += [] if query.topic is None else ['--topic', query.topic]
-    replay += [] if query.camera is None else ['--camera', query.camera]
-    replay += [] if query.fps is None else ['--fps', str(query.fps)]
+    for option, value in (('topic', query.topic), ('camera', query.camera), ('fps', query.fps)):
+        replay += [] if value is None else [f'--{option}', str(value)]
     record = [executable('record'), '--output']
     matches, closures = folder / 'matches.jsonl', folder / 'loop_closures.jsonl'
     recorders = {'record': [*record, str(matches)]}
