@@ -63,6 +63,18 @@ def require_above(name: str, value: float, bound: float, below: float = math.inf
         raise SettingsError(f'{name} = {value} must be above {bound}{upper}')
 
 
+def require_monotonic(name: str, values: tuple[float, ...], start: float, end: float) -> None:
+    """Raise SettingsError if values do not go strictly from ``start`` on to ``end`` at most."""
+    array = np.asarray(values)
+    ahead = (array - start if array.dtype.kind in 'fiu' else np.empty(0)) * np.sign(end - start)
+    valid = array.ndim == 1 and ahead.size and 0 <= ahead[0] <= ahead[-1] <= abs(end - start)
+    if not (valid and (np.diff(ahead) > 0).all()):
+        raise SettingsError(
+            f'{name} = {values}: expected numbers, at least one, each beyond the one before, from '
+            f'{start} to {end}'
+        )
+
+
 def require_whole(name: str, value: float, least: int, unit: str = '') -> None:
     """Raise SettingsError if a setting is less, or no whole number."""
     require_at_least(name, value, least, unit)
@@ -98,6 +110,51 @@ def float_array(values: np.ndarray, name: str, axes: str) -> np.ndarray:
     array = np.asarray(values)
     require_shape(name, array, axes, 'float32', 'float64')
     return np.ascontiguousarray(array)
+
+
+def float32_vector(name: str, values: np.ndarray, shortest: int, longest: int) -> np.ndarray:
+    """
+    Return a contiguous float32 vector of finite values or +inf.
+
+    :raises InputError: another type or length, NaN or -inf.
+    """
+    array = np.asarray(values)
+    require_shape(name, array, 'n', 'float32', 'float64')
+    if not shortest <= len(array) <= longest:
+        raise InputError(f'{name} of {len(array)} places: expected {shortest} to {longest}')
+    if not array.min(initial=np.inf) > -np.inf:
+        no_nan(array, name)
+    return np.ascontiguousarray(array, np.float32)
+
+
+def relative_weights(count: int, *weights: np.ndarray) -> list[np.ndarray]:
+    """
+    Return relative probabilities, finite and at least 0, not all of them 0, float64, (count,).
+
+    :raises InputError: others.
+    """
+    arrays = [np.asarray(each) for each in weights]
+    for array in arrays:
+        valid = array.shape == (count,) and array.dtype.kind in 'fiu'
+        if not (valid and array.min() >= 0 and 0 < array.sum() < math.inf):
+            raise InputError(f'weights {array}: expected {count} numbers, at least 0, not all 0')
+    return [np.ascontiguousarray(array, np.float64) for array in arrays]
+
+
+def require_indices(name: str, values: object, end: object) -> None:
+    """Raise InputError if not all are whole numbers of at least 0 and below ``end``."""
+    array = np.asarray(values)
+    is_valid = array.dtype.kind in 'iu' or not array.size
+    if not is_valid or not np.all((array >= 0) & (array < np.asarray(end))):
+        raise InputError(f'{name} = {values}: expected whole numbers of at least 0, below {end}')
+
+
+def require_ascending(name: str, values: object, end: int) -> None:
+    """Raise InputError if values are no ascending indices below ``end``, (m,), int64."""
+    require_shape(name, np.asarray(values), 'm', 'int32', 'int64')
+    require_indices(name, values, end)
+    if (np.diff(np.asarray(values)) <= 0).any():
+        raise InputError(f'{name} = {values}: expected them ascending, each once')
 
 
 def no_nan(array: np.ndarray, name: str) -> np.ndarray:

@@ -17,6 +17,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from stavpr_ros import checks
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.filter.kernels import speed_factors
@@ -93,7 +94,7 @@ class DevicePlaceFilter(Filter):
         self._steps = torch.from_numpy(self._step_probabilities).float().to(device)
         self._speed_steps = torch.tensor([0, -1, 1], device=device)
         # sums of states on the map and of lost ones, by level; sums by place; places; states of
-        # the first of them; their paths: 16 times the place of each image, newest first, plus the
+        # the first of them; their paths: V times the place of each image, newest first, plus the
         # speed; below 0 before the path entered the map
         copied, states = min(COPIED, n), len(self._rows)
         sizes = 2 * K, 2 * K, copied, copied, states, (lag + 1) * states
@@ -139,6 +140,7 @@ class DevicePlaceFilter(Filter):
         """See :meth:`PlaceFilter.update`; z is on the device, (n,)."""
         self._read()
         s, (K, V) = self.settings, self._shape
+        checks.require_shape('z', z, f'{len(self._z) if len(z) else 0}')
         if not self.count:
             self._states[:, self._pad :] = s.start / (K * V * self._real)
             self._states.index_fill_(1, self._gaps, 0)
@@ -165,7 +167,8 @@ class DevicePlaceFilter(Filter):
         sent['taps'][:, 0], sent['back'][:] = np.tile(taps, (K, 1)), back
         if speed_likelihoods is None:
             speed_likelihoods = np.ones(V)
-        factors = speed_factors(speed_weights, speed_likelihoods, s.keep_speed)
+        weights = checks.relative_weights(V, speed_weights, speed_likelihoods)
+        factors = speed_factors(*weights, s.keep_speed)
         speeds, v = sent['speeds'], np.arange(V)
         speeds[v, 1, v], speeds[v[1:], 2, v[:-1]] = factors[0], factors[1, 1:]
         speeds[v[:-1], 3, v[1:]] = factors[2, :-1]
@@ -235,7 +238,7 @@ class DevicePlaceFilter(Filter):
         earlier = (torch.stack(places) - firsts[:, None]) // K - self._pad
         earlier = torch.where(on_map.cumprod(dim=0) > 0, earlier, -1)
         now = top.repeat_interleave(K * V)[None] - self._pad
-        return (16 * torch.cat([now, earlier]) + torch.stack(speeds)).int().view(-1)
+        return (V * torch.cat([now, earlier]) + torch.stack(speeds)).int().view(-1)
 
     def _read(self) -> None:
         """Wait for the results of the latest image, once."""
@@ -258,11 +261,12 @@ class DevicePlaceFilter(Filter):
     def belief(self, n: int, images_ago: int) -> Belief:
         """See :meth:`PlaceFilter.belief`."""
         self._read()
+        checks.require_indices('images_ago', images_ago, min(self._lag + 1, self.count))
         (K, V), then = self._shape, self._paths[images_ago]
         least = NEGLIGIBLE * self._top_states.max()
         rows = np.flatnonzero((self._top_states >= max(least, 1e-300)) & (then >= 0))
         now = rows % (K * V) // V, rows % V, self._top[rows // (K * V)]
-        states = np.stack([then[rows] // 16, *now, then[rows] % 16], axis=1).astype(np.int64)
+        states = np.stack([then[rows] // V, *now, then[rows] % V], axis=1).astype(np.int64)
         return Belief(*merged(states, self._top_states[rows].astype(np.float64)))
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
@@ -280,7 +284,7 @@ class DevicePlaceFilter(Filter):
         self._read()
         (K, V), (k, v, y) = self._shape, state[:3]
         column = (int(np.flatnonzero(self._top == y)[0]) * K + k) * V + v
-        return self._paths[: images + 1, column] // 16
+        return self._paths[: images + 1, column] // V
 
 
 def _move_back(values: torch.Tensor, places: slice, count: int, pad: int) -> None:

@@ -5,6 +5,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from stavpr_ros import checks
+
+MAX_SPEED, MIN_LEVEL = 126, -1000  # a step and one place more are within a block of the filter
+MAX_SHARE = 1 - 1e-9  # of states that keep their speed, and that enter the map: the others remain
 
 
 @dataclass(frozen=True)
@@ -12,8 +16,10 @@ class FilterSettings:
     """
     Model of the filter; tuned on the data sets named in benchmarks/results/robust_mode.md.
 
-    :param speeds: places that the query passes an image; between two, a path costs evidence.
-    :param levels: mean z-normalized distance of right places, from bad to good conditions.
+    :param speeds: places that the query passes an image, ascending, at most ``MAX_SPEED``;
+        between two, a path costs evidence.
+    :param levels: mean z-normalized distance of right places, below 0, descending: from bad to
+        good conditions.
     :param weight: alpha of an image that differs from the one before as neighboring places of the
         map do.
     :param most_change, least_change: limits of the change, over the change of neighboring places,
@@ -28,6 +34,7 @@ class FilterSettings:
     :param change_deviation: of the logarithm of the change at one speed.
     :param speed_weight: exponent of the likelihood of a speed. Below 1, since successive changes,
         means of five, are not independent.
+    :raises SettingsError: values that are no model.
     """
 
     speeds: tuple[float, ...] = (0.0, 0.25, 0.33, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
@@ -44,6 +51,18 @@ class FilterSettings:
     start: float = 0.9
     change_deviation: float = 0.5
     speed_weight: float = 0.25
+
+    def __post_init__(self) -> None:
+        checks.require_monotonic('speeds', self.speeds, 0, MAX_SPEED)
+        checks.require_monotonic('levels', self.levels, 0, MIN_LEVEL)
+        for name in ('weight', 'least_change', 'standstill', 'speed_weight'):
+            checks.require_at_least(name, getattr(self, name), 0)
+        checks.require_at_least('most_change', self.most_change, self.least_change)
+        checks.require_above('change_deviation', self.change_deviation, 0)
+        checks.require_above('leave', self.leave, 0, 1)  # off the map there is always a state
+        most = {'keep_level': 1, 'start': 1, 'spread': 0.5, 'keep_speed': MAX_SHARE}
+        for name in (*most, 'enter'):
+            checks.require_between(name, getattr(self, name), 0, most.get(name, MAX_SHARE))
 
     def level_changes(self) -> np.ndarray:
         """Return the probability of each level by the one before, (K, K), float32."""

@@ -41,6 +41,7 @@ that makes their sum 1 is part of the next image's level changes.
 """
 
 import numpy as np
+from stavpr_ros import checks
 from stavpr_ros.filter.kernels import advance, PLACES
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.paths import (
@@ -69,7 +70,9 @@ class PlaceFilter(Filter):
 
     :param places: places that there is room for.
     :param lag: most images that states are followed back.
-    :param gaps: columns between sessions; a state that enters one leaves the map.
+    :param gaps: columns between sessions, ascending; a state that enters one leaves the map.
+    :raises SettingsError: no lag, or places below 0.
+    :raises InputError: arguments of any method that do not fit the places, lag and speeds.
     """
 
     def __init__(
@@ -79,6 +82,9 @@ class PlaceFilter(Filter):
         settings: FilterSettings = MODEL,
         gaps: np.ndarray = NO_PLACES,
     ) -> None:
+        checks.require_whole('places', places, 0)
+        checks.require_whole('lag', lag, 1, 'image')
+        checks.require_ascending('gaps', gaps, places)
         self.settings = settings
         self._gaps = gaps
         self._speeds = np.array(self.settings.speeds, np.float64)
@@ -109,6 +115,7 @@ class PlaceFilter(Filter):
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
+        checks.require_whole('places', places, self._room)
         a, origins, by_place = self._a, self._origins, self._by_place
         self._allocate(places)
         self._a[: len(a)], self._origins[:, : len(a)] = a, origins
@@ -116,6 +123,7 @@ class PlaceFilter(Filter):
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
+        checks.require_indices('count', count, self._room + 1)
         _move_up(self._a, count, 0)
         for origins in self._origins:
             _move_up(origins, count, ALL_ENTERED)
@@ -124,6 +132,8 @@ class PlaceFilter(Filter):
     def move_back(self, places: slice, count: int) -> None:
         """Move states back: :meth:`Filter.move_back`."""
         y = np.arange(places.start, places.stop)
+        checks.require_indices('places', [*y, *(y - count)], self._room)
+        checks.require_whole('count', count, len(y), 'places')
         block, at, block_to, at_to = *divmod(y, BLOCK), *divmod(y - count, BLOCK)
         self._a[block_to, :, :, at_to] += self._a[block, :, :, at]
         self._by_place[y - count] += self._by_place[y]
@@ -152,7 +162,13 @@ class PlaceFilter(Filter):
         not_near: np.ndarray = NO_PLACES,
     ) -> None:
         """See :meth:`Filter.update`."""
+        z = checks.float32_vector('z', z, int(self._gaps.max(initial=-1)) + 1, self._room)
         s, n, slot = self.settings, len(z), self.count % len(self._steps)
+        checks.require_at_least('weight', weight, 0)
+        checks.require_indices('not_near', not_near, n)
+        if speed_likelihoods is None:
+            speed_likelihoods = np.ones(len(s.speeds))
+        speeds = checks.relative_weights(len(s.speeds), speed_weights, speed_likelihoods)
         if not self.count and n:
             states = len(self._speeds) * max(n - len(self._gaps), 1)  # of a level
             self._a[: -(-n // BLOCK)] = s.start / (len(self._levels) * states)
@@ -165,12 +181,10 @@ class PlaceFilter(Filter):
             z = z.copy()
             z[not_near] = np.maximum(z[not_near], 0)
             z[self._gaps] = NO_PLACE
-        if speed_likelihoods is None:
-            speed_likelihoods = np.ones(len(self._speeds))
         self._off = self._off @ self._level_changes
         total = advance(
-            self._a, n, np.ascontiguousarray(z), np.float32(weight), self._levels,
-            self._level_changes, self._scale, self._speeds, speed_weights, speed_likelihoods,
+            self._a, n, z, np.float32(weight), self._levels,
+            self._level_changes, self._scale, self._speeds, *speeds,
             self.count, s.keep_speed, s.spread, s.leave, s.enter, self._off, self._gaps,
             self._halos, self._origins[slot], self._steps[slot], self._by_place, self._maxima,
         )  # fmt: skip
@@ -186,6 +200,8 @@ class PlaceFilter(Filter):
 
     def belief(self, n: int, images_ago: int) -> Belief:
         """See :meth:`Filter.belief`."""
+        checks.require_indices('n', n, self._room + 1)
+        checks.require_indices('images_ago', images_ago, min(len(self._steps) + 1, self.count))
         newest = (self.count - 1) % len(self._steps)
         states = self._a, self._by_place, self._maxima, n
         return Belief(
@@ -199,11 +215,14 @@ class PlaceFilter(Filter):
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """See :meth:`Filter.most_probable`."""
+        checks.require_ascending('excluded', excluded, len(self._by_place))
         place, probability = find_most_probable(self._by_place, self._maxima, excluded)
         return place, probability * self._scale
 
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
         """See :meth:`Filter.path`; a state is level, speed, place, speed then."""
+        checks.require_indices('state', state[:3], (*self._a.shape[1:3], self._room))
+        checks.require_indices('images', images, len(self._steps) + 1)
         places = np.empty(images + 1, np.int32)
         trace_back(
             *state[:3].tolist(), self._origins, self._steps,
@@ -216,5 +235,6 @@ def _move_up(values: np.ndarray, count: int, none: int) -> None:
     """Move places of (blocks, K, ., BLOCK) up by ``count``; behind them, write ``none``."""
     for row in np.ndindex(values.shape[1:3]):
         places = values[:, *row].ravel()  # a copy
-        places[:-count], places[-count:] = places[count:].copy(), none
+        end = len(places) - count
+        places[:end], places[end:] = places[count:].copy(), none
         values[:, *row] = places.reshape(len(values), -1)

@@ -1,0 +1,131 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The public classes of the filter, with arguments that do not fit: an error, and no change."""
+
+import numpy as np
+import pytest
+from stavpr_ros.errors import InputError, SettingsError, StavprError
+from stavpr_ros.filter import FilterSettings, PlaceFilter
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+N, LAG, V = 100, 4, len(FilterSettings().speeds)
+SAME, Z, S = np.ones(V), np.zeros(N, np.float32), FilterSettings()
+NAN, INF = float('nan'), float('inf')
+
+
+def changed(values, *pairs):
+    out = np.array(values)
+    for index, value in pairs:
+        out[index] = value
+    return out
+
+
+def driven(*gaps):
+    one, rng = PlaceFilter(N, LAG, gaps=np.array(gaps, np.int64)), np.random.default_rng(0)
+    for image in range(8):
+        one.update(changed(rng.standard_normal(N, np.float32), (20 + image, -4)), 0.28, SAME)
+    return one
+
+
+STATE = driven().belief(N, 0).states[0]
+WRONG_UPDATES = [
+    (np.zeros(3 * N, np.float32), 0.3, SAME), (np.zeros(N + 1, np.float32), 0.3, SAME),
+    (np.zeros((2, N), np.float32), 0.3, SAME), (np.zeros(N, np.int64), 0.3, SAME),
+    (np.zeros(N, complex), 0.3, SAME), (changed(Z, (3, NAN)), 0.3, SAME),
+    (changed(Z, (3, -INF)), 0.3, SAME), (changed(Z, (3, -INF), (4, INF)), 0.3, SAME),
+    (Z, NAN, SAME), (Z, -0.1, SAME), (Z, INF, SAME), (Z, '0.3', SAME),
+    (Z, 0.3, np.ones(V - 1)), (Z, 0.3, np.ones(V + 1)), (Z, 0.3, changed(SAME, (1, NAN))),
+    (Z, 0.3, changed(SAME, (1, -1))), (Z, 0.3, np.zeros(V)), (Z, 0.3, SAME, np.ones(3)),
+    (Z, 0.3, SAME, changed(SAME, (1, INF))), (Z, 0.3, SAME, SAME, np.array([N])),
+    (Z, 0.3, SAME, SAME, np.array([-1])), (Z, 0.3, SAME, SAME, np.ones(N, bool)),
+]  # fmt: skip
+WRONG_CALLS = [
+    ('evict', N + 1), ('evict', -1), ('evict', 0.5), ('grow', N - 1), ('grow', N + 0.5),
+    ('belief', 10 * N, 0), ('belief', N, LAG + 1), ('belief', N, -1), ('path', STATE, LAG + 1),
+    ('path', STATE, -1), ('path', changed(STATE, (0, 99)), 1), ('path', changed(STATE, (1, V)), 1),
+    ('path', changed(STATE, (2, 10**9)), 1), ('most_probable', np.array([5, 3])),
+    ('most_probable', np.array([5.0])), ('move_back', slice(10, 20), 15),
+    ('move_back', slice(90, 110), 30), ('move_back', slice(50, 70), 10),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize('call', [('update', *each) for each in WRONG_UPDATES] + WRONG_CALLS)
+def test_arguments_that_do_not_fit_are_an_error_and_change_nothing(call):
+    """Kernels trust shapes: a place more than there is room for ends the process."""
+    one, expected = driven(), driven()
+    with pytest.raises(StavprError):
+        getattr(one, call[0])(*call[1:])
+    for each in (one, expected):
+        each.update(Z, 0.3, SAME)
+    np.testing.assert_array_equal(one.places_of_states(), expected.places_of_states())
+
+
+def test_error_names_what_came_and_what_was_expected():
+    with pytest.raises(InputError, match=f'z of 300 places: expected 0 to {N}'):
+        PlaceFilter(N, LAG).update(np.zeros(300, np.float32), 0.3, SAME)
+    with pytest.raises(InputError, match='z of 4 places: expected 11 to 100'):
+        driven(9, 10).update(np.zeros(4, np.float32), 0.3, SAME)
+    with pytest.raises(InputError, match='images_ago = 0'):
+        PlaceFilter(N, LAG).belief(N, 0)
+
+
+def test_eviction_of_nothing_changes_nothing_and_of_all_leaves_nothing():
+    one, expected = driven(), driven()
+    one.evict(0)
+    np.testing.assert_array_equal(one.places_of_states(), expected.places_of_states())
+    np.testing.assert_array_equal(one.belief(N, LAG).weights, expected.belief(N, LAG).weights)
+    one.evict(N)
+    assert not one.places_of_states().any()
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [(-1, LAG), (2.5, LAG), (N, 0), (N, -3), (N, 1.5), (N, '4')]
+    + [(N, LAG, S, np.array(gaps)) for gaps in ([N], [-1], [5, 4], [4.5])],
+)
+def test_filter_without_room_or_lag_or_with_gaps_elsewhere_is_an_error(arguments):
+    with pytest.raises(StavprError):
+        PlaceFilter(*arguments)
+
+
+WRONG_VALUES = {
+    'speeds': [(), (0.0, NAN), (0.0, INF), (-1.0, 1.0), (1.0, 0.5), (1.0, 1.0), (127.0,), ('a',)],
+    'levels': [(), (1.0,), (-2.0, -1.0), (NAN,), (-INF,), ((-1.0,),)],
+    **{name: [-1, NAN, INF, '1'] for name in ('weight', 'standstill', 'speed_weight')},
+    **{name: [1.5, -0.1, NAN] for name in ('keep_level', 'start', 'spread', 'keep_speed')},
+    'enter': [1.0, -0.1, NAN],
+    'leave': [0.0, 1.0, NAN],
+    'most_change': [0.1, INF],
+    'least_change': [-1, 3.0, NAN],
+    'change_deviation': [0.0, NAN],
+}
+
+
+@pytest.mark.parametrize('name', WRONG_VALUES)
+def test_settings_that_are_no_model_are_rejected_by_name(name):
+    for value in WRONG_VALUES[name]:
+        with pytest.raises(SettingsError, match=name.replace('least', '(least|most)')):
+            FilterSettings(**{name: value})
+
+
+@pytest.mark.parametrize('speeds', [tuple(0.25 * v for v in range(17)), (0.0, 126.0), (2.5,)])
+@pytest.mark.parametrize('kind', ['cpu', 'device'])
+def test_models_of_many_or_fast_speeds_follow_the_camera(speeds, kind):
+    """Paths, which pack place and speed on a device, and steps of almost a block of memory."""
+    n, s, rng, as_z = 4200, FilterSettings(speeds=speeds), np.random.default_rng(2), np.asarray
+    one = PlaceFilter(n, LAG, s)
+    if kind == 'device':
+        as_z = pytest.importorskip('torch').from_numpy
+        from stavpr_ros.filter.device_filter import DevicePlaceFilter
+
+        one = DevicePlaceFilter(n, LAG, s, device='cpu')
+    places = 1000 + np.rint(speeds[-1] * np.arange(25)).astype(int)
+    for place in places:
+        z = changed(rng.standard_normal(n, np.float32), (place, -6))
+        one.update(as_z(z), 0.5, np.ones(len(speeds)))
+    belief = one.belief(n, LAG)
+    best = belief.weights.argmax()
+    assert belief.places[best] == places[-1 - LAG]
+    assert one.path(belief.states[best], LAG)[::-1].tolist() == places[-1 - LAG :].tolist()
+    with pytest.raises(InputError, match='z'):
+        one.update(as_z(np.zeros(n + 1, np.float32)), 0.5, np.ones(len(speeds)))
