@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from pipelines import localizing, message, process
-from places import features_of, map_of
+from places import features_of, map_of, route_strips
 import pytest
 from scipy.stats import chi2
 from stavpr_ros.alignment import SequenceSettings
@@ -166,6 +166,19 @@ def test_session_of_a_match_ends_its_track():
     matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
     assert all(match.accepted for match in matches[LENGTH : CORNER - 6])
     assert all(match.accepted for match in matches[CORNER + LENGTH :])
+
+
+def test_early_matches_are_compared_since_the_first_of_them():
+    """The robot was carried 30 m before it came back: what no match is of does not count."""
+    route, elsewhere = route_strips(3, 200, 32), route_strips(7, 24, 32)
+    strips = np.concatenate([route[:, :70], elsewhere, route[:, 110:190]], axis=1)
+    way = track(count=174) + (np.arange(174) >= 94)[:, None] * (0, 30)
+    one = PlaceRecognizer(
+        driven_map(features_of(route, 0.2, 1), track(count=200)), RecognizerSettings()
+    )
+    matches = drive(one, features_of(strips, 0.2, 2), way)
+    assert len(matches[100].path) < len(matches[-1].path)  # an early one
+    assert all(match.accepted for match in matches[95:])
 
 
 def test_reset_forgets_the_way():

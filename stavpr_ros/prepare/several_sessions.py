@@ -49,7 +49,11 @@ class SeveralSessions:
         self._chunks = np.where(related < 0, numbers, same_as[related]) // CHUNK  # of positions
         self._ends = np.array([runs[0].start, *(run.stop for run in runs)])
         self._farther = np.zeros(len(runs))  # how much farther the nearest place of each is
-        self._turn = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the query: no session is farther than another."""
+        self._farther[:] = self._turn = 0
 
     @property
     def places(self) -> int:

@@ -76,7 +76,7 @@ class FilterWindow(QueryWindow):
         self.change = ImageChange(layout.passes(places), settings, length)
         self.choice = PathChoice(self.filter, self.change, layout, width)
         self._likely, self._recent = likely, RecentWindows(likely)
-        self._own = self._of_window = -math.inf  # evidence of the latest match, and of the window
+        self._own = -math.inf  # evidence of the latest match
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
         self._repeated = slice(0, 0)  # columns that the latest path is in, beyond a lap
@@ -98,7 +98,7 @@ class FilterWindow(QueryWindow):
         self.filter.reset()
         self.change.reset()
         self._at_rest, self._entered, self._recent = None, 0, RecentWindows(self._likely)
-        self._repeated = slice(0, 0)
+        self._repeated, self._means = slice(0, 0), PlaceMeans()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -173,8 +173,7 @@ class FilterWindow(QueryWindow):
         match = self._at_rest
         if match is None:
             match = self._match_image(len(self.images), middle, nms_radius)
-            self._of_window = self._own
-        self._recent.add(self._of_window)
+            self._recent.add(self._own)
         self._at_rest = match if self._rests(middle) else None
         return in_places(match, self.layout)
 

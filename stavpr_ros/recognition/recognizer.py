@@ -62,6 +62,7 @@ class Verdict(NamedTuple):
 
     :param match: by the images alone.
     :param distance, probability: also by odometry; NaN without a sequence.
+    :param run: of :class:`RelativeMotion` with this match; None = not compared.
     """
 
     match: WindowMatch
@@ -70,6 +71,7 @@ class Verdict(NamedTuple):
     reason: str
     distance: float = math.nan
     probability: float = math.nan
+    run: tuple[int, int, int, int] | None = None
 
 
 EMPTY = Verdict(WindowMatch(), Limits(), Status.WARMING_UP, '')
@@ -241,11 +243,16 @@ class SequenceRecognizer(ABC):
         verdict = Verdict(WindowMatch(), self._limits, Status.WARMING_UP, reason)
         if window.buffer.full:
             verdict = self._verdict(window.match(radius), self._limits)
+        runs = [verdict.run]
         if verdict.status is not Status.MATCH:
             newest = window.match_newest(radius)
             if newest.nearest is not None:
                 early = self._verdict(newest, self._limits.raised(EARLY))
+                runs.append(early.run)
                 verdict = early if early.status is Status.MATCH else verdict
+        # of the first match that images accept; the other one is no other image
+        runs.sort(key=lambda run: run is None or run[-1] < 0)
+        self._motion.run = runs[0] or self._motion.run
         self._newest = verdict
         return verdict
 
@@ -256,9 +263,10 @@ class SequenceRecognizer(ABC):
             return Verdict(match, limits, Status.NO_MATCH, self.no_places)
         distance, probability = match.nearest.distance, match.probability
         status, reason = limits.decide(distance, probability)
+        run = None
         if len(self._motion.positions) and np.isfinite(self._motion.trajectory[-1][0]):
             accepted, layout = status is Status.MATCH, self._window.layout
-            agreed = self._motion.agreement(
+            agreed, run = self._motion.agreement(
                 match,
                 (len(match.path) - 1) // 2,
                 accepted,
@@ -271,7 +279,7 @@ class SequenceRecognizer(ABC):
                 status, reason = limits.decide(distance, probability)
                 if accepted and status is not Status.MATCH:
                     reason += ': odometry disagrees with its path'
-        return Verdict(match, limits, status, reason, distance, probability)
+        return Verdict(match, limits, status, reason, distance, probability, run)
 
     def _built(self, verdict: 'Verdict', is_oldest: bool = False, **fields: Any) -> Match:
         """
@@ -435,6 +443,8 @@ class PlaceRecognizer(SequenceRecognizer):
         super().reset()
         if self._centering is not None:
             self._centering.reset()
+        if isinstance(self._matcher, SeveralSessions):
+            self._matcher.reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """

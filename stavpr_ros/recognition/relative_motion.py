@@ -21,6 +21,7 @@ MIN_IMAGES = 3
 LONGEST = 5  # windows of the trajectory that are compared
 FARTHEST = 5  # places from image to image
 MIN_DOUBT = 1e-9  # no probability is 1
+NO_PLACE = -FARTHEST - 1  # no match goes on from it
 Positions = Sequence[np.ndarray] | np.ndarray
 
 
@@ -37,6 +38,9 @@ class RelativeMotion:
         nothing is compared.
 
     ``trajectory`` contains x and y of each image by odometry, (2,), meters; NaN = unknown.
+    ``run`` describes the matches that continue each other: images since the window of the first
+    one began; place of the last one, images after it, and its newest place, below 0 if images
+    alone do not accept it.
     """
 
     def __init__(self, length: int, error: float, positions: Positions) -> None:
@@ -47,7 +51,7 @@ class RelativeMotion:
     def reset(self) -> None:
         """Drop the images of the query."""
         self.trajectory.clear()
-        self._followed, self._last = 0, 0  # matches that continued each other; place of the last
+        self.run = 0, NO_PLACE, 0, NO_PLACE
 
     def agreement(
         self,
@@ -56,9 +60,11 @@ class RelativeMotion:
         accepted: bool,
         first: int,
         session: tuple[int, int],
-    ) -> float:
+    ) -> tuple[float, tuple[int, int, int, int]]:
         """
         Return the p-value of the trajectory, given the path of a match with a sequence.
+
+        Also ``run`` with this match, for the owner to keep: an image may have several.
 
         The last position of the trajectory, of the match's newest image, is known.
 
@@ -69,9 +75,12 @@ class RelativeMotion:
         """
         assert match.nearest is not None
         place, newest = match.nearest.middle, int(match.path[-1, 1])
-        follows = accepted and 0 <= match.direction * (place - self._last) <= FARTHEST
-        self._followed = self._followed + 1 if follows else 0
-        self._last = place
+        length, agreed = len(match.path), 1.0
+        since, *last = self.run
+        after = length - 1 - position
+        step = place - last[0] if after == last[1] else newest - last[2]
+        follows = accepted and 0 <= match.direction * step <= FARTHEST
+        run = since + 1 if follows else length, place, after, newest if accepted else NO_PLACE
         reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
         low = max(first, session[0], place - reach)
         high = min(first + len(self.positions), session[1], place + reach)
@@ -80,15 +89,13 @@ class RelativeMotion:
         if match.direction < 0:
             track, ends = track[::-1], (high - 1 - place, high - 1 - newest)
         trajectory = np.array(self.trajectory)
-        length, agreed = len(match.path), 1.0
         if ends[1] < ends[0]:  # over the seam of a closed route, where the poses have the drift
-            return agreed
-        after = length - 1 - position
-        for count in {length, min(len(trajectory), length + self._followed)}:
+            return agreed, run
+        for count in {length, min(len(trajectory), run[0])}:
             part = trajectory[-count:]
             p_value = agreement(track, ends, part, count - 1 - after, self._error)
             agreed = agreed if np.isnan(p_value) else min(agreed, p_value)
-        return agreed
+        return agreed, run
 
 
 def with_odometry_test(probability: float, agreed: float) -> float:
