@@ -3,9 +3,13 @@
 """The public classes of the filter, with arguments that do not fit: an error, and no change."""
 
 import numpy as np
+from places import features_of, route_strips
 import pytest
+from stavpr_ros.alignment import best_match, SequenceDistances, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.filter import FilterSettings, PlaceFilter
+from stavpr_ros.prepare import make_matcher, prepare_map, z_normalized
+from stavpr_ros.relative_pose.offset import OffsetFilter, WIDTH
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 N, LAG, V = 100, 4, len(FilterSettings().speeds)
@@ -129,3 +133,35 @@ def test_models_of_many_or_fast_speeds_follow_the_camera(speeds, kind):
     assert one.path(belief.states[best], LAG)[::-1].tolist() == places[-1 - LAG :].tolist()
     with pytest.raises(InputError, match='z'):
         one.update(as_z(np.zeros(n + 1, np.float32)), 0.5, np.ones(len(speeds)))
+
+
+# ------------------------------------------------ what the filter's inputs are made with
+
+
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
+@pytest.mark.parametrize('strategy', ['adaptive', 'none'])
+def test_matcher_and_centering_reject_strips_of_other_shapes(strategy, precision):
+    features = features_of(route_strips(0, 40))
+    prepared = prepare_map(features, precision)
+    spatial = SpatialSettings(strategy)
+    matcher = make_matcher(prepared.features, spatial, 'cpu', precision)
+    image = features.strips[:, 0]
+    for wrong in (image[:, :-1], image[:-1], image.astype(float)):
+        with pytest.raises(InputError, match=r'strips: shape .*, expected \(7, n, 24\) float32'):
+            matcher.distances(wrong, features.weights[: len(wrong), 0])
+    with pytest.raises(InputError, match=r'weights: shape \(3, 1\)'):
+        matcher.distances(image, features.weights[:3, 0])
+    for wrong in (image[:, :-1], image[:-1]):
+        with pytest.raises(InputError, match=r'strips: shape .*, expected \(7, 24\)'):
+            prepared.centering.next_query(wrong)
+    with pytest.raises(InputError, match='counted: shape'):
+        z_normalized(matcher.distances(image, features.weights[:, 0]), counted=np.ones(3, bool))
+
+
+def test_other_kernels_reject_arrays_of_other_lengths():
+    with pytest.raises(InputError, match='lengths: shape'):
+        best_match(SequenceDistances(np.ones(9, np.float32), np.ones(3, np.int32)), 2)
+    columns = np.zeros((WIDTH, 6), np.float32)
+    for pair in ((columns, columns[:, :3]), (columns[:9], columns), (columns, columns[:9])):
+        with pytest.raises(InputError, match=r'(query|place): shape'):
+            OffsetFilter().update(*pair)

@@ -12,7 +12,7 @@ from stavpr_fleet.city_map import CityMap
 from stavpr_fleet.neighborhoods import Votes
 from stavpr_fleet.store import place_vectors, sample_places
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.errors import FeatureMismatchError, SettingsError, StavprError
+from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.model import MODEL
@@ -172,11 +172,7 @@ class FleetRecognizer(SequenceRecognizer):
     ) -> Match:
         """See :meth:`SequenceRecognizer.update`."""
         odometry_xy = position_of(pose)
-        self._require_one_image(features, 'the map')
-        if features.dimension != self._city.dimension:
-            raise FeatureMismatchError(
-                f'strips of {features.dimension} dimensions, the map has {self._city.dimension}'
-            )
+        self._require_one_image(features, 'the map', self._city.dimension)
         strips = self._centering.next_query(features.strips[:, 0])
         row = self._matcher.distances(strips, features.weights[:, 0])
         sampled, change = row[: self._sampled][self._learned.distinct(self._sampled)], 1.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.checks import float_array, no_nan
+from stavpr_ros.checks import float_array, no_nan, require_shape
 from stavpr_ros.errors import InputError
 
 NO_PATH = np.empty((0, 2), np.int32)
@@ -102,6 +102,7 @@ def best_match(matches: SequenceDistances, nms_radius: int) -> SequenceMatch | N
     from stavpr_ros.alignment.cpu.lm_dtw import nearest_elsewhere
 
     distances = matches.distances
+    require_shape('lengths', matches.lengths, f'{len(distances)}')
     if distances.size == 0:
         return None
     start = int(np.argmin(distances))

@@ -158,6 +158,23 @@ class LocalFeatures:
                 f'have {other.to_json()}: extract the query with the settings of the map'
             )
 
+    def require_fit(self, settings: FeatureSettings, where: str, dimension: int) -> None:
+        """
+        Reject features that do not fit those of places: kernels trust their shapes.
+
+        :param settings, dimension: of the places; a dimension of 0 is unknown yet.
+        :raises FeatureMismatchError: other settings, or those of another network.
+        :raises InputError: strips or weights of another shape or type.
+        """
+        self.require_same_settings(settings, where)
+        strips, n, d = require_shape('strips', self.strips, f'{settings.strips} n d', 'float32')
+        require_shape('weights', self.weights, f'{strips} {n}')
+        if dimension not in (0, d):
+            raise FeatureMismatchError(
+                f'strips of {d} dimensions, {where} has {dimension}: it was not made with this '
+                'network; build it again'
+            )
+
     @staticmethod
     def concatenate(parts: 'Sequence[LocalFeatures]') -> 'LocalFeatures':
         """Join the features of several batches of images."""

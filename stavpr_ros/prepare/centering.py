@@ -12,6 +12,7 @@ distinguishes no places.
 from collections.abc import Callable
 
 import numpy as np
+from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.filter.motion import change_weights
@@ -168,6 +169,8 @@ class MeanCentering:
 
         :param strips: shape (W, d); the same is returned.
         """
+        W, d = self.mean.shape
+        require_shape('strips', strips, f'{W} {d}')
         self._before = self._sum, self._count
         if self._centering:
             self._sum = self._sum + strips

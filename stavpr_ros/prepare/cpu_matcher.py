@@ -9,6 +9,7 @@ from stavpr_ros.alignment.cpu import dot, int8
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import adaptive_weights, image_distances
+from stavpr_ros.checks import require_shape
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty, is_aligned
@@ -41,14 +42,17 @@ class CpuMatcher:
 
     _map: np.ndarray | tuple[np.ndarray, np.ndarray]
     _cells: tuple[int, int] | None = None
+    _axes = 'W n d'  # of the strips of images
 
     def __init__(
         self,
         features: LocalFeatures | Int8Features,
         spatial: SpatialSettings,
     ) -> None:
-        self._prepare(len(features.strips), spatial)
+        W, _, d = features.strips.shape
+        self._prepare(W, spatial)
         self._cells = features.cells if spatial.vertical else None
+        self._axes = f'{W} n {d}'
         self._weights = features.weights
         self.places = self._weights.shape[1]
         if isinstance(features, Int8Features):
@@ -80,7 +84,9 @@ class CpuMatcher:
 
     def distance_matrix(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of Q images to every place, (Q, n)."""
-        out: np.ndarray = np.empty((strips.shape[1], self.places), np.float32)
+        _, Q, _ = require_shape('strips', strips, self._axes, 'float32')
+        require_shape('weights', weights, f'{len(strips)} {Q}')
+        out: np.ndarray = np.empty((Q, self.places), np.float32)
         if len(strips) == 1:  # one vector an image: its alignment is its cosine distance
             if isinstance(self._map, tuple):
                 int8.cosine_distances(self._map, int8.tiled(strips), out)

@@ -3,6 +3,7 @@
 """z-normalization of the distances of an image to all places."""
 
 import numpy as np
+from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.filter.columns import ONE_SESSION
 
@@ -26,6 +27,7 @@ def z_normalized(
     """
     z = np.empty(len(row), np.float32)
     counted = np.ones(len(row), bool) if counted is None else counted
+    require_shape('counted', counted, f'{len(row)}', 'bool')
     _z_normalize(row, counted, firsts, z)
     if not around:
         return z

@@ -123,7 +123,8 @@ class LoopCloser(SequenceRecognizer):
         Without a stamp, only the count of images excludes places.
         """
         odometry_xy = position_of(pose)
-        self._require_one_image(features, 'the route so far')
+        dimension = self._route.latest.shape[2] if len(self) else 0
+        self._require_one_image(features, 'the route so far', dimension)
         self._append(features, stamp)
         self._track.append(odometry_xy)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)

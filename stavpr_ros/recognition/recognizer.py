@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import numpy as np
 from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
-from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import likely_evidence
 from stavpr_ros.filter.model import MODEL
@@ -215,13 +215,13 @@ class SequenceRecognizer(ABC):
         columns = self._window.layout.columns_of(places - buffer.first)
         return buffer.at(columns[None])
 
-    def _require_one_image(self, features: Any, where: str) -> None:
+    def _require_one_image(self, features: Any, where: str, dimension: int) -> None:
         if not isinstance(features, LocalFeatures):
             expected = (
                 'the LocalFeatures of one image, as of place_map.extractor().extract([image])'
             )
             require_type('features', features, LocalFeatures, expected)
-        features.require_same_settings(self._feature_settings, where)
+        features.require_fit(self._feature_settings, where, dimension)
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images: expected one image')
         require_finite(features, 'the image')
@@ -350,6 +350,7 @@ class PlaceRecognizer(SequenceRecognizer):
             () if poses is None else poses[:, :2],
         )
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
+            features.require_fit(place_map.settings, 'the map', features.dimension)
             for _, block in blocks(features):
                 require_finite(block, 'the map')
         self._dimension = features.dimension
@@ -455,28 +456,18 @@ class PlaceRecognizer(SequenceRecognizer):
         :raises FeatureMismatchError: made with other settings.
         :raises InputError: features that are not finite.
         """
-        features.require_same_settings(self._feature_settings, 'the map')
-        self._require_dimension(features)
+        features.require_fit(self._feature_settings, 'the map', self._dimension)
         require_finite(features, 'the image')
         if self._centering is not None:
             features = self._centering.places(features)
         return self._matcher.distance_matrix(features.strips, features.weights)
-
-    def _require_dimension(self, features: LocalFeatures) -> None:
-        """Reject features of another network than the map's; the kernels trust their shape."""
-        if features.dimension != self._dimension:
-            raise FeatureMismatchError(
-                f'strips of {features.dimension} dimensions, the map has {self._dimension}: it '
-                'was not made with this network; build it again'
-            )
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
     ) -> Match:
         """See :meth:`SequenceRecognizer.update`."""
         odometry_xy = position_of(pose)
-        self._require_one_image(features, 'the map')
-        self._require_dimension(features)
+        self._require_one_image(features, 'the map', self._dimension)
         strips = features.strips[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)

@@ -147,6 +147,8 @@ class OffsetFilter:
 
         :param query, place: their columns, as :func:`describe_columns` returns them.
         """
+        _, d = require_shape('query', query, f'{WIDTH} d', 'float32')
+        require_shape('place', place, f'{WIDTH} {d}', 'float32')
         evidence, is_covered = block_evidence(query, place, self._beside)
         self._earlier = FORGETTING * _drifted(self._earlier) + evidence
         log = np.where(is_covered, self._earlier + self._prior, -np.inf)
