@@ -34,7 +34,8 @@ def plain_change(a, b):
 
 
 def learned(strips):
-    change, seen = ImageChange(strips.shape[1], SETTINGS), PlaceChanges(strips.shape[1], MAX_LAG)
+    n = strips.shape[1]
+    change, seen = ImageChange(n, SETTINGS, 20), PlaceChanges(n, MAX_LAG)
     seen.add(strips)
     change.learn(seen.changes)
     return change
@@ -42,7 +43,7 @@ def learned(strips):
 
 def learned_on_route(strips, room):
     """Return what is learned from one place after the other; memory grows to the room."""
-    route = ImageChange(5, SETTINGS)
+    route = ImageChange(5, SETTINGS, 20)
     for n in range(1, strips.shape[1] + 1):
         if n == 6:
             route.grow(room)

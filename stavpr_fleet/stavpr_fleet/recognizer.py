@@ -14,6 +14,7 @@ from stavpr_fleet.store import place_vectors, sample_places
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.features.registry import likely_evidence
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.motion import ImageChange, MAX_LAG
@@ -121,7 +122,9 @@ class FleetRecognizer(SequenceRecognizer):
                 'is matched in mode robust, without vertical alignment'
             )
         positions = () if city.poses is None else city.poses[:, :2]
-        super().__init__(settings, city.settings, FilterWindow(settings.sequence, 0), positions)
+        self._evidence = likely_evidence(city.settings.kind)
+        self._filter_window = FilterWindow(settings.sequence, 0, likely=self._evidence)
+        super().__init__(settings, city.settings, self._filter_window, positions)
         self._city, self._timeout = city, timeout
         index = city.store.index
         self._centering = index.centering()
@@ -137,14 +140,14 @@ class FleetRecognizer(SequenceRecognizer):
         self._matcher = CpuMatcher(
             LocalFeatures(self._strips, self._weights, city.settings), settings.spatial
         )
-        self._learned = ImageChange(self._sampled, MODEL)
+        self._learned = ImageChange(self._sampled, MODEL, settings.sequence.length)
         self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
+        self._in_use = np.zeros(CHUNKS, bool)  # of this query, or all while the store fails
         self._last_use = np.zeros(CHUNKS, np.int64)  # number of the image that requested it last
         self._places = np.full(CHUNKS * CHUNK, -1)
         self._same_as = self._places.copy()
         self._from_before = np.ones(len(self._places), np.float32)
-        self._pending: Future[_Lookup] | None = None
         self._count = 0
         self.reset()
 
@@ -159,7 +162,9 @@ class FleetRecognizer(SequenceRecognizer):
         return min(len(self._images), self._settings.sequence.length)
 
     def reset(self) -> None:
-        """Drop the images of the query; the loaded chunks stay."""
+        """Drop the images of the query; loaded chunks stay until they are requested again."""
+        self._in_use[:] = False
+        self._pending: Future[_Lookup] | None = None
         self._centering.reset()
         self._images: deque[_Image] = deque(maxlen=HISTORY)
         self._vectors: deque[tuple[int, np.ndarray]] = deque(maxlen=self._settings.sequence.length)
@@ -235,7 +240,9 @@ class FleetRecognizer(SequenceRecognizer):
             lookup = pending.result()
         except StavprError as error:
             self.problem = f'the loaded neighborhoods are used: {error}'
-            return False
+            if is_empty := not len(self._order):
+                self._in_use[:] = self._chunks >= 0
+            return is_empty and bool(self._in_use.any())
         self.problem = ''
         return self._take(lookup)
 
@@ -276,9 +283,10 @@ class FleetRecognizer(SequenceRecognizer):
 
     def _take(self, lookup: _Lookup) -> bool:
         """Put fetched places into the slots that were requested longest ago."""
-        self._last_use[np.isin(self._chunks, lookup.chunks)] = self._count
+        requested, before = np.isin(self._chunks, lookup.chunks), self._in_use.sum()
+        self._last_use[requested], self._in_use[requested] = self._count, True
         if lookup.fetched is None:
-            return False
+            return bool(self._in_use.sum() > before)
         self._city.remember(lookup.places, lookup.fetched)
         changes = PlaceChanges(len(lookup.places), 1)
         centered = self._centering.places(lookup.fetched.features, changes.add)
@@ -296,6 +304,7 @@ class FleetRecognizer(SequenceRecognizer):
             all_of_it = slice(slot * CHUNK, (slot + 1) * CHUNK)
             target = slice(slot * CHUNK, slot * CHUNK + len(here))
             self._chunks[slot], self._last_use[slot] = chunk, self._count
+            self._in_use[slot] = True
             self._places[all_of_it] = -1
             self._places[target] = lookup.places[here]
             self._same_as[target] = lookup.same_as[here]
@@ -310,7 +319,7 @@ class FleetRecognizer(SequenceRecognizer):
 
     def _rebuild(self) -> None:
         """Run the filter over the latest images again, over the loaded places."""
-        filled = np.flatnonzero(self._places >= 0)
+        filled = np.flatnonzero((self._places >= 0) & np.repeat(self._in_use, CHUNK))
         self._order = filled[np.argsort(self._places[filled])]
         places = self._places[self._order]
         if not len(places):
@@ -323,13 +332,17 @@ class FleetRecognizer(SequenceRecognizer):
         layout = CityLayout(places, firsts, same_as, self._settings.nms_radius)
         share = len(places) / len(self._city)
         model = replace(MODEL, start=MODEL.start * share, enter=MODEL.enter * share)
-        window = FilterWindow(self._settings.sequence, len(places), model, layout)
+        sequence = self._settings.sequence
+        window = FilterWindow(sequence, len(places), model, layout, likely=self._evidence)
+        window.recent = self._filter_window.recent  # the drive goes on
+        window.choice.learn_times(self._city.stamps[places])
         window.change.copy_statistics(self._learned, self._from_before[self._order])
         self._window = self._filter_window = window
         for image in self._images:
             self._push(image)
 
     def _push(self, image: _Image) -> None:
+        self._filter_window.change.next_query(image.strips)
         self._filter_window.add(image.z[self._order], image.stamp, image.change)
 
 

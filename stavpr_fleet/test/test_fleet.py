@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps of a fleet: their stores, recognition in neighborhoods, and stores that fail."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 import threading
 import time
 
@@ -26,7 +26,7 @@ from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.prepare.centering import unit_norm
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.recognizer import EARLY
 
 for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
@@ -160,7 +160,7 @@ def test_recognizer_in_neighborhoods_matches_as_exact_one(store, city, query, tm
     for i in accepted[5:]:
         assert found[i].accepted
         assert abs(found[i].sequence.middle - exact[i].sequence.middle) <= 1
-        assert abs(found[i].probability - exact[i].probability) < 0.1
+        assert abs(found[i].probability - exact[i].probability) < 0.01
         np.testing.assert_allclose(found[i].path[:, 1], exact[i].path[:, 1], atol=2)
     newest, row = found[-1].sequence.middle, recognizer.newest_row()
     np.testing.assert_array_equal(recognizer.window_columns(np.arange(CITY))[-1], row)
@@ -170,6 +170,33 @@ def test_recognizer_in_neighborhoods_matches_as_exact_one(store, city, query, tm
     assert recognizer.ranked(3)[0].place == newest
     recognizer.reset()
     assert recognizer.window_fill == 0
+
+
+@pytest.mark.parametrize('kind', ['gradient', 'efficientnet_lite1'])
+def test_probabilities_are_those_of_the_same_map_on_a_robot(kind):
+    """Of a map whose chunks are all loaded at once; in other light, with a detour."""
+    features = replace(walk(96), settings=replace(SOURCE, kind=kind))
+    place_map = replace(descriptor_map(features), stamps=np.arange(1, 97) ** 2 * SECOND)
+    query = seen_again(features, 3.0)
+    query.strips[:, 60:70] = walk(10, seed=9).strips
+    one = FleetRecognizer(CityMap.of(MemoryStore(place_map)), SETTINGS, timeout=60)
+    pairs = zip(drive(one, query), drive(PlaceRecognizer(place_map, SETTINGS), query), strict=True)
+    probabilities = [(found.probability, expected.probability) for found, expected in pairs]
+    np.testing.assert_allclose(*np.transpose(probabilities), atol=1e-4)
+
+
+def test_recognizer_after_a_reset_answers_as_a_new_one(city, query):
+    """Also one whose store fails, by the chunks of before."""
+    one, new = (FleetRecognizer(CityMap.of(Faulty(city)), SETTINGS, timeout=60) for _ in 'ab')
+    drive(one, query)
+    one.reset()
+    for found, expected in zip(drive(one, query), drive(new, query), strict=True):
+        for field in fields(Match):
+            pair = (getattr(each, field.name) for each in (found, expected))
+            np.testing.assert_array_equal(*pair, err_msg=field.name)
+    one._city.store.cut = True
+    one.reset()
+    assert drive(one, query)[-1].accepted
 
 
 def test_recognizer_off_the_map_matches_nothing(city):

@@ -67,7 +67,7 @@ class RecentWindows:
     :param likely: own evidence of a likely window.
     """
 
-    def __init__(self, likely: float = SURE) -> None:
+    def __init__(self, likely: float) -> None:
         self._least = likely
         self._likely = self._sure = 0.5
         self._count = FIRST

@@ -47,7 +47,7 @@ class ImageChange:
     :param length: images in the window of the query.
     """
 
-    def __init__(self, places: int, settings: FilterSettings, length: int = 20) -> None:
+    def __init__(self, places: int, settings: FilterSettings, length: int) -> None:
         self._settings, self._length = settings, length
         self._at_rest: np.ndarray | None = None  # kept, as these that count, until the map changes
         self._distinct: np.ndarray | None = None

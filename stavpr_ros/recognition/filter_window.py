@@ -18,7 +18,6 @@ from stavpr_ros.filter.evidence import (
     own_evidence,
     path_probability,
     RecentWindows,
-    SURE,
 )
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.motion import ImageChange
@@ -49,7 +48,7 @@ class FilterWindow(QueryWindow):
         each place is subtracted (:mod:`stavpr_ros.filter.place_means`).
     :param likely: of :class:`RecentWindows`.
 
-    ``change`` compares images, ``filter`` contains the states.
+    ``change`` compares images, ``filter`` contains the states, ``recent`` is of the drive.
     """
 
     buffer_class: Callable[..., SequenceBuffer] = SequenceBuffer
@@ -64,7 +63,8 @@ class FilterWindow(QueryWindow):
         normalizes: bool = False,
         around: int = 0,
         to_oldest: bool = False,
-        likely: float = SURE,
+        *,
+        likely: float,
     ) -> None:
         layout = layout or ColumnLayout()
         length, width = sequence.length, layout.width(places)
@@ -75,7 +75,7 @@ class FilterWindow(QueryWindow):
         self.filter: Filter = self.filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(layout.passes(places), settings, length)
         self.choice = PathChoice(self.filter, self.change, layout, width)
-        self._likely, self._recent = likely, RecentWindows(likely)
+        self._likely, self.recent = likely, RecentWindows(likely)
         self._own = -math.inf  # evidence of the latest match
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
@@ -97,7 +97,7 @@ class FilterWindow(QueryWindow):
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._at_rest, self._entered, self._recent = None, 0, RecentWindows(self._likely)
+        self._at_rest, self._entered, self.recent = None, 0, RecentWindows(self._likely)
         self._repeated, self._means = slice(0, 0), PlaceMeans()
 
     def grow(self, places: int) -> None:
@@ -173,7 +173,7 @@ class FilterWindow(QueryWindow):
         match = self._at_rest
         if match is None:
             match = self._match_image(len(self.images), middle, nms_radius)
-            self._recent.add(self._own)
+            self.recent.add(self._own)
         self._at_rest = match if self._rests(middle) else None
         return in_places(match, self.layout)
 
@@ -287,7 +287,7 @@ class FilterWindow(QueryWindow):
         near = self.layout.around(int(chosen.path[position]), APART)
         elsewhere = self.buffer.best_elsewhere(numbers, position, near)
         lead = chosen.score, elsewhere, len(numbers)
-        self._own, recent = own_evidence(posterior, *lead), self._recent.share
+        self._own, recent = own_evidence(posterior, *lead), self.recent.share
         return path_probability(self._own, recent), path_probability(
             own_evidence(least, *lead), recent
         )

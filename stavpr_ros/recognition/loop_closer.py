@@ -257,9 +257,8 @@ def _route_window(settings: RecognizerSettings) -> QueryWindow:
     options, sequence = settings.applied_options, settings.sequence
     if not options.place_filter:
         return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
-    return FilterWindow(
-        sequence, 0, ROUTE_MODEL, None, options.query_znorm, AROUND, to_oldest=True
-    )
+    arguments = sequence, 0, ROUTE_MODEL, None, options.query_znorm, AROUND, True
+    return FilterWindow(*arguments, likely=math.inf)  # its probabilities are without evidence
 
 
 def least_limit(exclude: int, length: int) -> int:
