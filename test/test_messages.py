@@ -9,14 +9,17 @@ from builtin_interfaces.msg import Time
 from fixtures import route_images
 from nav_msgs.msg import Odometry
 import numpy as np
+from places import features_of, map_of, route_strips
 import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import encode_thumbnail, GrowingMap
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.pipeline import ImageResult, overlay
 from stavpr_ros.recognition import Match, Status
+from stavpr_ros.relative_pose.odometry import align
+from stavpr_ros.relative_pose.pair import matched_pair
 from stavpr_ros.ros.messages import (
     image_message,
     loop_closure_message,
@@ -101,6 +104,28 @@ def test_matched_pose_message_has_the_spread_of_near_places(places):
     nowhere = accepted(np.array([[4, 33]], np.int32))
     assert matched_pose_message(HEADER, nowhere, places, 'odom') is None
     assert matched_pose_message(HEADER, rejected(), places, 'odom') is None
+
+
+@pytest.mark.parametrize('newest', range(4, 11))
+def test_neighbors_of_a_place_are_of_its_session(newest):
+    """Three sessions 500 m apart: spread of the pose, and poses around the place of an edge."""
+    n, index = 15, np.repeat(np.arange(3, dtype=np.int32), 5)
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (n, 1))
+    poses[:, :2] = np.column_stack([np.arange(n), 500.0 * index])
+    parts = {'sessions': tuple(map(Session, 'abc')), 'session_index': index, 'poses': poses}
+    thumbnails = (encode_thumbnail(route_images(1)[0]),) * n
+    merged = map_of(features_of(route_strips(0, n)), thumbnails=thumbnails, **parts)
+    own = np.arange(newest // 5 * 5, newest // 5 * 5 + 5)
+    path = np.column_stack([np.arange(5), np.maximum(newest + np.arange(-4, 1), own[0])])
+    match = accepted(path.astype(np.int32))
+    message = matched_pose_message(HEADER, match, merged, 'map')
+    assert message.pose.covariance[7] == pytest.approx(0.01)
+    assert message.pose.covariance[0] <= 2
+    distances = np.abs(np.subtract.outer(path[:, 1], np.arange(n)))
+    pair = matched_pair(match.match, newest, merged, None, poses[:5], lambda at: distances[:, at])
+    np.testing.assert_array_equal(pair.poses, poses[own])
+    assert (pair.first, sorted(pair.thumbnails)) == (own[0], own.tolist())
+    assert abs(align(pair).pose[1]) < 1e-9
 
 
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])

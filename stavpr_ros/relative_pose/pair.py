@@ -70,11 +70,11 @@ class MatchedPair:
     :param middle: position of the image in the window.
     :param distances: of the images of the window to the places around, shape (l, k); +inf = not
         compared. Empty where alignment by odometry is impossible or not wanted.
-    :param first: index of the first of the places around it.
+    :param first: index of the first of the places around it, all of the place's session.
     :param poses: of the base at those places, shape (k, 7); NaN = unknown.
     :param direction: 1 = the camera moves along the places, -1 = against them.
-    :param thumbnails: of places of the same session at most ``TRIANGULATION_RADIUS`` away, by
-        index: JPEG images, empty = none.
+    :param thumbnails: of these places at most ``TRIANGULATION_RADIUS`` away, by index: JPEG
+        images, empty = none.
     :param relative_yaw: of the base of the query in the base of the place, by the mountings of
         the cameras, radians to the left.
     """
@@ -129,6 +129,10 @@ def matched_pair(
     low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
     low = max(start, min(low, place) - TRIANGULATION_RADIUS)
     high = min(start + len(places), max(high, place) + TRIANGULATION_RADIUS + 1)
+    session = places.place(place).session  # its neighbors in another one were taken elsewhere
+    others = np.array([i for i in range(low, high) if places.place(i).session != session], int)
+    low = int(others[others < place].max(initial=low - 1)) + 1
+    high = int(others[others > place].min(initial=high))
     poses = np.full((high - low, 7), np.nan)
     if places.poses is not None:
         poses[:] = places.poses[low - start : high - start]
@@ -136,12 +140,10 @@ def matched_pair(
     has_poses = not np.isnan([poses[place - low], query_poses[match.position]]).any()
     if distances_to is not None and has_poses:
         distances = distances_to(np.arange(low, high))
-    session = places.place(place).session
     thumbnails, radius = {}, TRIANGULATION_RADIUS
     if len(places.thumbnails):
         for index in range(max(low, place - radius), min(high, place + radius + 1)):
-            if places.place(index).session == session:
-                thumbnails[index] = _thumbnail(places, index - start)
+            thumbnails[index] = _thumbnail(places, index - start)
     return MatchedPair(
         places, place, query, query_poses, match.position, distances, low, poses, thumbnails,
         match.direction, relative_yaw,

@@ -273,9 +273,9 @@ def matched_pose_message(
     Return the pose of the place of the newest image; None without a match or a known pose.
 
     It is turned by the mountings of the cameras, where the map states them. The covariance is
-    diagonal: the variance over the poses of the two places before and after it, rotation vectors
-    about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2. It does not include a lateral
-    offset of the camera from the route.
+    diagonal: the variance over the poses of the two places before and after it in its session,
+    rotation vectors about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2. It does not
+    include a lateral offset of the camera from the route.
 
     :param frame: of the poses of the map.
     """
@@ -286,7 +286,8 @@ def matched_pose_message(
         return None
     first = places.first if isinstance(places, GrowingMap) else 0
     around = range(max(first, newest - 2), min(first + len(places), newest + 3))
-    near = np.array([near for near in (places.place(i).pose for i in around) if near is not None])
+    session, near_by = places.place(newest).session, [places.place(i) for i in around]
+    near = np.array([p.pose for p in near_by if p.pose is not None and p.session == session])
     from scipy.spatial.transform import Rotation
 
     own = turned(pose, -result.relative_yaw)  # of the place
