@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import math
 import numbers
 import re
+from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
@@ -82,9 +83,9 @@ def require_whole(name: str, value: float, least: int, unit: str = '') -> None:
         raise SettingsError(f'{name} = {value} must be a whole number')
 
 
-def require_shape(name: str, array: np.ndarray, axes: str, *dtypes: str) -> tuple[int, ...]:
+def require_shape(name: str, array: Any, axes: str, *dtypes: str) -> tuple[int, ...]:
     """
-    Return the shape of an array.
+    Return the shape of an array, or of a tensor.
 
     :param axes: of each axis its size, or a name: axes of one name have one size, which is above 0
         where the name begins with a capital, as ``W W n``.

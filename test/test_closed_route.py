@@ -67,6 +67,17 @@ def test_routes_that_cannot_be_closed_are_rejected(open_map):
             with_seam(place_map, is_closed=True)
 
 
+def test_candidates_on_both_sides_of_the_seam_are_neighbors(closed_map):
+    one, apart = PlaceRecognizer(closed_map, FORWARD), []
+    query = laps(60, LAP + 30, 1.5, 2)
+    for i in range(len(query)):
+        one.update(query[i : i + 1])
+        places = closed_map.same_as[[each.place for each in one.ranked(4)]]
+        between = np.abs(np.subtract.outer(places, places))[~np.eye(len(places), dtype=bool)]
+        apart += np.minimum(between, LAP - between).tolist()
+    assert min(apart) > FORWARD.nms_radius
+
+
 @pytest.mark.parametrize('against', [False, True])
 def test_no_image_is_lost_at_the_seam(open_map, closed_map, against):
     """Three laps, also against the map: all images after the first window are matched."""

@@ -9,9 +9,11 @@ from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
+from places import features_of, map_of, route_strips
 import pytest
 from robot import LATCHED, LENGTH
-from stavpr_ros.ros.localized import Localization, NOWHERE
+from stavpr_ros.mapping import Session
+from stavpr_ros.ros.localized import along_route, Localization, NOWHERE
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
@@ -66,6 +68,38 @@ def test_robot_is_localized_after_a_sure_match_that_three_of_five_confirm(result
     if count is not None:
         expected[count:] = [True] * (len(results) - count)
     assert states(*results) == expected
+
+
+@pytest.mark.parametrize('step', [-4.5, -1, 0.5, 2, 4.5])
+def test_robot_is_localized_while_it_moves(step):
+    """Whatever is a second best match: nms_radius is no limit of the speed."""
+    assert states(*[(round(100 + step * i), 0.95) for i in range(6)])[3:] == [True] * 3
+
+
+@pytest.mark.parametrize('nms_radius', [0, 2, 30])
+def test_matches_that_jump_confirm_nothing(nms_radius, monkeypatch):
+    monkeypatch.setattr(SETTINGS.pipeline, 'nms_radius', nms_radius)
+    assert not any(states(*[(100 + 200 * (i % 2), 0.95) for i in range(4)]))
+
+
+def test_positions_are_those_of_the_route_whatever_session_shows_them():
+    """Of two drives on one route, the second with two places of its own; of a closed route."""
+    same_as = np.array([0, 1, 2, 3, 4, 5, 6, 1, 2, 9, 10, 5, 6], np.int32)
+    index = np.repeat(np.arange(2, dtype=np.int32), [7, 6])
+    sessions = {'sessions': (Session('a'), Session('b')), 'session_index': index}
+    both = map_of(features_of(route_strips(0, 13)), same_as=same_as, **sessions)
+    positions, lap = along_route(both)
+    assert (positions.tolist(), lap) == ([*range(7), 1, 2, 3, 4, 5, 6], 0)
+    localization = Localization(SETTINGS)
+    for place in (1, 8, 3, 11):  # now of one session, now of the other
+        localization.update(int(positions[place]), 0.95, None, lap)
+    assert localization.is_localized
+    closed = np.append(np.arange(80), np.arange(20)).astype(np.int32)
+    positions, lap = along_route(map_of(features_of(route_strips(0, 100)), same_as=closed))
+    localization.reset()
+    for place in (77, 79, 81, 3):
+        localization.update(int(positions[place]), 0.95, None, lap)
+    assert (lap, localization.is_localized) == (80, True)
 
 
 def test_robot_is_lost_after_images_or_meters_without_a_match():

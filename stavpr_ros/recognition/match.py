@@ -260,6 +260,7 @@ def ranked_candidates(
     count: int,
     nms_radius: int,
     positions: Callable[[np.ndarray | int], np.ndarray] = np.asarray,
+    lap: int = 0,
 ) -> list[Candidate]:
     """
     Rank places by non-maximum suppression: no candidate is close to one ranked before it.
@@ -270,7 +271,8 @@ def ranked_candidates(
     :param sequences: all sequences, in any order; of equal costs the first is taken.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than this many places from each other.
-    :param positions: of places, between which the distance is measured.
+    :param positions: of places, between which the distance is measured; lap: of a closed route,
+        else 0.
     :raises InputError: count below 0.
     """
     if count < 0:
@@ -281,7 +283,8 @@ def ranked_candidates(
     costs, at_position = costs.copy(), positions(places)
     ranked = [nearest]
     while len(ranked) < count and len(costs):
-        costs[np.abs(at_position - positions(ranked[-1].place)) <= nms_radius] = np.inf
+        apart = np.abs(at_position - positions(ranked[-1].place))
+        costs[np.minimum(apart, np.abs(lap - apart) if lap else apart) <= nms_radius] = np.inf
         best = int(np.argmin(costs))
         if math.isinf(costs[best]):
             break

@@ -183,8 +183,9 @@ class SequenceRecognizer(ABC):
         newest, nearest = self._newest, None
         if (sequence := newest.match.nearest) is not None:
             nearest = Candidate(sequence.middle, newest.distance, newest.probability)
-        positions, radius = self._window.layout.positions, self._settings.nms_radius
-        return ranked_candidates(nearest, newest.match.sequences(), count, radius, positions)
+        layout, radius = self._window.layout, self._settings.nms_radius
+        where = layout.positions, layout.lap
+        return ranked_candidates(nearest, newest.match.sequences(), count, radius, *where)
 
     def newest_row(self) -> np.ndarray:
         """

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the robot is localized, with hysteresis, and the place where it is: latched topics."""
 
+from collections.abc import Sequence
 import math
 
 import numpy as np
@@ -14,6 +15,7 @@ from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Bool, String
 
 TRIAL, CONFIRMATIONS = 5, 3  # images after a match, and how many of them must match near it
+NEAR, FARTHEST = 10, 5  # places that are near a match, and from image to image, at most
 NOWHERE = 'none'  # ~/current_node of a robot that is not localized
 
 
@@ -22,29 +24,32 @@ class Localization:
     The state of being localized, image by image.
 
     True after a match of ``localized_probability`` that 3 of the next 5 images confirm by a match
-    within ``nms_radius`` of it; false after ``lost_images`` images or ``lost_distance`` meters
-    without a match.
+    near it, or as far from it as a camera moves until then; false after ``lost_images`` images or
+    ``lost_distance`` meters without a match.
     """
 
     def __init__(self, settings: NodeSettings) -> None:
-        self._settings, self._radius = settings, settings.pipeline.nms_radius
+        self._settings = settings
         self.reset()
 
     def reset(self) -> None:
         """Be not localized, as at the start."""
         self.is_localized = False
-        self._first = -1  # place of the match that is on trial, -1 = none
+        self._first = -1  # position of the match that is on trial, -1 = none
         self._tried = self._confirmed = 0  # images since then, and those that match near it
         self._unmatched = 0  # images since the last match
         self._position: np.ndarray | None = None  # at the last match, or the first one after it
 
-    def update(self, place: int, probability: float, position: np.ndarray | None) -> None:
+    def update(
+        self, place: int, probability: float, position: np.ndarray | None, lap: int = 0
+    ) -> None:
         """
         Take the result of an image in the window.
 
-        :param place: of the match, -1 = none.
+        :param place: of the match, as :func:`along_route` numbers it, -1 = none.
         :param probability: of it, NaN in mode paper: any match begins a trial.
         :param position: x y z of the odometry, None = unknown.
+        :param lap: places of a lap of a closed route, 0 = another one.
         """
         matched = place >= 0
         self._unmatched = 0 if matched else self._unmatched + 1
@@ -58,7 +63,9 @@ class Localization:
             return
         if self._first >= 0:
             self._tried += 1
-            self._confirmed += matched and abs(place - self._first) <= self._radius
+            apart = abs(place - self._first)
+            apart = min(apart, abs(lap - apart)) if lap else apart
+            self._confirmed += matched and apart <= max(NEAR, FARTHEST * self._tried)
             if self._confirmed >= CONFIRMATIONS:
                 self.is_localized, self._first = True, -1
                 return
@@ -69,6 +76,25 @@ class Localization:
             self._first, self._tried, self._confirmed = place, 0, 0
 
 
+def along_route(places: PlaceMap) -> tuple[Sequence[int] | np.ndarray, int]:
+    """
+    Return the position of each place along the route, (n,), and the places of a closed lap.
+
+    Of a place that an earlier session shows as well, the position is the one there, and the places
+    after it follow, up to the next such place.
+    """
+    if places.same_as is None:
+        return range(len(places)), 0
+    numbers = np.arange(len(places))
+    related = np.where(places.same_as < numbers, numbers, -1)
+    session = np.zeros(len(places), int) if places.session_index is None else places.session_index
+    for run in np.split(numbers, np.flatnonzero(np.diff(session)) + 1):
+        related[run] = np.maximum.accumulate(related[run])
+    positions = np.where(related < 0, numbers, places.same_as[related] + numbers - related)
+    seam = places.seam
+    return positions, 0 if seam is None else len(places) - 1 - seam
+
+
 class LocalizedPublisher:
     """Publishes ``~/localized`` and ``~/current_node`` when they change; on the worker."""
 
@@ -77,6 +103,7 @@ class LocalizedPublisher:
         self._localized = node.create_publisher(Bool, '~/localized', LATCHED)
         self._current_node = node.create_publisher(String, '~/current_node', LATCHED)
         self._places: PlaceMap | GrowingMap | None = None
+        self._route: tuple[Sequence[int] | np.ndarray, int] = (), 0
         self._published: tuple[bool | None, str] = (None, '')
         self._publish(NOWHERE)
 
@@ -99,10 +126,14 @@ class LocalizedPublisher:
         if places is not self._places:
             self.reset()
             self._places = places
+            if isinstance(places, PlaceMap):
+                self._route = along_route(places)
         if result.cause or not isinstance(places, PlaceMap):
             return
         position = None if odometry is None else odometry[:3]
-        self._state.update(result.newest_index, result.probability, position)
+        positions, lap = self._route
+        along = int(positions[result.newest_index]) if result.accepted else -1
+        self._state.update(along, result.probability, position, lap)
         if not self.is_localized:
             self._publish(NOWHERE)
         elif result.accepted:
