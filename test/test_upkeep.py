@@ -478,6 +478,24 @@ def test_old_versions_are_deleted(path, first, monkeypatch):
         roll_back(path, versions.versions(path)[2].map_id)
 
 
+def test_versions_of_a_branch_that_was_left_are_deleted(path, first):
+    def update(seconds):
+        opened, before = FileVersion.of(path), current_version(path)
+        changed = replace(first, stamps=first.stamps + seconds)
+        return save_version(path, opened, changed, before, Version(''), None)
+
+    folder = Path(f'{path}.history')
+    for day in range(1, 4):
+        left = update(2 * day)
+        assert roll_back(path).map_id != left.map_id
+        assert (folder / f'{left.map_id}.stavpr').exists()
+        (folder / 'notes.txt').touch()
+        update(2 * day + 1)
+        assert not list(folder.glob(f'{left.map_id}*'))
+    assert len(list(folder.glob('*.stavpr'))) == len(versions.versions(path)) == 4
+    assert (folder / 'notes.txt').exists()
+
+
 @pytest.mark.parametrize('content', ['{', '[]', '{"map_id": "x"}', '\ud800'])
 def test_damaged_record_is_rejected(path, content):
     folder = Path(f'{path}.history')

@@ -303,6 +303,10 @@ def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, repor
     early = found['decision']['early_matched']
     assert calibration['images'] == declared + early > declared
     assert f'{early} early matches, 0 of them wrongly' in text
+    # a node has the first match with the early ones, and none for the end of the last window
+    online, matched = (found['decision'][name] for name in ('online_matched', 'matched'))
+    assert early < online < matched == len(rows)
+    assert f'(online: {online}, when each image comes)' in text
     error = calibration['expected_calibration_error']
     assert f'expected calibration error {error:.4f}' in text
     page = (tmp_path / 'report' / 'report.html').read_text(encoding='utf-8')
@@ -417,7 +421,8 @@ def test_evaluate_without_truth_reports_matches_of_unequal_traverses(folders, ru
     assert output.splitlines()[0] == 'elsewhere on the map map, no ground truth'
     assert 'matched, default: ' in output
     found = read_json((tmp_path / 'report' / 'results.json').read_text())
-    assert found['decision'].keys() == {'rule', 'images', 'matched', 'early_matched'}
+    counts = {'matched', 'early_matched', 'online_matched'}
+    assert found['decision'].keys() == {'rule', 'images', *counts}
     assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & found.keys()
     with (tmp_path / 'report' / 'answers.csv').open() as file:
         rows = list(csv.DictReader(file))

@@ -11,6 +11,7 @@ program, the map is the version before or the new one.
 from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
+import re
 import shutil
 import time
 
@@ -23,7 +24,7 @@ from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output
 
 SUFFIX = '.history'
-KEPT = 10  # versions; older ones are deleted
+KEPT = 10  # versions; older ones, and those of a branch that was left, are deleted
 MAX_PLACES = 2**24
 
 
@@ -138,9 +139,17 @@ def save_version(
     content = json.dumps(asdict(version), allow_nan=False)
     write_output(folder / f'{map_id}.json', content, JSON, True)
     _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
-    for each in versions(path)[KEPT:]:
-        (folder / f'{each.map_id}.stavpr').unlink(missing_ok=True)
+    _clean(folder, [each.map_id for each in versions(path)])
     return version
+
+
+def _clean(folder: Path, chain: list[str]) -> None:
+    """Delete old versions, and all of a branch that was left by a return to an earlier one."""
+    for file in folder.glob('*.*'):
+        is_version = re.fullmatch('[0-9a-f]{16}', file.stem) is not None
+        remaining = {'.stavpr': chain[:KEPT], '.json': chain}.get(file.suffix, [file.stem])
+        if is_version and file.stem not in remaining:
+            file.unlink(missing_ok=True)
 
 
 def roll_back(path: str | Path, map_id: str = '') -> Version:

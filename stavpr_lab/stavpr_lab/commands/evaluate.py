@@ -338,9 +338,8 @@ def _print_report(report: 'Report') -> None:
         wrong = f'; of {stated} with ground truth, {decision["matched_with_truth"]}{wrong}'
     if report.default_threshold is not None:
         print(f'matched above the probability {1 - report.default_threshold:.4g}')
-    print(
-        f'matched, {decision["rule"]}: {decision["matched"]} of {decision["images"]} images{wrong}'
-    )
+    online = f' (online: {decision["online_matched"]}, when each image comes)'
+    print(f'matched, {decision["rule"]}: {decision["matched"]} of {images} images{wrong}{online}')
     if decision['early_matched']:
         wrong = f', {decision["early_wrong"]} of them wrongly' if report.has_truth else ''
         print(f'and {decision["early_matched"]} early matches{wrong}')

@@ -85,6 +85,7 @@ class TraverseResults:
     :param accepted: whether the recognizer accepts the window's match, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
     :param published: M >= N matches: the early ones behind these, and the image of each, (M,).
+    :param online: images at which the recognizer had a match at once, as a node has; N at most.
     """
 
     sequence: Ranking
@@ -95,6 +96,7 @@ class TraverseResults:
     accepted: np.ndarray = field(repr=False)
     probabilities: np.ndarray = field(repr=False)
     published: tuple[ImageMatches, np.ndarray] = field(repr=False)
+    online: int = 0
 
 
 @dataclass(frozen=True)
@@ -256,8 +258,9 @@ def recognize_traverse(
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
     sequence, distances = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
-        sequence, single, seconds, *distances, matched.accepted, matched.probabilities, published
-    )
+        sequence, single, seconds, *distances, matched.accepted, matched.probabilities, published,
+        sum(match.accepted for match in matches),
+    )  # fmt: skip
 
 
 def evaluate_on_map(

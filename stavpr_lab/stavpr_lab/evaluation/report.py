@@ -97,7 +97,11 @@ class Report:
         return [column[truth.is_stated] for column in columns] if truth.kind else list(columns)
 
     def decision(self) -> dict[str, Any]:
-        """Return how many images are matched, and by early matches; with ground truth, wrongly."""
+        """
+        Return how many images are matched, and by early matches; with ground truth, wrongly.
+
+        Online, an image counts that has a match when it comes: a node publishes so many.
+        """
         counts = self.counts
         decision: dict[str, Any] = {
             'rule': 'best F1' if self.default_threshold is None else 'default',
@@ -107,6 +111,7 @@ class Report:
         matches, images = self.evaluation.results.published
         early = slice(len(self.accepted), None)
         decision['early_matched'] = len(images[early])
+        decision['online_matched'] = self.evaluation.results.online
         if not self.has_truth:
             return decision
         truth = self.evaluation.ground_truth.select(images)
