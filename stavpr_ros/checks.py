@@ -3,6 +3,7 @@
 """Checks of arguments and settings at the border of the public functions."""
 
 from collections.abc import Iterable
+from functools import lru_cache
 import math
 import numbers
 import re
@@ -92,14 +93,20 @@ def require_shape(name: str, array: Any, axes: str, *dtypes: str) -> tuple[int, 
     :param dtypes: allowed types; none = any.
     :raises InputError: another shape or type.
     """
-    words = axes.split()
-    sizes = dict(zip(words, array.shape, strict=False))
-    shape = tuple(int(word) if word.isdecimal() else sizes.get(word) for word in words)
-    is_empty = any(not size for word, size in sizes.items() if word[0].isupper())
-    if array.shape != shape or is_empty or (dtypes and array.dtype not in dtypes):
-        expected = f'({", ".join(words)}) {" or ".join(dtypes)}'.rstrip()
+    if not _fits(array.shape, array.dtype, axes, dtypes):
+        expected = f'({", ".join(axes.split())}) {" or ".join(dtypes)}'.rstrip()
         raise InputError(f'{name}: shape {array.shape} {array.dtype}, expected {expected}')
     return tuple(array.shape)
+
+
+@lru_cache(1024)
+def _fits(shape: tuple[int, ...], dtype: Any, axes: str, dtypes: tuple[str, ...]) -> bool:
+    """Return whether an array has the axes and one of the types: :func:`require_shape`."""
+    words = axes.split()
+    sizes = dict(zip(words, shape, strict=False))
+    expected = tuple(int(word) if word.isdecimal() else sizes.get(word) for word in words)
+    is_empty = any(not size for word, size in sizes.items() if word[0].isupper())
+    return shape == expected and not is_empty and (not dtypes or dtype in dtypes)
 
 
 def float_array(values: np.ndarray, name: str, axes: str) -> np.ndarray:
@@ -120,10 +127,10 @@ def float32_vector(name: str, values: np.ndarray, shortest: int, longest: int) -
     :raises InputError: another type or length, NaN or -inf.
     """
     array = np.asarray(values)
-    require_shape(name, array, 'n', 'float32', 'float64')
-    if not shortest <= len(array) <= longest:
-        raise InputError(f'{name} of {len(array)} places: expected {shortest} to {longest}')
-    if not array.min(initial=np.inf) > -np.inf:
+    (n,) = require_shape(name, array, 'n', 'float32', 'float64')
+    if not shortest <= n <= longest:
+        raise InputError(f'{name} of {n} places: expected {shortest} to {longest}')
+    if n and not array.min() > -np.inf:
         no_nan(array, name)
     return np.ascontiguousarray(array, np.float32)
 
@@ -136,26 +143,31 @@ def relative_weights(count: int, *weights: np.ndarray) -> list[np.ndarray]:
     """
     arrays = [np.asarray(each) for each in weights]
     for array in arrays:
-        valid = array.shape == (count,) and array.dtype.kind in 'fiu'
-        if not (valid and array.min() >= 0 and 0 < array.sum() < math.inf):
+        numbers = array.tolist() if array.shape == (count,) and array.dtype.kind in 'fiu' else ()
+        if not (numbers and 0 < sum(numbers) < math.inf and min(numbers) >= 0):
             raise InputError(f'weights {array}: expected {count} numbers, at least 0, not all 0')
     return [np.ascontiguousarray(array, np.float64) for array in arrays]
 
 
-def require_indices(name: str, values: object, end: object) -> None:
+def require_indices(name: str, values: Any, end: int) -> None:
     """Raise InputError if not all are whole numbers of at least 0 and below ``end``."""
-    array = np.asarray(values)
-    is_valid = array.dtype.kind in 'iu' or not array.size
-    if not is_valid or not np.all((array >= 0) & (array < np.asarray(end))):
+    low = high = values
+    if not isinstance(values, int):
+        array = np.asarray(values)
+        if not array.size:
+            return
+        low, high = (array.min(), array.max()) if array.dtype.kind in 'iu' else (-1, -1)
+    if not 0 <= low <= high < end:
         raise InputError(f'{name} = {values}: expected whole numbers of at least 0, below {end}')
 
 
-def require_ascending(name: str, values: object, end: int) -> None:
-    """Raise InputError if values are no ascending indices below ``end``, (m,), int64."""
-    require_shape(name, np.asarray(values), 'm', 'int32', 'int64')
-    require_indices(name, values, end)
-    if (np.diff(np.asarray(values)) <= 0).any():
-        raise InputError(f'{name} = {values}: expected them ascending, each once')
+def require_ascending(name: str, values: np.ndarray, end: int) -> None:
+    """Raise InputError if values are no ascending indices below ``end``, (m,), integers."""
+    require_shape(name, values, 'm', 'int32', 'int64')
+    if not len(values):
+        return
+    if values[0] < 0 or values[-1] >= end or (values[1:] <= values[:-1]).any():
+        raise InputError(f'{name} = {values}: expected ascending indices below {end}, each once')
 
 
 def no_nan(array: np.ndarray, name: str) -> np.ndarray:

@@ -221,7 +221,8 @@ class PlaceFilter(Filter):
 
     def path(self, state: np.ndarray, images: int) -> np.ndarray:
         """See :meth:`Filter.path`; a state is level, speed, place, speed then."""
-        checks.require_indices('state', state[:3], (*self._a.shape[1:3], self._room))
+        for part, end in zip(state[:3].tolist(), (*self._a.shape[1:3], self._room), strict=True):
+            checks.require_indices('state', part, end)
         checks.require_indices('images', images, len(self._steps) + 1)
         places = np.empty(images + 1, np.int32)
         trace_back(
