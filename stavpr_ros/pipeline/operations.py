@@ -89,6 +89,7 @@ class Operation(ABC):
         save_state: SaveState,
     ) -> None:
         self.settings, self.extractor, self.save_state = settings, extractor, save_state
+        self.drives: list[GrowingMap] = []  # which may update the map; empty = none is recorded
         self.places: PlaceMap | GrowingMap | None = place_map
         self.reference = place_map  # that images are matched with; None = the recorded route
         self.recognizer: SequenceRecognizer | None = None
@@ -104,9 +105,10 @@ class Operation(ABC):
         self._window: deque[WindowRow] = deque(maxlen=settings.sequence.length)
         self._image: np.ndarray | None = None  # the last one
 
-    def take_drives(self) -> list[PlaceMap]:
-        """Return the drives since the start or the last call, which may update the map."""
-        return []
+    def _begin_drive(self) -> None:
+        assert self.extractor is not None
+        limit, settings = self.settings.max_places, self.extractor.settings
+        self.drives.append(GrowingMap(settings, self.extractor.projection, limit))
 
     @abstractmethod
     def _start(self, place_map: PlaceMap | None) -> None:
@@ -158,6 +160,18 @@ class Operation(ABC):
     def window_fill(self) -> int:
         """Return the number of images in the window of the recognizer."""
         return 0 if (recognizer := self.recognizer) is None else recognizer.window_fill
+
+    def take_drives(self) -> list[GrowingMap]:
+        """Return the recorded drives, which belong to the caller now; another one begins."""
+        drives = [each for each in self.drives if len(each)]
+        self.drives = [each for each in self.drives if not len(each)]
+        if drives and not self.drives:
+            self._begin_drive()
+        return drives
+
+    def return_drives(self, drives: list[GrowingMap]) -> None:
+        """Take drives back that are in no file."""
+        self.drives[:0] = drives
 
     def apply(self, settings: PipelineSettings) -> None:
         """
@@ -359,7 +373,6 @@ class Localizer(Operation):
 
     def _start(self, place_map: PlaceMap | None) -> None:
         settings = self.settings
-        self._drives: list[GrowingMap] = []
         if self.extractor is None or place_map is None:
             return
         if settings.update_map and os.path.isfile(self.save_state.path):
@@ -368,35 +381,22 @@ class Localizer(Operation):
 
     def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
         assert self.recognizer is not None
-        jpeg = row.jpeg if self._drives else b''
+        jpeg = row.jpeg if self.drives else b''
         result = ImageResult.of_match(self.recognizer.update(features, row.stamp, row.pose))
-        if self._drives and sum(map(len, self._drives)) < self.settings.max_places:
-            self._drives[-1].add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
+        if self.drives and sum(map(len, self.drives)) < self.settings.max_places:
+            self.drives[-1].add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
         return result
 
     def _thumbnail_width(self, camera: Camera | None) -> int:
         return (
-            super()._thumbnail_width(camera) or bool(self._drives) * self.settings.thumbnail_width
+            super()._thumbnail_width(camera) or bool(self.drives) * self.settings.thumbnail_width
         )
-
-    def _begin_drive(self) -> None:
-        assert self.extractor is not None
-        limit, settings = self.settings.max_places, self.extractor.settings
-        self._drives.append(GrowingMap(settings, self.extractor.projection, limit))
 
     def reset(self) -> None:
         """Empty the window; another drive begins."""
         super().reset()
-        if self._drives and len(self._drives[-1]):
+        if self.drives and len(self.drives[-1]):
             self._begin_drive()
-
-    def take_drives(self) -> list[PlaceMap]:
-        """Return the recorded drives, and begin another one."""
-        drives = [each.snapshot() for each in self._drives if len(each)]
-        if self._drives:
-            self._drives = []
-            self._begin_drive()
-        return drives
 
 
 class Mapper(Operation):

@@ -12,6 +12,7 @@ from stavpr_ros.mapping import GrowingMap, load_map, merge_maps, open_map, Place
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.stores import is_address, store_of
+from stavpr_ros.pipeline.drives import write_drives
 from stavpr_ros.pipeline.operations import CLASSES, Localizer, Operation
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
@@ -126,12 +127,15 @@ class Pipeline:
         :param loaded: the map to localize on, to extend, or (loop closure) whose kind of features
             to use.
         :raises InputError: unsaved places would be lost.
+        :raises OutputError: a recorded drive, which may update the map, cannot be written.
         :raises StavprError: an unknown operation, or invalid settings.
         """
         settings, name = settings or self.settings, operation or self.operation.name
         settings.require_operation(name)
         if loaded is not None or name != self.operation.name:
             self._require_no_loss(name, loaded)
+            if settings.update_map:
+                write_drives(self.operation, lambda function: function())
             self._start(name, settings, loaded)
         else:
             self.operation.apply(settings)

@@ -2,25 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Saving a recorded map while images are processed; files of other maps are never overwritten."""
 
-from collections.abc import Callable
 from logging import Logger
 from pathlib import Path
-import time
 from typing import Any
 
-from stavpr_ros.errors import InputError, JournalError, OutputTakenError, StavprError
-from stavpr_ros.mapping import load_map, PlaceMap, save_map
+from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
+from stavpr_ros.mapping import PlaceMap, save_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
-from stavpr_ros.output_file import FileVersion, Force, MAP, numbered, require_replaceable
+from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
+from stavpr_ros.pipeline.drives import OnWorker, take_up_drives, write_drives
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.same_places import with_last_related
-from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
-from stavpr_ros.units import DATED, SECOND
-
-OnWorker = Callable[[Callable[[], Any]], Any]
 
 
 def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: Force) -> int:
@@ -42,25 +37,26 @@ def update_own_map(pipeline: Pipeline, on_worker: OnWorker, log: 'Logger | Any')
     """
     Let the drives of localization update the file of its map (docs/upkeep.md), on this thread.
 
+    They are on the disk before, where the next call or start finds them after an error.
+
     :returns: places of the last version; 0 = there is none, the log has the reasons.
     :raises StavprError: a file that cannot be read or written; it stays as it is.
     """
-    state, places = pipeline.save_state, 0
-    settings = UpkeepSettings(precision=pipeline.settings.precision)
-    for drive in on_worker(pipeline.operation.take_drives):
-        start = int(drive.stamps[0])  # the drive of a simulation is named by the present time
-        seconds = start / SECOND if start >= DATED else time.time()
-        name = time.strftime('drive %Y-%m-%d %H:%M:%S', time.gmtime(seconds))
-        opened, place_map = FileVersion.of(state.path), load_map(state.path)
-        try:
-            version = update_file(state.path, opened, place_map, drive, settings, name)
-        except InputError as error:
-            log.warning(f'{name} does not update {state.path}: {error}')
-            continue
-        state.own(state.path)
-        places = len(version.use)
-        log.info(f'{name} updates {state.path}, {places} places: {"; ".join(version.changes)}')
-    return places
+    operation, state = pipeline.operation, pipeline.save_state
+    if not operation.drives:
+        return 0
+    write_drives(operation, on_worker)
+    precision = pipeline.settings.precision
+    return take_up_drives(state.path, precision, log, lambda: state.own(state.path))
+
+
+def take_up_earlier_drives(path: str, precision: str, log: 'Logger | Any') -> None:
+    """Let the drives of an earlier run update the file of its map, before it is loaded."""
+    try:
+        take_up_drives(path, precision, log, lambda: None)
+    except Exception as error:  # any error: the node must start
+        cause = str(error) if isinstance(error, StavprError) else repr(error)
+        log.error(f'the drives of an earlier run are not in {path}: {cause}')
 
 
 def save_recorded_map(
@@ -85,7 +81,7 @@ def save_recorded_map(
             log.warning(f'{unsaved} recorded places are in no map: set save_path, call ~/save_map')
         return True
     except TimeoutError:
-        if not pipeline.unsaved:
+        if not (pipeline.unsaved or any(map(len, pipeline.operation.drives))):
             return True
         log.error('the map is not saved: the worker is still busy at the end of the node')
     except Exception as error:  # any error: the node must end, and the loss must be logged

@@ -23,6 +23,7 @@ from stavpr_ros.pipeline.saving import (
     open_journal,
     recover_maps,
     save_recorded_map,
+    take_up_earlier_drives,
 )
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Status
@@ -129,6 +130,9 @@ class Runtime:
             # a route of loop closure does not continue a map
             continued = recovered if settings.operation != 'loop_closure' else ''
             if map_path := settings.map_path or continued:
+                if self.updates_map:
+                    precision = settings.pipeline.precision
+                    take_up_earlier_drives(map_path, precision, node.get_logger())
                 self.load(map_path)
         except BaseException:
             self.close()

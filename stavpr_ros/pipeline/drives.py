@@ -1,0 +1,117 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recorded drives on their way into the map of localization: on the disk until they are in it.
+
+``route.stavpr.history/drives`` has each drive as a map of its images, whose name is the drive's.
+It is written at once, before the map is updated, which takes long; whatever ends the program, the
+next one finds the drive there, or in a version of the map.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+import fcntl
+from logging import Logger
+import os
+from pathlib import Path
+import time
+from typing import Any
+
+from stavpr_ros.errors import InputError, MapFileError, OutputTakenError
+from stavpr_ros.mapping import load_map, PlaceMap, save_map
+from stavpr_ros.mapping.journal_map import DAMAGED
+from stavpr_ros.mapping.versions import history_of, versions
+from stavpr_ros.output_file import explained, FileVersion, numbered
+from stavpr_ros.pipeline.operations import Operation
+from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
+from stavpr_ros.units import DATED, SECOND
+
+OnWorker = Callable[[Callable[[], Any]], Any]
+
+
+def write_drives(operation: Operation, on_worker: OnWorker) -> None:
+    """
+    Move the recorded drives of an operation from memory to files, on this thread.
+
+    :param on_worker: calls a function on the thread of the operation.
+    :raises OutputError: a drive cannot be written; it stays in memory, as all later ones.
+    """
+    drives = on_worker(operation.take_drives)
+    try:
+        while drives:
+            _write(operation.save_state.path, drives[0].snapshot())
+            del drives[0]
+    finally:
+        if drives:
+            on_worker(lambda: operation.return_drives(drives))
+
+
+def take_up_drives(
+    path: str, precision: str, log: 'Logger | Any', on_update: Callable[[], object]
+) -> int:
+    """
+    Let the drives that were written update the file of their map, oldest first; delete them.
+
+    :param precision: in which the map is loaded.
+    :param on_update: called after each update.
+    :returns: places of the last version; 0 = there is none, the log has the reasons.
+    :raises StavprError: a file that cannot be read or written; map and drives stay as they are.
+    """
+    places, folder = 0, _folder(path)
+    if not folder.is_dir():
+        return places
+    with explained(folder), _locked(folder):
+        files = sorted(folder.glob('*.stavpr'), key=lambda file: file.stem)
+        if files:
+            log.info(f'updating {path} with {len(files)} drives, which are in {folder} until then')
+        for file in files:
+            name, opened, place_map = file.stem, FileVersion.of(path), load_map(path)
+            try:
+                drive, settings = load_map(file), UpkeepSettings(precision=precision)
+            except MapFileError as error:
+                damaged = file.rename(file.with_name(file.name + DAMAGED))
+                log.error(f'{name} does not update {path}: {error}; {damaged} is kept')
+                continue
+            try:
+                if name not in (version.drive for version in versions(path)):
+                    version = update_file(path, opened, place_map, drive, settings, name)
+                    on_update()
+                    places = len(version.use)
+                    changes = '; '.join(version.changes)
+                    log.info(f'{name} updates {path}, {places} places: {changes}')
+            except InputError as error:
+                log.warning(f'{name} does not update {path}: {error}')
+            file.unlink()
+    return places
+
+
+def _folder(path: str) -> Path:
+    return history_of(path) / 'drives'
+
+
+def _write(path: str, drive: PlaceMap) -> None:
+    """Write a drive under a name that no other drive of the map has."""
+    folder, names = _folder(path), set()
+    with explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with suppress(MapFileError):
+        names = {version.drive for version in versions(path)}
+    start = int(drive.stamps[0])  # the drive of a simulation is named by the present time
+    seconds = start / SECOND if start >= DATED else time.time()
+    name = time.strftime('drive %Y-%m-%d %H-%M-%S.stavpr', time.gmtime(seconds))
+    for file in numbered(folder / name):
+        if file.stem not in names:
+            with suppress(OutputTakenError):
+                save_map(drive, file)
+                return
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Wait until no other program, or thread, updates the map."""
+    file = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(file)

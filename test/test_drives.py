@@ -1,0 +1,202 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded drives are on the disk until they are in the map, whatever ends the program."""
+
+from pathlib import Path
+import signal
+from unittest.mock import Mock
+
+from pipelines import localizing, process
+from processes import node_process
+import pytest
+from robot import PARAMETERS
+from stavpr_ros.alignment import SequenceSettings
+from stavpr_ros.errors import OutputError
+from stavpr_ros.mapping import load_map, save_map, versions
+from stavpr_ros.mapping.versions import current_version
+from stavpr_ros.pipeline import drives, read_map
+from stavpr_ros.pipeline.saving import (
+    save_recorded_map,
+    take_up_earlier_drives,
+    update_own_map,
+)
+from test_upkeep import built, OTHER, ROUTE
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+DRIVES = [*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], ROUTE[20:180], ROUTE
+NAMES = [f'drive 2023-11-14 22-{minute}' for minute in ('13-21', '30-01', '46-41')]
+
+
+class Killed(BaseException):
+    """The end of a program at a point."""
+
+
+@pytest.fixture(scope='module')
+def first():
+    return built(ROUTE)
+
+
+@pytest.fixture
+def path(first, tmp_path):
+    path = tmp_path / 'route.stavpr'
+    save_map(first, path)
+    return str(path)
+
+
+@pytest.fixture(scope='module')
+def recorded(first, tmp_path_factory):
+    """Return the three drives of a pipeline."""
+    path = tmp_path_factory.mktemp('recorded') / 'route.stavpr'
+    save_map(first, path)
+    pipeline = localizing(str(path), update_map=True, sequence=SequenceSettings(20))
+    for number, drive in enumerate(DRIVES):
+        process(pipeline, drive, first=1_700_000_000 + 1000 * number)
+        pipeline.operation.reset()
+    return pipeline.operation.take_drives()
+
+
+@pytest.fixture
+def pipeline(path, recorded):
+    """Return a pipeline on the map, after the drives."""
+    pipeline = localizing(path, update_map=True, sequence=SequenceSettings(20))
+    pipeline.operation.return_drives([*recorded])
+    return pipeline
+
+
+def waiting(path):
+    return sorted(file.stem for file in Path(f'{path}.history/drives').glob('*'))
+
+
+def at_once(function):
+    return function()
+
+
+def fails_at(monkeypatch, module, name, number, error):
+    """Let the call of this number of a function fail, once."""
+    function, calls = getattr(module, name), []
+
+    def failing(*arguments, **options):
+        calls.append(name)
+        if len(calls) == number:
+            raise error
+        return function(*arguments, **options)
+
+    monkeypatch.setattr(module, name, failing)
+
+
+@pytest.mark.parametrize('number', [1, 3])
+def test_drive_that_cannot_be_written_stays_in_memory(pipeline, path, monkeypatch, number):
+    """So do the later ones; the earlier ones are on the disk."""
+    fails_at(monkeypatch, drives, 'save_map', number, OutputError('no space'))
+    log = Mock()
+    assert not save_recorded_map(pipeline, at_once, '', log)
+    assert 'no space' in log.error.call_args.args[0]
+    assert waiting(path) == NAMES[: number - 1]
+    assert [len(each) for each in pipeline.operation.drives] == [
+        *(len(drive) for drive in DRIVES[number - 1 :]), 0,
+    ]  # fmt: skip
+    assert update_own_map(pipeline, at_once, log)
+    assert (current_version(path).number, waiting(path)) == (3, [])
+
+
+@pytest.mark.parametrize('number', [1, 3])
+def test_update_that_fails_keeps_its_drive_for_the_next_one(pipeline, path, monkeypatch, number):
+    """A full disk, or a map that another program has replaced."""
+    fails_at(monkeypatch, drives, 'update_file', number, OutputError('no space'))
+    with pytest.raises(OutputError, match='no space'):
+        update_own_map(pipeline, at_once, Mock())
+    assert waiting(path) == NAMES[number - 1 :]
+    assert update_own_map(pipeline, at_once, Mock())
+    assert (current_version(path).number, waiting(path)) == (3, [])
+
+
+@pytest.mark.parametrize(
+    ('module', 'name', 'number'),
+    [
+        (drives, 'update_file', 1),
+        (versions, 'save_map', 2),
+        (versions, 'write_output', 2),
+        (versions, '_copy', 3),
+        (Path, 'unlink', 1),  # of a drive that is in the map
+    ],
+)
+def test_next_start_takes_up_the_drives_once(pipeline, path, monkeypatch, module, name, number):
+    with monkeypatch.context() as patch:
+        fails_at(patch, module, name, number, Killed())
+        with pytest.raises(Killed):
+            update_own_map(pipeline, at_once, Mock())
+    assert waiting(path)
+    log = Mock()
+    take_up_earlier_drives(path, 'float32', log)
+    assert not log.error.called
+    assert (current_version(path).number, waiting(path)) == (3, [])
+    assert current_version(path).map_id == load_map(path).map_id
+
+
+def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path, monkeypatch):
+    fails_at(monkeypatch, drives, 'update_file', 1, Killed())
+    with pytest.raises(Killed):
+        update_own_map(pipeline, at_once, Mock())
+    folder = Path(f'{path}.history/drives')
+    (folder / 'drive 1.stavpr').write_bytes(b'cut off')
+    save_map(built(OTHER), folder / 'drive 2.stavpr')
+    log = Mock()
+    take_up_earlier_drives(path, 'float32', log)
+    assert 'drive 1 does not update' in log.error.call_args.args[0]
+    assert 'drive 2 does not update' in log.warning.call_args.args[0]
+    assert (current_version(path).number, waiting(path)) == (3, ['drive 1.stavpr'])
+
+
+def test_drives_of_equal_times_have_names_of_their_own(pipeline, path, recorded):
+    """Stamps of a simulation begin anew; a name in the history means that the drive is there."""
+    assert update_own_map(pipeline, at_once, Mock())
+    pipeline.operation.return_drives([recorded[2], recorded[2]])
+    assert update_own_map(pipeline, at_once, Mock())
+    assert current_version(path).number == 5
+    assert current_version(path).drive == f'{NAMES[2]}-3'
+
+
+def test_load_map_keeps_the_drives_on_the_other_map(pipeline, path, first, tmp_path, monkeypatch):
+    save_map(first, tmp_path / 'other.stavpr')
+    other = read_map(str(tmp_path / 'other.stavpr'), pipeline.settings)
+    with monkeypatch.context() as patch:
+        fails_at(patch, drives, 'save_map', 2, OutputError('no space'))
+        with pytest.raises(OutputError, match='no space'):
+            pipeline.change(loaded=other)
+    assert pipeline.save_state.path == path
+    pipeline.change(loaded=other)
+    assert waiting(path) == NAMES
+    take_up_earlier_drives(path, 'float32', Mock())
+    assert current_version(path).number == 3
+
+
+def test_busy_worker_at_the_end_is_no_silent_loss(pipeline):
+    def busy(function):
+        raise TimeoutError
+
+    log = Mock()
+    assert not save_recorded_map(pipeline, busy, '', log)
+    assert 'worker is still busy' in log.error.call_args.args[0]
+
+
+def test_all_drives_are_in_the_map_after_a_kill_during_the_update(robot, path, tmp_path):
+    values = PARAMETERS | {'sequence_length': 20, 'min_probability': 0.5, 'map_path': path}
+    values |= {'update_map': True, 'maps_folder': tmp_path}
+    node = node_process(tmp_path / 'log', **values)
+    again = None
+    try:
+        robot.wait_for_node()
+        for images in DRIVES:
+            robot.drive(images)
+            robot.stamp -= 10_000 * 10**9  # the clock was set back: another drive
+        node.popen.send_signal(signal.SIGINT)
+        robot.until(lambda: 'with 3 drives' in node.output(), 'the update')
+        node.popen.kill()
+        node.wait()
+        again = node_process(tmp_path / 'again', **values)
+        robot.until(lambda: 'places, features' in again.output(), 'the map')
+    finally:
+        node.end()
+        if again is not None:
+            again.end()
+    assert (current_version(path).number, waiting(path)) == (3, [])
