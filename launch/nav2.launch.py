@@ -10,19 +10,15 @@ its name to node_names there. The bond requires the package bond, which Nav2 has
 """
 
 from launch import LaunchDescription
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-from stavpr_ros.ros.launching import node_launch
+from stavpr_ros.ros.launching import node_launch, other_node
 
 
 def generate_launch_description() -> LaunchDescription:
     """Describe the node and its manager."""
-    manager = Node(
-        package='nav2_lifecycle_manager',
-        executable='lifecycle_manager',
-        name='lifecycle_manager_stavpr',
-        namespace=LaunchConfiguration('namespace'),
-        output='screen',
-        parameters=[{'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 4.0}],
+    manager = other_node(
+        'nav2_lifecycle_manager',
+        'lifecycle_manager',
+        'lifecycle_manager_stavpr',
+        fixed={'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 4.0},
     )
-    return node_launch(manager, needs='nav2_lifecycle_manager', autostart=False)
+    return node_launch(*manager, needs='nav2_lifecycle_manager', autostart=False)

@@ -9,36 +9,22 @@ The corrected odometry is on /pose_graph/odometry, the correction on /pose_graph
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
-from stavpr_ros.ros.launching import node_launch
+from stavpr_ros.ros.launching import node_launch, other_node
 
+RENAMED = {'graph_keyframe_distance': 'keyframe_distance', 'correct_tf': 'publish_tf'}
 ARGUMENTS = {
     'max_correction_speed': (0.0, 'm/s at which the corrected pose moves at most; 0: at once'),
+    'max_odometry_gap': (5.0, 'seconds without odometry that begin a new session, above 0'),
+    'appearance_edges': (True, 'closures without a relative pose count as edges'),
+    'autostart': (True, 'shared'),
+    'map_frame': ('map', 'shared'),
+    'maps_folder': ('', 'shared'),
+    'graph_keyframe_distance': (1.0, 'meters between keyframes of the pose graph, above 0'),
     'correct_tf': (False, 'publish map -> odom of the pose graph on /tf; not with publish_tf'),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
     """Describe the node in operation loop_closure, and the pose graph."""
-    values = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=type(default))
-        for name, (default, _) in ARGUMENTS.items()
-    }
-    values['publish_tf'] = values.pop('correct_tf')
-    graph = Node(
-        package='stavpr_slam',
-        executable='pose_graph',
-        name='pose_graph',
-        namespace=LaunchConfiguration('namespace'),
-        output='screen',
-        remappings=[('odom', LaunchConfiguration('odom'))],
-        parameters=[values],
-    )
-    own = [
-        DeclareLaunchArgument(name, default_value=str(default).lower(), description=description)
-        for name, (default, description) in ARGUMENTS.items()
-    ]
-    return node_launch(*own, graph, needs='stavpr_slam', operation='loop_closure')
+    graph = other_node('stavpr_slam', 'pose_graph', 'pose_graph', ARGUMENTS, {}, RENAMED)
+    return node_launch(*graph, needs='stavpr_slam', operation='loop_closure')

@@ -10,11 +10,17 @@ import sys
 from launch_files import load_launch, PACKAGES, use_stand_ins, words
 from processes import executable
 import pytest
+from stavpr_nav.parameters import REPEAT, TEACH
 from stavpr_ros.parameters import BY_NAME, RENAMED
+from stavpr_slam.ros.graph_node import PARAMETERS as GRAPH
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = sorted((ROOT / 'launch').glob('*.launch.py'))
-NAMES = [path.name.partition('.')[0] for path in FILES]
+FILES = {
+    path.name.partition('.')[0]: path
+    for folder in ('launch', 'stavpr_nav/launch')
+    for path in sorted((ROOT / folder).glob('*.launch.py'))
+}
+NAMES = [*FILES]
 FIXED = {
     'stavpr': {},
     'replay': {},
@@ -23,7 +29,22 @@ FIXED = {
     'multi_camera': {},
     'nav2': {'autostart': False},
     'pose_graph': {'operation': 'loop_closure'},
+    'teach': {'operation': 'mapping'},
+    'repeat': {'operation': 'localization'},
 }
+TABLES = {  # of the parameters of each node
+    'node': {row.name: row.default for row in BY_NAME.values()},
+    'teach': {name: default for name, (default, _) in TEACH.items()},
+    'repeat': {name: default for name, (default, _) in REPEAT.items()},
+    'pose_graph': {name: default for name, (default, _) in GRAPH.items()},
+    'lifecycle_manager': dict.fromkeys(('autostart', 'node_names', 'bond_timeout'), ''),
+}
+NO_ARGUMENTS = {'match_topic', 'loop_closure_topics', 'robots'}  # and of the lifecycle manager
+OTHER_NAMES = {  # parameters of the pose graph whose names the recognition node has, too
+    'keyframe_distance': 'graph_keyframe_distance',
+    'publish_tf': 'correct_tf',
+}
+COMMON = {'image', 'odom', 'camera_info', 'namespace', 'params_file', 'use_sim_time'}
 TEXTS = {bool: ('true', True), int: ('3', 3), float: ('1', 1.0), str: ('2', '2')}
 
 REPLAY = {'bag', 'topic', 'odometry', 'also', 'rate', 'fps', 'start_offset', 'duration'}
@@ -34,12 +55,12 @@ REPLAY |= {'record', 'lossless', 'loop', 'start_paused', 'shutdown'}
 def load(monkeypatch):
     """Return the description of a launch file, by the stand-in."""
     use_stand_ins(monkeypatch)
-    yield lambda name: load_launch(ROOT / 'launch' / f'{name}.launch.py')
+    yield lambda name: load_launch(FILES[name])
     sys.modules.pop('stavpr_ros.ros.launching', None)
 
 
 def test_launch_files_are_those_tested_here():
-    assert sorted(FIXED) == NAMES
+    assert sorted(FIXED) == sorted(NAMES)
 
 
 def test_launching_imports_nothing_heavy():
@@ -60,41 +81,76 @@ def test_launch_file_without_a_package_that_it_needs_starts_nothing(load, name, 
         load(name).start(missing=[package])
 
 
+def text_and_value(default):
+    return TEXTS[type(default)]
+
+
 @pytest.mark.parametrize('name', NAMES)
-def test_launch_file_has_an_argument_for_every_parameter(load, name):
-    """Everything is given at once: names and types are those of the table."""
+def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
+    """All are given at once; names and types are those of the tables of the nodes."""
     launch, fixed = load(name), FIXED[name]
-    common = {'image', 'odom', 'namespace', 'params_file', 'use_sim_time'}
-    own = {'replay': REPLAY, 'multi_camera': {'cameras'}}
-    own['pose_graph'] = {'max_correction_speed', 'correct_tf'}
-    expected = (set(BY_NAME) | set(RENAMED)) - set(fixed) | common | own.get(name, set())
+    types = {**TABLES['node'], 'use_sim_time': False}
+    own = {'replay': REPLAY, 'multi_camera': {'cameras'}}.get(name, set())
+    for node in launch.start():
+        types = {**TABLES.get(node.executable, {}), **types}
+    if name == 'pose_graph':
+        types |= {argument: TABLES[name][each] for each, argument in OTHER_NAMES.items()}
+    given = {n: text_and_value(types[n])[0] for n in launch.arguments if n in types}
+    expected = (set(types) | set(RENAMED) | COMMON | own) - set(fixed) - NO_ARGUMENTS
+    if name == 'nav2':
+        expected -= set(TABLES['lifecycle_manager'])
     assert set(launch.arguments) == expected
     for argument in launch.arguments.values():
         assert len(argument.description) > 10
-        assert hasattr(argument, 'default_value') or argument.first in ('bag', 'cameras')
-    types = {row.name: type(row.default) for row in BY_NAME.values()} | {'use_sim_time': bool}
-    given = {n: TEXTS[kind][0] for n, kind in types.items() if n not in fixed}
-    parameters = launch.start(**given)[0].parameters[1]
-    assert set(parameters) == set(types)
-    for parameter, value in parameters.items():
-        if parameter in fixed:
-            assert value == fixed[parameter]
-        else:
-            kind = types[parameter]
-            assert (repr(value.first), value.value_type) == (repr(TEXTS[kind][1]), kind)
+        assert hasattr(argument, 'default_value') or argument.first in (
+            'bag',
+            'cameras',
+            'run_path',
+        )
+    reached = set()
+    for node in launch.start(**given):
+        if node.executable == 'replay':  # which publishes /clock instead
+            continue
+        file, values = node.parameters
+        assert words(file) == '${params_file}'
+        renamed = OTHER_NAMES if node.executable == 'pose_graph' else {}
+        for parameter, default in {**TABLES[node.executable], 'use_sim_time': False}.items():
+            argument = renamed.get(parameter, parameter)
+            if argument in given:
+                reached.add(argument)
+                value = values[parameter]
+                kind, text = type(default), repr(text_and_value(types[argument])[1])
+                assert (repr(value.first), value.value_type) == (text, kind), (
+                    node.name,
+                    parameter,
+                )
+        topics = {topic: words(to) for topic, to in node.remappings}
+        assert topics == {
+            **{each: f'${{{each}}}' for each in ('image', 'odom', 'camera_info')},
+            'image/compressed': '${image}/compressed',
+        }
+        assert words(node.namespace) == '${namespace}' + '/front' * (name == 'multi_camera')
+    assert reached == set(given) - set(RENAMED)
 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_launch_file_leaves_empty_arguments_to_the_parameter_file(load, name):
-    node = load(name).start()[0]
-    assert words(node.parameters[0]) == '${params_file}'
+    node, *others = load(name).start()
     assert node.parameters[1:] == [FIXED[name]]
-    assert Path(executable(node.executable)).exists()
     assert (node.package, node.name) == ('stavpr_ros', 'stavpr')
-    assert words(node.namespace) == '${namespace}' + '/front' * (name == 'multi_camera')
-    topics = {topic: words(to) for topic, to in node.remappings}
-    expected = {'image': '${image}', 'image/compressed': '${image}/compressed', 'odom': '${odom}'}
-    assert topics == expected
+    assert words(node.sigterm_timeout) == '${sigterm_timeout}'
+    assert float(node.sigterm_timeout.default) > 300  # the update of several drives
+    for other in [node, *others]:
+        if other.package.startswith('stavpr'):
+            assert Path(executable(other.executable)).exists()
+        if other.executable in ('teach', 'repeat'):
+            assert set(other.parameters[1]) <= {'run_path'}  # required
+
+
+@pytest.mark.parametrize(('name', 'argument'), [('repeat', 'max_speed'), ('repeat', 'stamped')])
+def test_argument_of_another_node_of_the_wrong_type_is_rejected_by_name(load, name, argument):
+    with pytest.raises(RuntimeError, match=f"{argument} = 'fast': expected"):
+        load(name).start(**{argument: 'fast'})
 
 
 def test_launch_of_cameras_starts_a_node_for_each_with_its_name_in_paths(load):
@@ -105,24 +161,17 @@ def test_launch_of_cameras_starts_a_node_for_each_with_its_name_in_paths(load):
 
 
 def test_launch_for_nav2_has_a_manager_with_a_bond(load):
-    (manager,) = load('nav2').nodes
+    _, manager = load('nav2').start()
     assert manager.package == 'nav2_lifecycle_manager'
-    assert manager.parameters == [
-        {'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 4.0}
-    ]
-    assert words(manager.namespace) == '${namespace}'
+    assert manager.parameters[1] == {
+        'autostart': True, 'node_names': ['stavpr'], 'bond_timeout': 4.0,
+    }  # fmt: skip
 
 
-def test_launch_of_pose_graph_has_the_odometry_of_the_node(load):
-    (graph,) = load('pose_graph').nodes
-    assert Path(executable(graph.executable)).parent.name == graph.package == 'stavpr_slam'
-    assert [(topic, words(to)) for topic, to in graph.remappings] == [('odom', '${odom}')]
-    assert words(graph.namespace) == '${namespace}'
-    values = {name: (words(v.first), v.value_type) for name, v in graph.parameters[0].items()}
-    assert values == {
-        'max_correction_speed': ('${max_correction_speed}', float),
-        'publish_tf': ('${correct_tf}', bool),
-    }
+def test_pose_graph_has_its_own_of_two_names_whatever_is_in_the_parameter_file(load):
+    _, graph = load('pose_graph').start()
+    values = {name: value.first for name, value in graph.parameters[1].items()}
+    assert values == {'keyframe_distance': 1.0, 'publish_tf': False}
 
 
 @pytest.mark.parametrize(
@@ -142,10 +191,16 @@ def test_launch_argument_of_the_wrong_type_is_rejected_by_name(load, name, value
     ('arguments', 'expected'),
     [
         (['max_rat:=3', 'image:=/camera'], "argument 'max_rat' is unknown: did you mean max_rate"),
-        (['webcam:=/c'], "argument 'webcam' is unknown: see the option --show-args"),
+        (
+            ['sigterm_timeout:=9', 'webcam:=/c'],
+            "argument 'webcam' is unknown: see the option --show-args",
+        ),
     ],
 )
-@pytest.mark.parametrize('file', [['stavpr_ros', 'x.launch.py'], ['/launch/file.launch.py']])
+@pytest.mark.parametrize(
+    'file',
+    [['stavpr_ros', 'x.launch.py'], ['stavpr_nav', 'x.launch.py'], ['/launch/file.launch.py']],
+)
 def test_launch_argument_that_is_unknown_is_rejected(load, monkeypatch, file, arguments, expected):
     monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', *file, *arguments])
     with pytest.raises(RuntimeError, match=re.escape(expected)):
@@ -190,9 +245,11 @@ def test_launch_of_replay_passes_its_options(load, given, expected):
 
 
 def test_documented_launch_arguments_exist(load):
-    pages = [ROOT / 'README.md', *(ROOT / 'docs').glob('*.md')]
+    pages = [ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')]
     text = ' '.join(page.read_text() for page in pages).replace('\\\n', ' ')
-    found = re.findall(r'^ros2 launch stavpr_ros (\w+)\.launch\.py(.*)', text, re.M)
-    assert {'stavpr', 'replay', 'multi_camera', 'nav2'} <= {name for name, _ in found}
+    found = re.findall(r'^ros2 launch stavpr_(?:ros|nav) (\w+)\.launch\.py(.*)', text, re.M)
+    assert {'stavpr', 'replay', 'multi_camera', 'nav2', 'teach', 'repeat'} <= {
+        name for name, _ in found
+    }
     for name, given in found:
         assert set(re.findall(r'(\w+):=', given)) <= set(load(name).arguments), (name, given)

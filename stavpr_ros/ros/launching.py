@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arguments and node of the launch files, from the table of parameters; a light import."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 import difflib
-from pathlib import Path
+import os
 import sys
+from types import MappingProxyType
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription
@@ -17,6 +18,9 @@ from launch_ros.substitutions import FindPackageShare
 from stavpr_ros.parameters import EXPECTED, PARAMETERS, RENAMED
 
 PACKAGE = 'stavpr_ros'
+PACKAGES = {PACKAGE, 'stavpr_nav'}  # with launch files that use this module
+END_SECONDS = '600'  # for a node that saves, or updates, a map at its end; launch gives 10
+END_TIMEOUTS = 'sigterm_timeout', 'sigkill_timeout'  # arguments that launch itself reads
 TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
 }
@@ -31,7 +35,59 @@ def remappings() -> list[tuple[str, Any]]:
         ('image', image),
         ('image/compressed', [image, '/compressed']),
         ('odom', LaunchConfiguration('odom')),
+        ('camera_info', LaunchConfiguration('camera_info')),
     ]
+
+
+def other_node(
+    package: str,
+    executable: str,
+    name: str,
+    table: Mapping[str, tuple[Any, str]] = MappingProxyType({}),
+    fixed: Mapping[str, object] = MappingProxyType({}),
+    renamed: Mapping[str, str] = MappingProxyType({}),
+) -> list[Any]:
+    """
+    Describe a node beside the recognition node: its arguments, and the action that starts it.
+
+    It has the topics, the ``params_file`` and ``use_sim_time`` of the recognition node, and the
+    arguments that are parameters of both.
+
+    :param table: default and sentence of each parameter, by the name of its argument.
+    :param fixed: parameters that the launch file sets itself.
+    :param renamed: parameters whose arguments have other names, since the recognition node has a
+        parameter of this name: always given, whatever ``params_file`` has for that.
+    """
+
+    def start(context: LaunchContext) -> list[Node]:
+        values = {}
+        for argument, (default, _) in {**table, 'use_sim_time': (False, '')}.items():
+            if text := LaunchConfiguration(argument).perform(context):
+                value = value_of(argument, text, type(default))
+                parameter = renamed.get(argument, argument)
+                values[parameter] = ParameterValue(value, value_type=type(default))
+        return [
+            Node(
+                package=package,
+                executable=executable,
+                name=name,
+                namespace=LaunchConfiguration('namespace'),
+                output='screen',
+                remappings=remappings(),
+                parameters=[LaunchConfiguration('params_file'), {**values, **fixed}],
+            )
+        ]
+
+    own = [
+        DeclareLaunchArgument(
+            argument,
+            default_value=str(default) if argument in renamed else '',
+            description=sentence + '; empty: as set in params_file' * (argument not in renamed),
+        )
+        for argument, (default, sentence) in table.items()
+        if argument not in TYPES
+    ]
+    return [*own, OpaqueFunction(function=start)]
 
 
 def node_launch(
@@ -80,13 +136,14 @@ def unknown_arguments(words: Iterable[str], names: Iterable[str]) -> list[str]:
     return problems
 
 
-def value_of(name: str, text: str) -> bool | float | str:
+def value_of(name: str, text: str, kind: type | None = None) -> bool | float | str:
     """
     Return the value of an argument that is a parameter.
 
+    :param kind: its type; None = of the parameter of the recognition node.
     :raises RuntimeError: a text of another type; names the parameter.
     """
-    kind = TYPES[name]
+    kind = kind or TYPES[name]
     try:
         return {'true': True, 'false': False}[text.lower()] if kind is bool else kind(text)
     except (KeyError, ValueError):
@@ -98,8 +155,9 @@ def _check(names: list[str], needs: str) -> OpaqueFunction:
 
     def check(context: LaunchContext) -> None:
         file = context.get_locals_as_dict().get('current_launch_file_path')
-        own = PACKAGE in sys.argv or file in (str(Path(word).resolve()) for word in sys.argv)
-        if own and (problems := unknown_arguments(sys.argv, names)):
+        paths = (os.path.realpath(word) for word in sys.argv)
+        own = not PACKAGES.isdisjoint(sys.argv) or os.path.realpath(file or '') in paths
+        if own and (problems := unknown_arguments(sys.argv, [*names, *END_TIMEOUTS])):
             raise RuntimeError('; '.join(problems))
         if needs:
             try:
@@ -121,6 +179,11 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
         DeclareLaunchArgument('image', default_value=image, description='topic of the images'),
         DeclareLaunchArgument('odom', default_value=odom, description='topic of the odometry'),
         DeclareLaunchArgument(
+            'camera_info',
+            default_value='camera_info',
+            description='topic of the intrinsics; camera_info: the one beside the images',
+        ),
+        DeclareLaunchArgument(
             'namespace', default_value='', description='namespace of node and topics'
         ),
         DeclareLaunchArgument(
@@ -128,7 +191,7 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
             default_value=PathJoinSubstitution(
                 [FindPackageShare(PACKAGE), 'config', 'stavpr.yaml']
             ),
-            description='file of all parameters',
+            description='file of the parameters of all nodes',
         ),
         *(
             DeclareLaunchArgument(
@@ -155,4 +218,5 @@ def _node(texts: dict[str, str], fixed: dict[str, object], camera: str) -> Node:
         output='screen',
         remappings=remappings(),
         parameters=[LaunchConfiguration('params_file'), values | fixed],
+        sigterm_timeout=LaunchConfiguration('sigterm_timeout', default=END_SECONDS),
     )

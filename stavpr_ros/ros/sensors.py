@@ -118,7 +118,7 @@ class CameraInput:
         self._known: tuple[Any, ...] = ()  # message, frames and camera of the last call
         self._yaw: tuple[str | None, str, float] = (None, '', 0.0)  # frames, result of a call
         self.assumed = False
-        topic = _topic(node)
+        topic = camera_info_topic(node)
         self.problem = f'nothing was received on {topic}'
         qos = QoSProfile(depth=1, reliability=BEST_EFFORT)
         self._subscription = subscribe(node, CameraInfo, topic, self._on_info, qos)
@@ -214,8 +214,8 @@ class CameraInput:
         return p.x, p.y, p.z, o.x, o.y, o.z, o.w
 
 
-def _topic(node: Node) -> str:
-    """Return the topic: camera_info if that is remapped, else the one beside the images."""
+def camera_info_topic(node: Node) -> str:
+    """Return the topic of the intrinsics: camera_info if remapped, else beside the images."""
     own = node.resolve_topic_name('camera_info')
     plain = f'{node.get_namespace().rstrip("/")}/camera_info'
     beside = node.resolve_topic_name('image').rpartition('/')[0] + '/camera_info'
