@@ -4,13 +4,20 @@
 The velocities of the taught run at the places of its map.
 
 They come from the poses of the map, or from a recorded file: CSV with the columns stamp (seconds,
-of the clock that stamps the images), speed (m/s) and turn (rad/s, to the left). Both are
-integrated between two places, so that a robot that repeats them drives the same distance and turns
-by the same angle. Time in which the robot was at rest is left out.
+of the clock that stamps the images), speed (m/s) and turn (rad/s, to the left), and the session of
+the map that it is of, in a line ``# session: ID``. Both are integrated between two places, so that
+a robot that repeats them drives the same distance and turns by the same angle. Time in which the
+robot was at rest is left out.
+
+The places of the other sessions of the map serve recognition: what matches them is at a position
+along the taught session.
 """
 
 import csv
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+import re
 
 import numpy as np
 from stavpr_nav.follower import TaughtRun
@@ -23,18 +30,25 @@ STILL_SPEED, STILL_TURN = 0.02, 0.02  # m/s and rad/s; below both, the robot is 
 STANDING = 1e-3  # seconds between two places that are left of a time at rest
 MAX_GAP = 1.0  # seconds without a velocity that are bridged
 MARGIN = 2.0  # seconds before the first and after the last velocity in which places may be
+SESSION = '# session: '  # begins the line that names the session of a run
+MAX_UNRELATED = 20  # places in a row of another session whose position is between their neighbors
 
 
-def read_velocities(path: str | Path) -> np.ndarray:
+def read_velocities(path: str | Path) -> tuple[np.ndarray, str]:
     """
     Read a recorded run; a torn last line is ignored.
 
-    :returns: stamps, speeds and turns, shape (m, 3), float64.
+    :returns: stamps, speeds and turns, shape (m, 3), float64; id of the session, '' = not named.
     :raises InputError: not such a file, numbers that are not finite, stamps that decrease.
     """
+    session = ''
     try:
         with open(path, newline='', encoding='utf-8') as file:
-            head, *rows = csv.reader(file)
+            lines = file.readlines()
+        for line in lines:
+            if line.startswith(SESSION) and line.endswith('\n'):
+                session = line.removeprefix(SESSION).strip()
+        head, *rows = csv.reader(line for line in lines if not line.startswith('#'))
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f'{path} cannot be read as a taught run: {error}') from error
     if rows and len(rows[-1]) != len(COLUMNS):
@@ -50,25 +64,101 @@ def read_velocities(path: str | Path) -> np.ndarray:
         )
     if not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
         raise InputError(f'{path}: numbers must be finite, and stamps must not decrease')
-    return table
+    return table, session
 
 
-def taught_run(place_map: PlaceMap, velocities: np.ndarray | None = None) -> TaughtRun:
+def taught_places(
+    place_map: PlaceMap, velocities: np.ndarray | None = None, session: str = ''
+) -> np.ndarray:
     """
-    Return the velocities of the taught run at the places of a map.
+    Return the places of the taught session, in the order of the run, shape (n,).
+
+    They are of the first session whose stamps are within the velocities, if there are any. An
+    update of the map may have divided a session: its parts are ``ID``, ``ID-2`` and so on.
+
+    :param velocities: of the run, see :func:`taught_run`.
+    :param session: id of the session, '' = any.
+    :raises InputError: the map has no such session.
+    """
+    index, sessions = place_map.session_index, place_map.sessions
+    if index is None or len(sessions) == 1:
+        return np.arange(len(place_map))
+    is_taught = np.ones(len(place_map), bool)
+    if velocities is not None:
+        first, last = velocities[[0, -1], 0] + (-MARGIN, MARGIN)
+        is_taught = (place_map.stamps >= first * SECOND) & (place_map.stamps <= last * SECOND)
+
+    def is_part(number: int, name: str) -> bool:
+        return re.fullmatch(rf'{re.escape(name)}(-\d+)*', sessions[number].id) is not None
+
+    possible = np.unique(index[is_taught]).tolist()
+    if session:
+        possible = [number for number in possible if is_part(number, session)]
+    if not possible:
+        raise InputError(
+            f'no session {session!r} of the map was recorded with the velocities: it has '
+            f'{[each.id for each in sessions]}; correct the line {SESSION!r} of the run, or take '
+            'map and run of one drive'
+        )
+    whole = replace(sessions[possible[0]], id='')
+    taught, roots = np.zeros(0, np.int64), place_map.same_as
+    for number in possible:
+        places = np.flatnonzero(index == number)
+        # another drive of the same name shows the same places again
+        is_new = roots is None or not np.isin(roots[places], roots[taught]).any()
+        if (
+            replace(sessions[number], id='') == whole
+            and is_part(number, session or sessions[possible[0]].id)
+            and is_new
+        ):
+            taught = np.append(taught, places)
+    return taught
+
+
+def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
+    """
+    Return the position of each place of the map among the taught ones, (N,), int; -1 = unknown.
+
+    Of a place of another session it is the one of the taught place that shows the same. Where a
+    few are related to none, it is between the positions of their neighbors.
+
+    :param taught: places of the taught session, ascending, shape (n,).
+    """
+    n, numbers = len(place_map), np.arange(len(place_map))
+    roots = numbers if place_map.same_as is None else place_map.same_as
+    of_root = np.full(n, -1)
+    of_root[roots[taught][::-1]] = np.arange(len(taught))[::-1]  # the first one of several
+    result = of_root[roots]
+    result[taught] = np.arange(len(taught))
+    index = place_map.session_index
+    for session in range(len(place_map.sessions)) if index is not None else ():
+        related = np.flatnonzero((index == session) & (result >= 0))
+        for before, after in pairwise(related.tolist()):
+            gap, ahead = after - before, result[after] - result[before]
+            if 1 < gap <= MAX_UNRELATED and 0 <= ahead <= 2 * gap:
+                steps = np.arange(1, gap) / gap
+                result[before + 1 : after] = np.rint(result[before] + steps * ahead)
+    return result
+
+
+def taught_run(
+    place_map: PlaceMap, velocities: np.ndarray | None = None, taught: np.ndarray | None = None
+) -> TaughtRun:
+    """
+    Return the velocities of the taught run at its places of a map.
 
     :param velocities: stamps, speeds and turns, shape (m, 3); None = from the poses of the map.
-    :raises InputError: the map has several sessions, or no stamps; it has no poses, and none are
-        needed only with velocities; these do not cover the places.
+    :param taught: the places, see :func:`taught_places`; None = all.
+    :raises InputError: the places have no stamps; they have no poses, and none are needed only
+        with velocities; these do not cover the places.
     """
-    stamps = place_map.stamps / SECOND
-    if len(stamps) < 2 or (np.diff(stamps) <= 0).any() or len(place_map.sessions) > 1:
-        raise InputError(
-            f'{len(stamps)} places of {max(1, len(place_map.sessions))} sessions: expected one '
-            'session with increasing stamps; `stavpr map sessions --keep` selects it'
-        )
+    if taught is None:
+        taught = np.arange(len(place_map))
+    stamps = _stamps(place_map.stamps[taught] / SECOND, velocities)
+    if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
+        raise InputError(f'{len(stamps)} places: expected two with increasing stamps')
     if velocities is None:
-        moved, turned = _of_poses(place_map)
+        moved, turned = _of_poses(None if place_map.poses is None else place_map.poses[taught])
         seconds = np.diff(stamps)
         is_moving = (abs(moved) > STILL_SPEED * seconds) | (abs(turned) > STILL_TURN * seconds)
         moving = seconds * is_moving
@@ -84,12 +174,27 @@ def taught_run(place_map: PlaceMap, velocities: np.ndarray | None = None) -> Tau
     following[following == len(moving)] = np.flatnonzero(moving > STANDING)[-1]
     following = np.append(following, following[-1])
     times = np.concatenate([[0.0], np.cumsum(seconds)])
-    return TaughtRun(times, speeds[following], turns[following], place_map.seam)
+    seam = None
+    if place_map.same_as is not None:
+        roots = place_map.same_as[taught]
+        first = int(np.argmax(roots == roots[-1]))
+        seam = first if 2 * first < len(taught) - 1 else None
+    return TaughtRun(times, speeds[following], turns[following], seam)
 
 
-def _of_poses(place_map: PlaceMap) -> tuple[np.ndarray, np.ndarray]:
+def _stamps(stamps: np.ndarray, velocities: np.ndarray | None) -> np.ndarray:
+    """Return the stamps of places, between those beside where an update renewed the images."""
+    lowest, highest = stamps[0], stamps[-1]
+    if velocities is not None:
+        lowest, highest = velocities[[0, -1], 0] + (-MARGIN, MARGIN)
+    is_own = (stamps >= lowest) & (stamps <= highest)
+    is_own[[0, -1]] = True
+    numbers = np.arange(len(stamps))
+    return np.interp(numbers, numbers[is_own], stamps[is_own])
+
+
+def _of_poses(poses: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Return meters forward and radians between the places, shape (n - 1,) each."""
-    poses = place_map.poses
     if poses is None or not np.isfinite(poses).all():
         raise InputError(
             'not all places of the map have a pose: record the map with odometry, or velocities '

@@ -17,15 +17,15 @@ import rclpy
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from stavpr_msgs.action import Repeat
-from stavpr_msgs.msg import Offset, PlaceMatch
+from stavpr_msgs.msg import MapInfo, Offset, PlaceMatch
 from stavpr_nav.ros.repeat_node import RepeatNode
 from stavpr_nav.ros.teach_node import TeachNode
 from stavpr_nav.taught_run import read_velocities
 from stavpr_ros.errors import InputError, OutputError, SettingsError
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.mapping import load_map, merge_maps, save_map
 from stavpr_ros.mapping.merging import select_places
 from stavpr_ros.relative_pose.offset import DISTANT
 from stavpr_ros.ros.messages import image_message
@@ -33,6 +33,7 @@ from std_msgs.msg import Bool, Header
 
 POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
 PERIOD = 0.1  # seconds between two images
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FAST = {'max_acceleration': 100.0, 'max_speed': 2.0}
 
 
@@ -208,6 +209,46 @@ def test_two_laps_of_a_closed_map(rover, repeat, map_file, tmp_path):
     assert max(one.laps for one in rover.feedback) == 1
 
 
+def test_map_of_several_sessions_is_repeated_by_matches_of_any(rover, repeat, map_file, tmp_path):
+    """The other session serves recognition: its places are positions of the taught one."""
+    first = load_map(map_file)
+    n = len(first)
+    both = merge_maps([first, first], ['monday', 'tuesday'])
+    same_as = np.tile(np.arange(n), 2).astype(np.int32)
+    same_as[n + 40 :] = np.arange(n + 40, 2 * n)  # a detour
+    save_map(replace(both, same_as=same_as), tmp_path / 'both.stavpr')
+    node = repeat(map_path=str(tmp_path / 'both.stavpr'), give_up_after=2.0)
+    rover.images, rover.map_id = [*rover.images[:n]] * 2, node._map.map_id
+    rover.place = n + 3.0
+    handle = rover.send(place_index=n + 9, start_index=n + 3)
+    result = rover.result_of(handle.get_result_async()).result
+    assert (result.code, result.place_index) == (Repeat.Result.REACHED, 9)
+    assert 3 <= rover.offsets[-1].place_index <= 9
+    assert not rover.send(place_index=n + 45).accepted
+    rover.place = n + 45.0  # beside the taught run
+    handle = rover.send(start_index=3)
+    result = rover.result_of(handle.get_result_async()).result
+    assert (result.code, result.distance) == (Repeat.Result.LOST, 0)
+
+
+@pytest.mark.parametrize(
+    ('remapped', 'topic'),
+    [
+        (('image:=/front/image_raw',), '/front/camera_info'),
+        (('image:=/front/image_raw', 'camera_info:=/rear/info'), '/rear/info'),
+        (('camera_info:=camera_info', 'image:=left/image'), '/left/camera_info'),
+        ((), '/camera_info'),
+    ],
+)
+def test_intrinsics_are_beside_the_images(context, map_file, remapped, topic):
+    words = [word for rule in remapped for word in ('-r', rule)]
+    options = {'cli_args': ['--ros-args', *words]} if words else {}
+    node = RepeatNode(context=context, **overrides(map_path=map_file), **options)
+    topics = [name for name, _ in node.get_subscriber_names_and_types_by_node('repeat', '/')]
+    node.destroy_node()
+    assert topic in topics
+
+
 def test_node_that_ends_stops_the_robot(rover, repeat):
     node = repeat()
     rover.send(start_index=3)
@@ -295,20 +336,23 @@ def test_velocities_are_recorded(context, tmp_path, source):
     twist = getattr(twist, 'twist', twist)
     twist.linear.x, twist.angular.z = 0.5, -0.25
     publisher = sender.create_publisher(kind, topic, 10)
+    infos = sender.create_publisher(MapInfo, 'stavpr/map_info', LATCHED)
     end, stamp = time.monotonic() + TIMEOUT, 0
-    while len(path.read_text().splitlines()) < 5:
+    while len(path.read_text().splitlines()) < 6 or 'new' not in path.read_text():
         assert time.monotonic() < end
         stamp += 1
         if hasattr(message, 'header'):
             message.header.stamp.sec = 100 + stamp
         publisher.publish(message)
+        infos.publish(MapInfo(operation='mapping', sessions=['old', 'new']))
         executor.spin_once(timeout_sec=0.05)
     with pytest.raises(OutputError, match='File exists'):
         TeachNode(context=context, **overrides(run_path=str(path)))
     executor.shutdown()
     node.destroy_node()
     sender.destroy_node()
-    velocities = read_velocities(path)
+    velocities, session = read_velocities(path)
+    assert session == 'new'
     np.testing.assert_allclose(velocities[:, 1:], [[0.5, -0.25]] * len(velocities))
 
 

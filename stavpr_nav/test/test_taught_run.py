@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stavpr_nav.taught_run import read_velocities, taught_run
+from stavpr_nav.taught_run import positions, read_velocities, taught_places, taught_run
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import descriptor_map
+from stavpr_ros.mapping import descriptor_map, merge_maps
+from stavpr_ros.mapping.merging import keep_places
 
 SECOND = 10**9
 HEAD = 'stamp,speed,turn\n'
@@ -78,7 +79,89 @@ def test_a_gap_of_the_velocities_counts_as_standing():
 def test_files_are_read_without_a_torn_last_line(tmp_path):
     path = tmp_path / 'run.csv'
     path.write_text(HEAD + '1.5,0.2,0.1\n2.5,0.3,-0.1\n3.5,0.')
-    np.testing.assert_array_equal(read_velocities(path), [[1.5, 0.2, 0.1], [2.5, 0.3, -0.1]])
+    velocities, session = read_velocities(path)
+    np.testing.assert_array_equal(velocities, [[1.5, 0.2, 0.1], [2.5, 0.3, -0.1]])
+    assert session == ''
+
+
+@pytest.mark.parametrize('before', [True, False])
+def test_files_name_the_session_of_the_run(tmp_path, before):
+    path, lines = tmp_path / 'run.csv', [HEAD, '1.5,0.2,0.1\n', '2.5,0.3,-0.1\n']
+    lines.insert(0 if before else 2, '# session: my yard\n')
+    path.write_text(''.join([*lines, '# session: torn']))
+    velocities, session = read_velocities(path)
+    assert (len(velocities), session) == (2, 'my yard')
+
+
+def two_sessions(start=100, related=True):
+    """Return two drives past 30 places; every third place of the second has no relation."""
+    first, second = (
+        route(at + np.arange(30) * 0.5, arc(np.arange(30) * 0.05)) for at in (0, start)
+    )
+    both = merge_maps([first, second], ['monday', 'tuesday'])
+    same_as = np.arange(60, dtype=np.int32)
+    if related:
+        same_as[30:] = np.where(np.arange(30) % 3 == 1, same_as[30:], np.arange(30))
+    return replace(both, same_as=same_as)
+
+
+def velocities_from(start):
+    at = start + np.arange(0, 15, 0.1)
+    return np.column_stack([at, np.full(len(at), 0.2), np.full(len(at), 0.1)])
+
+
+@pytest.mark.parametrize(
+    ('start', 'velocities', 'session', 'expected'),
+    [
+        (100, None, '', 0),
+        (100, None, 'tuesday', 30),
+        (100, velocities_from(100), '', 30),  # by the stamps
+        (0, velocities_from(0), '', 0),  # of a simulation: all begin at 0
+        (0, velocities_from(0), 'tuesday', 30),
+    ],
+)
+def test_taught_run_is_of_one_session(start, velocities, session, expected):
+    both = two_sessions(start)
+    taught = taught_places(both, velocities, session)
+    assert taught.tolist() == [*range(expected, expected + 30)]
+    run = taught_run(both, velocities, taught)
+    np.testing.assert_allclose(run.speeds, 0.2, rtol=0.05)
+    assert run.seam is None
+    at = positions(both, taught)
+    assert at[taught].tolist() == [*range(30)]
+    other = np.delete(at, taught)
+    assert other[1:-1].tolist() == [*range(1, 29)]
+
+
+def test_places_of_a_detour_have_no_position():
+    both = two_sessions(related=False)
+    assert (positions(both, taught_places(both))[30:] == -1).all()
+
+
+def test_session_that_an_update_has_divided_and_renewed_is_one_run():
+    """Renewed places have the stamps of another drive; a drive of the same name is no part."""
+    both = two_sessions()
+    both = replace(both, stamps=both.stamps + 10**9)
+    stamps = both.stamps.copy()
+    stamps[5:9] = np.arange(4) + 10**18
+    divided = keep_places(replace(both, stamps=stamps), np.delete(np.arange(60), range(14, 17)))
+    assert [each.id for each in divided.sessions] == ['monday', 'monday-2', 'tuesday']
+    for velocities in (None, velocities_from(1)):
+        taught = taught_places(divided, velocities, 'monday')
+        assert taught.tolist() == [*range(27)]
+        run = taught_run(divided, velocities, taught)
+        assert run.distances[-1] == pytest.approx(2.9, 0.05)
+        np.testing.assert_allclose(np.diff(run.times[:14]), 0.5)
+    alike = merge_maps([route(np.arange(1, 20)), route(np.arange(1, 20))], ['monday'] * 2)
+    alike = replace(alike, same_as=np.tile(np.arange(19), 2).astype(np.int32))
+    assert taught_places(alike).tolist() == [*range(19)]
+
+
+def test_session_that_the_map_lacks_is_named():
+    with pytest.raises(InputError, match=r"no session 'friday' .* \['monday', 'tuesday'\]"):
+        taught_places(two_sessions(), None, 'friday')
+    with pytest.raises(InputError, match='take map and run of one drive'):
+        taught_places(two_sessions(), velocities_from(1000))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from functools import lru_cache
 import math
+import os
 import threading
 import traceback
 from typing import Any
@@ -27,7 +28,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_nav.driver import Driver, Goal, Outcome
 from stavpr_nav.follower import Command, FollowerSettings, Observation
 from stavpr_nav.parameters import REPEAT
-from stavpr_nav.taught_run import read_velocities, taught_run
+from stavpr_nav.taught_run import positions, read_velocities, taught_places, taught_run
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.mapping import open_map
 from stavpr_ros.mapping.camera import FORWARD
@@ -36,6 +37,7 @@ from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilt
 from stavpr_ros.ros.diagnostics import one_status
 from stavpr_ros.ros.messages import camera_of, nanoseconds
 from stavpr_ros.ros.rclpy_workarounds import log_failure
+from stavpr_ros.ros.sensors import camera_info_topic
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Bool
@@ -78,11 +80,7 @@ class RepeatNode(Node):
             raise SettingsError(f'image_transport = {transport!r}: expected raw or compressed')
         self._give_up_after = float(values['give_up_after'])
         self._needs_deadman, self._base = values['require_deadman'], values['base_frame']
-        self._map = open_map(values['map_path'])
-        if not self._map.thumbnails:
-            raise InputError(f'{values["map_path"]} has no thumbnails: expected images of places')
-        velocities = read_velocities(values['run_path']) if values['run_path'] else None
-        self._run = taught_run(self._map, velocities)
+        self._load(*map(os.path.expanduser, (values['map_path'], values['run_path'])))
         self._columns = lru_cache(32)(self._columns_of)
         self._expansion = Expansion(self._columns, self._run.distances)
         self._filter, self._focal = OffsetFilter(), math.nan
@@ -109,7 +107,7 @@ class RepeatNode(Node):
         self.create_subscription(*images, self._on_image, best_effort)
         self.create_subscription(PlaceMatch, values['match_topic'], self._on_match, 10)
         self.create_subscription(
-            CameraInfo, 'camera_info', self._on_camera, qos_profile_sensor_data
+            CameraInfo, camera_info_topic(self), self._on_camera, qos_profile_sensor_data
         )
         self.create_subscription(Bool, 'deadman', self._on_deadman, best_effort)
         self._worker = threading.Thread(target=self._work, daemon=True, name='offset')
@@ -123,9 +121,20 @@ class RepeatNode(Node):
         self.create_timer(PERIOD, self._control, clock=steady)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.get_logger().info(
-            f'{len(self._map)} places, {self._run.distances[-1]:.0f} m'
+            f'{len(self._taught)} places, {self._run.distances[-1]:.0f} m'
             f'{", closed" if self._run.seam is not None else ""}: waiting for a goal'
         )
+
+    def _load(self, map_path: str, run_path: str) -> None:
+        """Read the map and the taught run."""
+        self._map = open_map(map_path)
+        if not self._map.thumbnails:
+            raise InputError(f'{map_path} has no thumbnails: expected images of places')
+        velocities, session = read_velocities(run_path) if run_path else (None, '')
+        # places of the map by position along the run, and the reverse
+        self._taught = taught_places(self._map, velocities, session)
+        self._positions = positions(self._map, self._taught)
+        self._run = taught_run(self._map, velocities, self._taught)
 
     def destroy_node(self) -> None:
         """Stop the robot, and end."""
@@ -208,16 +217,19 @@ class RepeatNode(Node):
     def _observation(self, image: Any, match: PlaceMatch) -> Observation:
         """Return what an image shows; publish its offset where the place is known."""
         place, probability, offset = match.newest_index, match.probability, None
-        if match.status != PlaceMatch.MATCH:
+        if match.status == PlaceMatch.MATCH:  # -1 = beside the taught run
+            place = int(self._positions[place]) if 0 <= place < len(self._map) else -1
+        else:
             with self._lock:
                 place = self._driver.expected_place() if self._driver else -1
             probability = math.nan
-        if 0 <= place < len(self._map):
+        if 0 <= place < len(self._taught):
             columns = describe_columns(decode_message(image))
             offset = self._filter.update(columns, self._columns(place))
             lateral = self._expansion.lateral(offset, place, self._focal)
+            index = self._place(place)
             self._offset.publish(offset_message(offset, lateral, image.header, self._focal, {
-                'map_id': self._map.map_id, 'place_index': place, 'place_id': self._map.ids[place],
+                'map_id': self._map.map_id, 'place_index': index, 'place_id': self._map.ids[index],
             }))  # fmt: skip
         else:
             place = -1
@@ -225,7 +237,7 @@ class RepeatNode(Node):
         return Observation(nanoseconds(image.header.stamp) / SECOND, place, probability, offset)
 
     def _columns_of(self, place: int) -> np.ndarray:
-        thumbnail = self._map.thumbnail(place)
+        thumbnail = self._map.thumbnail(self._place(place))
         if thumbnail is None:
             raise ImageError(f'place {place} has no thumbnail', kind='damaged')
         return describe_columns(thumbnail)
@@ -244,19 +256,32 @@ class RepeatNode(Node):
         try:
             if self._driver is not None:
                 raise InputError('another goal is driven to: cancel it')
-            place = goal.place_index
+            place, start = map(self._position, (goal.place_index, goal.start_index))
             if goal.place_id:
                 if goal.place_id not in self._map.ids:
                     raise InputError(f'no place has the identifier {goal.place_id!r}')
-                place = self._map.ids.index(goal.place_id)
+                place = self._position(self._map.ids.index(goal.place_id))
             self._driver = Driver(
-                self._run, Goal(place, goal.laps, goal.start_index), self._now(), self._settings,
+                self._run, Goal(place, goal.laps, start), self._now(), self._settings,
                 self._needs_deadman, self._give_up_after,
             )  # fmt: skip
         except InputError as error:
             self.get_logger().error(f'the goal is rejected: {error}')
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
+
+    def _position(self, place: int) -> int:
+        """Return the position of a place of the map along the taught run; -1 stays."""
+        if place == -1:
+            return place
+        position = int(self._positions[place]) if 0 <= place < len(self._map) else -1
+        if position < 0:
+            raise InputError(f'place {place} is not on the taught run, of {len(self._taught)}')
+        return position
+
+    def _place(self, position: int) -> int:
+        """Return the place of the map at a position along the taught run; -1 stays."""
+        return position if position < 0 else int(self._taught[position])
 
     def _on_accepted(self, handle: Any) -> None:
         self._handle, self._ended = handle, Future()
@@ -280,7 +305,7 @@ class RepeatNode(Node):
             handle.abort()
         self.get_logger().info(f'{driver.outcome.name.lower()} after {driver.distance:.1f} m')
         return Repeat.Result(
-            code=int(driver.outcome), message=text, place_index=driver.place,
+            code=int(driver.outcome), message=text, place_index=self._place(driver.place),
             laps=driver.laps, distance=driver.distance,
         )  # fmt: skip
 
@@ -303,7 +328,7 @@ class RepeatNode(Node):
             assert self._ended is not None
             self._ended.set_result(None)
         elif self._steps % FEEDBACK == 0:
-            handle.publish_feedback(feedback_of(driver))
+            handle.publish_feedback(feedback_of(driver, self._place(driver.place)))
 
     def _publish(self, command: Command) -> None:
         twist = Twist()
@@ -345,12 +370,12 @@ def offset_message(
     )  # fmt: skip
 
 
-def feedback_of(driver: Driver) -> Repeat.Feedback:
-    """Return the feedback of a drive."""
+def feedback_of(driver: Driver, place: int) -> Repeat.Feedback:
+    """Return the feedback of a drive; place: of the map."""
     newest, command = driver.newest, driver.command
     offset = newest.offset if newest is not None else None
     return Repeat.Feedback(
-        place_index=driver.place,
+        place_index=place,
         probability=newest.probability if newest is not None else math.nan,
         shift=offset.shift if offset is not None and offset.is_valid else math.nan,
         speed=command.speed, turn=command.turn, distance_to_go=driver.distance_to_go,

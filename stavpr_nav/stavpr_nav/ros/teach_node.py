@@ -10,9 +10,10 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from stavpr_msgs.msg import MapInfo
 from stavpr_nav.parameters import TEACH
-from stavpr_nav.taught_run import COLUMNS
+from stavpr_nav.taught_run import COLUMNS, SESSION
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.ros.messages import nanoseconds
 from stavpr_ros.units import SECOND
@@ -39,7 +40,7 @@ class TeachNode(Node):
             name: self.declare_parameter(name, default, READ_ONLY).value
             for name, (default, _) in PARAMETERS.items()
         }
-        path, source = Path(values['run_path']), values['source']
+        path, source = Path(values['run_path']).expanduser(), values['source']
         if source not in SOURCES:
             raise SettingsError(f'source = {source!r}: expected one of {", ".join(SOURCES)}')
         try:
@@ -47,15 +48,24 @@ class TeachNode(Node):
         except OSError as error:
             raise OutputError(f'run_path = {str(path)!r}: {error.strerror}') from error
         self._write(COLUMNS)
+        self._session = ''
         self._last = -sys.float_info.max
         topic, kind = SOURCES[source]
         self.create_subscription(kind, topic, self._on_message, qos_profile_sensor_data)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(MapInfo, 'stavpr/map_info', self._on_map_info, latched)
         self.get_logger().info(f'recording {topic} in {path}')
 
     def destroy_node(self) -> None:
         """Close the file."""
         self._file.close()
         super().destroy_node()
+
+    def _on_map_info(self, info: MapInfo) -> None:
+        """Name the session that the recognition node records, where its map has several."""
+        if info.operation == 'mapping' and info.sessions and info.sessions[-1] != self._session:
+            self._session = info.sessions[-1]
+            self._write([f'{SESSION}{self._session}'])
 
     def _on_message(self, message: Any) -> None:
         twist = getattr(message, 'twist', message)
