@@ -21,6 +21,7 @@ from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import matched_pair
 from stavpr_ros.ros.messages import (
+    BESIDE,
     image_message,
     loop_closure_message,
     matched_pose_message,
@@ -29,6 +30,7 @@ from stavpr_ros.ros.messages import (
     pose_message,
     time_message,
 )
+from stavpr_ros.ros.navigation import planar
 from std_msgs.msg import Header
 
 SECOND = 10**9
@@ -96,11 +98,13 @@ def test_matched_pose_message_has_the_spread_of_near_places(places):
     around = [34, 35, 36, 37]  # 33 has no pose
     expected = np.zeros((6, 6))
     np.fill_diagonal(expected, [np.var(around), np.var(np.square(around)), *[0.01] * 4])
+    across = np.array([-(37**2 - 34**2), 3]) / math.hypot(37**2 - 34**2, 3)
+    expected[:2, :2] += BESIDE**2 * np.outer(across, across)
     np.testing.assert_allclose(message.pose.covariance.reshape(6, 6), expected)
     for place, near in ((10, [10, 11, 12]), (59, [57, 58, 59])):  # the ends of the route
         at_end = accepted(np.array([[4, place]], np.int32))
         message = matched_pose_message(HEADER, at_end, places, 'odom')
-        assert message.pose.covariance[0] == pytest.approx(np.var(near))
+        assert message.pose.covariance[0] == pytest.approx(np.var(near) + BESIDE**2, rel=0.01)
     nowhere = accepted(np.array([[4, 33]], np.int32))
     assert matched_pose_message(HEADER, nowhere, places, 'odom') is None
     assert matched_pose_message(HEADER, rejected(), places, 'odom') is None
@@ -119,13 +123,37 @@ def test_neighbors_of_a_place_are_of_its_session(newest):
     path = np.column_stack([np.arange(5), np.maximum(newest + np.arange(-4, 1), own[0])])
     match = accepted(path.astype(np.int32))
     message = matched_pose_message(HEADER, match, merged, 'map')
-    assert message.pose.covariance[7] == pytest.approx(0.01)
     assert message.pose.covariance[0] <= 2
+    assert message.pose.covariance[7] < 5  # across the path, of the lateral offset
     distances = np.abs(np.subtract.outer(path[:, 1], np.arange(n)))
     pair = matched_pair(match.match, newest, merged, None, poses[:5], lambda at: distances[:, at])
     np.testing.assert_array_equal(pair.poses, poses[own])
     assert (pair.first, sorted(pair.thumbnails)) == (own[0], own.tolist())
     assert abs(align(pair).pose[1]) < 1e-9
+
+
+@pytest.mark.parametrize('heading', [0, 45, 90, 137, 250])
+@pytest.mark.parametrize(('spacing', 'turned'), [(0.3, 0), (0.3, 70), (2.5, 0), (0.0, 0)])
+def test_pose_is_as_uncertain_beside_the_path_as_a_lane_is_wide(
+    extractor, features, heading, spacing, turned
+):
+    """At any speed; where the poses are of positions only, or of a robot that begins at rest."""
+    route, angle = GrowingMap(extractor.settings, extractor.projection, 10), math.radians(heading)
+    orientation = Rotation.from_euler('z', heading + turned, degrees=True).as_quat()
+    for i in range(5):
+        position = [i * spacing * math.cos(angle), i * spacing * math.sin(angle), 0]
+        route.add(features, pose=np.array([*position, *orientation]))
+    match = accepted(np.array([[4, 2]], np.int32))
+    message = matched_pose_message(HEADER, match, route, 'map')
+    covariance = message.pose.covariance.reshape(6, 6)
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+    across = np.array([-math.sin(angle), math.cos(angle)])
+    along = np.array([across[1], -across[0]])
+    sideways = across @ covariance[:2, :2] @ across
+    assert 3.5 <= 2 * math.sqrt(sideways) < 4.0 + 2 * spacing
+    assert along @ covariance[:2, :2] @ along < 0.02 + 2.1 * spacing**2
+    flat = planar(message).pose.covariance.reshape(6, 6)
+    assert across @ flat[:2, :2] @ across >= sideways
 
 
 @pytest.mark.parametrize('axis', ['x', 'y', 'z'])

@@ -64,12 +64,13 @@ def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():
     given = PoseWithCovarianceStamped()
     given.pose.pose = pose_message(np.array([1, 2, 3, *tilted]))
     given.pose.covariance[::7] = [0.01, 4.0, 0.3, 0.3, 0.3, 0.01]
+    given.pose.covariance[1] = given.pose.covariance[6] = 0.2
     flat = planar(given).pose
     position, o = flat.pose.position, flat.pose.orientation
     assert (position.x, position.y, position.z) == (1, 2, 0)
     assert math.degrees(2 * math.atan2(o.z, o.w)) == pytest.approx(40)
     expected = np.zeros(36)
-    expected[[0, 7, 35]] = 0.25, 4, 0.0685
+    expected[[0, 1, 6, 7, 35]] = 0.25, 0.2, 0.2, 4, 0.0685
     np.testing.assert_array_equal(flat.covariance, expected)
 
 

@@ -44,6 +44,10 @@ from stavpr_ros.units import SECOND
 from std_msgs.msg import Header
 
 MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
+SHORT = 0.05  # meters along the path that have no direction
+BESIDE = (
+    1.75  # deviation of the lateral offset, m: on the other lane, 3.5 m, the place matches too
+)
 
 
 @dataclass(frozen=True)
@@ -272,10 +276,10 @@ def matched_pose_message(
     """
     Return the pose of the place of the newest image; None without a match or a known pose.
 
-    It is turned by the mountings of the cameras, where the map states them. The covariance is
-    diagonal: the variance over the poses of the two places before and after it in its session,
-    rotation vectors about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2. It does not
-    include a lateral offset of the camera from the route.
+    It is turned by the mountings of the cameras, where the map states them. The covariance has the
+    variances over the poses of the two places before and after it in its session, rotation vectors
+    about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2, and, across the path, the
+    variance of the lateral offset from it, which is not observed.
 
     :param frame: of the poses of the map.
     """
@@ -296,7 +300,13 @@ def matched_pose_message(
     message = PoseWithCovarianceStamped()
     message.header.stamp, message.header.frame_id = header.stamp, frame
     message.pose.pose = pose_message(pose)
-    message.pose.covariance[::7] = np.maximum(variances, MIN_VARIANCE)
+    covariance = np.diag(np.maximum(variances, MIN_VARIANCE))
+    x, y = near[-1, :2] - near[0, :2]
+    if math.hypot(x, y) < SHORT:  # the robot was at rest: across the view
+        x, y = Rotation.from_quat(own[3:]).apply((1.0, 0.0, 0.0))[:2]
+    across = np.array([-y, x]) / max(math.hypot(x, y), 1e-9)
+    covariance[:2, :2] += BESIDE**2 * np.outer(across, across)
+    message.pose.covariance = covariance.ravel()
     return message
 
 

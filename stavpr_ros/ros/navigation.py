@@ -153,6 +153,7 @@ def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:
     pose.orientation.z, pose.orientation.w = float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
     for i, least in ((0, MIN_VARIANCE_XY), (7, MIN_VARIANCE_XY), (35, MIN_VARIANCE_YAW)):
         result.pose.covariance[i] = max(least, message.pose.covariance[i])
+    result.pose.covariance[1] = result.pose.covariance[6] = message.pose.covariance[1]
     return result
 
 
