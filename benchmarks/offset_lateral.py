@@ -21,7 +21,7 @@ from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 
 SEEDS = (7, 21, 33)
-LEFT = (-1.0, 0.0, 0.5, 1.0, 2.0)  # meters from the path
+LEFT = (-1.0, -0.4, -0.2, 0.0, 0.2, 0.4, 1.0, 2.0)  # meters from the path
 WITHIN, SWAY, TURNED = range(10, 110), 0.15, math.radians(3)
 
 

@@ -8,20 +8,19 @@ import pytest
 from stavpr_ros.errors import ImageError, InputError
 from stavpr_ros.mapping import thumbnail_of
 from stavpr_ros.relative_pose import offset as module
-from stavpr_ros.relative_pose.expansion import Expansion
+from stavpr_ros.relative_pose.expansion import AHEAD, Expansion
 from stavpr_ros.relative_pose.offset import (
     A,
     B,
     BLOCKS,
     describe_columns,
-    DISTANT,
     DRIFT,
     EVIDENCE,
     JUMP,
     MIN_OVERLAP,
     Offset,
     OffsetFilter,
-    REACH,
+    PARTS,
     SHIFTS,
     STEP,
 )
@@ -65,16 +64,38 @@ def plain_evidence(query, place):
     evidence, is_enough = np.zeros((2, len(A), len(SHIFTS)))
     centers = (np.arange(BLOCKS) + 0.5) / BLOCKS * 2 - 1
     for model, (a, b) in enumerate(zip(A, B, strict=True)):
-        beside = np.rint((a * centers * abs(centers) + b * abs(centers)) * WIDTH / 2).astype(int)
-        for k, shift in enumerate(SHIFTS):
-            shifted = shift + beside
-            is_near = abs(shifted) <= REACH
-            used = means[np.flatnonzero(is_near), shifted[is_near] + REACH]
-            used = used[~np.isnan(used)]
-            if len(used):
-                evidence[model, k] = EVIDENCE * used.sum() / np.sqrt(BLOCKS * len(used))
+        pixels = (a * centers * abs(centers) + b * abs(centers)) * WIDTH / 2
+        beside = np.rint(pixels * PARTS) / PARTS
+        for k in range(len(SHIFTS)):
+            used = [
+                plain_mean(row, k + each)
+                for row, each in zip(means, beside, strict=True)
+                if not np.isnan(row[k])
+            ]
+            if used:
+                evidence[model, k] = EVIDENCE * np.sum(used) / np.sqrt(BLOCKS * len(used))
             is_enough[model, k] = len(used) >= MIN_OVERLAP * BLOCKS
     return evidence, is_enough
+
+
+def plain_mean(row, at):
+    """
+    Return a mean between pixels, by the cubic through them with the slopes of neighbors.
+
+    Beside the shifts at which the block overlaps, it is the last one.
+    """
+    first, last = np.flatnonzero(~np.isnan(row))[[0, -1]]
+    at = min(max(at, first), last)
+    k = min(int(np.floor(at)), last - 1)
+
+    def slope(i):
+        is_inside = first < i < last
+        return (row[i + 1] - row[i - 1]) / 2 if is_inside else row[k + 1] - row[k]
+
+    t = at - k
+    left, right = 2 * t**3 - 3 * t**2 + 1, 3 * t**2 - 2 * t**3
+    rising, falling = t**3 - 2 * t**2 + t, t**3 - t**2
+    return left * row[k] + right * row[k + 1] + rising * slope(k) + falling * slope(k + 1)
 
 
 def plain_drifted(earlier):
@@ -102,6 +123,17 @@ def test_shift_is_positive_where_the_scene_is_further_right(shift):
     assert result.shift * WIDTH == pytest.approx(shift, abs=1.0)
     assert result.deviation * WIDTH < 3
     assert abs(result.parallax) < 0.02
+
+
+@pytest.mark.parametrize('beside', [-1.8, -0.9, 0.0, 0.9, 1.8])
+@pytest.mark.parametrize('shift', [-9.0, 0.0, 9.0])
+def test_parallax_below_a_step_is_seen_and_no_shift_counts_as_parallax(beside, shift):
+    """A parallax of .9 pixels is .2 m on a street: less than half a step of B."""
+    results = []
+    for seed in range(6):
+        image = panorama(seed)
+        results.append(offset(warped(image, shift, beside), warped(image)).parallax * WIDTH)
+    assert np.mean(results) == pytest.approx(beside, abs=0.5)
 
 
 @pytest.mark.parametrize('beside', [-12.0, 12.0])
@@ -152,7 +184,7 @@ def forward(image, outward):
     """Return the middle of a panorama after a move forward; pixels outward at both sides."""
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     u = (x + 0.5 - WIDTH / 2) / (WIDTH / 2)
-    source = (PANORAMA - WIDTH) / 2 + x - outward * u * (DISTANT + abs(u))
+    source = (PANORAMA - WIDTH) / 2 + x - outward * u * (AHEAD + abs(u))
     return cv2.remap(image, source.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
 
 
@@ -160,7 +192,8 @@ def forward(image, outward):
 def test_lateral_offset_follows_from_the_expansion_between_places(spacing):
     """With an expansion of 0.06 half widths per meter, 1 m has a parallax of 0.06 f widths."""
     image, damaged = panorama(1), 3
-    places = [describe_columns(forward(image, 0.06 * spacing * k * WIDTH / 2)) for k in range(8)]
+    steps = 0.06 * spacing * (np.arange(8) - 4) * WIDTH / 2
+    places = [describe_columns(forward(image, each)) for each in steps]
 
     def columns(k):
         if k == damaged:

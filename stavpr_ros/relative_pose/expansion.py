@@ -4,7 +4,7 @@
 The lateral offset in meters: the parallax of an image over the expansion of the map's images.
 
 Where a camera drives d meters forward, the scene at the position u in -1..1 of the image moves
-outward by d c u (DISTANT + |u|) half widths, and where it drives t meters to the left, by
+outward by d c u (AHEAD + |u|) half widths, and where it drives t meters to the left, by
 2 f t c (DISTANT + |u|) to the right, if c = 1 / (2 f X) for a scene X meters beside the path and
 a focal length of f widths. c, the expansion per meter, follows from images of the map and
 the distances between them; then the parallax p gives t = p / (f c), without knowing X.
@@ -19,7 +19,7 @@ from stavpr_ros.errors import ImageError
 from stavpr_ros.relative_pose.offset import (
     BLOCK_CENTERS,
     block_evidence,
-    DISTANT,
+    in_parts,
     Offset,
     PRIOR_H,
     SHIFTS,
@@ -27,12 +27,13 @@ from stavpr_ros.relative_pose.offset import (
 )  # fmt: skip
 
 # Chosen on street 7; what half and double do on streets 21 and 33: benchmarks/results/repeat.md.
-RATES = np.geomspace(0.004, 1.0, 24)  # expansions, half widths per meter
+RATES = np.geomspace(0.004, 1.0, 48)  # expansions, half widths per meter
 STEPS = (1, 2, 4, 8)  # places between two compared images
 MAX_DISTANCE = 1.2  # meters between them; the next place counts in any case
 MIN_DISTANCE = 0.02
 RADIUS = 4  # places on both sides whose evidence is summed
 REMEMBERED = 64  # places
+AHEAD = 0.13  # DISTANT of the scene that the camera drives towards
 
 
 class Expansion:
@@ -80,8 +81,7 @@ class Expansion:
             if distance < MIN_DISTANCE:
                 continue
             u = BLOCK_CENTERS
-            outward = RATES[:, None] * u * (DISTANT + abs(u)) * distance * WIDTH / 2
-            beside = np.rint(outward).astype(np.int64)
+            beside = in_parts(RATES[:, None] * u * (AHEAD + abs(u)) * distance)
             try:
                 later, columns = self._columns(place + step), self._columns(place)
             except ImageError:

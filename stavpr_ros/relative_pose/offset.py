@@ -46,8 +46,9 @@ FLOOR_B = 0.007  # of the parallax: of a step of B
 # Deviations of the prior: h in widths; a and b in half widths.
 PRIOR_H, PRIOR_A, PRIOR_B = 0.25, 0.08, 0.15
 A, B = (axis.ravel() for axis in np.meshgrid(
-    np.linspace(-0.1, 0.1, 5), np.linspace(-0.3, 0.3, 13), indexing='ij'
+    np.linspace(-0.1, 0.1, 5), np.linspace(-0.3, 0.3, 25), indexing='ij'
 ))  # fmt: skip
+PARTS = 4  # of a pixel, in which the shift of a block is known: a small parallax is less than one
 SHIFTS = np.arange(-REACH, REACH + 1)
 BLOCK_CENTERS = ((np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5) * 2
 
@@ -126,13 +127,17 @@ def describe_columns(image: np.ndarray) -> np.ndarray:
     return columns / np.maximum(norms, 1e-6)
 
 
+def in_parts(half_widths: np.ndarray) -> np.ndarray:
+    """Return shifts beside h, half widths, in parts of a pixel, int64."""
+    return np.rint(half_widths * PARTS * WIDTH / 2).astype(np.int64)
+
+
 class OffsetFilter:
     """Estimates the offset of each image of a sequence."""
 
     def __init__(self) -> None:
         u = BLOCK_CENTERS
-        beside = (A[:, None] * u * abs(u) + B[:, None] * abs(u)) * WIDTH / 2
-        self._beside = np.rint(beside).astype(np.int64)
+        self._beside = in_parts(A[:, None] * u * abs(u) + B[:, None] * abs(u))
         of_model = (A / PRIOR_A) ** 2 + (B / PRIOR_B) ** 2
         self._prior = -0.5 * (of_model[:, None] + (SHIFTS / (PRIOR_H * WIDTH)) ** 2)
         self.reset()
@@ -192,8 +197,11 @@ def block_evidence(
     """
     Return the evidence (nats) for each (a, b) and shift, and whether enough blocks overlap.
 
+    The blocks that overlap by h alone count. One that a model moves out of the image is as similar
+    as at the border: models are compared by the same blocks, so that no shift counts as parallax.
+
     :param query, place: their columns, (WIDTH, d), float32.
-    :param beside: shift of each block of columns beside h, pixels, (models, BLOCKS).
+    :param beside: shift of each block of columns beside h, see :func:`in_parts`, (models, BLOCKS).
     """
     size, shifts, models = WIDTH // BLOCKS, 2 * REACH + 1, len(beside)
     means, is_covered = np.zeros((BLOCKS, shifts)), np.zeros((BLOCKS, shifts), np.bool_)
@@ -206,18 +214,53 @@ def block_evidence(
                 total += _dot(place[x], query[x + k - REACH])
             if 2 * (last - first) >= size:
                 means[block, k], is_covered[block, k] = total / (last - first), True
+    parts = _in_between(means, is_covered)
+    firsts, lasts = np.zeros(BLOCKS, np.int64), np.zeros(BLOCKS, np.int64)
+    for block in range(BLOCKS):
+        covered = np.flatnonzero(is_covered[block])
+        firsts[block], lasts[block] = PARTS * covered[0], PARTS * covered[-1]
     evidence, is_enough = np.zeros((models, shifts)), np.zeros((models, shifts), np.bool_)
     for model in range(models):
         for k in range(shifts):
             total, count = 0.0, 0
             for block in range(BLOCKS):
-                shift = k + beside[model, block]
-                if 0 <= shift < shifts and is_covered[block, shift]:
-                    total += means[block, shift]
+                if is_covered[block, k]:
+                    shift = PARTS * k + beside[model, block]
+                    total += parts[block, min(max(shift, firsts[block]), lasts[block])]
                     count += 1
             evidence[model, k] = EVIDENCE / BLOCKS * total * np.sqrt(BLOCKS / max(count, 1))
             is_enough[model, k] = count >= MIN_OVERLAP * BLOCKS
     return evidence, is_enough
+
+
+@kernel
+def _in_between(means: np.ndarray, is_covered: np.ndarray) -> np.ndarray:
+    """
+    Return the means at parts of a pixel, by cubic (Catmull-Rom) interpolation; NaN = unknown.
+
+    Linear interpolation lowers a peak between two pixels: small shifts would be zero.
+    """
+    blocks, shifts = means.shape
+    parts = np.full((blocks, PARTS * (shifts - 1) + 1), np.nan)
+    for block in range(blocks):
+        for k in range(shifts):
+            if is_covered[block, k]:
+                parts[block, PARTS * k] = means[block, k]
+        for k in range(shifts - 1):
+            if not (is_covered[block, k] and is_covered[block, k + 1]):
+                continue
+            p1, p2 = means[block, k], means[block, k + 1]
+            p0, p3 = 2 * p1 - p2, 2 * p2 - p1
+            if k > 0 and is_covered[block, k - 1]:
+                p0 = means[block, k - 1]
+            if k + 2 < shifts and is_covered[block, k + 2]:
+                p3 = means[block, k + 2]
+            for part in range(1, PARTS):
+                t = part / PARTS
+                square = 2 * p0 - 5 * p1 + 4 * p2 - p3
+                slope = p2 - p0 + t * (square + t * (3 * (p1 - p2) + p3 - p0))
+                parts[block, PARTS * k + part] = p1 + t / 2 * slope
+    return parts
 
 
 @kernel
