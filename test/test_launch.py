@@ -138,8 +138,8 @@ def test_launch_file_leaves_empty_arguments_to_the_parameter_file(load, name):
     node, *others = load(name).start()
     assert node.parameters[1:] == [FIXED[name]]
     assert (node.package, node.name) == ('stavpr_ros', 'stavpr')
-    assert words(node.sigterm_timeout) == '${sigterm_timeout}'
-    assert float(node.sigterm_timeout.default) > 300  # the update of several drives
+    assert words(node.sigkill_timeout) == '${sigkill_timeout}'
+    assert float(node.sigkill_timeout.default) > 300  # the update of several drives
     for other in [node, *others]:
         if other.package.startswith('stavpr'):
             assert Path(executable(other.executable)).exists()

@@ -19,7 +19,7 @@ from stavpr_ros.parameters import EXPECTED, PARAMETERS, RENAMED
 
 PACKAGE = 'stavpr_ros'
 PACKAGES = {PACKAGE, 'stavpr_nav'}  # with launch files that use this module
-END_SECONDS = '600'  # for a node that saves, or updates, a map at its end; launch gives 10
+END_SECONDS = '600'  # for a node that saves, or updates, a map at its end; launch gives 5
 END_TIMEOUTS = 'sigterm_timeout', 'sigkill_timeout'  # arguments that launch itself reads
 TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
@@ -218,5 +218,5 @@ def _node(texts: dict[str, str], fixed: dict[str, object], camera: str) -> Node:
         output='screen',
         remappings=remappings(),
         parameters=[LaunchConfiguration('params_file'), values | fixed],
-        sigterm_timeout=LaunchConfiguration('sigterm_timeout', default=END_SECONDS),
+        sigkill_timeout=LaunchConfiguration('sigkill_timeout', default=END_SECONDS),
     )
