@@ -14,7 +14,7 @@ from stavpr_nav.parameters import REPEAT, TEACH
 from stavpr_ros.parameters import BY_NAME, RENAMED
 from stavpr_slam.ros.graph_node import PARAMETERS as GRAPH
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 FILES = {
     path.name.partition('.')[0]: path
     for folder in ('launch', 'stavpr_nav/launch')
