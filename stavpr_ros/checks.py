@@ -182,3 +182,51 @@ def no_nan(array: np.ndarray, name: str) -> np.ndarray:
             f'{name} has {bad} NaN or -inf among {array.size} values: check the features'
         )
     return array
+
+
+def rgb_image(image: Any, name: str = 'image', *dtypes: str) -> np.ndarray:
+    """
+    Return an image as an array, RGB, shape (height, width, 3), C-contiguous.
+
+    :param image: an array, or an object that NumPy converts to one, such as a PIL image.
+    :param dtypes: allowed types; none = uint8.
+    :raises InputError: another type or shape, and how to convert it.
+    """
+    dtypes = dtypes or ('uint8',)
+    try:
+        array = np.asarray(image)
+    except (TypeError, ValueError, RuntimeError) as error:  # a ragged list, a tensor of a GPU
+        raise InputError(
+            f'{name} is {type(image).__name__}, which is no array ({error}): expected RGB pixels '
+            'of shape (height, width, 3), uint8'
+        ) from error
+    if array.ndim == 3 and array.shape[2] == 3 and array.size and array.dtype.name in dtypes:
+        return np.ascontiguousarray(array)
+    raise InputError(
+        f'{name} is {type(image).__name__} of shape {array.shape} {array.dtype}: expected RGB '
+        f'pixels of shape (height, width, 3), {" or ".join(dtypes)}: {_conversion(image, array)}'
+    )
+
+
+def _conversion(image: Any, array: np.ndarray) -> str:
+    """Return how to convert an image that is no RGB image of bytes."""
+    shape, is_number = array.shape, array.dtype.kind in 'buif'
+    is_finite = is_number and bool(np.isfinite(array).all())
+    low, high = (array.min(), array.max()) if is_finite and array.size else (0, 0)
+    rows = (
+        (hasattr(image, 'image'), 'give its field image'),
+        (not is_number, 'give the pixels as numbers; open_source(path) reads files'),
+        (not array.size, 'it has no pixels: check that it was read'),
+        (hasattr(image, 'convert'), "take np.asarray(image.convert('RGB'))"),  # a PIL image
+        (len(shape) == 4, 'give each image alone, as image[0]'),
+        (len(shape) == 2, 'gray becomes RGB by np.stack(3 * [image], axis=2)'),
+        (shape[2:] == (1,), 'gray becomes RGB by np.repeat(image, 3, axis=2)'),
+        (shape[2:] == (4,), 'take image[..., :3], without the transparency'),
+        (shape[:1] == (3,), 'the channels come first: take image.transpose(1, 2, 0)'),
+        (shape[2:] != (3,), 'an axis is missing, or has another size'),
+        (not is_finite, 'values are NaN or infinite: replace them first'),
+        (low >= 0 and high <= 1, 'values of 0 to 1 become bytes by np.uint8(255 * image)'),
+        (low >= 0 and high <= 255, 'take np.uint8(image)'),
+        (True, f'values are {low} to {high}: scale them to 0 to 255, then np.uint8(image)'),
+    )
+    return next(remedy for applies, remedy in rows if applies)

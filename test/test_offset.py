@@ -216,7 +216,7 @@ def test_lateral_offset_is_uncertain_where_places_are_at_rest():
 
 
 def test_image_of_another_type_is_rejected():
-    with pytest.raises(InputError, match=r'image: shape \(4, 4\)'):
+    with pytest.raises(InputError, match=r'image is ndarray of shape \(4, 4\)'):
         describe_columns(np.zeros((4, 4)))
 
 

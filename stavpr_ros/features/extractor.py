@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images to local features: backbone, strips, projection; and the record of their settings."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_at_least, require_shape
+from stavpr_ros.checks import require_at_least, require_shape, rgb_image
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.registry import (
     Backbone,
@@ -34,10 +34,14 @@ class Projection:
 
     :param matrix: shape (d, dimension), float32.
     :param name: description of its origin.
+    :raises InputError: another shape or type.
     """
 
     matrix: np.ndarray
     name: str
+
+    def __post_init__(self) -> None:
+        require_shape('matrix of the projection', self.matrix, 'D Dimension', 'float32')
 
     @classmethod
     def gaussian(cls, dimension_in: int, dimension: int = 512, seed: int = 0) -> 'Projection':
@@ -120,12 +124,17 @@ class LocalFeatures:
     :param settings: the settings of the extractor.
     :param cells: rows H and columns of a strip's cells: strips are (channels, H, columns),
         flattened; None if unknown, and after a random projection.
+    :raises InputError: arrays of other shapes or types.
     """
 
     strips: np.ndarray
     weights: np.ndarray
     settings: FeatureSettings
     cells: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        W, n, _ = require_shape('strips', self.strips, 'W n d', 'float32')
+        require_shape('weights', self.weights, f'{W} {n}', 'float32')
 
     def __len__(self) -> int:
         return self.strips.shape[1]
@@ -302,8 +311,13 @@ class FeatureExtractor:
         :param images: RGB, each (h, w, 3) uint8, of any size.
         :returns: local features of shape (W, len(images), d).
         :raises ImageError: the features are not finite.
+        :raises InputError: other images, or one that is not in a list.
         """
-        images = [np.ascontiguousarray(image) for image in images]  # views as well
+        if getattr(images, 'ndim', 1) in (0, 2, 3) or not isinstance(images, Iterable):
+            raise InputError(
+                f'images is one {type(images).__name__}: expected a list, extract([image])'
+            )
+        images = [rgb_image(image, f'image {i}') for i, image in enumerate(images)]
         strips, cells = self._cut(self._backbone.feature_maps(images))
         if not np.isfinite(strips).all():
             raise ImageError(

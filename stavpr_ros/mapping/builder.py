@@ -273,11 +273,13 @@ def _places(
 def _with_poses(
     frames: Iterable[Frame], poses: np.ndarray | Trajectory | None
 ) -> Iterator[tuple[Frame, np.ndarray | None]]:
+    frames = map(_frame, frames)
     if poses is None:
         yield from ((frame, None) for frame in frames)
     elif isinstance(poses, Trajectory):
         yield from ((frame, poses.at(frame.stamp)) for frame in frames)
     else:
+        require_type('poses', poses, np.ndarray, 'an array (images, 7), or a Trajectory')
         require_shape('poses', poses, 'images 7')
         count = 0
         for count, frame in enumerate(frames, 1):
@@ -285,6 +287,11 @@ def _with_poses(
                 yield frame, _pose(poses[count - 1], f'image {count - 1} {frame.identifier!r}')
         if count != len(poses):
             raise InputError(f'{len(poses)} poses for {count} images: expected one each')
+
+
+def _frame(frame: Frame) -> Frame:
+    require_type('an item of frames', frame, Frame, 'Frame(image, stamp, identifier)')
+    return frame
 
 
 def _pose(row: np.ndarray, name: str) -> np.ndarray | None:

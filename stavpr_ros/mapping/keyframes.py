@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_at_least, require_between
+from stavpr_ros.checks import require_at_least, require_between, rgb_image
 from stavpr_ros.compilation import kernel
 from stavpr_ros.features.area import BLUE, GREEN, HALF, RED
 from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
@@ -61,10 +61,12 @@ def small_gray(image: np.ndarray) -> np.ndarray:
 
     :param image: RGB, uint8, shape (h, w, 3).
     :returns: float32, shape (24, 32).
+    :raises InputError: another image.
     """
+    image = rgb_image(image)
     width, height = SIZE
     is_whole = not (image.shape[0] % height or image.shape[1] % width)
-    if not is_whole or image.shape[0] > MOST_ROWS * height or not image.flags.c_contiguous:
+    if not is_whole or image.shape[0] > MOST_ROWS * height:
         small = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
     else:
         small = np.empty((height, width, 3), np.uint8)
@@ -212,8 +214,9 @@ class KeyframeSelector:
         :param stamp: nanoseconds; 0 = unknown.
         :param pose: where it was taken, shape (7,); None = unknown.
         :param image: RGB, uint8, shape (h, w, 3), kept.
-        :raises InputError: an invalid pose; nothing is changed.
+        :raises InputError: an invalid pose or image; nothing is changed.
         """
+        rgb_image(image)
         pose = None if pose is None else checked_pose(pose)
         compared, self._compared = self._compared, None
         is_compared = compared is not None and compared[0] is image

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_shape
+from stavpr_ros.checks import require_at_least, require_shape, rgb_image
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
@@ -330,7 +330,10 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
 
     :param image: RGB (h, w, 3) uint8.
     :param width: pixels; narrower images keep their size.
+    :raises InputError: another image.
     """
+    image = rgb_image(image)
+    require_at_least('width of thumbnails', width, 1, 'pixel')
     most = math.sqrt(MAX_THUMBNAIL_PIXELS / 2 / (image.shape[0] * image.shape[1]))
     scale = min(1.0, width / image.shape[1], most)
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))

@@ -24,7 +24,12 @@ def checked_pose(pose: np.ndarray) -> np.ndarray:
     :raises InputError: another shape, values that are not finite or beyond ``FARTHEST``, or a
         quaternion of a norm outside ``NORMS``.
     """
-    own = np.array(pose, np.float64)
+    try:
+        own = np.array(pose, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f'pose {pose!r:.200} is no array ({error}): expected 7 numbers'
+        ) from error
     require_shape('pose, x y z and quaternion x y z w', own, '7')
     if not (np.abs(own) <= FARTHEST).all():  # NaN as well
         raise InputError(

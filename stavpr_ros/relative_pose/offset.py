@@ -21,8 +21,9 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_shape
+from stavpr_ros.checks import require_shape, require_type, rgb_image
 from stavpr_ros.compilation import kernel, reassociating_kernel
+from stavpr_ros.errors import InputError
 
 WIDTH = 192  # pixels of the compared images
 GROUND = 0.62  # the rows below this part of the height are not compared
@@ -102,7 +103,7 @@ def describe_columns(image: np.ndarray) -> np.ndarray:
     :param image: RGB, shape (h, w, 3), uint8.
     :returns: unit vectors, shape (WIDTH, ROWS * ORIENTATIONS), float32.
     """
-    require_shape('image', image, 'H W 3', 'uint8')
+    image = rgb_image(image)
     height = max(ROWS, round(WIDTH * image.shape[0] / image.shape[1] * GROUND))
     above = cv2.cvtColor(image[: max(1, round(image.shape[0] * GROUND))], cv2.COLOR_RGB2GRAY)
     gray = cv2.resize(above, (WIDTH, height), interpolation=cv2.INTER_AREA)
@@ -151,9 +152,9 @@ class OffsetFilter:
         Return the offset of an image against the image of its place.
 
         :param query, place: their columns, as :func:`describe_columns` returns them.
+        :raises InputError: other arrays; the filter is as before.
         """
-        _, d = require_shape('query', query, f'{WIDTH} d', 'float32')
-        require_shape('place', place, f'{WIDTH} {d}', 'float32')
+        query, place = _columns(query, 'query'), _columns(place, 'place')
         evidence, is_covered = block_evidence(query, place, self._beside)
         self._earlier = FORGETTING * _drifted(self._earlier) + evidence
         log = np.where(is_covered, self._earlier + self._prior, -np.inf)
@@ -177,6 +178,16 @@ class OffsetFilter:
             shift / WIDTH, deviation / WIDTH, parallax, float(ratio), similarity,
             math.sqrt(variance_b + FLOOR_B**2),
         )  # fmt: skip
+
+
+def _columns(columns: np.ndarray, name: str) -> np.ndarray:
+    """Return columns as the kernels read them."""
+    remedy = 'columns as of describe_columns(image)'
+    require_type(name, columns, np.ndarray, remedy)
+    require_shape(f'{name}, {remedy}', columns, f'{WIDTH} {ROWS * ORIENTATIONS}', 'float32')
+    if not np.isfinite(columns).all():
+        raise InputError(f'{name} has values that are not finite: expected {remedy}')
+    return np.ascontiguousarray(columns)
 
 
 # ------------------------------------------------ kernels

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from stavpr_ros.checks import require_type, rgb_image
 
 MAX_PIXELS = 64_000_000
 """Largest decoded image: the header of a small file may claim one that exhausts the memory."""
@@ -19,11 +20,19 @@ class Frame:
     :param image: RGB, uint8, shape (height, width, 3), C-contiguous.
     :param stamp: when it was taken, nanoseconds; 0 = unknown.
     :param identifier: a file name, or topic and number.
+    :raises InputError: another image, a stamp that is no whole number, or an
+        identifier that is no text.
     """
 
     image: np.ndarray
     stamp: int
     identifier: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'image', rgb_image(self.image, 'image of the frame'))
+        whole = 'whole nanoseconds, as time.time_ns(); 0 = unknown'
+        require_type('stamp', self.stamp, (int, np.integer), whole)
+        require_type('identifier', self.identifier, str, 'a text, such as the name of the file')
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +68,9 @@ class ImageRecord:
         :param image: RGB, uint8 or uint16, shape (height, width, 3).
         :param time_ns: when it was recorded, nanoseconds.
         :param stamp_ns: header stamp, nanoseconds; the time of recording if not given.
+        :raises InputError: another image.
         """
+        image = rgb_image(image, 'image', 'uint8', 'uint16')
         height, width = image.shape[:2]
         stamp = time_ns if stamp_ns is None else stamp_ns
         data = np.ascontiguousarray(image, f'<u{image.itemsize}').reshape(-1).view(np.uint8)

@@ -1,0 +1,150 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays of users at the public entries: a sentence with the remedy, or the features."""
+
+import time
+
+import numpy as np
+from PIL import Image
+import pytest
+from stavpr_ros.errors import InputError
+from stavpr_ros.features import FeatureExtractor, LocalFeatures, Projection
+from stavpr_ros.mapping import (
+    build_map,
+    encode_thumbnail,
+    KeyframeSelector,
+    KeyframeSettings,
+    small_gray,
+    Trajectory,
+)
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
+from stavpr_ros.sources.frame import Frame, ImageRecord
+
+RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+FLOAT = RGB / 255
+NAN = np.where(RGB < 9, np.nan, FLOAT)
+EXTRACTOR = FeatureExtractor()
+
+
+class Tensor:
+    def __array__(self, *_, **__):
+        raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+
+
+IMAGES = {
+    'float': (FLOAT, 'np.uint8(255 * image)'),
+    'float32': (FLOAT.astype(np.float32), 'np.uint8(255 * image)'),
+    'float of bytes': (RGB.astype(float), 'np.uint8(image)'),
+    'NaN': (NAN, 'NaN'),
+    'infinite': (np.full((9, 9, 3), np.inf), 'infinite'),
+    '16 bit': (RGB.astype(np.uint16) * 256, 'scale them to 0 to 255'),
+    'signed': (RGB.astype(np.int8), 'scale them to 0 to 255'),
+    'int64': (RGB.astype(int), 'np.uint8(image)'),
+    'bool': (RGB > 99, '255 * image'),
+    'gray': (RGB[..., 0], 'np.stack(3 * [image], axis=2)'),
+    'gray with an axis': (RGB[..., :1], 'np.repeat(image, 3, axis=2)'),
+    'RGBA': (np.dstack([RGB, RGB[..., :1]]), 'image[..., :3]'),
+    'two channels': (RGB[..., :2], 'another size'),
+    'channels first': (RGB.transpose(2, 0, 1), 'image.transpose(1, 2, 0)'),
+    'batch': (RGB[None], 'image[0]'),
+    'no rows': (RGB[:0], 'no pixels'),
+    'nothing': (np.zeros(0, np.uint8), 'no pixels'),
+    'a number': (np.uint8(3), 'axis'),
+    'None': (None, 'open_source(path)'),
+    'a name': ('image.png', 'open_source(path)'),
+    'objects': (RGB.astype(object), 'as numbers'),
+    'complex': (RGB.astype(complex), 'as numbers'),
+    'a list': (RGB.tolist(), 'np.uint8(image)'),
+    'a ragged list': ([[1, 2], [3]], 'no array'),
+    'a tensor with gradients': (Tensor(), 'requires grad'),
+    'PIL gray': (Image.fromarray(RGB[..., 0]), "image.convert('RGB')"),
+    'PIL palette': (Image.fromarray(RGB).convert('P'), "image.convert('RGB')"),
+    'a frame': (Frame(RGB, 0, ''), 'field image'),
+}
+
+
+def compare(image):
+    selector = KeyframeSelector(KeyframeSettings(change=0.01))
+    selector.accept(0, None, RGB)
+    selector.too_alike(image)
+
+
+ENTRIES = {
+    'extract': lambda image: EXTRACTOR.extract([RGB, image]),
+    'Frame': lambda image: Frame(image, 0, ''),
+    'encode_thumbnail': encode_thumbnail,
+    'small_gray': small_gray,
+    'too_alike': compare,
+    'accept': lambda image: KeyframeSelector(KeyframeSettings()).accept(0, None, image),
+    'describe_columns': describe_columns,
+    'of_image': lambda image: ImageRecord.of_image(image, 0),
+}
+
+
+@pytest.mark.parametrize('entry', ENTRIES)
+@pytest.mark.parametrize('kind', IMAGES)
+def test_an_image_of_another_kind_is_a_sentence_that_converts_it(kind, entry):
+    image, remedy = IMAGES[kind]
+    if (kind, entry) == ('16 bit', 'of_image'):
+        assert ImageRecord.of_image(image, 0).encoding == 'rgb16'
+        return
+    with pytest.raises(InputError) as caught:
+        ENTRIES[entry](image)
+    text = str(caught.value)
+    assert type(image).__name__ in text
+    assert remedy in text
+    assert 'expected RGB pixels of shape (height, width, 3), uint8' in text
+    assert len(text) < 400
+
+
+@pytest.mark.parametrize('make', [
+    lambda: Image.fromarray(RGB), lambda: np.asfortranarray(RGB), lambda: RGB[::-1][::-1],
+    lambda: np.ma.masked_equal(RGB, 3), lambda: memoryview(RGB),
+])  # fmt: skip
+@pytest.mark.parametrize('entry', ENTRIES)
+def test_what_is_an_rgb_image_is_taken_as_it_is(entry, make):
+    image, expected = make(), RGB.copy()
+    if isinstance(image, np.ndarray):
+        image.flags.writeable = False
+    ENTRIES[entry](image)
+    np.testing.assert_array_equal(Frame(image, 0, '').image, expected)
+    np.testing.assert_array_equal(
+        EXTRACTOR.extract([image]).strips, EXTRACTOR.extract([expected]).strips
+    )
+
+
+@pytest.mark.parametrize('images', [RGB, RGB[..., 0], Image.fromarray(RGB), None, np.uint8(1)])
+def test_one_image_instead_of_a_list_is_a_sentence(images):
+    with pytest.raises(InputError, match=r'expected a list, extract\(\[image\]\)'):
+        EXTRACTOR.extract(images)
+
+
+@pytest.mark.parametrize(('work', 'text'), [
+    (lambda: build_map([RGB], EXTRACTOR, progress=False), r'ndarray: expected Frame\('),
+    (lambda: build_map([RGB], EXTRACTOR, Trajectory(), progress=False), r'ndarray: .*Frame\('),
+    (lambda: build_map([Frame(RGB, 0, '')], EXTRACTOR, [[0] * 7]), 'list: expected an array'),
+    (lambda: Frame(RGB, time.time(), ''), r'stamp is of type float: .*time\.time_ns\(\)'),
+    (lambda: Frame(RGB, 0, 3), 'identifier is of type int: expected a text'),
+    (lambda: encode_thumbnail(RGB, 0), 'width of thumbnails = 0 must be at least 1'),
+    (lambda: Trajectory().add(1, 'here'), r"pose 'here' is no array"),
+    (lambda: Trajectory().add(1, {}), r'pose \{\} is no array'),
+    (lambda: Projection(np.eye(3), 'mine'), r'matrix of the projection: .*float64, .*float32'),
+    (lambda: LocalFeatures(FLOAT, FLOAT[0], EXTRACTOR.settings), 'strips: .*float64, .*float32'),
+    (lambda: LocalFeatures(np.ones((7, 2, 9), 'f'), np.ones((7, 1), 'f'), EXTRACTOR.settings),
+     r'weights: shape \(7, 1\) float32, expected \(7, 2\)'),
+])  # fmt: skip
+def test_other_arguments_are_named_with_what_is_expected(work, text):
+    with pytest.raises(ValueError, match=text):
+        work()
+
+
+@pytest.mark.parametrize('bad', [
+    RGB, None, np.zeros((192, 80)), np.full((192, 80), np.nan, np.float32), np.zeros((9, 80), 'f')
+])  # fmt: skip
+def test_columns_of_another_kind_leave_the_filter_as_it_was(bad):
+    columns, offsets = describe_columns(RGB), OffsetFilter()
+    expected = OffsetFilter().update(columns, columns)
+    for query, place in ((bad, columns), (columns, bad)):
+        with pytest.raises(InputError, match=r'describe_columns\(image\)'):
+            offsets.update(query, place)
+    assert offsets.update(columns, columns) == expected
