@@ -30,6 +30,16 @@ def resolve(target: str) -> Any:
     return getattr(import_module(module), name)
 
 
+def one(group: str, name: str) -> Any:
+    """
+    Import the object of one entry point of a group; None = no package has it.
+
+    :raises ImportError: its module, or one that it needs, is missing.
+    """
+    entry = next(iter(entry_points(group=group, name=name)), None)
+    return None if entry is None else entry.load()
+
+
 @cache
 def load(group: str) -> dict[str, Any]:
     """

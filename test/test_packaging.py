@@ -3,13 +3,14 @@
 """What each package installs, the dependencies it declares, and the command ``stavpr``."""
 
 import ast
+from functools import partial
+from importlib import import_module
 import os
 from pathlib import Path
 import re
 import shutil
 import subprocess
 import sys
-from unittest.mock import Mock
 from xml.etree import ElementTree
 import zipfile
 
@@ -20,8 +21,10 @@ import pytest
 import setuptools
 import stavpr_ros
 from stavpr_ros import plugins
-from stavpr_ros.commands import COMMANDS, stavpr
+from stavpr_ros.commands import COMMANDS, program, stavpr
 from stavpr_ros.compilation import CACHE
+from stavpr_ros.errors import UnavailableError
+from stavpr_ros.mapping import save_map
 
 ROOT = Path(__file__).resolve().parents[1]
 SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
@@ -323,11 +326,51 @@ def test_stavpr_without_a_package_names_it(monkeypatch, capsys):
     assert 'choose from build_map' in capsys.readouterr().err
 
 
-def test_stavpr_without_torch_names_its_extra(monkeypatch, capsys):
-    error = ModuleNotFoundError("No module named 'torch'", name='torch')
-    monkeypatch.setattr(stavpr.importlib, 'import_module', Mock(side_effect=error))
-    assert stavpr.main(['map', 'info', 'x']) == 2
-    assert "this needs torch, an extra: pip install '.[torch]'" in capsys.readouterr().err
+@pytest.mark.parametrize('module', program.OPTIONAL)
+def test_a_command_without_an_optional_module_names_its_package(monkeypatch, capsys, module):
+    """The module is missing while the command is imported, or while it runs, or a part of it."""
+    monkeypatch.setitem(sys.modules, module, None)
+    sentence = f'{program.OPTIONAL[module]}, which is not installed: pip install '
+    sentence += program.OPTIONAL[module]
+    for name in (module, f'{module}.part'):
+        assert program.run_program('work', partial(import_module, name)) == 1
+        assert capsys.readouterr().err == f'work: this needs {sentence}\n'
+    with pytest.raises(UnavailableError, match=re.escape(sentence)):
+        program.require_modules('json', module)
+    monkeypatch.setattr(stavpr.importlib, 'import_module', lambda _: import_module(module))
+    assert stavpr.main(['map', 'info', 'x']) == 1
+    assert capsys.readouterr().err == f'stavpr: this needs {sentence}\n'
+    with pytest.raises(ModuleNotFoundError):  # of an error of this package
+        program.run_program('work', lambda: import_module('stavpr_ros.nothing'))
+
+
+def test_packages_of_optional_modules_are_those_of_the_extras():
+    listed = re.findall(r"'([\w-]+)>=", (ROOT / 'setup.py').read_text())
+    assert {*program.OPTIONAL.values()} <= {*listed, 'evo'}
+
+
+@pytest.mark.parametrize(('module', 'words'), [
+    ('sklearn', ('evaluate', '--truth', 'identity', '--json', 'result.json')),
+    ('matplotlib', ('evaluate', '--output', 'report')),
+    ('jinja2', ('evaluate',)),
+    ('matplotlib', ('map', 'info', '--plot', 'map.png')),
+])  # fmt: skip
+def test_a_report_without_its_packages_is_refused_before_any_work(
+    monkeypatch, capsys, tmp_path, small_map, module, words
+):
+    monkeypatch.chdir(tmp_path)
+    save_map(small_map, 'monday.stavpr')
+    if words[0] == 'evaluate':
+        words += ('--map', 'monday.stavpr', '--query', 'tuesday')  # which is nowhere
+    else:
+        words += ('monday.stavpr',)
+    for name in [each for each in sys.modules if each.startswith('stavpr_lab.map_plot')]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in [each for each in sys.modules if each.partition('.')[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    assert stavpr.main([*words]) == 1
+    assert 'which is not installed: pip install ' in capsys.readouterr().err
 
 
 def test_script_of_setuptools_lets_pkg_resources_be_imported():

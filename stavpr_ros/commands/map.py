@@ -230,13 +230,13 @@ def _info(arguments: argparse.Namespace) -> None:
 
 def _tool(name: str) -> Callable[..., Any]:
     """Return a function that another package provides."""
-    tools = plugins.load(plugins.MAP_TOOLS)
-    if name not in tools:
+    tool: Callable[..., Any] | None = plugins.one(plugins.MAP_TOOLS, name)
+    if tool is None:
         raise UnavailableError(
             f'{name} needs the package {TOOLS[name]}, which is not installed: build it, or '
             '`pip install .` in the repository'
         )
-    return tools[name]
+    return tool
 
 
 def describe(place_map: 'PlaceMap', path: Path) -> str:

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import difflib
 from importlib import import_module
+from importlib.util import find_spec
 from io import TextIOWrapper
 import math
 import os
@@ -15,13 +16,30 @@ import sys
 from types import MappingProxyType
 from typing import Any, NoReturn, TextIO, TypeVar
 
-from stavpr_ros.errors import printable, SettingsError, StavprError
+from stavpr_ros.errors import printable, SettingsError, StavprError, UnavailableError
 from stavpr_ros.parameters import BY_NAME
 from stavpr_ros.signals import interrupted, obey_signals, run_until_signal
 from stavpr_ros.threads import wait_passively
 
 DONE, FAILED, BAD_USAGE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
 
+OPTIONAL = {
+    'av': 'av',
+    'faiss': 'faiss-cpu',
+    'evo': 'evo',
+    'h5py': 'h5py',
+    'jinja2': 'jinja2',
+    'matplotlib': 'matplotlib',
+    'onnx': 'onnx',
+    'onnxruntime': 'onnxruntime',
+    'pillow_heif': 'pillow-heif',
+    'qdrant_client': 'qdrant-client',
+    'qdrant_edge': 'qdrant-edge-py',
+    'ray': 'ray',
+    'sklearn': 'scikit-learn',
+    'torch': 'torch',
+}
+"""Modules that only a part of the commands needs, and the packages of pip that have them."""
 
 T = TypeVar('T')
 
@@ -124,6 +142,23 @@ def say(line: str, file: TextIO | None = None) -> None:
     print(printable(line), file=file)
 
 
+def lacking(module: str) -> str:
+    """Return that a command needs a module, and how to install it; '' = a module of its own."""
+    package = OPTIONAL.get(module.partition('.')[0])
+    return f'this needs {package}, which is not installed: pip install {package}' * bool(package)
+
+
+def require_modules(*modules: str) -> None:
+    """
+    Raise UnavailableError if a module is missing, before a command begins its work.
+
+    :param modules: of ``OPTIONAL``.
+    """
+    for module in modules:
+        if find_spec(module) is None:
+            raise UnavailableError(lacking(module))
+
+
 def until_unread(work: Callable[[], T]) -> T | int:
     """Return what a function returns; 141 if no one reads its output any more, as of ``head``."""
     try:
@@ -161,6 +196,11 @@ def run_program(
         say(f'{name}: {error}', sys.stderr)
         exit_codes: dict[type[StavprError], int] = {SettingsError: BAD_USAGE, **codes}
         return next((code for kind, code in exit_codes.items() if isinstance(error, kind)), FAILED)
+    except ModuleNotFoundError as error:
+        if not (text := lacking(error.name or '')):
+            raise
+        say(f'{name}: {text}', sys.stderr)
+        return FAILED
     except BaseException as error:
         # an interrupt within a foreign library comes out as another exception
         if not (isinstance(error, KeyboardInterrupt) or interrupted()):

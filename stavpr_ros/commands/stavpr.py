@@ -9,7 +9,7 @@ import sys
 import stavpr_ros
 from stavpr_ros import plugins
 from stavpr_ros.commands import Command, COMMANDS
-from stavpr_ros.commands.program import suggestion, until_unread
+from stavpr_ros.commands.program import lacking, suggestion, until_unread
 
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
@@ -76,10 +76,10 @@ def main(args: list[str] | None = None) -> int:
     try:
         return until_unread(lambda: _main(sys.argv[1:] if args is None else args))
     except ModuleNotFoundError as error:
-        if error.name != 'torch':
+        if not (text := lacking(error.name or '')):
             raise
-        print("stavpr: this needs torch, an extra: pip install '.[torch]'", file=sys.stderr)
-        return 2
+        print(f'stavpr: {text}', file=sys.stderr)
+        return 1
 
 
 def _main(arguments: list[str]) -> int:

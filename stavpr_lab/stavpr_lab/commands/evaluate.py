@@ -15,6 +15,7 @@ from stavpr_ros.commands.program import (
     add_fps,
     add_parameter,
     make_parser,
+    require_modules,
     run_program,
     say,
 )
@@ -390,6 +391,8 @@ def _run(arguments: argparse.Namespace) -> None:
     from stavpr_lab.evaluation.report_files import PAGE, write_folder, write_json
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
+    if folder:
+        require_modules('jinja2')
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
     if folder:
@@ -442,6 +445,8 @@ def main(args: list[str] | None = None) -> int:
             return _run_each(parser, arguments, sys.argv[1:] if args is None else args)
         arguments.query = arguments.query[0] if arguments.query else None
         _check(parser, arguments)
+        if arguments.truth:
+            require_modules('sklearn')
         if arguments.protocol:
             from stavpr_lab.commands.evaluate_protocol import run_protocol
 
