@@ -356,7 +356,7 @@ def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.recognition.same_places import with_same_places
     from stavpr_ros.sources.folder import text_of
 
-    maps = [_verified(path) for path in arguments.maps]
+    arguments.maps, arguments.cameras, maps = _distinct(arguments.maps, arguments.cameras)
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
@@ -365,6 +365,25 @@ def _merge(arguments: argparse.Namespace) -> None:
     if not arguments.different_routes:
         merged = with_same_places(merged)
     _write(merged, arguments)
+
+
+def _distinct(
+    paths: list[str], cameras: list[str]
+) -> tuple[list[str], list[str], list['PlaceMap']]:
+    """Open maps without those whose drives are in an earlier one; as well their cameras."""
+    from stavpr_ros.recognition.same_drive import has_drives_of
+
+    kept: list[int] = []
+    maps = [_verified(path) for path in paths]
+    for i, place_map in enumerate(maps):
+        twin = next((j for j in kept if has_drives_of(maps[j], place_map)), None)
+        if twin is None:
+            kept.append(i)
+        else:
+            say(f'{paths[i]} has the images of {paths[twin]}: it is left out')
+    if len(cameras) == len(paths):
+        cameras = [cameras[i] for i in kept]
+    return [paths[i] for i in kept], cameras, [maps[i] for i in kept]
 
 
 def _camera(text: str) -> tuple[str, float | None]:
@@ -442,7 +461,7 @@ def _update(arguments: argparse.Namespace) -> None:
         version = update_file(arguments.map, opened, place_map, drive, settings, name)
     for change in version.changes:
         say(change)
-    places = len(version.use)
+    places = len(version.use) or len(place_map)
     say(f'{arguments.map}: {places} places, id {version.map_id}, was {place_map.map_id}')
 
 

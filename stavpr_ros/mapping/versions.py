@@ -14,6 +14,7 @@ from pathlib import Path
 import re
 import shutil
 import time
+from typing import Any
 
 from stavpr_ros.errors import InputError, MapFileError, OutputError
 from stavpr_ros.mapping.map_container import read_json
@@ -42,6 +43,8 @@ class Version:
     :param changes: what the update added and removed, and why: sentences.
     :param use: of each place, the decayed number of drives that were recognized there; empty = 1.
     :param missed: of each place, the drives in a row that passed it unrecognized; empty = 0.
+    :param drives: the last ones, name, first stamp and hashes
+        (:class:`stavpr_ros.recognition.same_drive.DriveHash`).
     """
 
     map_id: str
@@ -53,6 +56,13 @@ class Version:
     changes: tuple[str, ...] = ()
     use: tuple[float, ...] = ()
     missed: tuple[int, ...] = ()
+    drives: tuple[tuple[str, int, str], ...] = ()
+
+
+def _drive(value: Any, where: str) -> None:
+    if not (isinstance(value, list) and [type(each) for each in value] == [str, int, str]):
+        raise ValueError(f'{where} is {value!r:.80}: expected name, stamp and hashes of a drive')
+    bytes.fromhex(value[2])
 
 
 _check = record(
@@ -63,6 +73,7 @@ _check = record(
         'changes': list_of(text(4096), 0, 4096),
         'use': list_of(number, 0, MAX_PLACES),
         'missed': list_of(integer(0, 2**31), 0, MAX_PLACES),
+        'drives': list_of(_drive, 0, KEPT),
     }
 )
 
@@ -104,29 +115,15 @@ def save_version(
     statistics: MapStatistics | None,
 ) -> Version:
     """
-    Replace a map by its next version.
+    Replace a map by its next version; a map with the id of the present one stays as it is.
 
     :param opened: the file when it was read; another one is not replaced.
     :param before: the present version; version: the next one, whose id and parent are filled in.
     :raises OutputError: it cannot be written, or the file has changed; the map stays as it is.
     """
-    folder = history_of(path)
-    old = folder / f'{before.map_id}.stavpr'
-    try:
-        folder.mkdir(exist_ok=True)
-        if not _is_sound(old, before.map_id):
-            old.unlink(missing_ok=True)
-            _copy(Path(path), old, False)
-    except OSError as error:
-        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
-    features = open_map(path).features
-    storage = features.storage if isinstance(features, StoredFeatures) else ''
-    new = folder / 'new.stavpr'
-    map_id = save_map(place_map, new, storage, force=True, statistics=statistics)
-    try:
-        new.replace(folder / f'{map_id}.stavpr')
-    except OSError as error:
-        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
+    folder, map_id = history_of(path), place_map.map_id
+    if map_id != before.map_id:
+        map_id = _write_version(path, place_map, before, statistics)
     version = replace(
         version,
         map_id=map_id,
@@ -137,8 +134,13 @@ def save_version(
         time=int(time.time()),
     )
     content = json.dumps(asdict(version), allow_nan=False)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
     write_output(folder / f'{map_id}.json', content, JSON, True)
-    _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
+    if map_id != before.map_id:
+        _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
     _clean(folder, [each.map_id for each in versions(path)])
     return version
 
@@ -172,6 +174,30 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
     return current_version(path)
 
 
+def _write_version(
+    path: str | Path, place_map: PlaceMap, before: Version, statistics: MapStatistics | None
+) -> str:
+    """Write a version, beside the present one, into the history; return its id."""
+    folder = history_of(path)
+    old = folder / f'{before.map_id}.stavpr'
+    try:
+        folder.mkdir(exist_ok=True)
+        if not _is_sound(old, before.map_id):
+            old.unlink(missing_ok=True)
+            _copy(Path(path), old, False)
+    except OSError as error:
+        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
+    features = open_map(path).features
+    storage = features.storage if isinstance(features, StoredFeatures) else ''
+    new = folder / 'new.stavpr'
+    map_id = save_map(place_map, new, storage, force=True, statistics=statistics)
+    try:
+        new.replace(folder / f'{map_id}.stavpr')
+    except OSError as error:
+        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
+    return map_id
+
+
 def _is_sound(file: Path, map_id: str) -> bool:
     """Return whether a file is a version, undamaged."""
     try:
@@ -194,6 +220,8 @@ def _read(folder: Path, map_id: str) -> Version | None:
     file = folder / f'{map_id}.json'
     try:
         data = read_json(file.read_bytes(), file.name)
+        if isinstance(data, dict):
+            data.setdefault('drives', [])  # records without it are older
         _check(data, file.name)
         if data['map_id'] != map_id:
             raise ValueError('it is of another version')
@@ -202,4 +230,5 @@ def _read(folder: Path, map_id: str) -> Version | None:
     except (OSError, ValueError) as error:
         raise MapFileError(f'{file} is damaged ({error}): move it elsewhere') from error
     lists = {name: tuple(data[name]) for name in ('changes', 'use', 'missed')}
+    lists['drives'] = tuple(map(tuple, data['drives']))
     return Version(**data | lists)

@@ -18,7 +18,7 @@ map, so that no path leads from one into the other.
 The root of a place is the place of an earlier session that shows the same, or itself.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -32,11 +32,12 @@ from stavpr_ros.filter.model import MODEL
 from stavpr_ros.mapping import merge_maps, PlaceMap, select_places, Session
 from stavpr_ros.mapping.merging import keep_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.mapping.versions import current_version, save_version, Version
+from stavpr_ros.mapping.versions import current_version, KEPT, save_version, Version
 from stavpr_ros.output_file import FileVersion
 from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.recognizer import PlaceRecognizer
+from stavpr_ros.recognition.same_drive import drive_hash, DriveHash, earlier_drive, session_hashes
 from stavpr_ros.recognition.same_places import recognized, SamePlaces
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.verification import GeometricSettings, PlaceVerifier
@@ -95,12 +96,14 @@ def update_map(
     """
     Return a map after a drive, and its version, without id and parent.
 
+    A map that neither learns places nor loses some is returned as it is.
+
     :param drive: all its images, as a map with the features of this one.
     :param name: of the drive, for the sessions.
     :param version: of the map.
     :raises InputError: the drive is not certain where it is; it teaches nothing.
     """
-    n = len(place_map)
+    before, n = place_map, len(place_map)
     # identifiers that stay when places come and go: their numbers where there is none
     ids = tuple(each or str(i) for i, each in enumerate(place_map.ids))
     place_map = replace(place_map, ids=ids)
@@ -136,8 +139,11 @@ def update_map(
         which = 'of the oldest drives' if keeps_drives else 'that helped least'
         changes.append(f'removed {removed} places {which}, above {limit} places')
     certain = (driven.of_windows >= 0).mean()
+    after = keep_places(grown, kept) if changes else before
     changes.insert(0, f'certain of {certain:.0%} of {len(drive)} images')
-    return keep_places(grown, kept), replace(
+    if after is before:
+        changes.append('nothing is added, the map stays as it is')
+    return after, replace(
         version,
         drive=name,
         changes=tuple(changes),
@@ -158,12 +164,21 @@ def update_file(
     Let a drive update the map of a file, and return its new version.
 
     :param opened: the file when it was read; place_map: its content.
+    A drive that the map or its last versions have learned from changes nothing; ``changes`` of the
+    present version, which is returned, then names it.
+
     :raises InputError: the drive is not certain where it is, or has other features.
     :raises OutputError: the version cannot be written; the map stays as it is.
     """
     drive.features.require_same_settings(place_map.settings, 'the map')
     before = current_version(path)
+    earlier = [DriveHash(*each) for each in before.drives]
+    if one := earlier_drive(drive, [*earlier, *session_hashes(place_map, 'the map')]):
+        text = f'{name} has the images of {one.name}, taken already: the map stays as it is'
+        return replace(before, changes=(text,))
     updated, version = update_map(place_map, drive, name, before, settings)
+    drives = *before.drives[1 - KEPT :], astuple(drive_hash(name, drive))
+    version = replace(version, drives=drives)
     return save_version(path, opened, updated, before, version, statistics_of_map(updated))
 
 
