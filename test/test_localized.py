@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
+import rclpy
 from robot import LATCHED, LENGTH
 from stavpr_ros.mapping import Session
 from stavpr_ros.ros.localized import along_route, Localization, NOWHERE
@@ -141,7 +142,24 @@ def test_behavior_tree_has_nodes_of_nav2_and_reads_the_place():
     assert all(set(node.attrib) - {'name'} <= TREE_NODES[node.tag] for node in nodes)
     by_tag = {node.tag: node.attrib for node in nodes}
     selector = by_tag['ControllerSelector']
-    assert selector['topic_name'] == '/stavpr/current_node'
     assert selector['default_controller'] == NOWHERE
     assert selector['selected_controller'] == '{place}'
     assert by_tag['ScriptCondition']['code'] == f"place != '{NOWHERE}'"
+
+
+@pytest.mark.parametrize('namespace', ['', '/robot1', '/fleet/robot_2'])
+def test_behavior_tree_reads_the_topic_of_the_node_in_its_own_namespace(robot, start, namespace):
+    """Nav2 subscribes by a node in the namespace of bt_navigator."""
+    topic = next(ElementTree.parse(TREE).getroot().iter('ControllerSelector')).get('topic_name')
+    remapped = ['-r', f'__ns:={namespace or "/"}']
+    node = start(*remapped, wait=False)
+    navigator = rclpy.create_node('bt_navigator', context=robot.context, cli_args=[
+        '--ros-args', *remapped
+    ])  # fmt: skip
+    try:
+        resolved = navigator.resolve_topic_name(topic)
+        assert resolved == f'{namespace}/stavpr/current_node'
+        places = robot.listen(String, resolved, LATCHED)
+        robot.until(lambda: bool(places), f'the place of {node.get_fully_qualified_name()}')
+    finally:
+        navigator.destroy_node()
