@@ -271,7 +271,7 @@ VALUES = [
     ('recognition', {'applied_threshold': 0.25}, 'min_probability=0.750'),
     ('recognition', {'recent_edges': {'dropped': 2}}, 'edges_dropped_10s=2'),
     ('recognition', {}, 'statuses_no_match=990'),
-    *(('recognition', NOTHING, f'{name}=none') for name in ('last_place', 'threshold')),
+    *(('recognition', NOTHING, f'{name}=none') for name in ('last_newest_index', 'threshold')),
     ('processing', {'drops': {'queue full': 6}}, 'dropped_queue_full=6'),
     ('processing', {}, 'work_max_ms=22.250'),
 ]

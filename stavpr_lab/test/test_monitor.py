@@ -4,13 +4,18 @@
 
 import base64
 from http.client import HTTPConnection
+from importlib.resources import files
 from itertools import cycle
 import json
 import math
 import re
+import shutil
 import signal
+import subprocess
 import threading
+import time
 
+import cv2
 import numpy as np
 from processes import Process, TIMEOUT
 import pytest
@@ -22,6 +27,8 @@ from stavpr_lab.monitor.node import encode_row, History, KEPT, Monitor, span_of
 from stavpr_lab.monitor.server import MonitorServer
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
+
+CHROMIUM = shutil.which('chromium')
 
 
 @pytest.fixture
@@ -130,9 +137,49 @@ def test_server_serves_the_page_the_events_and_the_image(served, history):
     history.show(b'jpeg')
     status, line = served('GET', '/events')
     events = json.loads(line.removeprefix(b'data: '))
+    assert events.pop('now') == pytest.approx(time.monotonic(), abs=TIMEOUT)
     assert (status, events) == (200, {'state': 'active', 'image': 2, 'samples': []})
     assert served('GET', '/image.jpg?2') == (200, b'jpeg')
     assert served('GET', '/../setup.py')[0] == 404
+
+
+EVENTS = """<script>
+class EventSource {
+  constructor() {
+    setTimeout(() => { this.onopen(); this.onmessage({ data: JSON.stringify(NEWS) }); });
+  }
+}
+</script>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
+@pytest.mark.parametrize('route', [[], [[0, 0], [9, 4]]], ids=['places', 'poses'])
+@pytest.mark.parametrize('old', [0, 104])
+def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
+    numbers = {'place': 40, 'nearest': 40, 'probability': 0.9, 'distance': 0.1, 'threshold': 0.5}
+    history.set('map', {'operation': 'localization', 'state': 'fixed', 'places': 90, 'path': ''})
+    history.set('route', route)
+    history.set('pose', [4, 2, 0, 7.0])
+    texts = {'status': 'match', 'reason': '', 'row': ''}
+    history.add({'time': 7.0, 'span': [0, 1]} | texts | numbers)
+    news = json.dumps(history.since(0, 0)[1] | {'now': 7.0 + old})
+    content = (files('stavpr_lab.monitor') / 'page.html').read_text()
+    page = tmp_path / 'page.html'
+    page.write_text(content.replace('<script>', f'{EVENTS.replace("NEWS", news)}<script>', 1))
+    browser = [CHROMIUM, '--headless=new', '--no-sandbox', '--disable-gpu']
+    browser += ['--window-size=900,900', '--virtual-time-budget=1500']
+    browser.append(f'--user-data-dir={tmp_path / "profile"}')
+    run = [*browser, '--dump-dom', page.as_uri()]
+    shown = subprocess.check_output(run, text=True, timeout=100, stderr=subprocess.DEVNULL)
+    now = re.search(r'<div id="now"[^>]*>[^<]*', shown)[0]
+    assert ('stale' in now, bool(re.search(r'\d+ s ago: place 40', now))) == (old > 0,) * 2, now
+    shot = tmp_path / f'{old}.png'
+    run = [*browser, f'--screenshot={shot}', page.as_uri()]
+    subprocess.run(run, check=True, capture_output=True, timeout=100)
+    pixels = cv2.imread(str(shot)).astype(int)[:, 530:]  # position on the map, and the right half
+    is_green = pixels[..., 1] - pixels[..., [0, 2]].max(axis=-1) > 40
+    assert bool(is_green[:350].sum() > 50) is (old == 0)
+    print(f'screenshot: {shot}')
 
 
 def test_server_runs_commands_and_returns_their_errors(served):

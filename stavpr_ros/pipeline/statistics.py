@@ -105,7 +105,7 @@ class Statistics:
 
         :param status: name of the status, as ``'NO_MATCH'`` or ``'no match'``.
         :param reason: why there is no match; empty if there is one.
-        :param place: index of the recognized place, -1 = none.
+        :param place: index of the place of the image itself, newest_index, -1 = none.
         :param distance: of the nearest sequence, NaN = none.
         :param stages: seconds by stage, ``WAITING`` among them; empty = not measured.
         """

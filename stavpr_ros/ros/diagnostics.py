@@ -119,7 +119,7 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             'length': settings.sequence.length,
             'last_status': counts.status or None,
             'last_reason': counts.reason or None,
-            'last_place': counts.place if counts.place >= 0 else None,
+            'last_newest_index': counts.place if counts.place >= 0 else None,
             'last_distance': counts.distance,
             'last_answer_age_s': counts.answered.age,
             'localized': health.localized,

@@ -431,9 +431,10 @@ class Runtime:
                 self._log_skips(result, nanoseconds(header.stamp))
             return
         self._skipped_since = None
-        self.last_match, self.last_frame, status = message, frames.frame, result.status
-        place = message.newest_index if status is Status.MAPPED else message.place_index
-        self._statistics.add_match(status.name, result.reason, place, message.distance, stages)
+        self.last_match, self.last_frame = message, frames.frame
+        self._statistics.add_match(
+            result.status.name, result.reason, message.newest_index, message.distance, stages
+        )
 
     def _with_yaw(
         self,

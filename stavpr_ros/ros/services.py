@@ -145,7 +145,7 @@ class Services:
             response.pose = pose or response.pose
 
         runtime.worker.run(relocalize)
-        return response.match.reason or f'place {response.match.place_index}'
+        return response.match.reason or f'place {response.match.newest_index}'
 
     def _set_operation(self, runtime: Runtime, request: Any, response: Any) -> str:
         self._operate(request.operation)

@@ -228,7 +228,7 @@ class Monitor:
     def _on_match(self, message: PlaceMatch) -> None:
         self.history.add(
             {
-                'time': time.time(),
+                'time': time.monotonic(),
                 'status': dict(enumerate(STATUSES)).get(message.status, 'unknown'),
                 'reason': message.reason,
                 'place': message.newest_index,
@@ -263,7 +263,7 @@ class Monitor:
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         position, turn = message.pose.pose.position, message.pose.pose.orientation
         yaw = math.atan2(2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2))
-        self.history.set('pose', [position.x, position.y, yaw])
+        self.history.set('pose', [position.x, position.y, yaw, time.monotonic()])
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         own = [

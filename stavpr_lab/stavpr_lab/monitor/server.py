@@ -12,6 +12,7 @@ import socket
 from socketserver import TCPServer
 import sys
 import threading
+import time
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -167,6 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
             with history.viewer():
                 while not history.closed:
                     version, changes = history.since(version, EVENT_SECONDS)
+                    changes['now'] = time.monotonic()  # as the times of samples and pose
                     self.wfile.write(f'data: {json.dumps(changes)}\n\n'.encode())
         except OSError:
             pass  # the browser has closed
