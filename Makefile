@@ -147,6 +147,7 @@ pose-graphs: build ## measure the pose graph on KITTI in groups, and on public g
 shell: override EXTRAS += evaluation
 shell: build ## open a bash in which the built packages are found
 	@echo 'The executables are in $(EXECUTABLES)/ and $(LAB)/. Leave with exit.'
+	@echo 'Nodes run here, as stavpr COMMAND; ros2 launch, topic and bag need ROS 2 Jazzy: README, On a robot.'
 	@$(RUN) env PS1='(stavpr_ros) \w\$$ ' bash --norc -i || true
 
 clean: ## remove build/ install/ log/ docs/_build/

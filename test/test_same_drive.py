@@ -77,7 +77,7 @@ def test_the_map_itself_is_no_drive(path, tmp_path, capsys):
     assert open_map(path).map_id == before
 
 
-def test_merge_leaves_out_a_map_whose_images_another_one_has(path, tmp_path, capsys):
+def test_merge_names_a_map_whose_images_another_one_has(path, tmp_path, capsys):
     copy, small, tuesday = (str(tmp_path / f'{name}.stavpr') for name in ('copy', 'half', 'tue'))
     assert main(['compact', path, small]) == 0
     save_map(load_map(path), copy)
@@ -85,10 +85,11 @@ def test_merge_leaves_out_a_map_whose_images_another_one_has(path, tmp_path, cap
                        progress=False), tuesday)  # fmt: skip
     both, twice = str(tmp_path / 'both.stavpr'), str(tmp_path / 'twice.stavpr')
     assert main(['merge', both, path, tuesday]) == 0
-    assert 'left out' not in capsys.readouterr().out
-    assert main(['merge', twice, both, path, copy, small, '--cameras', *'abcd']) == 0
-    assert capsys.readouterr().out.count(f'has the images of {both}: it is left out') == 3
-    assert len(open_map(twice)) == len(open_map(both)) == 2 * len(ROUTE)
+    assert 'has the images' not in capsys.readouterr().err
+    assert main(['merge', twice, both, path, copy, small, '--different-routes']) == 0
+    assert capsys.readouterr().err.count(f'has the images of {both}, which teach nothing') == 3
+    assert main(['merge', twice, path, path, '--different-routes', '--force']) == 0
+    assert f'{path} has the images of {path}, which' in capsys.readouterr().err
 
 
 def test_drives_of_other_times_or_more_images_are_other_drives():

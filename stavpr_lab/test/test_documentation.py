@@ -73,12 +73,14 @@ def run(workspace, monkeypatch, capsys):
     return printed
 
 
-def test_readme_python_example_runs(run):
-    (example,) = code_blocks(ROOT / 'README.md', 'python')
-    lines = run(exec, example, {'__name__': '__main__'}).splitlines()
+def test_readme_python_examples_run(run):
+    of_folders, of_arrays = code_blocks(ROOT / 'README.md', 'python')
+    lines = run(exec, of_folders, {'__name__': '__main__'}).splitlines()
     assert len(lines) == 40
     assert lines[0].startswith('0 WARMING_UP -1 nan')
     assert [line.split()[1] for line in lines[30:]] == ['MATCH'] * 10
+    answers = [line.split()[1:4] for line in lines]
+    assert [line.split() for line in run(exec, of_arrays, {}).splitlines()] == answers
 
 
 @pytest.mark.parametrize('page', ['recognition', 'mapping', 'sources'])

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tutorials: their blocks ``sh`` and ``python`` run, one page after the other, as written."""
 
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -51,3 +52,16 @@ def test_blocks_of_tutorials_run_in_order_in_one_folder(pages, folder, request):
     recordings = [*folder.glob('*.jsonl')]
     assert len(recordings) == (2 if pages == PAGES else 0)
     assert {len(file.read_text().splitlines()) for file in recordings} <= {IMAGES}
+
+
+def test_webcam_page_opens_the_newest_recording(tmp_path):
+    text = (FOLDER / 'webcam.md').read_text()
+    recording = re.search(r'save_path:=(\S+)', text)[1]
+    expression = re.search(r'map_path:=(.*)', text)[1]
+    for age, name in ((20, 'route.stavpr'), (10, 'route-2.stavpr')):
+        path = tmp_path / name
+        path.touch()
+        os.utime(path, (1e9 - age, 1e9 - age))
+        echo = ['bash', '-c', f'echo {recording} {expression}']
+        first, newest = subprocess.check_output(echo, cwd=tmp_path, text=True).split()
+        assert (first, newest) == (str(tmp_path / 'route.stavpr'), str(path))

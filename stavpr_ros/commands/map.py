@@ -356,7 +356,8 @@ def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.recognition.same_places import with_same_places
     from stavpr_ros.sources.folder import text_of
 
-    arguments.maps, arguments.cameras, maps = _distinct(arguments.maps, arguments.cameras)
+    maps = [_verified(path) for path in arguments.maps]
+    _name_twins(arguments.maps, maps)
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
@@ -367,23 +368,15 @@ def _merge(arguments: argparse.Namespace) -> None:
     _write(merged, arguments)
 
 
-def _distinct(
-    paths: list[str], cameras: list[str]
-) -> tuple[list[str], list[str], list['PlaceMap']]:
-    """Open maps without those whose drives are in an earlier one; as well their cameras."""
+def _name_twins(paths: list[str], maps: list['PlaceMap']) -> None:
+    """Name maps whose images an earlier one has."""
     from stavpr_ros.recognition.same_drive import has_drives_of
 
-    kept: list[int] = []
-    maps = [_verified(path) for path in paths]
     for i, place_map in enumerate(maps):
-        twin = next((j for j in kept if has_drives_of(maps[j], place_map)), None)
-        if twin is None:
-            kept.append(i)
-        else:
-            say(f'{paths[i]} has the images of {paths[twin]}: it is left out')
-    if len(cameras) == len(paths):
-        cameras = [cameras[i] for i in kept]
-    return [paths[i] for i in kept], cameras, [maps[i] for i in kept]
+        twin = next((j for j in range(i) if has_drives_of(maps[j], place_map)), None)
+        if twin is not None:
+            text = f'{paths[i]} has the images of {paths[twin]}, which teach nothing twice'
+            say(f'{text}: leave it out', sys.stderr)
 
 
 def _camera(text: str) -> tuple[str, float | None]:
