@@ -100,7 +100,7 @@ def test_drives_of_other_times_or_more_images_are_other_drives():
     assert earlier_drive(built([*ROUTE, *OTHER]), known) is None  # longer
 
 
-def test_real_drives_in_one_light_are_told_apart(data_folder):
+def test_real_drives_in_one_light_are_two_drives(data_folder):
     left, right = (
         build_map(open_source(data_folder / 'gardens_point' / name), FeatureExtractor(),
                   thumbnails=False, progress=False)
