@@ -122,6 +122,10 @@ def save_version(
     :raises OutputError: it cannot be written, or the file has changed; the map stays as it is.
     """
     folder, map_id = history_of(path), place_map.map_id
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
     if map_id != before.map_id:
         map_id = _write_version(path, place_map, before, statistics)
     version = replace(
@@ -134,10 +138,6 @@ def save_version(
         time=int(time.time()),
     )
     content = json.dumps(asdict(version), allow_nan=False)
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
     write_output(folder / f'{map_id}.json', content, JSON, True)
     if map_id != before.map_id:
         _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
@@ -181,7 +181,6 @@ def _write_version(
     folder = history_of(path)
     old = folder / f'{before.map_id}.stavpr'
     try:
-        folder.mkdir(exist_ok=True)
         if not _is_sound(old, before.map_id):
             old.unlink(missing_ok=True)
             _copy(Path(path), old, False)
