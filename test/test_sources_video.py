@@ -5,6 +5,7 @@
 from contextlib import suppress
 import time
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ class Output:
         seconds, _, *self._shape = video_decoder.FRAME.unpack(message)
         if self._shape == [0, video_decoder.CUT_OFF]:
             self.cut_off.append(seconds)
-        else:
+        elif self._shape != [0, video_decoder.JUMP]:
             self.times.append(seconds)
 
     def check(self, times, images=None):
@@ -161,6 +162,27 @@ def test_clock_that_starts_again_is_continued(tmp_path):
     assert len(output.times) == 2 * FRAMES
 
 
+@pytest.mark.parametrize('later', [1000, -4, 95443.7])  # the last: over the end of 33 bits
+def test_clock_of_a_stream_that_jumps_is_continued_and_named(tmp_path, caplog, later):
+    first = write_video(tmp_path / 'first.ts', colored_images(30), 'libx264')
+    second = copy_video(first, tmp_path / 'second.ts', max(later, 0))
+    if later < 0:
+        first = copy_video(first, tmp_path / 'later.ts', -later)
+    path = tmp_path / 'dash.ts'
+    path.write_bytes(first.read_bytes() + second.read_bytes())
+    frames = list(open_source(path, fps=RATE))
+    np.testing.assert_allclose(seconds(frames), np.arange(60) / RATE, atol=0.002)
+    assert caplog.text.count('dash.ts jumps by') == (later < 95000)
+
+
+def test_small_copies_of_a_camera_are_no_part_of_the_drive(tmp_path):
+    small = write_video(tmp_path / 'small.mp4', colored_images(30)[:, ::2, ::2])
+    small.rename(tmp_path / 'DJI_0001.LRF')
+    assert len(open_source(tmp_path, fps=RATE)) == 30
+    write_video(tmp_path / 'DJI_0001.MP4', colored_images(60))
+    assert len(open_source(tmp_path, fps=RATE)) == 60
+
+
 def test_ten_bits_become_eight(tmp_path):
     images = np.repeat(np.arange(0, 240, 8, dtype=np.uint8), 3).reshape(-1, 1, 1, 3)
     images = np.broadcast_to(images, (30, HEIGHT, WIDTH, 3))
@@ -232,6 +254,54 @@ def test_video_that_ends_early_is_reported_once(tmp_path):
     errors = []
     assert 2 <= len(list(open_source(path, on_error=errors.append))) < 10
     assert len(errors) == 1
+
+
+@pytest.mark.parametrize('sounds', [[(0, 8)], [(5, 9)], [(0, 1)], [(0, 1), (3, 6)]])
+@pytest.mark.parametrize(
+    ('name', 'codec', 'voice'),
+    [
+        ('recorder.mkv', 'libx264', 'aac'),
+        ('browser.webm', 'libvpx', 'libopus'),
+        ('stream.flv', 'libx264', 'aac'),
+        ('old.wmv', 'wmv2', 'mp2'),
+        ('dash.ts', 'libx264', 'aac'),
+        ('phone.mov', 'libx264', 'aac'),
+    ],
+)
+def test_sound_may_have_another_length(tmp_path, name, codec, voice, sounds):
+    sounds = sounds[:1] if name.endswith('flv') else sounds  # it has one track
+    path = write_video(tmp_path / name, colored_images(30), codec, sounds=sounds, voice=voice)
+    Output(path).check(np.arange(30) / RATE)
+
+
+@pytest.mark.parametrize('suffix', ['mkv', 'flv', 'mov'])
+def test_video_with_sound_that_is_cut_is_reported(tmp_path, suffix):
+    fast = {'movflags': 'faststart'} if suffix == 'mov' else {}
+    path = tmp_path / f'cut.{suffix}'
+    with av.open(str(path), 'w', options=fast) as container:
+        stream, sound = (
+            container.add_stream('libx264', rate=30),
+            container.add_stream('aac', 48000),
+        )
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, 'yuv420p'
+        for i, image in enumerate(colored_images()):
+            frame = av.VideoFrame.from_ndarray(image, format='rgb24')
+            container.mux(stream.encode(frame))
+            voice = av.AudioFrame.from_ndarray(np.zeros((1, 1600), np.float32), 'fltp', 'mono')
+            voice.sample_rate, voice.pts = 48000, 1600 * i
+            container.mux(sound.encode(voice))
+        container.mux(stream.encode(None))
+        container.mux(sound.encode(None))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    with pytest.raises(ImageError, match='ends early'):
+        list(open_source(path))
+
+
+def test_second_track_of_video_is_named(tmp_path, caplog):
+    path = write_video(tmp_path / 'dash.mkv', colored_images(30), tracks=2)
+    Output(path).check(np.arange(30) / RATE, colored_images(30))
+    assert len(open_source(path, fps=RATE)) == 30
+    assert 'dash.mkv has 2 tracks of video, as of two cameras: the first' in caplog.text
 
 
 def test_size_in_the_header_is_limited(tmp_path):

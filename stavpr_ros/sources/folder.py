@@ -21,11 +21,13 @@ from stavpr_ros.sources.suffixes import HEIF, OTHER_IMAGES, SUFFIXES
 from stavpr_ros.units import SECOND
 
 VIDEOS = frozenset({
-    '.264', '.265', '.3g2', '.3gp', '.asf', '.avi', '.divx', '.dv', '.f4v', '.flv', '.h264',
-    '.h265', '.hevc', '.ivf', '.m2t', '.m2ts', '.m2v', '.m4v', '.mjpeg', '.mjpg', '.mkv', '.mod',
-    '.mov', '.mp4', '.mpe', '.mpeg', '.mpg', '.mts', '.mxf', '.nut', '.ogv', '.qt', '.rm', '.tod',
-    '.tp', '.ts', '.vob', '.webm', '.wmv', '.wtv', '.y4m',
+    '.264', '.265', '.360', '.3g2', '.3gp', '.asf', '.avi', '.divx', '.dv', '.f4v', '.flv',
+    '.h264', '.h265', '.hevc', '.insv', '.ivf', '.lrf', '.lrv', '.m2t', '.m2ts', '.m2v', '.m4v',
+    '.mjpeg', '.mjpg', '.mkv', '.mod', '.mov', '.mp4', '.mpe', '.mpeg', '.mpegts', '.mpg', '.mts',
+    '.mxf', '.nut', '.ogv', '.osv', '.qt', '.rm', '.tod', '.tp', '.ts', '.vob', '.webm', '.wmv',
+    '.wtv', '.y4m',
 })  # fmt: skip
+PROXIES = frozenset({'.lrf', '.lrv'})  # of cameras: small copies of the videos beside them
 FOREIGN = re.compile(
     r'@.*|#recycle|#snapshot|\$recycle\.bin|lost\+found|__macosx|system volume information|'
     r'_*thumb(nail)?s?',

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP files that rosbags refuses: of another profile, or without an end after a power loss."""
 
-from functools import cache
 from io import BufferedReader, RawIOBase
-import logging
 from pathlib import Path, PosixPath
 from typing import Any
 
 from stavpr_ros.errors import SourceError
+from stavpr_ros.sources.notes import note_once
 
 MAGIC = b'\x89MCAP0\r\n'
 DATA_END, FOOTER = 0x0F, 0x02  # codes of records: a byte, eight bytes of length, and content
@@ -45,19 +44,13 @@ def with_end(staged: Path, path: Path) -> Path:
             if end > size or head[0] in (0, DATA_END, FOOTER):
                 break
             at = end
-    _note_cut(path, size - at)
+    note_once(
+        f'{path} has no end, as after a power loss: its whole records are read, all but the last '
+        f'{size - at} bytes; `mcap recover` makes a file with an index'
+    )
     cut = _CutPath(staged)
     cut.size = at
     return cut
-
-
-@cache  # once for each file
-def _note_cut(path: Path, count: int) -> None:
-    logging.getLogger(__name__).warning(
-        '%s has no end, as after a power loss: its whole records are read, all but the last %d '
-        'bytes; `mcap recover` makes a file with an index',
-        *(path, count),
-    )
 
 
 class _CutPath(PosixPath):

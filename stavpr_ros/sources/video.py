@@ -18,11 +18,12 @@ from stavpr_ros.errors import ImageError, SettingsError, SourceError
 from stavpr_ros.regular_file import require_regular
 from stavpr_ros.sources.bag_path import reading
 from stavpr_ros.sources.files import reduce
-from stavpr_ros.sources.folder import VIDEOS
+from stavpr_ros.sources.folder import PROXIES, VIDEOS
 from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.sources.notes import note_once
 from stavpr_ros.sources.order import natural_key
 from stavpr_ros.sources.suffixes import SUFFIXES as IMAGES
-from stavpr_ros.sources.video_decoder import CUT_OFF, EARLY, FACTS, FRAME, REASONS, REMEDY
+from stavpr_ros.sources.video_decoder import CUT_OFF, EARLY, FACTS, FRAME, JUMP, REASONS, REMEDY
 from stavpr_ros.units import SECOND
 
 FPS = 5.0
@@ -42,6 +43,7 @@ def video_files(path: str | Path) -> list[Path]:
     with reading(path):
         files = list(path.glob('[!.]*')) if path.is_dir() else [path]
         videos = [one for one in files if one.suffix.lower() in VIDEOS and not one.is_dir()]
+    videos = [one for one in videos if one.suffix.lower() not in PROXIES] or videos
     if sum(one.suffix.lower() in IMAGES for one in files) >= max(len(videos), 2):
         return []
     return sorted(videos, key=lambda file: natural_key(file.name))
@@ -105,17 +107,22 @@ class VideoSource:
                     facts.append(FACTS.unpack(next(messages)))
                 except _DecoderError as error:
                     raise SourceError(f'{file} {error}') from error
-        self._durations, rates, created, *sizes = np.array(facts).T
+        self._durations, rates, created, tracks, *sizes = np.array(facts).T
         self._rate = rates[0]
         disorder = created.all() and (np.diff(created) < 0).any()
         if disorder or np.ptp(sizes, 1).any() or np.ptp(rates) > SAME_RATE * self._rate:
             rows = zip(self._files, facts, strict=True)
             listed = ', '.join(
-                f'{one.name} ({w}x{h}, {r:.4g} Hz)' for one, (_, r, _, h, w) in rows
+                f'{one.name} ({w}x{h}, {r:.4g} Hz)' for one, (_, r, _, _, h, w) in rows
             )
             raise SourceError(
                 f'{path} has videos of several sizes or rates, or not in the order of creation: '
                 f'expected the files of one drive; name one of {listed}'
+            )
+        if (count := int(tracks.max())) > 1:
+            note_once(
+                f'{path} has {count} tracks of video, as of two cameras: the first one is read; '
+                '`ffmpeg -i FILE -map 0:v:1 -c copy second.mkv` makes a file of the second'
             )
         self._start = round(created[0] * SECOND) or SECOND
 
@@ -143,6 +150,11 @@ class VideoSource:
                         i += 1
                     elif width == CUT_OFF:
                         self._cut_off(file, seconds)
+                    elif width == JUMP:
+                        note_once(
+                            f'the clock of {self._files[file]} jumps by {seconds:.0f} s: the '
+                            'images behind it follow at the frame rate; it may be several drives'
+                        )
             except _DecoderError as error:
                 self._cut_off(file, seconds, f': {error}')
         if not i:

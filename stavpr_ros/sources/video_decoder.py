@@ -6,7 +6,8 @@ The program that decodes videos for :class:`stavpr_ros.sources.video.VideoSource
 ``python3 -m stavpr_ros.sources.video_decoder FPS FILE...`` writes messages to its standard output,
 a connection: what each file states (``FACTS``); then a header (``FRAME``) for every decoded frame,
 which the pixels of an image follow: RGB, uint8. Frames between the images have height and width 0.
-A file that is shorter than it states ends with a header of the seconds that it has, ``CUT_OFF``.
+A file that is shorter than it states ends with a header of the seconds that it has, ``CUT_OFF``;
+a header ``JUMP`` precedes the first frame where the clock of a file jumps.
 """
 
 from collections.abc import Iterator
@@ -22,16 +23,19 @@ from typing import Any
 import numpy as np
 from stavpr_ros.sources.frame import MAX_PIXELS
 
-FACTS = struct.Struct('<dddII')  # duration, s; rate, Hz; creation, s since 1970; height, width
+# duration, s; rate, Hz; creation, s since 1970; tracks of video; height, width
+FACTS = struct.Struct('<dddIII')
 FRAME = struct.Struct('<dIII')  # seconds after the start of the first file, file, height, width
-CUT_OFF = 1  # width of a header without height
+CUT_OFF, JUMP = 1, 2  # width of a header without height
 MEMORY = 4 << 30  # bytes of address space
 COMPLETE = 0.9  # share of the stated duration, which may be an estimate
 EARLY = 0.002  # seconds that an image may be early by: containers round to milliseconds
 RESTART = 1.0  # seconds back: another recording in the same file, no frames out of order
+AHEAD = 10.0  # seconds, or periods, ahead in a stream: another clock, as ffmpeg takes it, no pause
 TICK = 1e-4  # seconds: nearer times are equal
 RATE = 25  # Hz, of a file that states none
 NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS: bare streams, whose duration and rate are guesses
+DISCONTINUOUS = 0x200  # AVFMT_TS_DISCONT: streams, whose clocks may jump
 HDR = {16, 18}  # transfer functions PQ and HLG, shown as BT.709, 1
 
 REFERENCES = 'concat dash hls image2 imf lavfi rtsp sap sdp vapoursynth avisynth vobsub'
@@ -72,30 +76,84 @@ def _open(path: str) -> Any:
     return av.open(path, options=options, metadata_errors='replace')
 
 
-def _video(container: Any) -> Any:
+def _tracks(container: Any) -> list[Any]:
+    """Return the tracks of video, without covers and thumbnails."""
+    from av.stream import Disposition
+
+    stills, best = Disposition.attached_pic | Disposition.timed_thumbnails, _best(container)
+    return [
+        each
+        for each in container.streams.video
+        if each is best
+        or (each.codec_context and not each.disposition & stills and each.frames != 1)
+    ]
+
+
+def _best(container: Any) -> Any:
     stream = container.streams.best('video')
     if stream is None or stream.codec_context is None:
         sys.exit(NOT_OPENED)
+    return stream
+
+
+def _video(container: Any) -> Any:
+    stream = _tracks(container)[0]
     if stream.width * stream.height > MAX_PIXELS:
         sys.exit(TOO_LARGE)
     return stream
 
 
-def _facts(container: Any) -> tuple[float, float, float, int, int]:
-    stream, duration, created = _video(container), (container.duration or 0) / 1e6, 0.0
+def _facts(container: Any) -> tuple[float, float, float, int, int, int]:
+    stream, created = _video(container), 0.0
     bare = container.format.flags & NO_TIMES
     rate = (not bare and stream.average_rate) or stream.guessed_rate or RATE
     with suppress(ValueError):
         stated = datetime.fromisoformat(container.metadata.get('creation_time', ''))
         created = stated.replace(tzinfo=stated.tzinfo or UTC).timestamp()
         created *= 0 < created < 2**31  # the range of stamps in ROS
+    duration, tracks = _duration(container, stream, rate), len(_tracks(container))
+    return duration, float(rate), created, tracks, stream.height, stream.width
+
+
+def _duration(container: Any, stream: Any, rate: Any) -> float:
+    """Return the duration of the pictures, or of the file if it has no other, s; 0 = unknown."""
+    if container.format.flags & NO_TIMES:
+        return 0.0
     if container.format.name == 'avi':  # FFmpeg shortens the duration of a file that is cut off
-        duration = float(stream.frames / rate)
-    elif stream.duration:
-        duration = float(stream.duration * stream.time_base)
-    elif container.format.name.startswith('matroska'):  # it states the last time
-        duration -= max(container.start_time or 0, 0) / 1e6
-    return (0.0 if bare else duration), float(rate), created, stream.height, stream.width
+        return float(stream.frames / rate)
+    if stream.duration:
+        return float(stream.duration * stream.time_base)
+    file = (container.duration or 0) / 1e6
+    if not container.format.name.startswith('matroska'):
+        return file
+    with suppress(ValueError):  # both are the last time
+        hours, minutes, seconds = map(float, stream.metadata.get('DURATION', '').split(':'))
+        start = float((stream.start_time or 0) * stream.time_base)
+        return hours * 3600 + minutes * 60 + seconds - start
+    return file - max(container.start_time or 0, 0) / 1e6
+
+
+class _Packets:
+    """
+    The packets of the pictures; ``begin`` and ``end`` are of all tracks, s.
+
+    Sound or text may be longer than the pictures, and is what the duration of most files is of;
+    MP4 states one of each track.
+    """
+
+    def __init__(self, container: Any) -> None:
+        self._container, self._stream = container, _video(container)
+        self.begin, self.end = math.inf, -math.inf
+
+    def __iter__(self) -> Iterator[Any]:
+        own = [self._stream] if self._container.format.name.startswith('mov') else []
+        for packet in self._container.demux(*own):
+            if packet.pts is not None and packet.time_base:
+                self.begin = min(self.begin, float(packet.pts * packet.time_base))
+                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
+                self.end = max(self.end, end)
+            if packet.stream_index == self._stream.index:
+                yield packet
 
 
 def decode(fps: float, paths: list[str], output: Connection) -> None:
@@ -106,7 +164,10 @@ def decode(fps: float, paths: list[str], output: Connection) -> None:
     for file, path in enumerate(paths):
         with _open(path) as container:
             start, (duration, rate, *_) = end, _facts(container)
-            for seconds, frame in _frames(container, start, 1 / rate):
+            packets = _Packets(container)
+            for seconds, frame, jump in _frames(container, packets, start, 1 / rate):
+                if jump:
+                    output.send_bytes(FRAME.pack(jump, file, 0, JUMP))
                 number = (seconds + EARLY) * fps
                 if number < due:
                     output.send_bytes(FRAME.pack(seconds, file, 0, 0))
@@ -116,16 +177,19 @@ def decode(fps: float, paths: list[str], output: Connection) -> None:
                     output.send_bytes(image.reshape(-1).data)
                     due = math.floor(number) + 1
                 end = seconds + 1 / rate
-            if end - start < COMPLETE * duration:
+            if max(end - start, packets.end - packets.begin) < COMPLETE * duration:
                 output.send_bytes(FRAME.pack(end - start, file, 0, CUT_OFF))
 
 
-def _frames(container: Any, start: float, period: float) -> Iterator[tuple[float, Any]]:
+def _frames(
+    container: Any, packets: _Packets, start: float, period: float
+) -> Iterator[tuple[float, Any, float]]:
     """
-    Yield the frames with increasing times, the first one at ``start``.
+    Yield the frames with increasing times, the first one at ``start``, and jumps of the clock, s.
 
-    A time that is missing or falls is continued by the frame rate. AVI has no times of
-    presentation: there the times of decoding count, which FFmpeg gives in the order of frames.
+    A time that is missing, falls, or jumps in a stream is continued by the frame rate. AVI has no
+    times of presentation: there the times of decoding count, which FFmpeg gives in the order of
+    frames.
     """
     from av import FFmpegError, InvalidDataError
 
@@ -133,17 +197,21 @@ def _frames(container: Any, start: float, period: float) -> Iterator[tuple[float
     stream.thread_type, stream.codec_context.thread_count = 'AUTO', 2
     stream.codec_context.options = {'max_pixels': str(MAX_PIXELS)}
     bare, avi = container.format.flags & NO_TIMES, container.format.name == 'avi'
+    ahead = AHEAD * max(1, period)
+    ahead = ahead if container.format.flags & DISCONTINUOUS else math.inf
     with suppress(FFmpegError):  # cut off
-        for packet in container.demux(stream):
+        for packet in packets:
             with suppress(InvalidDataError):  # damaged: players skip it, too
                 for frame in packet.decode():
                     ticks = frame.dts if avi or frame.pts is None else frame.pts
                     stated = math.nan if bare or ticks is None else float(ticks * frame.time_base)
-                    following = seconds + period
-                    if math.isnan(origin) or stated - origin < seconds - RESTART:
+                    following, jump = seconds + period, 0.0
+                    if math.isnan(origin):
                         origin = stated - following
+                    elif (step := stated - origin - seconds) < -RESTART or step > ahead:
+                        origin, jump = stated - following, step
                     seconds = stated - origin if stated - origin > seconds + TICK else following
-                    yield seconds, frame
+                    yield seconds, frame, jump
 
 
 def rgb_of(frame: Any, reformatter: Any) -> np.ndarray:

@@ -29,27 +29,44 @@ def write_video(
     metadata: dict[str, str] | None = None,
     times=None,
     high_dynamic_range: bool = False,
+    sounds=(),
+    voice: str = 'aac',
+    tracks: int = 1,
 ) -> Path:
     """
     Write a video.
 
     :param images: RGB, uint8; of ``colored_images`` if not given.
     :param times: of the frames, in frames; 0, 1, 2, ... if not given.
+    :param sounds: begin and end of each track of sound, seconds, encoded by ``voice``.
+    :param tracks: of video, of equal images.
     :param high_dynamic_range: state BT.2020 and SMPTE ST 2084; the images are not changed.
     """
     images = colored_images() if images is None else images
     with av.open(str(path), 'w') as container:
         container.metadata.update(metadata or {})
-        stream = container.add_stream(codec, rate=rate, options=options or {})
-        stream.height, stream.width = images[0].shape[:2]
-        stream.pix_fmt, stream.bit_rate = pixels, 1_000_000
-        if high_dynamic_range:
-            stream.color_primaries, stream.color_trc, stream.colorspace = 9, 16, 9  # ITU-T H.273
+        streams = [
+            container.add_stream(codec, rate=rate, options=options or {}) for _ in range(tracks)
+        ]
+        for stream in streams:
+            stream.height, stream.width = images[0].shape[:2]
+            stream.pix_fmt, stream.bit_rate = pixels, 1_000_000
+            if high_dynamic_range:
+                stream.color_primaries, stream.color_trc, stream.colorspace = 9, 16, 9  # H.273
+        voices = [container.add_stream(voice, rate=48000, layout='mono') for _ in sounds]
         for i, image in enumerate(images):
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
-            frame.pts = int(i if times is None else times[i])
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+            for stream in streams:
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
+                frame.pts = int(i if times is None else times[i])
+                container.mux(stream.encode(frame))
+        for stream in streams:
+            container.mux(stream.encode(None))
+        for stream, (begin, end) in zip(voices, sounds, strict=True):
+            for at in range(int(begin * 48000), int(end * 48000), 960):
+                frame = av.AudioFrame.from_ndarray(np.zeros((1, 960), np.float32), 'fltp', 'mono')
+                frame.sample_rate, frame.pts = 48000, at
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode(None))
     return path
 
 
