@@ -117,7 +117,7 @@ distribution = setup(
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=10.2',
-        'rosbags>=0.10',
+        'rosbags>=0.11.9',
         'scipy>=1.11',
         'tqdm>=4.66',
         *(EVALUATION if WHEEL else []),

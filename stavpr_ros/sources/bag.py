@@ -13,6 +13,7 @@ from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
+from stavpr_ros.sources.notes import note_once
 from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE, VideoStream
 from stavpr_ros.units import SECOND
 
@@ -76,7 +77,7 @@ class BagSource:
 
         :param start: seconds after the start of the bag.
         :param duration: seconds from there on.
-        :raises SourceError: the bag is damaged further on, or ends early.
+        :raises SourceError: the bag is damaged further on.
         """
         return self._each(self._record, start, duration)
 
@@ -110,8 +111,7 @@ class BagSource:
         stream = VideoStream() if self.message_type in VIDEO else None
         with open_bag(self.path) as bag:
             index = -1
-            connections = [each for each in bag.reader.connections if each.topic == self.topic]
-            messages = bag.messages(connections, start, duration)
+            messages = bag.messages({self.topic}, start, duration)
             for index, (_, time_ns, raw) in enumerate(messages):
                 try:
                     message = self._message(bag, raw)
@@ -126,9 +126,9 @@ class BagSource:
                     continue
                 yield item
             if (start, duration) == (0, math.inf) and index + 1 < self._count:
-                raise SourceError(
+                note_once(
                     f'{self.path} ends early: {index + 1} of the {self._count} messages of '
-                    f'{self.topic} that it states are present; try `ros2 bag reindex`'
+                    f'{self.topic} that it states are present'
                 )
 
     def _message(self, bag: OpenBag, raw: bytes) -> Any:
@@ -149,10 +149,10 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
     """Topic to (type, messages); the publishers of one topic added up."""
     return {
         name: (
-            ' and '.join(sorted({message_type(each) for each in info.connections})),
-            info.msgcount,
+            ' and '.join(sorted(set(map(message_type, connections)))),
+            sum(each.msgcount for each in connections),
         )
-        for name, info in bag.reader.topics.items()
+        for name, connections in sorted(bag.topics.items())
     }
 
 
@@ -207,8 +207,7 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     poses = []
     with open_bag(path) as bag:
         name = _named(path, _topics(bag), topic, {ODOMETRY})
-        connections = [each for each in bag.reader.connections if each.topic == name]
-        for _, time_ns, raw in bag.messages(connections):
+        for _, time_ns, raw in bag.messages({name}):
             try:
                 message = bag.deserialize(raw, ODOMETRY)
             except Exception:  # garbage raises errors of any type

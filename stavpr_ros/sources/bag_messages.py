@@ -9,7 +9,6 @@ from typing import Any
 
 from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
-from rosbags.rosbag2 import Reader as Ros2Reader
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.bag_file import message_type, open_bag
@@ -25,10 +24,10 @@ def list_topics(path: Path) -> dict[str, RecordedTopic]:
     with open_bag(path) as bag:
         return {
             name: RecordedTopic(
-                name, message_type(info.connections[0]), any(map(_is_latched, info.connections))
+                name, message_type(connections[0]), any(map(_is_latched, connections))
             )
-            for name, info in bag.reader.topics.items()
-            if info.msgcount
+            for name, connections in sorted(bag.topics.items())
+            if sum(each.msgcount for each in connections)
         }
 
 
@@ -46,9 +45,8 @@ def read_messages(
     :raises SourceError: the bag is damaged, or a message cannot be converted.
     """
     with open_bag(path) as bag:
-        connections = [each for each in bag.reader.connections if each.topic in topics]
-        convert = None if isinstance(bag.reader, Ros2Reader) else _Ros1()
-        for connection, time_ns, raw in bag.messages(connections, start, duration):
+        convert = _Ros1() if bag.is_ros1 else None
+        for connection, time_ns, raw in bag.messages(topics, start, duration):
             kind = message_type(connection)
             content = raw if convert is None else convert(kind, raw)
             yield MessageRecord(time_ns, connection.topic, bytes(content))

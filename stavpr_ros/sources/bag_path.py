@@ -1,29 +1,46 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a path is a bag, without rosbags, which loads slowly."""
+"""Whether a path is a bag, and the files of one, without rosbags, which loads slowly."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from stavpr_ros.errors import SourceError, StavprError
+from stavpr_ros.regular_file import open_regular
 from stavpr_ros.sources.suffixes import SUFFIXES
 
 METADATA = 'metadata.yaml'
 IN_METADATA = b'rosbag2_bagfile_information'  # not in files of other programs
 STORAGE_SUFFIXES = frozenset({'.db3', '.mcap', '.bag'})
+ZSTD = '.zstd'  # behind the suffix of a file that is compressed as a whole
+MAGIC = {
+    b'SQLite format 3\0': '.db3',
+    b'\x89MCAP0\r\n': '.mcap',
+    b'#ROSBAG V2.0': '.bag',
+    b'\x28\xb5\x2f\xfd': ZSTD,
+}
+"""The first bytes of the files of bags, and the suffixes that they should have."""
 
 
 def is_bag(path: Path) -> bool:
     """
-    Return whether a path is a bag and no folder of images, by names only.
+    Return whether a path is a bag and no folder of images: by names, of one file by its content.
 
     :raises SourceError: the folder cannot be listed.
     """
     with reading(path):
         if path.is_dir():
             return _is_folder_of_bag(path)
-        return path.suffix.lower() in STORAGE_SUFFIXES
+        return _is_storage(path) or (path.is_file() and storage_kind(path) in STORAGE_SUFFIXES)
+
+
+def storage_kind(file: Path) -> str:
+    """Return the suffix that the content of a file asks for; else the one that it has."""
+    with open_regular(file) as opened:  # a pipe would never end
+        start = opened.read(max(map(len, MAGIC)))
+    kinds = (kind for magic, kind in MAGIC.items() if start.startswith(magic))
+    return next(kinds, file.suffix.lower())
 
 
 @contextmanager
@@ -46,8 +63,12 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """Return the files of a folder that bags store messages in."""
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in STORAGE_SUFFIXES)
+    """Return the files of a folder that bags store messages in, by their names."""
+    return sorted(filter(_is_storage, folder.iterdir()))
+
+
+def _is_storage(file: Path) -> bool:
+    return Path(file.name.lower().removesuffix(ZSTD)).suffix in STORAGE_SUFFIXES
 
 
 def _is_folder_of_bag(folder: Path) -> bool:
