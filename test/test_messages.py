@@ -78,6 +78,13 @@ def places(extractor, features):
 # ------------------------------------------------ ~/match
 
 
+def test_stamps_after_2038_wrap_as_in_the_messages_of_others():
+    for seconds in (0, 2**31 - 1, 2**31, 2**32 - 1):
+        message = time_message(seconds * SECOND + 5)
+        assert message.sec % 2**32 == seconds
+        assert nanoseconds(message) == seconds * SECOND + 5
+
+
 def test_status_equals_the_constants_of_the_message():
     constants = {name: getattr(PlaceMatch, name) for name in Status.__members__}
     assert constants == {status.name: status.value for status in Status}

@@ -6,6 +6,7 @@ Video topics: packets by encoders of PyAV, in substitutes for the messages of ot
 The substitutes are built from the published definitions, in a bag or in this process.
 """
 
+import sys
 from types import SimpleNamespace
 
 from bags import SECOND, writing
@@ -14,12 +15,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 from sensor_msgs.msg import CompressedImage
-from stavpr_ros.errors import ImageError
+from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros import input as ros_input
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.sources import files
-from stavpr_ros.sources.bag import BagSource
+from stavpr_ros.sources.bag import BagSource, COMPRESSED
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.video_topic import (
     DEFINITIONS,
@@ -176,6 +177,56 @@ def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded
             assert np.median(np.abs(frame.image.astype(int) - IMAGES[i])) < 4
         record = next(source.records())
         assert (record.encoding, record.stamp_ns) == ('rgb8', SECOND)
+
+
+@pytest.mark.parametrize('ros1', [False, True])
+def test_video_in_compressed_images_of_a_bag_is_decoded(tmp_path, codec, encoded, ros1):
+    path = tmp_path / 'drive.bag'
+    with writing(path, ros1) as bag:
+        for i, packet in enumerate(encoded):
+            data = np.frombuffer(bytes(packet), np.uint8)
+            fields = bag.header((i + 1) * SECOND), f'bgr8; {CODECS[codec][1].upper()}', data
+            bag.write('/camera/compressed', COMPRESSED, (i + 1) * SECOND, *fields)
+    check([frame.image for frame in BagSource(path)])
+    assert len(list(BagSource(path).records())) == COUNT
+
+
+@pytest.mark.parametrize('has_pyav', [True, False])
+def test_node_decodes_video_in_compressed_images(context, monkeypatch, encoded, codec, has_pyav):
+    if not has_pyav:
+        monkeypatch.setitem(sys.modules, 'av.video.reformatter', None)
+    node, queue = ManagedNode('n', context=context), []
+    settings = SimpleNamespace(image_transport='compressed', max_rate=0.0, max_stamp_gap=2.0)
+    images = ros_input.ImageInput(
+        node,
+        settings,
+        Statistics(),
+        lambda message, arrival: queue.append(message),
+        lambda message, reason: None,
+        lambda reason: None,
+    )
+    try:
+        for i, packet in enumerate(encoded):
+            header, data = Header(stamp=Time(sec=i + 1)), bytes(packet)
+            images.on_image(CompressedImage(header=header, format=CODECS[codec][1], data=data))
+        assert [each.header.stamp.sec for each in queue] == list(range(1, COUNT + 1))
+        if has_pyav:
+            check(list(map(decode_message, queue)))
+        else:
+            with pytest.raises(ImageError, match='pip install av'):
+                decode_message(queue[0])
+    finally:
+        images.close()
+        node.destroy_node()
+
+
+def test_topics_of_other_transports_have_a_remedy(tmp_path):
+    kind = 'theora_image_transport/msg/Packet'
+    with writing(tmp_path / 'drive') as bag:
+        bag._store.register(get_types_from_msg('uint8[] data\n', kind))
+        bag.write('/camera/theora', kind, SECOND, np.zeros(9, np.uint8))
+    with pytest.raises(SourceError, match='republish TRANSPORT raw'):
+        BagSource(tmp_path / 'drive')
 
 
 def test_damaged_foxglove_message_of_a_bag_is_an_error_of_its_image(tmp_path):

@@ -15,7 +15,7 @@ import numpy as np
 from stavpr_ros.commands.program import make_parser, run_program, say
 from stavpr_ros.errors import OutputError
 from stavpr_ros.output_file import atomic_output, AtomicFile, RECORDING
-from stavpr_ros.units import SECOND
+from stavpr_ros.units import SECOND, WRAP
 
 if TYPE_CHECKING:
     from stavpr_msgs.msg import LoopClosure, PlaceMatch
@@ -61,7 +61,7 @@ def _record(message: Any) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """Return stamps as nanoseconds, other messages as their fields by name, NaN as None."""
     if hasattr(value, 'nanosec'):
-        return int(value.sec) * SECOND + int(value.nanosec)
+        return int(value.sec) % WRAP * SECOND + int(value.nanosec)
     if hasattr(value, 'get_fields_and_field_types'):
         return {name: _plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if isinstance(value, np.ndarray | Sequence) and not isinstance(value, str):

@@ -22,13 +22,13 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import ImageError, SettingsError, UnavailableError
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import StampWatch, Statistics
 from stavpr_ros.ros.messages import message_class, nanoseconds
 from stavpr_ros.ros.parameters import transport_remedy, TRANSPORTS
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, ReceivedGroup, Receiver
-from stavpr_ros.sources.video_topic import VideoStream
+from stavpr_ros.sources.video_topic import is_packet, VideoImage, VideoStream
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Header
 
@@ -88,8 +88,8 @@ class ImageInput:
         self._lock = threading.Lock()  # close() waits for the image of another thread
         self._closed = False
         self._type, ending = TRANSPORTS[settings.image_transport]
-        is_video = self._type not in (TRANSPORTS['raw'][0], TRANSPORTS['compressed'][0])
-        self._video = VideoStream() if is_video else None
+        self._is_video = self._type not in (TRANSPORTS['raw'][0], TRANSPORTS['compressed'][0])
+        self._video = VideoStream() if self._is_video else None
         self._lost = self._counted = 0  # images between publisher and subscription; in statistics
         # as in image_transport, other topics are below the one that `image` is remapped to
         name = node.resolve_topic_name('image') + ending if ending else 'image'
@@ -98,7 +98,7 @@ class ImageInput:
             node,
             message_class(self._type),
             name,
-            PACKETS if is_video else QUEUE,
+            PACKETS if self._is_video else QUEUE,
             self.on_image,
             self._on_lost,
             self._on_refused,
@@ -156,9 +156,7 @@ class ImageInput:
                 return
             arrival = time.monotonic()
             self._statistics.add_image()
-            if self._video is not None:
-                message = self._video.read(message, Header)  # others depend on it
-                self._count_lost()
+            message = self._decoded(message)
             stamp = nanoseconds(message.header.stamp)
             ahead, missing = self.stamps.update(stamp)
             self._statistics.add_stamp_jump(ahead, missing)
@@ -169,6 +167,18 @@ class ImageInput:
                 self._reject(message, reason)
             else:
                 self._enqueue(message, arrival)
+
+    def _decoded(self, message: Any) -> Any:
+        """Return the image of a packet of video, on which later ones depend; else the message."""
+        if not (self._is_video or is_packet(message)):
+            return message
+        try:
+            self._video = self._video or VideoStream()
+        except UnavailableError as error:  # PyAV is missing, and the format came as a surprise
+            return VideoImage(message.header, ImageError(str(error), kind='encoding'), lambda _: _)
+        image = self._video.read(message, Header)
+        self._count_lost()
+        return image
 
     def _exceeds_rate(self, stamp: int, arrival: float) -> str:
         """Return why an image exceeds ``max_rate``, by stamps, or by arrival without them."""

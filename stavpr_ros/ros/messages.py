@@ -40,7 +40,7 @@ from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.sources.frame import ImageRecord
-from stavpr_ros.units import SECOND
+from stavpr_ros.units import SECOND, WRAP
 from std_msgs.msg import Header
 
 MIN_VARIANCE = 0.01  # of a pose: (0.1 m)^2 and (0.1 rad)^2
@@ -80,12 +80,13 @@ _NO_MATCH = PlaceMatch(
 
 def time_message(nanoseconds: int) -> Time:
     """Return a time as a message; 0 means unknown."""
-    return Time(sec=int(nanoseconds) // SECOND, nanosec=int(nanoseconds) % SECOND)
+    seconds = (int(nanoseconds) // SECOND + WRAP // 2) % WRAP - WRAP // 2
+    return Time(sec=seconds, nanosec=int(nanoseconds) % SECOND)
 
 
 def nanoseconds(time: Time) -> int:
     """Return a time in nanoseconds."""
-    return int(time.sec) * SECOND + int(time.nanosec)
+    return int(time.sec) % WRAP * SECOND + int(time.nanosec)
 
 
 def pose_message(pose: np.ndarray) -> Pose:

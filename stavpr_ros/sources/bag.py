@@ -14,8 +14,8 @@ from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.sources.notes import note_once
-from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE, VideoStream
-from stavpr_ros.units import SECOND
+from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE, is_packet, VideoStream
+from stavpr_ros.units import SECOND, WRAP
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
@@ -108,14 +108,17 @@ class BagSource:
         start: float = 0.0,
         duration: float = math.inf,
     ) -> Iterator[Item]:
-        stream = VideoStream() if self.message_type in VIDEO else None
+        stream = None
         with open_bag(self.path) as bag:
             index = -1
             messages = bag.messages({self.topic}, start, duration)
             for index, (_, time_ns, raw) in enumerate(messages):
                 try:
                     message = self._message(bag, raw)
-                    item = finish(index, time_ns, stream.read(message) if stream else message)
+                    if self.message_type in VIDEO or is_packet(message):
+                        stream = stream or VideoStream()
+                        message = stream.read(message)
+                    item = finish(index, time_ns, message)
                 except ImageError as error:
                     image_error = ImageError(
                         f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind
@@ -142,7 +145,7 @@ class BagSource:
 
 def _stamp(message: Any) -> int:
     stamp = message.header.stamp
-    return int(stamp.sec * SECOND + stamp.nanosec)
+    return int(stamp.sec) % WRAP * SECOND + int(stamp.nanosec)
 
 
 def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
@@ -170,7 +173,15 @@ def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -
             f'{path} has {len(nonempty)} image topics, choose one (--topic): {_listed(nonempty)}'
         )
     expected = ', '.join([RAW, COMPRESSED, *sorted(VIDEO)])
-    raise SourceError(f'{path} has no images (expected {expected}): there are {_listed(topics)}')
+    remedy = ''
+    if any('Packet' in kind or 'Compressed' in kind for kind, _ in topics.values()):
+        remedy = (
+            '; while it is played, `ros2 run image_transport republish TRANSPORT raw` makes '
+            'images of another transport, such as theora'
+        )
+    raise SourceError(
+        f'{path} has no images (expected {expected}): there are {_listed(topics)}{remedy}'
+    )
 
 
 def _named(path: Path, topics: dict[str, tuple[str, int]], topic: str, kinds: set[str]) -> str:

@@ -138,10 +138,10 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
                     continue
                 readers.append(reader)
                 kinds.add(kind)
-            for error in damaged:
+            for reason in damaged:
                 if not readers:
-                    raise error
-                note_once(f'a part of {path} is left out: {error}')
+                    raise reason
+                note_once(f'a part of {path} is left out: {reason}')
             if len(kinds) > 1 or (len(files) > 1 and not names and '.bag' not in kinds):
                 _require_parts(path, files, readers)
             bag = OpenBag(path, readers, '.bag' in kinds)

@@ -17,6 +17,10 @@ import numpy as np
 from stavpr_ros.errors import ImageError
 from stavpr_ros.sources import files
 
+_FILES = {'jpeg', 'jpg', 'mjpeg', 'png'}
+"""Encodings of raw messages that have the bytes of a file, of cameras on USB."""
+_OTHER_FORMATS = re.compile('avif|jxl|jp2|j2k|jpeg ?2000|jpegxl|gif|heic|qoi|svg|exr|raw')
+"""Formats of compressed messages that are not read."""
 _MEASUREMENTS = re.compile(r'(8S|16S|32[SUF]|64[SUF])C\d*')
 """Encodings of depth images, vectors and other measurements, without brightness."""
 # Rows: R, G, B of Y, U, V and 1: BT.601 in the range of video (Y 16..235), as in OpenCV.
@@ -143,6 +147,7 @@ ENCODINGS: dict[str, Encoding] = {
     'nv24': Encoding(1, 1, nv24_to_rgb, chroma_rows=2),
 }
 """The supported raw encodings."""
+_LOWER_CASE = {name.lower(): encoding for name, encoding in ENCODINGS.items()}
 
 
 def decode_image(
@@ -164,9 +169,9 @@ def decode_image(
 
     :param height: rows of the image; NV12, NV21 and NV24 have rows of color below them.
     :param width: pixels per row.
-    :param encoding: a key of :data:`ENCODINGS`.
+    :param encoding: a key of :data:`ENCODINGS`, in upper or lower case.
     :param is_bigendian: byte order of 16 bit values.
-    :param step: bytes from one row to the next; rows may be padded.
+    :param step: bytes from one row to the next; rows may be padded. 0 = they are not.
     :param data: the bytes: anything with the buffer protocol. The last row's padding may be
         missing.
     :param least: rows and columns that are needed of a large image, which is reduced then, see
@@ -178,8 +183,9 @@ def decode_image(
     """
     layout = _layout(encoding)
     row = width * layout.channels * layout.value_bytes
+    step = step or row
     rows = height + int(height * layout.chroma_rows)
-    _check_header(height, width, encoding, step, row)
+    _check_header(height, width, encoding, layout, step, row)
     flat = files.flat_bytes(data)
     min_size = (rows - 1) * step + row
     if flat.size < min_size:
@@ -227,6 +233,8 @@ def decode_message(
         return files.reduce(message.decode(), least)
     if hasattr(message, 'format'):
         return decode_compressed_message(message, least, to_bytes)
+    if message.encoding.lower() in _FILES:
+        return files.decode_file(message.data, None, least, to_bytes)
     return decode_image(
         message.height,
         message.width,
@@ -265,7 +273,11 @@ def decode_compressed_message(
     try:
         return files.decode_file(message.data, _demosaic_of(message.format), least, to_bytes)
     except ImageError as error:
-        raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
+        remedy = ''
+        if _OTHER_FORMATS.search(message.format.lower()):
+            remedy = '; set the format of the publisher to jpeg or png (image_transport)'
+        text = f'format {message.format!r}: {error}{remedy}'
+        raise ImageError(text, kind='format' if remedy else error.kind) from error
 
 
 def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -284,7 +296,7 @@ def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
 
 
 def _layout(encoding: str) -> Encoding:
-    layout = ENCODINGS.get(encoding)
+    layout = ENCODINGS.get(encoding) or _LOWER_CASE.get(encoding.lower())
     if layout is not None:
         return layout
     problem, remedy, kind = 'not supported', 'set the driver, or use image_proc', 'encoding'
@@ -297,13 +309,15 @@ def _layout(encoding: str) -> Encoding:
     )
 
 
-def _check_header(height: int, width: int, encoding: str, step: int, row: int) -> None:
+def _check_header(
+    height: int, width: int, encoding: str, layout: Encoding, step: int, row: int
+) -> None:
     if height < 1 or width < 1:
         raise ImageError(
             f'image of {width}x{height} pixels: expected at least 1x1; check the camera driver',
             kind='size',
         )
-    rows, columns = ENCODINGS[encoding].block
+    rows, columns = layout.block
     if height % rows or width % columns:
         raise ImageError(
             f'{encoding} image of {width}x{height} pixels: expected a width that is a multiple of '

@@ -27,10 +27,16 @@ ROS1_FFMPEG = (
 )
 CODECS = {'h264': re.compile('[hx]264|avc'), 'hevc': re.compile('[hx]265|hevc')}
 """Decoders of FFmpeg, and what the names of their encoders contain, such as libx264."""
+VIDEO = re.compile(r'[hx]26[45]|avc|hevc|av1|vp[89]|theora')  # formats of CompressedImage
 UNIT = re.compile(rb'\x00\x00\x01(.)', re.DOTALL)  # Annex B: start code, type of the unit
 KEY_FRAME = 1  # flag of FFmpeg
 MAX_GAP = 1000  # packets; a larger step of pts is another stream, or a time
 NO_KEY_FRAME = 'no key frame'  # kind of an error
+
+
+def is_packet(message: Any) -> bool:
+    """Return whether the ``format`` of a ``CompressedImage`` is a video, not an image."""
+    return bool(VIDEO.search(str(getattr(message, 'format', '')).lower()))
 
 
 class VideoImage:
@@ -88,7 +94,8 @@ class VideoStream:
         """
         Decode a packet; one that gives no image becomes an error of the image.
 
-        :param message: ``FFMPEGPacket`` or ``CompressedVideo``, or any object with its fields.
+        :param message: ``FFMPEGPacket``, ``CompressedVideo`` or ``CompressedImage``, or any object
+            with its fields.
         :param make_header: of ``stamp`` and ``frame_id``, where the message has no header.
         """
         header = getattr(message, 'header', None)
@@ -154,10 +161,9 @@ class VideoStream:
 
 
 def _codec(name: str) -> str:
-    """Return the decoder of ``codec;pixels;...``, or of the name of an encoder."""
-    first = name.partition(';')[0].lower()
+    """Return the decoder of ``codec;pixels;...``, or of the name of an encoder or format."""
     for codec, pattern in CODECS.items():
-        if pattern.search(first):
+        if pattern.search(name.lower()):
             return codec
     raise ImageError(
         f'video of {name!r} is not decoded: expected H.264 or H.265; choose another encoder',
