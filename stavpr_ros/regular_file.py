@@ -47,6 +47,12 @@ def elsewhere(path: str | Path) -> str:
     return ''
 
 
+def home_folder() -> Path:
+    """Return the home of the user, ``/`` of one without, as containers have it."""
+    home = Path(os.path.expanduser('~'))
+    return home if home.is_absolute() else Path('/')
+
+
 def open_regular(path: str | Path) -> io.FileIO:
     """
     Open a regular file for reading, unbuffered; symbolic links are followed.

@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 from typing import TypeVar
+import warnings
 
 Result = TypeVar('Result')
 _limits = [0]  # the last one set
@@ -24,6 +25,8 @@ def wait_passively() -> None:
     otherwise: blocks of a map are multiplied side by side. A choice that the user has made
     (OMP_WAIT_POLICY, OPENBLAS_NUM_THREADS) stays.
     """
+    # numba asks for a lock in /dev/shm when it is imported, for a module that is not used
+    warnings.filterwarnings('ignore', '.*Could not obtain multiprocessing lock')
     os.environ.setdefault('OMP_WAIT_POLICY', 'PASSIVE')
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 

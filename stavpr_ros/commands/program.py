@@ -201,6 +201,16 @@ def run_program(
             raise
         say(f'{name}: {text}', sys.stderr)
         return FAILED
+    except OSError as error:
+        if interrupted():
+            say(f'{name}: {interruption()}', sys.stderr)
+            return INTERRUPTED
+        say(
+            f'{name}: {error}; expected folders that can be written and have room: name others, '
+            'TMPDIR for temporary files',
+            sys.stderr,
+        )
+        return FAILED
     except BaseException as error:
         # an interrupt within a foreign library comes out as another exception
         if not (isinstance(error, KeyboardInterrupt) or interrupted()):

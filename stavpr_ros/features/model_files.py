@@ -9,17 +9,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
-from stavpr_ros.regular_file import open_regular
+from stavpr_ros.regular_file import home_folder, open_regular
 
 
 def cache_folder() -> Path:
     """Return the folder of downloads, ``$XDG_CACHE_HOME/stavpr_ros`` or below ``~/.cache``."""
-    return Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'stavpr_ros'
+    return Path(os.environ.get('XDG_CACHE_HOME') or home_folder() / '.cache') / 'stavpr_ros'
 
 
 def models_folder() -> Path:
     """Return the folder of the user's models: ``$STAVPR_MODELS``, or below ``~/.local/share``."""
-    share = os.environ.get('XDG_DATA_HOME') or Path.home() / '.local' / 'share'
+    share = os.environ.get('XDG_DATA_HOME') or home_folder() / '.local' / 'share'
     return Path(os.environ.get('STAVPR_MODELS') or Path(share) / 'stavpr_ros' / 'models')
 
 

@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 import fcntl
+import io
 from itertools import chain, pairwise
 import json
 import os
 from pathlib import Path
 import re
 import struct
-import tempfile
 from typing import NamedTuple, Self
 import zlib
 
@@ -226,7 +226,7 @@ class JournalReader:
                     self.source, self.base = source, Base(path, places, checksum)
                 case _:
                     raise ValueError('another format or version')
-            with tempfile.TemporaryFile(buffering=0) as raw, errors_of(self.path):
+            with io.FileIO(os.memfd_create('template'), 'r+b') as raw, errors_of(self.path):
                 raw.write(self.template_content)
                 self.template = in_memory(map_of(MapFile(raw, self.path)))
         except (ValueError, OSError, StavprError) as error:

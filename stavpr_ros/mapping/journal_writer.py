@@ -77,7 +77,8 @@ class JournalWriter:
         :raises JournalError: it cannot be created.
         """
         try:
-            with tempfile.TemporaryDirectory() as folder:
+            beside = Path(target).absolute().parent
+            with tempfile.TemporaryDirectory(dir=beside, prefix='.journal-') as folder:
                 save_map(template, Path(folder, 'map'))
                 begin = partial(header, template=Path(folder, 'map').read_bytes(), source=source)
             path, file = _create(Path(target), begin(base))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from stavpr_ros.checks import require_plain
 from stavpr_ros.errors import SettingsError
+from stavpr_ros.regular_file import home_folder
 
 
 def maps_folder(parameter: str) -> Path:
@@ -16,10 +17,10 @@ def maps_folder(parameter: str) -> Path:
     :param parameter: maps_folder, '' = ``stavpr/maps`` in the user's data folder.
     """
     if parameter:
-        return Path(parameter).expanduser().absolute()
+        return Path(os.path.expanduser(parameter)).absolute()
     data = os.environ.get('XDG_DATA_HOME', '')
     # the XDG Base Directory Specification: a relative one is ignored
-    home = Path(data) if os.path.isabs(data) else Path.home() / '.local' / 'share'
+    home = Path(data) if os.path.isabs(data) else home_folder() / '.local' / 'share'
     return home / 'stavpr' / 'maps'
 
 

@@ -27,7 +27,12 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 from stavpr_ros.errors import SettingsError, StavprError, UnavailableError
-from stavpr_ros.ros.rclpy_workarounds import log_failure, PromptExecutor, ros_arguments_checked
+from stavpr_ros.ros.rclpy_workarounds import (
+    log_failure,
+    PromptExecutor,
+    ros_arguments_checked,
+    with_log_files,
+)
 from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
 
 SIGNAL_POLL = 0.2  # seconds until a signal is noticed by an executor that it does not wake
@@ -99,7 +104,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """
     with ros_arguments_checked():
-        texts = _texts(sys.argv[1:] if arguments is None else arguments)
+        texts = with_log_files(_texts(sys.argv[1:] if arguments is None else arguments))
         rclpy.init(args=texts, signal_handler_options=SignalHandlerOptions.NO)
     left_behind = False
     try:

@@ -7,10 +7,13 @@ The tests of this module also show the failure of each without its workaround: s
 when upstream is fixed, and the workaround can go.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, ExitStack, suppress
 import os
+from pathlib import Path
+import sys
+from tempfile import TemporaryFile
 import threading
 import time
 import traceback
@@ -31,6 +34,7 @@ from rclpy.parameter import Parameter
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.regular_file import home_folder
 
 RECEIVER_POLL = 10**9  # nanoseconds until a receiver detects the end of the process
 END_POLL = 0.01  # seconds until a receiver is noticed to call back
@@ -68,13 +72,34 @@ def ros_arguments_checked() -> Iterator[None]:
         rclpy_implementation.UnknownROSArgsError,
     ) as error:
         if 'initialize logging' in str(error):
-            home = os.environ.get('ROS_HOME') or '~/.ros'
-            folder = os.environ.get('ROS_LOG_DIR') or os.path.join(home, 'log')
             raise UnavailableError(
-                f'the log directory {os.path.expanduser(folder)} cannot be written: set '
-                'ROS_LOG_DIR to a folder that can be'
+                f'the log directory {_log_folder()} cannot be written: set ROS_LOG_DIR to a '
+                'folder that can be'
             ) from error
         raise SettingsError(f'the arguments after --ros-args are invalid: {error}') from error
+
+
+def _log_folder() -> Path:
+    home = os.environ.get('ROS_HOME') or home_folder() / '.ros'
+    return Path(os.path.expanduser(os.environ.get('ROS_LOG_DIR') or Path(home) / 'log'))
+
+
+def with_log_files(arguments: Sequence[str] | None) -> Sequence[str] | None:
+    """
+    Return arguments of ``rclpy.init``; without files of a log where none can be written.
+
+    No upstream issue was found: on a read-only system, ``rclpy.init`` raises a RuntimeError.
+    """
+    folder = _log_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        reason = f'no log is written to {folder} ({error.strerror}): set ROS_LOG_DIR to change it'
+        print(reason, file=sys.stderr)
+        own = sys.argv if arguments is None else arguments
+        return [*own, '--ros-args', '--disable-external-lib-logs']
+    return arguments
 
 
 _warning_filters = threading.Lock()  # they belong to the process
