@@ -76,6 +76,26 @@ def test_node_runs_without_a_log_folder(variable):
     assert 'runs' in done.stderr
 
 
+@pytest.mark.parametrize('size', [0, 10**15])
+def test_node_without_shared_memory_uses_udp(tmp_path, size):
+    names = f'process.SHARED_MEMORY, process.SEGMENT = {str(tmp_path / "shm")!r}, {size}'
+    if size:
+        (tmp_path / 'shm').mkdir()
+    program = f'from stavpr_ros.ros import process\n{names}\n{NODE}\nprint(process.os.environ)'
+    names = os.environ.keys() - {'FASTRTPS_DEFAULT_PROFILES_FILE'}
+    environment = {name: os.environ[name] for name in names}
+    done = subprocess.run(
+        [sys.executable, '-c', program],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert 'shm (' in done.stderr
+    assert 'sent by UDP' in done.stderr
+    assert 'config/fastdds_udp.xml' in done.stdout
+
+
 def test_user_without_a_home_has_the_root(monkeypatch):
     def unknown(_):
         raise KeyError

@@ -7,9 +7,11 @@ from contextlib import contextmanager, nullcontext
 import difflib
 import os
 from pathlib import Path
+from shutil import disk_usage
 import signal
 import socket
 import sys
+from tempfile import TemporaryFile
 import threading
 import time
 import traceback
@@ -42,6 +44,8 @@ SERVICE_SECONDS = 2.0  # until a node shows its parameter service; tools may hav
 # read by Fast DDS 2.14, which ignores the FASTDDS_ spelling of later versions
 PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 PROFILES_FILE = 'config/fastdds_large_images.xml'
+SHARED_MEMORY, UDP_FILE = '/dev/shm', 'config/fastdds_udp.xml'
+LARGE_SEGMENT, SEGMENT = 40_000_000, 1_000_000  # bytes of shared memory, with what belongs to it
 SIMILARITY = 0.54  # of names: --map is map_path (0.55), and not map_frame (0.50)
 ROS_OPTIONS = ('enclave', 'log-level', 'param', 'params-file', 'remap')
 
@@ -53,18 +57,39 @@ def prepare_transport() -> None:
     Give this process shared memory for images; to be called before ``rclpy.init``.
 
     The default segment of 512 KiB is smaller than one 640x480 color image, and the publisher's
-    segment is the one that counts. A profile set by the user stays; other middlewares ignore it.
+    segment is the one that counts. Without room, images are sent by UDP: Fast DDS would crash. A
+    profile set by the user stays; other middlewares ignore it.
 
     :raises UnavailableError: the package's share folder is not found.
     """
+    _choose_transport(LARGE_SEGMENT, PROFILES_FILE)
+
+
+def _choose_transport(size: int, profiles_file: str = '') -> None:
+    """Use a profile if shared memory has room for so many bytes, else the one of UDP."""
     if os.environ.get(PROFILES_VARIABLE):
         return
+    folder = Path(SHARED_MEMORY)
     try:
-        profiles = Path(get_package_share_directory('stavpr_ros')) / PROFILES_FILE
+        TemporaryFile(dir=folder).close()
+        reason = '' if disk_usage(folder).free > size else f'less than {size / 1e6:.1f} MB free'
+    except OSError as error:
+        reason = str(error.strerror)
+    if reason:
+        profiles_file = UDP_FILE
+        print(
+            f'images are not shared in {folder} ({reason}), but sent by UDP, which is slower: '
+            'make room (docker run --shm-size)',
+            file=sys.stderr,
+        )
+    if not profiles_file:
+        return
+    try:
+        profiles = Path(get_package_share_directory('stavpr_ros')) / profiles_file
     except PackageNotFoundError as error:
         raise UnavailableError(
             'the package stavpr_ros is not installed (no entry in AMENT_PREFIX_PATH): expected '
-            f'its share folder with {PROFILES_FILE}; build it, source local_setup.bash'
+            f'its share folder with {profiles_file}; build it, source local_setup.bash'
         ) from error
     if not profiles.is_file():
         raise UnavailableError(
@@ -103,6 +128,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     :param arguments: without the program's name; the process's own if None.
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """
+    _choose_transport(SEGMENT)
     with ros_arguments_checked():
         texts = with_log_files(_texts(sys.argv[1:] if arguments is None else arguments))
         rclpy.init(args=texts, signal_handler_options=SignalHandlerOptions.NO)

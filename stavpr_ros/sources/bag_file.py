@@ -14,18 +14,19 @@ from pathlib import Path, PureWindowsPath
 import re
 import shutil
 import sqlite3
-import sys
 from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Ros1Reader
+
+# its own requirements: YAML of ruamel, zstd of Python 3.14 or its backport
+from rosbags.rosbag2.reader import YAML, zstd  # type: ignore[attr-defined]
 from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
-from ruamel.yaml import YAML
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.bag_path import (
     MAGIC,
@@ -40,11 +41,6 @@ from stavpr_ros.sources.mcap import with_end
 from stavpr_ros.sources.notes import note_once
 from stavpr_ros.sources.video_topic import DEFINITIONS, FFMPEG, FOXGLOVE, ROS1_FFMPEG
 from stavpr_ros.units import SECOND
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
 
 LOG_SUFFIXES = ('-wal', '-journal')
 """Files of SQLite beside a database with writes that are not in the database yet."""
@@ -174,8 +170,9 @@ def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
     file = folder / METADATA
     if not file.exists():
         return [], {}
+    content = file.read_bytes()
     try:
-        stated = YAML(typ='safe').load(file.read_text())['rosbag2_bagfile_information']
+        stated = YAML(typ='safe').load(content)['rosbag2_bagfile_information']
         names = [PureWindowsPath(each).name for each in stated['relative_file_paths']]
         topics = stated.get('topics_with_message_count') or []
         counts = {each['topic_metadata']['name']: int(each['message_count']) for each in topics}
