@@ -49,6 +49,8 @@ class Health:
     contrast: float = math.nan  # standard deviation of the last image, of 255; NaN = unknown
     applied_threshold: float | None = None  # the recognizer's; None = the settings'
 
+    oddities: tuple[str, ...] = ()  # of the inputs
+
     localized: bool = False
     sends_transform: bool = False  # map -> odom, of the last match
 
@@ -124,6 +126,7 @@ def loss(health: Health) -> str:
 def _image_faults(health: Health) -> Iterator[Finding]:
     """Yield the findings on images that arrived or were lost, and on their odometry."""
     counts, drops = health.counts, health.counts.dropped.recent
+    yield from ((WARN, text) for text in health.oddities)
     invalid = {cause: n for cause, n in drops.items() if cause.startswith(INVALID)}
     if invalid:
         kinds = ', '.join(f'{cause.removeprefix(INVALID)} {n}' for cause, n in invalid.items())

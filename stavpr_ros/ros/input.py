@@ -28,6 +28,7 @@ from stavpr_ros.pipeline.statistics import StampWatch, Statistics
 from stavpr_ros.ros.messages import message_class, nanoseconds
 from stavpr_ros.ros.parameters import transport_remedy, TRANSPORTS
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, ReceivedGroup, Receiver
+from stavpr_ros.sources.oddities import source_of, StreamWatch
 from stavpr_ros.sources.video_topic import is_packet, VideoImage, VideoStream
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Header
@@ -84,6 +85,7 @@ class ImageInput:
         self.stamps = StampWatch(settings.max_stamp_gap)
         self.max_rate = settings.max_rate
         self.remedy = ''
+        self._watch = StreamWatch()
         self._last: float | None = None  # seconds, of the last image within the rate
         self._lock = threading.Lock()  # close() waits for the image of another thread
         self._closed = False
@@ -126,6 +128,13 @@ class ImageInput:
             subscription.choice,
         )
 
+    def oddities(self) -> list[str]:
+        """Return what is odd about the last images, for the diagnostics."""
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        count = sum(info.topic_type == self._type for info in infos)
+        mixed = f'images of {count} publishers are mixed on {self.topic}: a topic for each'
+        return [mixed] * (count > 1) + self._watch.oddities(has_epoch=False)
+
     def close(self) -> None:
         """Unsubscribe from images, including one that another thread has just taken."""
         with self._lock:
@@ -158,6 +167,7 @@ class ImageInput:
             self._statistics.add_image()
             message = self._decoded(message)
             stamp = nanoseconds(message.header.stamp)
+            self._watch.add(stamp, round(arrival * SECOND), source_of(message))
             ahead, missing = self.stamps.update(stamp)
             self._statistics.add_stamp_jump(ahead, missing)
             if ahead < 0:

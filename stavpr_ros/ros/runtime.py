@@ -377,9 +377,21 @@ class Runtime:
             odometry_fault='' if odometry is None else odometry.fault(),
             contrast=pipeline.operation.contrast,
             applied_threshold=pipeline.operation.threshold,
+            oddities=self._oddities(),
             localized=self._localized.is_localized,
             sends_transform=self._navigation is not None and self._navigation.sends_transform,
         )
+
+    def _oddities(self) -> tuple[str, ...]:
+        """Return what is odd about the inputs; log each kind once."""
+        inputs = (each for each in (self.images, self.odometry, self.camera) if each is not None)
+        texts = tuple(text for each in inputs for text in each.oddities())
+        for text in texts:
+            kind = ''.join(filter(str.isalpha, text))
+            if kind not in self._logged_reasons:
+                self._logged_reasons.add(kind)
+                self._node.get_logger().warning(text)
+        return texts
 
     # images
 

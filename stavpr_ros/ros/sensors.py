@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The subscriptions to odometry and to camera_info, and the camera's place on the robot."""
 
+from collections import deque
 from collections.abc import Callable
 import importlib
 import time
 from typing import Any
 
 from nav_msgs.msg import Odometry
+import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
@@ -18,6 +20,7 @@ from stavpr_ros.mapping.trajectory import Trajectory
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.input import BEST_EFFORT, subscribe
 from stavpr_ros.ros.messages import camera_of, nanoseconds, odometry_pose
+from stavpr_ros.sources.oddities import RECENT, speed_oddity
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
 AT_THE_BASE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # pose of a camera without an offset
@@ -40,6 +43,7 @@ class OdometryInput:
         self.trajectory = Trajectory(timeout)
         self._node, self._timeout, self._on_rejected = node, timeout, on_rejected
         self._arrived: float | None = None
+        self._last: deque[tuple[int, np.ndarray]] = deque(maxlen=RECENT)  # stamps and poses
         self.frame = self.child_frame = ''
         qos = QoSProfile(depth=50, reliability=BEST_EFFORT)
         self._subscription = subscribe(node, Odometry, 'odom', self._on_odometry, qos)
@@ -55,19 +59,28 @@ class OdometryInput:
         fresh = self.freshness() == 'fresh'
         return '' if fresh else misdirected(self._node, self._subscription.topic_name)
 
+    def oddities(self) -> list[str]:
+        """Return what is odd about the last poses, for the diagnostics."""
+        if not (rows := list(self._last)):
+            return []
+        text = speed_oddity(np.array([stamp for stamp, _ in rows]), np.array([p for _, p in rows]))
+        return [text] if text else []
+
     def close(self) -> None:
         """Unsubscribe from odometry."""
         self._node.destroy_subscription(self._subscription)
 
     def _on_odometry(self, message: Odometry) -> None:
+        stamp, pose = nanoseconds(message.header.stamp), odometry_pose(message)
         try:
-            self.trajectory.add(nanoseconds(message.header.stamp), odometry_pose(message))
+            self.trajectory.add(stamp, pose)
         except InputError as error:
             self._on_rejected()
             self._node.get_logger().warning(
                 f'odometry rejected: {error}', throttle_duration_sec=REPORT_PERIOD
             )
             return
+        self._last.append((stamp, pose))
         self._arrived = time.monotonic()
         self.frame, self.child_frame = message.header.frame_id, message.child_frame_id
 
@@ -151,6 +164,11 @@ class CameraInput:
     def state(self) -> str:
         """Return the problem, or that camera and transform are known, for the diagnostics."""
         return self.problem or ('known, transform assumed' if self.assumed else 'known')
+
+    def oddities(self) -> list[str]:
+        """Return what is odd about the intrinsics, for the diagnostics."""
+        camera = self._known[3] if self._known else None
+        return [camera.oddity] if camera and camera.oddity else []
 
     def close(self) -> None:
         """Unsubscribe."""

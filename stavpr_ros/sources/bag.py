@@ -14,6 +14,7 @@ from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
 from stavpr_ros.sources.notes import note_once
+from stavpr_ros.sources.oddities import RECENT, source_of, speed_oddity, StreamWatch
 from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE, is_packet, VideoStream
 from stavpr_ros.units import SECOND, WRAP
 
@@ -52,6 +53,7 @@ class BagSource:
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
         self.least: tuple[int, int] | None = None
+        self._noted: set[str] = set()  # oddities
         with open_bag(self.path) as bag:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
@@ -108,7 +110,7 @@ class BagSource:
         start: float = 0.0,
         duration: float = math.inf,
     ) -> Iterator[Item]:
-        stream = None
+        stream, watch = None, StreamWatch()
         with open_bag(self.path) as bag:
             index = -1
             messages = bag.messages({self.topic}, start, duration)
@@ -118,7 +120,10 @@ class BagSource:
                     if self.message_type in VIDEO or is_packet(message):
                         stream = stream or VideoStream()
                         message = stream.read(message)
+                    watch.add(_stamp(message), time_ns, source_of(message))
                     item = finish(index, time_ns, message)
+                    if (index + 1) % RECENT == 0:
+                        self._note(watch)
                 except ImageError as error:
                     image_error = ImageError(
                         f'{self.path}, {self.topic}#{index}: {error}', kind=error.kind
@@ -128,11 +133,19 @@ class BagSource:
                     self.on_error(image_error)
                     continue
                 yield item
+            self._note(watch)
             if (start, duration) == (0, math.inf) and index + 1 < self._count:
                 note_once(
                     f'{self.path} ends early: {index + 1} of the {self._count} messages of '
                     f'{self.topic} that it states are present'
                 )
+
+    def _note(self, watch: StreamWatch) -> None:
+        for text in watch.oddities():
+            kind = text.split(maxsplit=1)[0]  # the numbers of each are of the last images
+            if kind not in self._noted:
+                self._noted.add(kind)
+                note_once(f'{self.path}, {self.topic}: {text}')
 
     def _message(self, bag: OpenBag, raw: bytes) -> Any:
         try:
@@ -235,6 +248,8 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     is_alone = (when[1:-1] < before - LATE) | (when[1:-1] > after + LATE)
     alone = 1 + np.flatnonzero(is_alone & (after >= before - LATE))
     when[alone], where[alone] = when[alone - 1], np.nan
+    if text := speed_oddity(when, where):
+        note_once(f'{path}, {topic}: {text}')
     back = np.maximum.accumulate(when) - when
     if back.max() > LATE:
         i = int(np.argmax(back > LATE))
