@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens bag files of every kind with rosbags, without writing beside them."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
@@ -93,7 +93,7 @@ class OpenBag:
             last = None if math.isinf(duration) else first + round(duration * SECOND)
             wanted = [[c for c in each.connections if c.topic in topics] for each in self.readers]
             parts = [
-                reader.messages(connections, first if start else None, last)
+                _read(reader)(connections, first if start else None, last)
                 for reader, connections in zip(self.readers, wanted, strict=True)
                 if connections  # none would be all
             ]
@@ -157,6 +157,12 @@ def _open_file(file: Path, stack: ExitStack) -> tuple[Any, str]:
             'it with the program that wrote it'
         )
     return reader, kind
+
+
+def _read(reader: Any) -> Callable[..., Iterator[tuple[Connection, int, bytes]]]:
+    """Return what yields the messages of a file, of MCAP without an index as they were written."""
+    has_no_index = isinstance(reader, McapReader) and not reader.chunks
+    return reader.messages_scan if has_no_index else reader.messages
 
 
 def _span(reader: Any) -> tuple[int, int]:
