@@ -307,7 +307,7 @@ def test_bag_with_foreign_or_cut_metadata_is_read_without_it(tmp_path, caplog, s
     assert len(list(open_source(tmp_path / 'bag'))) == 5
     assert f'{metadata} is damaged or of another program' in caplog.text
     next(file for file in (tmp_path / 'bag').iterdir() if file != metadata).unlink()
-    with pytest.raises(SourceError, match='is no bag: expected a folder, or a|has no images'):
+    with pytest.raises(SourceError, match=r'is no bag: expected a folder, or a|has no images'):
         open_source(tmp_path / 'bag')
 
 

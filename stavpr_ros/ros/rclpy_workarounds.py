@@ -7,7 +7,7 @@ The tests of this module also show the failure of each without its workaround: s
 when upstream is fixed, and the workaround can go.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, ExitStack, suppress
 import os
@@ -84,7 +84,7 @@ def _log_folder() -> Path:
     return Path(os.path.expanduser(os.environ.get('ROS_LOG_DIR') or Path(home) / 'log'))
 
 
-def with_log_files(arguments: Sequence[str] | None) -> Sequence[str] | None:
+def with_log_files(arguments: list[str]) -> list[str]:
     """
     Return arguments of ``rclpy.init``; without files of a log where none can be written.
 
@@ -97,8 +97,7 @@ def with_log_files(arguments: Sequence[str] | None) -> Sequence[str] | None:
     except OSError as error:
         reason = f'no log is written to {folder} ({error.strerror}): set ROS_LOG_DIR to change it'
         print(reason, file=sys.stderr)
-        own = sys.argv if arguments is None else arguments
-        return [*own, '--ros-args', '--disable-external-lib-logs']
+        return [*arguments, '--ros-args', '--disable-external-lib-logs']
     return arguments
 
 
