@@ -6,7 +6,15 @@ from dataclasses import dataclass
 import enum
 import math
 
-from stavpr_nav.follower import Command, FollowerSettings, Observation, RouteFollower, TaughtRun
+from stavpr_nav.evidence import OdometryComparison
+from stavpr_nav.follower import (
+    Command,
+    FollowerSettings,
+    NO_EVIDENCE,
+    Observation,
+    RouteFollower,
+    TaughtRun,
+)
 from stavpr_ros.errors import InputError
 
 DEADMAN_AGE = 0.5  # seconds that the dead-man switch counts after its last message
@@ -44,6 +52,9 @@ class Driver:
     :param needs_deadman: the robot moves only while :meth:`press` is called.
     :param give_up_after: seconds without an image of the route after which the drive ends, 0 =
         never; times without the dead-man switch do not count.
+    :param is_blocked: the drive before ended without evidence of motion: the dead-man switch has
+        to be released and pressed first, or :meth:`restart` to be called.
+    :param odometry: has to move while a speed is commanded, and only then; None = no odometry.
     :raises InputError: the goal is not on the route.
 
     ``outcome`` is None while it drives; ``laps`` passes of the seam, ``place`` of the newest image
@@ -58,6 +69,8 @@ class Driver:
         settings: FollowerSettings | None = None,
         needs_deadman: bool = True,
         give_up_after: float = 30.0,
+        is_blocked: bool = False,
+        odometry: OdometryComparison | None = None,
     ) -> None:
         n, self._run = len(run.times), run
         self._goal = n - 1 if goal.place == -1 else goal.place
@@ -69,7 +82,7 @@ class Driver:
             self._goal += n - 1 - run.seam
         if run.seam is None and goal.start > self._goal:
             raise InputError(f'place {self._goal} is before the start {goal.start}')
-        self._follower = RouteFollower(run, settings)
+        self._follower = RouteFollower(run, settings, odometry)
         if goal.start >= 0:
             self._follower.start(goal.start)
         self._lap = 0 if run.seam is None else n - 1 - run.seam
@@ -77,22 +90,55 @@ class Driver:
         self._last_lap: float | None = None
         self._needs_deadman, self._give_up_after = needs_deadman, give_up_after
         self._pressed = -math.inf
+        self._held = now if is_blocked else -math.inf  # when the switch was last pressed
         self._time = self._alive = now
         self.outcome: Outcome | None = None
         self.place, self.laps, self.distance = -1, 0, 0.0
         self.newest: Observation | None = None
         self.command = Command(0.0, 0.0, '')
+        if is_blocked:
+            self._follower.block()
 
     def press(self, now: float) -> None:
-        """Count the dead-man switch as pressed."""
-        self._pressed = now
+        """Count the dead-man switch as pressed; a new press ends a stop without evidence."""
+        if self._is_released(now):
+            self.restart()
+        self._pressed = self._held = now
 
     def release(self) -> None:
         """Count the dead-man switch as released."""
-        self._pressed = -math.inf
+        self._pressed = self._held = -math.inf
 
-    def expected_place(self) -> int:
-        """Return the place of an image without a match; -1 = unknown."""
+    def _is_released(self, now: float) -> bool:
+        """Whether the switch was released, and this program and the clock ran on."""
+        return now - self._held > DEADMAN_AGE and now - self._time <= DEADMAN_AGE
+
+    def restart(self) -> bool:
+        """Go on after a stop without evidence of motion; return whether there was one."""
+        was_blocked = self.is_blocked
+        if was_blocked:
+            self._follower.restart()
+        return was_blocked
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether the robot waits for a new press, or for :meth:`restart`."""
+        return self._follower.is_blocked
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an operator drives: the place of the robot is not known yet."""
+        return self.place < 0 and not self._follower.has_place
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether no speed is commanded."""
+        return not (self.command.speed or self.command.turn)
+
+    def expected_place(self, is_new: bool = True) -> int:
+        """Return the place of an image without a match, or as that before; -1 = unknown."""
+        if not is_new and self.newest is not None and self.newest.place >= 0:
+            return self.newest.place
         return self._follower.expected_place()
 
     def observe(self, observation: Observation, now: float) -> None:
@@ -116,6 +162,11 @@ class Driver:
             self.outcome = outcome
             self.command = self._follower.halt(now, self.command.reason)
 
+    def halt(self, now: float, reason: str) -> Command:
+        """Stop for now."""
+        self.command = self._follower.halt(now, reason)
+        return self.command
+
     def step(self, now: float) -> Command:
         """Return the velocities for now; to be called at a steady rate, above 10 Hz."""
         last = self._last_lap
@@ -123,8 +174,11 @@ class Driver:
             self.end(Outcome.REACHED, now)
         if self.outcome is not None:
             return self.command
+        if now - self._time > DEADMAN_AGE:  # the program or the clock has jumped: no release
+            self._held += now - self._time
         if self._needs_deadman and not 0 <= now - self._pressed <= DEADMAN_AGE:
-            self.command, self._alive = self._follower.halt(now, PAUSED), now
+            reason = NO_EVIDENCE if self.is_blocked else PAUSED
+            self.command, self._alive = self._follower.halt(now, reason), now
         else:
             self.command = self._follower.command(now)
         self.distance += abs(self.command.speed) * min(max(now - self._time, 0.0), 1.0)

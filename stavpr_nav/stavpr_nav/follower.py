@@ -14,6 +14,9 @@ bearing-only law of Krajnik et al. (Navigation without localisation, 2018) does,
 all features is the sum of the two. The weighted parallax is limited: far beside the path the robot
 returns at a small angle, and does not swing beyond it. The integral over the path takes out a
 constant pull to one side, of unequal wheels or a camera that does not look straight ahead.
+
+From a standstill the robot creeps until a match of another place shows that it moves. Where such
+evidence stays away, it stops until an operator starts it again; see ``stavpr_nav.evidence``.
 """
 
 from collections import deque
@@ -22,6 +25,7 @@ from functools import cached_property
 import math
 
 import numpy as np
+from stavpr_nav.evidence import MotionEvidence, OdometryComparison, path_speed
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.relative_pose.offset import Offset
 
@@ -33,7 +37,9 @@ MAX_STEER, MAX_APPROACH = 0.2, 0.1
 INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image, of summands too
 BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
 BRIDGE_TIME, BRIDGE_SHARE = 6.0, 0.5  # seconds of the taught run without a match; share of speed
-STUCK_TIME, STUCK_PLACES = 2.0, 4  # of the taught run, in which the place has to change
+CREEP = 0.3  # m/s from a standstill to the first evidence of motion
+MAX_STEP = 0.5  # seconds between two commands; beyond it the program or the clock has jumped
+NO_EVIDENCE = 'no evidence of motion: press the dead-man switch again, or call ~/start'
 FALL, MEMORY = 0.3, 10  # share of the recent similarity that is dissimilar; images of its mean
 FIRST = 3  # successive confirmed images, from which on the robot moves
 HISTORY = 200  # latest commands, to know how far the robot is since an image was taken
@@ -129,12 +135,16 @@ class Observation:
     :param place: that the image shows; -1 = unknown.
     :param probability: of the place; NaN = without a match, it is the expected place.
     :param offset: of the image against the place; None = unknown.
+    :param is_new: it differs from the images before, see ``stavpr_nav.evidence``.
+    :param is_judged: it was compared with the map; False = skipped, as no keyframe.
     """
 
     stamp: float
     place: int
     probability: float
     offset: Offset | None
+    is_new: bool = True
+    is_judged: bool = True
 
     @property
     def is_confirmed(self) -> bool:
@@ -142,8 +152,13 @@ class Observation:
         if self.place < 0 or self.offset is None:
             return False
         return self.offset.is_similar and (
-            not math.isnan(self.probability) or self.offset.similarity >= BRIDGE_SIMILARITY
+            self.is_matched or not self.is_judged or self.offset.similarity >= BRIDGE_SIMILARITY
         )
+
+    @property
+    def is_matched(self) -> bool:
+        """Whether the place is of a match."""
+        return not math.isnan(self.probability)
 
 
 @dataclass(frozen=True)
@@ -165,52 +180,103 @@ class RouteFollower:
     Follows a taught route; all times are seconds of one clock.
 
     :param taught: the velocities to repeat.
+    :param odometry: has to move while a speed is commanded, and only then; None = no odometry.
     """
 
-    def __init__(self, taught: TaughtRun, settings: FollowerSettings | None = None) -> None:
+    def __init__(
+        self,
+        taught: TaughtRun,
+        settings: FollowerSettings | None = None,
+        odometry: OdometryComparison | None = None,
+    ) -> None:
         self._taught, self._settings = taught, settings or FollowerSettings()
-        self._stuck = max(STUCK_TIME, STUCK_PLACES * float(np.median(np.diff(taught.times))))
         self._newest: Observation | None = None  # of the confirmed images
         self._received = self._confirmed = -math.inf
-        self._changed = 0.0  # what was repeated when the place last changed
-        self._stamp = -math.inf
+        self._stamp, self._delay = -math.inf, 0.0
         self._successive = 0
         self._integral = self._steer = 0.0
         self._similarity = 0.0  # mean of the latest matched images
+        self._probability = math.nan  # of the latest judged image
         self._last, self._time = Command(0.0, 0.0), -math.inf
-        # seconds of the taught run that were repeated, by the time of the commands
-        self._repeated: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], HISTORY)
-        # the last match, and what was repeated until then
+        # meters that were commanded, meters of odometry and seconds of the taught run that were
+        # repeated, by the time of the commands
+        self._totals: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
+        self._rest(np.zeros(3))
+        # the last match, and the seconds that were repeated until then
         self._anchor: tuple[int, float] | None = None
+        steps = path_speed(taught.speeds[:-1], taught.turns[:-1]) * np.diff(taught.times)
+        path = np.concatenate([[0.0], np.cumsum(steps)])
+        self._evidence = MotionEvidence(path, taught.seam, self._settings.max_age)
+        self._odometry = odometry
+        if odometry is not None:
+            odometry.commanded = 0.0  # of this drive
         self.end: int | None = None  # a place before the last at which the route ends
+
+    def _rest(self, totals: np.ndarray) -> None:
+        """Begin from rest: where the robot was before is unknown."""
+        self._totals.clear()
+        self._totals.append((-math.inf, totals))
+        self._last = Command(0.0, 0.0, self._last.reason)
 
     def start(self, place: int) -> None:
         """Set the place of a robot at rest; otherwise it moves after its first match."""
-        self._anchor = place, self._repeated[-1][1]
-        self._changed = self._repeated[-1][1]
+        totals = self._totals[-1][1]
+        self._anchor = place, float(totals[2])
+        self._evidence.restart(totals, place)
+
+    def restart(self) -> None:
+        """Go on after a stop by missing evidence of motion: an operator has looked."""
+        self._evidence.restart(self._totals[-1][1], self._newest.place if self._newest else -1)
+        if self._odometry is not None:
+            self._odometry.commanded = float(self._totals[-1][1][0])
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether evidence of motion is missing, until :meth:`restart`."""
+        return self._evidence.is_missing
+
+    @property
+    def has_place(self) -> bool:
+        """Whether the place of the robot was stated or matched."""
+        return self._anchor is not None
+
+    def block(self) -> None:
+        """Count evidence of motion as missing."""
+        self._evidence.is_missing = True
 
     def expected_place(self) -> int:
         """Return the place of an image soon after the last match; -1 = unknown."""
         if self._anchor is None:
             return -1
         place, before = self._anchor
-        done, times = self._repeated[-1][1] - before, self._taught.times
+        done, times = float(self._totals[-1][1][2]) - before, self._taught.times
         if done > BRIDGE_TIME:
             return -1
         time = self._taught.on_lap(float(times[place]) + done)
         return min(int(np.searchsorted(times, time)), len(times) - 1)
 
     def observe(self, observation: Observation, now: float) -> None:
-        """Take the result of an image."""
-        self._received, self._stamp = now, observation.stamp
+        """Take the result of an image; one that is out of order, or of later, is not used."""
+        late = now - observation.stamp
+        is_earlier = observation.stamp <= self._stamp
+        if late < -self._settings.max_delay or (is_earlier and late <= self._settings.max_delay):
+            return
+        self._received, self._stamp, self._delay = now, observation.stamp, max(late, 0.0)
+        if late > self._settings.max_delay:
+            return
+        if observation.is_judged:
+            self._probability = observation.probability
         if observation.is_confirmed and not self._falls(observation):
-            if self._newest is None or observation.place != self._newest.place:
-                self._changed = self._repeated[-1][1]
             self._newest, self._confirmed = observation, now
             self._successive += 1
-            if not math.isnan(observation.probability):
-                done = self._repeated[-1][1] - self._since(observation.stamp)
-                self._anchor = observation.place, done
+            totals, matched, bridge = self._until(observation.stamp), None, 0.0
+            if observation.is_matched:
+                self._anchor = observation.place, float(totals[2])
+                matched = observation.place if observation.is_new else None
+            elif observation.is_new and observation.is_judged:
+                bridge = BRIDGE_TIME
+            speed, is_judged = self._last.speed, observation.is_judged
+            self._evidence.take(observation.stamp, matched, totals, speed, is_judged, bridge)
         elif now - self._confirmed > self._settings.max_unconfirmed:
             self._successive = 0
 
@@ -225,17 +291,39 @@ class RouteFollower:
     def halt(self, now: float, reason: str) -> Command:
         """Halt for now; the robot accelerates from rest afterwards."""
         self._time, self._last = now, Command(0.0, 0.0, reason)
+        self._evidence.is_fresh = False
         return self._last
 
     def command(self, now: float) -> Command:
         """Return the velocities for now; to be called at a steady rate, above 10 Hz."""
-        step = min(now - self._time, 1.0) if math.isfinite(self._time) else 0.0
+        step = now - self._time
         self._time = now
+        if not 0 <= step <= MAX_STEP:
+            self._rest(self._totals[-1][1])
+            self._stamp = self._stamp if step > 0 else -math.inf
+            step = 0.0
+        self._count(step)
         self._last = self._limited(self._wanted(now), step)
+        if self._last.reason:
+            self._evidence.is_fresh = False
         return self._last
 
     def _stop_reason(self, now: float) -> str:
         """Return why the robot must not move; empty = it may."""
+        is_due = self._evidence.is_due(self._totals[-1][1], self._last.speed, self._delay)
+        odometry = self._odometry
+        if odometry is not None and odometry.stands(float(self._totals[-1][1][0])):
+            self.block()
+        if is_due and self._evidence.bridge:  # at its end
+            self.block()
+        if self.is_blocked:
+            return NO_EVIDENCE
+        if odometry is not None and not 0 <= now - odometry.received <= self._settings.max_age:
+            return 'no odometry'
+        return self._image_reason(now) or ('waiting for evidence of motion' if is_due else '')
+
+    def _image_reason(self, now: float) -> str:
+        """Return why the images do not permit motion; empty = they do."""
         settings = self._settings
         is_new = 0 <= now - self._received <= settings.max_age  # or the clock was set back
         if not is_new or now - self._stamp > settings.max_delay:
@@ -245,8 +333,6 @@ class RouteFollower:
             return 'not localized on the route'
         if self._confirmed < self._received:
             return 'the newest image is not of the route'
-        if self._repeated[-1][1] - self._changed > self._stuck:
-            return 'the place does not change'
         return 'waiting for more images of the route' if self._successive < FIRST else ''
 
     def _wanted(self, now: float) -> Command:
@@ -261,10 +347,11 @@ class RouteFollower:
         speed, turn, is_end = self._taught.at(newest.place, since)
         if is_end or (self.end is not None and times[newest.place] + since >= times[self.end]):
             return Command(0.0, 0.0, 'end of the route')
-        share = (newest.probability - UNCERTAIN) / (CERTAIN - UNCERTAIN)
+        share = (self._probability - UNCERTAIN) / (CERTAIN - UNCERTAIN)
         share = BRIDGE_SHARE if math.isnan(share) else min(max(share, SLOWEST), 1.0)
         share *= 1 if offset.is_valid else WITHOUT_OFFSET
-        share = min(share, settings.max_speed / max(abs(speed), 1e-9))
+        most = settings.max_speed if self._evidence.is_fresh else min(CREEP, settings.max_speed)
+        share = min(share, most / max(abs(speed), 1e-9))
         speed, turn = share * speed, share * turn
         self._steer = 0.0
         if offset.is_valid:
@@ -273,26 +360,37 @@ class RouteFollower:
         turn -= settings.gain * abs(speed) * (self._steer + self._integral)
         return Command(speed, turn)
 
+    def _until(self, stamp: float) -> np.ndarray:
+        """Return the totals at a time."""
+        return next((t for at, t in reversed(self._totals) if at <= stamp), self._totals[0][1])
+
     def _since(self, stamp: float) -> float:
         """Return the seconds of the taught run that were repeated since a time."""
-        before = next((done for at, done in reversed(self._repeated) if at <= stamp), 0.0)
-        return self._repeated[-1][1] - before
+        return float(self._totals[-1][1][2] - self._until(stamp)[2])
+
+    def _count(self, step: float) -> None:
+        """Count what the last command has repeated in the seconds since."""
+        moved = self._odometry.take_meters() if self._odometry is not None else 0.0
+        last, newest = self._last, self._newest
+        if last.reason or newest is None:
+            return
+        taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
+        done = last.speed / taught * step if abs(taught) > 1e-3 else step
+        added = np.array([path_speed(last.speed, last.turn) * step, moved, done])
+        self._totals.append((self._time, self._totals[-1][1] + added))
 
     def _limited(self, wanted: Command, step: float) -> Command:
-        """Limit velocities and accelerations, but no stop; count what is repeated."""
-        settings, newest = self._settings, self._newest
-        if wanted.reason or newest is None:
+        """Limit velocities and accelerations, but no stop."""
+        settings = self._settings
+        if wanted.reason:
             return wanted
         faster = settings.max_acceleration * step
         speed = min(max(wanted.speed, self._last.speed - faster), self._last.speed + faster)
         turning = settings.max_turn_acceleration * step
         turn = min(max(wanted.turn, self._last.turn - turning), self._last.turn + turning)
         turn = _limit(turn, settings.max_turn)
-        taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
-        done = speed / taught * step if abs(taught) > 1e-3 else step
-        self._repeated.append((self._time, self._repeated[-1][1] + done))
-        added = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
-        self._integral = _limit(self._integral + added, MAX_INTEGRAL)
+        more = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
+        self._integral = _limit(self._integral + more, MAX_INTEGRAL)
         return Command(speed, turn)
 
 

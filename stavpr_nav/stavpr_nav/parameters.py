@@ -14,6 +14,7 @@ REPEAT: dict[str, tuple[Any, str]] = {
     'match_topic': ('stavpr/match', 'matches of the recognition node'),
     'image_transport': ('raw', 'raw or compressed (topic image/compressed)'),
     'require_deadman': (True, 'drive only while `deadman` (std_msgs/Bool) is true'),
+    'use_odometry': (False, 'stop where `odom` (nav_msgs/Odometry) shows other motion, or none'),
     'give_up_after': (30.0, 's not localized after which a goal is aborted; 0 = never'),
     'stamped': (False, 'publish geometry_msgs/TwistStamped'),
     'base_frame': ('base_link', 'frame of TwistStamped'),

@@ -8,6 +8,7 @@ from pathlib import Path
 import time
 from xml.etree import ElementTree
 
+from domain import DOMAIN
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -21,6 +22,7 @@ from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from stavpr_msgs.action import Repeat
 from stavpr_msgs.msg import MapInfo, Offset, PlaceMatch
+from stavpr_nav.follower import NO_EVIDENCE
 from stavpr_nav.ros.repeat_node import RepeatNode
 from stavpr_nav.ros.teach_node import TeachNode
 from stavpr_nav.taught_run import read_velocities
@@ -30,6 +32,7 @@ from stavpr_ros.mapping.merging import select_places
 from stavpr_ros.relative_pose.offset import DISTANT
 from stavpr_ros.ros.messages import image_message
 from std_msgs.msg import Bool, Header
+from std_srvs.srv import Trigger
 
 POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
 PERIOD = 0.1  # seconds between two images
@@ -59,6 +62,8 @@ class Rover:
         self.client = ActionClient(self.node, Repeat, 'repeat')
         self.images, self.map_id, self.seam = images, map_id, None
         self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
+        self.held = False  # by an emergency stop
+        self.starter = self.node.create_client(Trigger, 'repeat/start')
         self.node.create_timer(PERIOD, self.look)
 
     def look(self):
@@ -74,7 +79,7 @@ class Rover:
         self.match.publish(match)
         self.image.publish(image)
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
-        if self.commands and hasattr(self.commands[-1], 'linear'):
+        if self.commands and not self.held and hasattr(self.commands[-1], 'linear'):
             step = self.commands[-1].linear.x * PERIOD
             self.place += step
             last = len(self.images) - 1
@@ -191,6 +196,79 @@ def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rove
     assert rover.rests()
 
 
+@pytest.mark.parametrize('needs_deadman', [True, False])
+def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repeat, needs_deadman):
+    """An emergency stop that holds the wheels looks as a camera does that repeats its image."""
+    repeat(give_up_after=0.0, require_deadman=needs_deadman)
+    rover.send(start_index=3)
+    rover.until(lambda: rover.place > 5)
+
+    def is_blocked():
+        return bool(rover.feedback) and rover.feedback[-1].reason == NO_EVIDENCE
+
+    rover.held = True
+    rover.until(is_blocked)
+    rover.held = False
+    rover.commands.clear()
+    rover.until(lambda: len(rover.commands) > 40)
+    assert not any(command.linear.x for command in rover.commands)
+    if needs_deadman:
+        rover.pressed = False
+        rover.commands.clear()
+        rover.until(lambda: len(rover.commands) > 20)
+        assert is_blocked()
+        rover.pressed = True
+    else:
+        answer = rover.result_of(rover.starter.call_async(Trigger.Request()))
+        assert answer.success
+        assert not rover.result_of(rover.starter.call_async(Trigger.Request())).success
+    rover.until(rover.drives)
+
+
+def test_nothing_is_published_before_the_first_match(rover, repeat):
+    repeat()
+    rover.status = PlaceMatch.NO_MATCH
+    rover.send()
+    rover.until(lambda: len(rover.feedback) > 5)
+    assert not rover.commands
+    rover.status = PlaceMatch.MATCH
+    rover.until(rover.drives)
+
+
+def test_other_type_of_velocity_rejects_the_goal(rover, repeat, capfd):
+    node, other = repeat(), rclpy.Context()
+    rclpy.init(context=other, domain_id=DOMAIN)
+    base = rclpy.create_node('base', context=other)
+    base.create_subscription(TwistStamped, 'cmd_vel', print, 10)
+    rover.until(lambda: len(node.get_subscriptions_info_by_topic('cmd_vel')) == 2)
+    assert not rover.send(start_index=3).accepted
+    error = capfd.readouterr().err
+    for word in ('msg/TwistStamped, this node publishes', 'msg/Twist: set the parameter stamped'):
+        assert word in error
+    base.destroy_node()
+    rclpy.shutdown(context=other)
+    rover.until(lambda: len(node.get_subscriptions_info_by_topic('cmd_vel')) == 1)
+    assert rover.send(start_index=3).accepted
+
+
+def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
+    repeat(use_odometry=True, give_up_after=0.0)
+    odometry = rover.node.create_publisher(Odometry, 'odom', 10)
+    rover.send(start_index=3)
+    rover.until(lambda: rover.feedback and rover.feedback[-1].reason == 'no odometry')
+    shown = []
+
+    def wheels():
+        message = Odometry(header=Header(stamp=rover.node.get_clock().now().to_msg()))
+        message.pose.pose.position.x = shown[0] if shown else rover.place
+        odometry.publish(message)
+
+    rover.node.create_timer(0.05, wheels)
+    rover.until(lambda: rover.place > 5)
+    shown.append(rover.place)
+    rover.until(lambda: rover.feedback[-1].reason == NO_EVIDENCE)
+
+
 def test_two_laps_of_a_closed_map(rover, repeat, map_file, tmp_path):
     """Its 10 places end where place 2 is; the goal is the second pass of place 5."""
     same_as = np.arange(10, dtype=np.int32)
@@ -297,7 +375,7 @@ def test_security_policy_allows_what_the_nodes_use(context, repeat, tmp_path, na
                 names = {entry.text.replace('~', f'/{name}') for entry in group}
                 allowed[right] = names
     assert allowed.pop('execute', {'/repeat'}) == {'/repeat'}
-    optional = {'/clock', '/image/compressed', '/cmd_vel'}
+    optional = {'/clock', '/image/compressed', '/cmd_vel', '/odom'}
     assert {r: n - optional for r, n in allowed.items()} == {
         r: n - optional for r, n in used.items()
     }

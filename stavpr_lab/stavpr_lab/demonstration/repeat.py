@@ -33,6 +33,7 @@ from stavpr_lab.demonstration.street.traverses import (
     RAINY_DUSK,
     Traverse,
 )
+from stavpr_nav.evidence import ImageComparison
 from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
@@ -47,6 +48,7 @@ STEP = 0.05  # seconds of the simulation, and of the control
 LATENCY, LOST = 0.15, 0.05  # seconds until an image is processed; share of images that are lost
 SLIP, SLIP_TURN = 0.05, 0.05  # deviations of the wheels' slip, shares; constant over seconds
 CONVERGENCE = 20.0  # meters at the start that are not counted
+PATIENCE = 1.0  # seconds until the operator lets a robot go on that stopped without evidence
 BRAKING, LAG = 5.0, 0.15  # m/s^2; time constant of the drive, seconds
 CONDITIONS = {
     'day': replace(GOOD_LIGHT, traffic=5),
@@ -183,6 +185,7 @@ class Autopilot:
         self.follower = RouteFollower(taught.run, settings)
         self._map, self._offset = taught.place_map, OffsetFilter()
         self._extractor = self._map.extractor()
+        self._comparison = ImageComparison()
         self._recognizer = PlaceRecognizer(self._map, RecognizerSettings())
         self.observation: Observation | None = None
 
@@ -199,7 +202,7 @@ class Autopilot:
             offset = self._offset.update(describe_columns(image), describe_columns(thumbnail))
         else:
             self._offset.reset()
-        return Observation(stamp, place, probability, offset)
+        return Observation(stamp, place, probability, offset, self._comparison.is_new(image))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +214,7 @@ class Drive:
     :param poses: shape (n, 3); errors: meters to the left of the path and radians, shape (n, 2).
     :param speeds: m/s, shape (n,).
     :param reasons: why the robot did not move, n texts.
+    :param presses: times that the operator let it go on.
     """
 
     times: np.ndarray
@@ -218,6 +222,7 @@ class Drive:
     errors: np.ndarray
     speeds: np.ndarray
     reasons: list[str]
+    presses: int = 0
 
     def within(self, meters: float, after: float = CONVERGENCE) -> float:
         """Return the share of the distance within a bound of the path, after a start."""
@@ -231,7 +236,7 @@ def repeat(
     taught: Taught, conditions: Conditions, seconds: float, begin: int = 0,
     left: float = 1.0, turned: float = TURNED, seed: int = 0, pull: float = 0.01,
     change: Callable[[np.ndarray, float], np.ndarray] = lambda image, time: image,
-    world: RingWorld | None = None,
+    world: RingWorld | None = None, has_operator: bool = True,
 ) -> Drive:  # fmt: skip
     """
     Repeat a taught route in the simulator.
@@ -241,6 +246,7 @@ def repeat(
     :param pull: rad/m that the robot turns to the left by itself.
     :param change: returns the image that the camera delivers at a time.
     :param world: another one than the taught one.
+    :param has_operator: an operator lets the robot go on that waits without evidence of motion.
     """
     dice = np.random.default_rng(seed)
     view = View(world or taught.world, conditions)
@@ -250,7 +256,7 @@ def repeat(
     robot, pilot = Robot(pose, dice, pull), Autopilot(taught)
     pilot.follower.start(begin)
     waiting: deque[tuple[float, Observation]] = deque()
-    rows, reasons = [], []
+    rows, reasons, presses, blocked_at = [], [], 0, math.inf
     for k in range(round(seconds / STEP)):
         time = k * STEP
         if k % round(1 / RATE / STEP) == 0 and dice.random() >= LOST:
@@ -262,10 +268,14 @@ def repeat(
         robot.move(command.speed, command.turn)
         rows.append((time, *robot.pose, *taught.error(robot.pose), robot.speed))
         reasons.append(command.reason)
+        blocked_at = min(blocked_at, time) if pilot.follower.is_blocked else math.inf
+        if has_operator and time - blocked_at >= PATIENCE:
+            presses, blocked_at = presses + 1, math.inf
+            pilot.follower.restart()
         if command.reason == 'end of the route' and robot.speed < 0.01:
             break
     table = np.array(rows)
-    return Drive(table[:, 0], table[:, 1:4], table[:, 4:6], table[:, 6], reasons)
+    return Drive(table[:, 0], table[:, 1:4], table[:, 4:6], table[:, 6], reasons, presses)
 
 
 def plot(taught: Taught, drives: dict[str, Drive], path: Path) -> None:
@@ -348,7 +358,9 @@ def stops(taught: Taught, seconds: float = CHANGED + 5) -> dict[str, float]:
         ) -> np.ndarray:
             return change(image) if time >= CHANGED else image
 
-        drive = repeat(taught, GOOD_LIGHT, seconds, begin=10, change=changed)
+        drive = repeat(
+            taught, GOOD_LIGHT, seconds, begin=10, change=changed, has_operator=False
+        )
         is_later = drive.times >= CHANGED
         at_rest = np.flatnonzero(is_later & (drive.speeds < 0.05))
         result[name] = float(drive.times[at_rest[0]] - CHANGED) if len(at_rest) else math.inf
@@ -366,9 +378,9 @@ def main() -> None:
     taught, drives = teach(RingWorld(), 0.0, length), {}
     images: list[np.ndarray] = []
     lines = [
-        '| lap | pull, rad/m | driven | time | at rest | within 0.5 m | within 1 m | largest '
-        '| mean | RMS |',
-        '|---|---|---|---|---|---|---|---|---|---|',
+        '| lap | pull, rad/m | driven | time | at rest | presses | within 0.5 m | within 1 m '
+        '| largest | mean | RMS |',
+        '|---|---|---|---|---|---|---|---|---|---|---|',
     ]
     for seed, lap in enumerate(Progress(LAPS[: arguments.laps], desc='repeat', unit='lap')):
 
@@ -386,8 +398,9 @@ def main() -> None:
         error = drive.errors[driven > CONVERGENCE, 0]
         lines.append(
             f'| {lap.light} | {lap.pull:+.2f} | {driven[-1]:.0f} m | {drive.times[-1]:.0f} s '
-            f'| {(drive.speeds < 0.02).sum() * STEP:.0f} s | {drive.within(0.5):.1%} '
-            f'| {drive.within(1.0):.1%} | {abs(error).max(initial=0):.2f} m '
+            f'| {(drive.speeds < 0.02).sum() * STEP:.0f} s | {drive.presses} '
+            f'| {drive.within(0.5):.1%} | {drive.within(1.0):.1%} '
+            f'| {abs(error).max(initial=0):.2f} m '
             f'| {error.mean():+.2f} m | {np.sqrt(np.mean(error**2)):.2f} m |'
         )
         tqdm.write(lines[-1])

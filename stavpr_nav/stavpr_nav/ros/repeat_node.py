@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node that drives along a taught route: images and matches in, offsets and velocities out."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import fields
 from functools import lru_cache
@@ -14,6 +14,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -25,7 +26,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from stavpr_msgs.action import Repeat
 from stavpr_msgs.msg import Offset as OffsetMessage
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_nav.driver import Driver, Goal, Outcome
+from stavpr_nav.driver import DEADMAN_AGE, Driver, Goal, Outcome
+from stavpr_nav.evidence import ImageComparison, OdometryComparison
 from stavpr_nav.follower import Command, FollowerSettings, Observation
 from stavpr_nav.parameters import REPEAT
 from stavpr_nav.taught_run import positions, read_velocities, taught_places, taught_run
@@ -41,16 +43,18 @@ from stavpr_ros.ros.sensors import camera_info_topic
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.units import SECOND
 from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
 
 PARAMETERS = REPEAT
 READ_ONLY = ParameterDescriptor(read_only=True)
 PERIOD, FEEDBACK = 0.05, 4  # s of the control; its steps of one feedback
 REMEMBERED = 20  # images and matches that wait for each other
-SHOWN = (  # SKIPPED: the robot is at rest, or the rate is limited; the place is the expected one
+CLOCK_STANDS = 'the clock does not advance'
+SHOWN = (  # SKIPPED: no keyframe, as of a robot at rest; it is at the expected place
     PlaceMatch.WARMING_UP,
     PlaceMatch.NO_MATCH,
     PlaceMatch.MATCH,
-    PlaceMatch.SKIPPED,
+    SKIPPED := PlaceMatch.SKIPPED,
 )
 
 
@@ -92,6 +96,10 @@ class RepeatNode(Node):
         self._matches: dict[int, PlaceMatch] = {}
         self._next: tuple[Any, PlaceMatch] | None = None
         self._driver: Driver | None = None
+        self._is_blocked = False  # the last drive ended without evidence of motion
+        self._comparison = ImageComparison()
+        self._odometry: OdometryComparison | None = None
+        self._clock_times: deque[float] = deque(maxlen=1 + round(DEADMAN_AGE / PERIOD))
         self._handle: Any = None
         self._ended: Future | None = None
         self._steps, self.is_ending = 0, False
@@ -100,16 +108,7 @@ class RepeatNode(Node):
         self._velocity = self.create_publisher(kind, 'cmd_vel', 10)
         self._offset = self.create_publisher(OffsetMessage, '~/offset', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        images: tuple[Any, str] = (Image, 'image')
-        if transport == 'compressed':
-            images = CompressedImage, 'image/compressed'
-        best_effort = qos_profile_sensor_data  # receives from reliable publishers as well
-        self.create_subscription(*images, self._on_image, best_effort)
-        self.create_subscription(PlaceMatch, values['match_topic'], self._on_match, 10)
-        self.create_subscription(
-            CameraInfo, camera_info_topic(self), self._on_camera, qos_profile_sensor_data
-        )
-        self.create_subscription(Bool, 'deadman', self._on_deadman, best_effort)
+        self._subscribe(values, transport)
         self._worker = threading.Thread(target=self._work, daemon=True, name='offset')
         self._worker.start()
         self._server = ActionServer(
@@ -135,6 +134,22 @@ class RepeatNode(Node):
         self._taught = taught_places(self._map, velocities, session)
         self._positions = positions(self._map, self._taught)
         self._run = taught_run(self._map, velocities, self._taught)
+
+    def _subscribe(self, values: Mapping[str, Any], transport: str) -> None:
+        images: tuple[Any, str] = (Image, 'image')
+        if transport == 'compressed':
+            images = CompressedImage, 'image/compressed'
+        best_effort = qos_profile_sensor_data  # receives from reliable publishers as well
+        self.create_subscription(*images, self._on_image, best_effort)
+        self.create_subscription(PlaceMatch, values['match_topic'], self._on_match, 10)
+        self.create_subscription(
+            CameraInfo, camera_info_topic(self), self._on_camera, qos_profile_sensor_data
+        )
+        self.create_subscription(Bool, 'deadman', self._on_deadman, best_effort)
+        if values['use_odometry']:
+            self._odometry = OdometryComparison(self._settings.max_speed)
+            self.create_subscription(Odometry, 'odom', self._on_odometry, best_effort)
+        self.create_service(Trigger, '~/start', self._on_start)
 
     def destroy_node(self) -> None:
         """Stop the robot, and end."""
@@ -217,14 +232,19 @@ class RepeatNode(Node):
     def _observation(self, image: Any, match: PlaceMatch) -> Observation:
         """Return what an image shows; publish its offset where the place is known."""
         place, probability, offset = match.newest_index, match.probability, None
+        pixels = decode_message(image)
+        is_new = self._comparison.is_new(pixels)
         if match.status == PlaceMatch.MATCH:  # -1 = beside the taught run
             place = int(self._positions[place]) if 0 <= place < len(self._map) else -1
         else:
-            with self._lock:
-                place = self._driver.expected_place() if self._driver else -1
             probability = math.nan
+        with self._lock:
+            if self._driver is None:
+                place = -1 if math.isnan(probability) else place
+            elif math.isnan(probability) or not (is_new or self._driver.is_at_rest):
+                place = self._driver.expected_place(is_new)
         if 0 <= place < len(self._taught):
-            columns = describe_columns(decode_message(image))
+            columns = describe_columns(pixels)
             offset = self._filter.update(columns, self._columns(place))
             lateral = self._expansion.lateral(offset, place, self._focal)
             index = self._place(place)
@@ -234,7 +254,8 @@ class RepeatNode(Node):
         else:
             place = -1
             self._filter.reset()
-        return Observation(nanoseconds(image.header.stamp) / SECOND, place, probability, offset)
+        stamp, is_judged = nanoseconds(image.header.stamp) / SECOND, match.status != SKIPPED
+        return Observation(stamp, place, probability, offset, is_new, is_judged)
 
     def _columns_of(self, place: int) -> np.ndarray:
         thumbnail = self._map.thumbnail(self._place(place))
@@ -251,6 +272,30 @@ class RepeatNode(Node):
             elif self._driver is not None:
                 self._driver.release()
 
+    def _on_start(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        with self._lock:
+            answer.success = self._is_blocked if self._driver is None else self._driver.restart()
+            self._is_blocked = False
+        answer.message = 'the robot may go on' if answer.success else 'no stop waits for a start'
+        return answer
+
+    def _on_odometry(self, message: Odometry) -> None:
+        place, turned = message.pose.pose.position, message.pose.pose.orientation
+        yaw = math.atan2(
+            2 * (turned.w * turned.z + turned.x * turned.y),
+            turned.w**2 + turned.x**2 - turned.y**2 - turned.z**2,
+        )
+        stamp = nanoseconds(message.header.stamp) / SECOND
+        assert self._odometry is not None
+        with self._lock:
+            problem = self._odometry.take(
+                message.header.frame_id, stamp, np.array([place.x, place.y, yaw]), self._now()
+            )
+        if problem:
+            self.get_logger().warning(
+                f'odometry is not used: {problem}', throttle_duration_sec=10.0
+            )
+
     def _on_goal(self, goal: Repeat.Goal) -> GoalResponse:
         """Take a goal unless there is one already, or it is not on the route."""
         try:
@@ -261,9 +306,10 @@ class RepeatNode(Node):
                 if goal.place_id not in self._map.ids:
                     raise InputError(f'no place has the identifier {goal.place_id!r}')
                 place = self._position(self._map.ids.index(goal.place_id))
+            self._require_one_type()
             self._driver = Driver(
                 self._run, Goal(place, goal.laps, start), self._now(), self._settings,
-                self._needs_deadman, self._give_up_after,
+                self._needs_deadman, self._give_up_after, self._is_blocked, self._odometry,
             )  # fmt: skip
         except InputError as error:
             self.get_logger().error(f'the goal is rejected: {error}')
@@ -282,6 +328,17 @@ class RepeatNode(Node):
     def _place(self, position: int) -> int:
         """Return the place of the map at a position along the taught run; -1 stays."""
         return position if position < 0 else int(self._taught[position])
+
+    def _require_one_type(self) -> None:
+        """Raise an InputError where a subscriber of the velocities expects another type."""
+        kind, topic = self._velocity.msg_type, self._velocity.topic_name
+        own = f'geometry_msgs/msg/{kind.__name__}'
+        for subscriber in self.get_subscriptions_info_by_topic(topic):
+            if subscriber.topic_type != own:
+                raise InputError(
+                    f'{subscriber.node_name} subscribes to {topic} as {subscriber.topic_type}, '
+                    f'this node publishes {own}: set the parameter stamped to {kind is Twist}'
+                )
 
     def _on_accepted(self, handle: Any) -> None:
         self._handle, self._ended = handle, Future()
@@ -319,9 +376,15 @@ class RepeatNode(Node):
             now = self._now()
             if handle.is_cancel_requested:
                 driver.end(Outcome.CANCELED, now)
-            command = driver.step(now)
-            self._publish(command)
+            self._clock_times.append(now)
+            if self._clock_times.count(now) > DEADMAN_AGE / PERIOD:
+                command = driver.halt(now, CLOCK_STANDS)
+            else:
+                command = driver.step(now)
+            if not driver.is_waiting or driver.outcome is not None:
+                self._publish(command)
             if driver.outcome is not None:
+                self._is_blocked = driver.is_blocked
                 self._driver = self._handle = None
         self._steps += 1
         if driver.outcome is not None:

@@ -1,0 +1,157 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How far a robot drives blind: meters from the image of its last evidence of motion to standstill.
+
+Driver and control law in a loop of simulated time, on a straight route at 1 m/s: the dead-man
+switch is pressed all the time, images are processed after ``LATENCY``, the base brakes with
+``BRAKING``. Each number is the worst of ``PHASES`` moments of the failure between two places.
+``python3 -m stavpr_lab.demonstration.blind`` prints the table.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from stavpr_nav.driver import Driver, Goal
+from stavpr_nav.evidence import OdometryComparison
+from stavpr_nav.follower import FollowerSettings, Observation, TaughtRun
+from stavpr_ros.relative_pose.offset import Offset
+
+SPEED, STEP, LATENCY, BRAKING = 1.0, 0.01, 0.05, 5.0  # m/s, seconds, seconds, m/s^2
+CONTROL, ODOMETRY = 5, 2  # steps between two commands, and between two odometry messages
+PHASES = 20
+BEFORE, AFTER = 12.0, 30.0  # meters before, seconds after the failure
+LIKE, UNLIKE = (Offset(0.0, 0.01, 0.0, 1e6, similarity) for similarity in (0.6, 0.0))
+
+
+@dataclass(frozen=True)
+class Failure:
+    """
+    What fails.
+
+    :param is_new: the images change. :param is_matched: they have a match.
+    :param swing: places between which the matches alternate.
+    :param wheels: they turn; False = something blocks the robot.
+    :param odometry: of the wheels; None = it is not used.
+    :param rate: of good images that go on, Hz; 0 = none. :param images: there are images.
+    """
+
+    is_new: bool = False
+    is_matched: bool = True
+    swing: int = 0
+    wheels: bool = True
+    odometry: bool | None = None
+    images: bool = True
+    rate: float = 0.0
+
+
+FAILURES = {
+    'the camera repeats its last image': Failure(),
+    'the same, without a match': Failure(is_matched=False),
+    'the same, with noise that counts as a change': Failure(is_new=True),
+    'it repeats images of two places in turn': Failure(swing=1),
+    'the wheels are blocked, the scene is busy': Failure(is_new=True, wheels=False),
+    'the same, matches alternate between two places': Failure(True, swing=1, wheels=False),
+    'the same, with odometry': Failure(is_new=True, wheels=False, odometry=True),
+    'odometry ends: meters after it': Failure(rate=5.0, odometry=False),
+    'the camera ends': Failure(images=False),
+}
+BRIDGE = Failure(is_new=True, is_matched=False)
+SLOW = {
+    'the camera falls to half its rate': Failure(rate=5.0),
+    'the camera falls to 1 image/s': Failure(rate=1.0),
+}
+
+
+def drive(
+    failure: Failure, spacing: float, rate: float, phase: float
+) -> tuple[float, str, float, float]:
+    """
+    Drive until a failure, and as long as the robot moves.
+
+    :param spacing: meters between two places. :param rate: images per second.
+    :param phase: 0 to 1 places after which it happens.
+    :returns: meters from the image of the last evidence to standstill, the reason at the end, the
+        meters after the first standstill, and those after the failure.
+    """
+    count = round((BEFORE + SPEED * AFTER) / spacing) + 10
+    run = TaughtRun(np.arange(count) * spacing / SPEED, np.full(count, SPEED), np.zeros(count))
+    settings = FollowerSettings(max_acceleration=1.0)
+    odometry = None if failure.odometry is None else OdometryComparison(SPEED)
+    driver = Driver(run, Goal(start=0), 0.0, settings, odometry=odometry)
+    waiting: deque[tuple[float, Observation]] = deque()
+    x = speed = commanded = 0.0
+    failed_at = stopped_at = math.inf
+    failed = 0.0
+    best, evidence, shown, next_image = 0, 0.0, 0, 0.0
+    for k in range(round(60 / STEP)):
+        now, is_failed = k * STEP, failed_at < math.inf
+        if not is_failed and x >= BEFORE + phase * spacing:
+            failed_at, is_failed, failed = now, True, commanded
+        if now >= next_image - 1e-9 and (failure.images or not is_failed):
+            next_image += 1 / (failure.rate if is_failed and failure.rate else rate)
+            has_place = not is_failed or failure.is_matched
+            if not is_failed or failure.rate:
+                shown = int(x / spacing + 1e-9)
+                if shown > best and stopped_at == math.inf:
+                    best, evidence = shown, commanded
+            swing = failure.swing * (round(now * rate) % 2) if is_failed else 0
+            place = shown - swing if has_place else driver.expected_place(failure.is_new)
+            waiting.append((now + LATENCY, Observation(
+                now, place, 0.99 if has_place else math.nan, LIKE if place >= 0 else None,
+                not is_failed or failure.is_new or failure.rate > 0,
+            )))  # fmt: skip
+        while waiting and waiting[0][0] <= now:
+            driver.observe(waiting.popleft()[1], now)
+        if odometry is not None and k % ODOMETRY == 0 and (failure.odometry or not is_failed):
+            odometry.take('odom', now, np.array([x, 0.0, 0.0]), now)
+        if k % CONTROL == 0:
+            driver.press(now)
+            command = driver.step(now)
+        speed = max(command.speed, speed - BRAKING * STEP)
+        commanded += speed * STEP
+        x += speed * STEP * (failure.wheels or not is_failed)
+        if is_failed and speed == 0 and command.reason and stopped_at == math.inf:
+            stopped_at = commanded
+        if now > failed_at + AFTER:
+            break
+    return stopped_at - evidence, command.reason, commanded - stopped_at, commanded - failed
+
+
+def table() -> list[str]:
+    """Return the lines of the table."""
+    columns = [(spacing, rate) for spacing in (0.25, 0.5) for rate in (10.0, 5.0)]
+    lines = [
+        '| 1 m/s; meters between places, images per second | '
+        + ' | '.join(f'{spacing:g} m, {rate:g}/s' for spacing, rate in columns) + ' | reason |',
+        '|---' * (len(columns) + 2) + '|',
+    ]  # fmt: skip
+    for name, failure in (
+        FAILURES | {'the bridge: other images, without a match': BRIDGE}
+    ).items():
+        cells, reasons = [], set()
+        for spacing, rate in columns:
+            drives = [drive(failure, spacing, rate, k / PHASES) for k in range(PHASES)]
+            cells.append(f'{max(each[3 if failure.rate else 0] for each in drives):.2f} m')
+            reasons |= {each[1].split(':')[0] for each in drives}
+        lines.append(f'| {name} | {" | ".join(cells)} | {", ".join(sorted(reasons))} |')
+    for name, failure in SLOW.items():
+        cells = [f'{meters_per_image(failure, spacing, rate):.2f} m' for spacing, rate in columns]
+        lines.append(f'| {name}: meters between images | {" | ".join(cells)} | it goes on |')
+    return lines
+
+
+def meters_per_image(failure: Failure, spacing: float, rate: float) -> float:
+    """Return the mean meters between the images of a slow camera, in seconds after its change."""
+    return drive(failure, spacing, rate, 0.5)[3] / AFTER / failure.rate
+
+
+def main() -> None:
+    """Print the table."""
+    print('\n'.join(table()))
+
+
+if __name__ == '__main__':
+    main()

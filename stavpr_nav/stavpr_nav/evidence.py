@@ -1,0 +1,217 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Evidence that the robot moves as it is commanded: images that change, matches of new places.
+
+A camera that repeats an image and wheels that are blocked look alike: matches keep their place, or
+alternate between neighbors. Only a match of a place that was not matched before is evidence.
+Meters of the path include turns: a radian counts as ``ARM`` meters, where this is more.
+"""
+
+from collections import deque
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+
+MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places are dense
+ARM = 0.5  # meters
+SAME_PLACE = 0.05  # meters between two places that show the same
+PERIODS = 1.25  # of images, after this distance or the next place
+INTERVALS = 3  # of the latest images, whose median is the period
+CELLS = (16, 12)  # columns and rows of the gray levels that are compared
+EQUAL_QUANTILE, EQUAL = 0.75, 0.012  # of the changes of the cells, over the contrast
+IMAGES = 5  # latest different images: a driver may repeat a ring of its buffers
+STILL_DISTANCE = 0.2  # meters that are commanded while odometry stays within MIN_MOTION
+MIN_MOTION = 0.02  # meters
+JUMP = 0.5  # meters between two odometry messages beyond twice the largest speed
+MAX_SECONDS = 1.0  # between them
+
+
+def path_speed(speed: Any, turn: Any) -> Any:
+    """Return meters of the path per second, of m/s and rad/s; numbers or arrays."""
+    return np.maximum(abs(speed), ARM * abs(turn))
+
+
+class ImageComparison:
+    """Tells new images from repetitions: up to noise, recompression, or a clock in the image."""
+
+    def __init__(self) -> None:
+        self._images: deque[np.ndarray] = deque(maxlen=IMAGES)
+
+    def is_new(self, image: np.ndarray) -> bool:
+        """
+        Return whether an image differs from each of the latest new ones.
+
+        :param image: RGB, shape (h, w, 3), uint8.
+        """
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        cells = cv2.resize(gray, CELLS, interpolation=cv2.INTER_AREA)
+        limit = EQUAL * float(cells.std())
+        for earlier in reversed(self._images):
+            change = cells - earlier
+            if np.quantile(abs(change - np.median(change)), EQUAL_QUANTILE) <= limit:
+                return False
+        self._images.append(cells)
+        return True
+
+
+class MotionEvidence:
+    """
+    Whether matches show the motion that is commanded.
+
+    :param meters: from the first place to each, shape (n,).
+    :param seam: the place that the last one of a closed route shows; None = the route is open.
+    :param max_period: seconds, the largest period of images that counts.
+
+    ``is_missing`` stays until :meth:`restart`; ``is_fresh``: there was evidence since the last
+    standstill, whose time the follower states; ``bridge``: see :meth:`take`.
+    """
+
+    def __init__(self, meters: np.ndarray, seam: int | None, max_period: float) -> None:
+        self._meters, self._seam, self._max_period = meters, seam, max_period
+        self._lap = math.inf if seam is None else float(meters[-1] - meters[seam])
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+        self._stamp = -math.inf
+        self.restart(np.zeros(3))
+
+    def restart(self, totals: np.ndarray, place: int = -1) -> None:
+        """
+        Begin anew at a standstill.
+
+        :param totals: see :meth:`take`.
+        :param place: where the robot is; -1 = unknown, at the first match.
+        """
+        self.is_missing = self.is_fresh = False
+        self._seen, self._place = np.zeros(len(self._meters), bool), -1
+        self._totals, self.bridge = totals, 0.0
+        if place >= 0:
+            self._see(place)
+
+    def take(
+        self,
+        stamp: float,
+        place: int | None,
+        totals: np.ndarray,
+        speed: float,
+        is_judged: bool = True,
+        bridge: float = 0.0,
+    ) -> None:
+        """
+        Take the result of an image of the route.
+
+        :param place: of a match of an image that is new; None = there is none.
+        :param totals: meters that were commanded, meters of odometry, and seconds of the taught
+            run that were repeated, until the image.
+        :param speed: m/s that is commanded.
+        :param is_judged: the image was compared with the map.
+        :param bridge: seconds of the taught run without evidence that the image permits.
+        """
+        if is_judged:
+            self._intervals.append(min(stamp - self._stamp, self._max_period))
+            self._stamp = stamp
+        self.bridge = bridge
+        if place is not None and not self._seen[place]:
+            self.is_fresh |= self._place >= 0
+            self._see(place)
+            self._totals = totals
+        elif self.is_due(totals, speed):
+            self.is_missing = True
+
+    def is_due(self, totals: np.ndarray, speed: float, delay: float = 0.0) -> bool:
+        """
+        Return whether there should have been evidence.
+
+        :param totals, speed: see :meth:`take`.
+        :param delay: seconds until an image is processed.
+        """
+        driven = totals - self._totals
+        period = float(np.median(self._intervals)) if self._intervals else self._max_period
+        seconds = PERIODS * period + delay
+        is_far = driven[:2].max() > max(MIN_DISTANCE, self._next()) + abs(speed) * seconds
+        return bool(is_far and driven[2] > self.bridge)
+
+    def _see(self, place: int) -> None:
+        """Count a place as seen, and those of the far half of a lap no longer."""
+        self._place = place
+        away = abs(self._meters - self._meters[place])
+        if math.isfinite(self._lap):
+            around = away % self._lap
+            self._seen &= np.minimum(around, self._lap - around) < self._lap / 4
+        self._seen |= away < SAME_PLACE
+
+    def _next(self) -> float:
+        """Return the meters to the next place that was not seen; 0 at the end of the route."""
+        if self._place < 0:
+            return 0.0
+        away = self._meters - self._meters[self._place]
+        if math.isfinite(self._lap):
+            away = away % self._lap
+        ahead = away[~self._seen & (away > 0)]
+        return float(ahead.min(initial=math.inf)) if len(ahead) else 0.0
+
+
+class OdometryComparison:
+    """
+    The motion of the wheels, by the positions of odometry.
+
+    :param max_speed: m/s; faster positions are jumps.
+
+    ``received``: when the latest valid position came; ``meters`` since :meth:`take_meters`;
+    ``commanded``: meters that were commanded until the robot moved last.
+    """
+
+    def __init__(self, max_speed: float) -> None:
+        self._max_speed = max_speed
+        self._last: tuple[str, float] | None = None
+        self._pose = self._from = np.zeros(3)
+        self.meters, self.received, self.commanded = 0.0, -math.inf, 0.0
+        self._judged = self.received
+
+    def take(self, frame: str, stamp: float, pose: np.ndarray, now: float) -> str:
+        """
+        Take a pose.
+
+        :param pose: x, y (meters) and yaw (radians), shape (3,).
+        :returns: why it is not valid; empty if it is.
+        """
+        if not (math.isfinite(stamp) and np.isfinite(pose).all()):
+            return f'pose {pose.tolist()}: expected finite numbers'
+        before, step = self._last, _length(pose - self._pose)
+        self._last, self._pose = (frame, stamp), pose
+        if before is None:
+            self._from = pose
+            return ''
+        seconds = stamp - before[1]
+        if before[0] != frame or not 0 < seconds <= MAX_SECONDS:
+            self._from = pose
+            return (
+                f'frame {frame!r}, {seconds:.3f} s after frame {before[0]!r}: expected one frame'
+            )
+        if step > 2 * self._max_speed * seconds + JUMP:
+            self._from = pose
+            return f'{step:.2f} m in {seconds:.3f} s is a jump'
+        self.meters, self.received = self.meters + step, now
+        return ''
+
+    def take_meters(self) -> float:
+        """Return the meters since the last call."""
+        meters, self.meters = self.meters, 0.0
+        return meters
+
+    def stands(self, commanded: float) -> bool:
+        """
+        Return whether a new pose shows that the robot stays while a speed is commanded.
+
+        :param commanded: meters until now.
+        """
+        is_later, self._judged = self._judged != self.received, self.received
+        if _length(self._pose - self._from) >= MIN_MOTION:
+            self._from, self.commanded = self._pose, commanded
+        return is_later and commanded - self.commanded > STILL_DISTANCE
+
+
+def _length(step: np.ndarray) -> float:
+    """Return the meters of the path between two poses."""
+    return float(path_speed(math.hypot(*step[:2]), math.remainder(step[2], 2 * math.pi)))
