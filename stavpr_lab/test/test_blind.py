@@ -9,6 +9,7 @@ from stavpr_lab.demonstration import blind
 from stavpr_nav.follower import NO_EVIDENCE
 
 LIMITS = {(0.25, 10.0): 0.6, (0.25, 5.0): 1.0, (0.5, 10.0): 0.9, (0.5, 5.0): 1.3}
+REASONS = {'odometry ends: meters after it': 'no odometry', 'the camera ends': 'no new image'}
 
 
 @pytest.mark.parametrize('name', blind.FAILURES)
@@ -18,8 +19,7 @@ def test_robot_stops_within_the_stated_meters_for_good(name, spacing, rate):
         meters, reason, later, _ = blind.drive(blind.FAILURES[name], spacing, rate, phase)
         assert meters <= LIMITS[spacing, rate]
         assert later < 1e-6
-        expected = {'odometry ends: meters after it': 'no odometry', 'the camera ends': 'no new image'}
-        assert reason == expected.get(name, NO_EVIDENCE)
+        assert reason == REASONS.get(name, NO_EVIDENCE)
 
 
 def test_bridge_ends_after_six_seconds_of_the_taught_run():

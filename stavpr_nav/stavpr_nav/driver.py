@@ -59,6 +59,7 @@ class Driver:
 
     ``outcome`` is None while it drives; ``laps`` passes of the seam, ``place`` of the newest image
     of the route (-1 = none yet), ``distance`` meters that were commanded.
+    ``is_waiting``: the place of the robot is not known yet, and an operator drives.
     """
 
     def __init__(
@@ -96,8 +97,8 @@ class Driver:
         self.place, self.laps, self.distance = -1, 0, 0.0
         self.newest: Observation | None = None
         self.command = Command(0.0, 0.0, '')
-        if is_blocked:
-            self._follower.block()
+        self._follower.evidence.is_missing = is_blocked
+        self.is_waiting = goal.start < 0
 
     def press(self, now: float) -> None:
         """Count the dead-man switch as pressed; a new press ends a stop without evidence."""
@@ -123,12 +124,7 @@ class Driver:
     @property
     def is_blocked(self) -> bool:
         """Whether the robot waits for a new press, or for :meth:`restart`."""
-        return self._follower.is_blocked
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether an operator drives: the place of the robot is not known yet."""
-        return self.place < 0 and not self._follower.has_place
+        return self._follower.evidence.is_missing
 
     @property
     def is_at_rest(self) -> bool:
@@ -147,6 +143,7 @@ class Driver:
         self.newest = observation
         if not observation.is_confirmed:
             return
+        self.is_waiting = False
         before, self.place = self.place, observation.place
         if self._last_lap is None:
             self._last_lap = self._passes - 1 + (self._lap > 0 and self.place >= self._goal)

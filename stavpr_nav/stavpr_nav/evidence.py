@@ -14,10 +14,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from stavpr_ros.errors import InputError
+from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
 
 MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places are dense
 ARM = 0.5  # meters
 SAME_PLACE = 0.05  # meters between two places that show the same
+BRIDGE_TIME = 6.0  # seconds of the taught run without a match, of images that change
 PERIODS = 1.25  # of images, after this distance or the next place
 INTERVALS = 3  # of the latest images, whose median is the period
 CELLS = (16, 12)  # columns and rows of the gray levels that are compared
@@ -66,7 +69,8 @@ class MotionEvidence:
     :param max_period: seconds, the largest period of images that counts.
 
     ``is_missing`` stays until :meth:`restart`; ``is_fresh``: there was evidence since the last
-    standstill, whose time the follower states; ``bridge``: see :meth:`take`.
+    standstill; ``bridge``: seconds of the taught run that the
+    images permit without evidence; ``is_changed``: there was a new image since the last evidence.
     """
 
     def __init__(self, meters: np.ndarray, seam: int | None, max_period: float) -> None:
@@ -83,11 +87,17 @@ class MotionEvidence:
         :param totals: see :meth:`take`.
         :param place: where the robot is; -1 = unknown, at the first match.
         """
-        self.is_missing = self.is_fresh = False
+        self.is_missing = False
+        self.rest(totals)
         self._seen, self._place = np.zeros(len(self._meters), bool), -1
-        self._totals, self.bridge = totals, 0.0
+        self._totals, self._changed = totals, totals[0]
+        self.bridge, self.is_changed = 0.0, True
         if place >= 0:
             self._see(place)
+
+    def rest(self, totals: np.ndarray) -> None:
+        """Count a standstill: what an image shows that was taken before is no evidence since."""
+        self.is_fresh, self._rested = False, totals[0]
 
     def take(
         self,
@@ -95,27 +105,31 @@ class MotionEvidence:
         place: int | None,
         totals: np.ndarray,
         speed: float,
+        is_new: bool = True,
         is_judged: bool = True,
-        bridge: float = 0.0,
     ) -> None:
         """
         Take the result of an image of the route.
 
-        :param place: of a match of an image that is new; None = there is none.
+        :param place: of a match; None = the image resembles the expected place.
         :param totals: meters that were commanded, meters of odometry, and seconds of the taught
             run that were repeated, until the image.
         :param speed: m/s that is commanded.
-        :param is_judged: the image was compared with the map.
-        :param bridge: seconds of the taught run without evidence that the image permits.
+        :param is_new, is_judged: see ``Observation``.
         """
         if is_judged:
             self._intervals.append(min(stamp - self._stamp, self._max_period))
             self._stamp = stamp
-        self.bridge = bridge
-        if place is not None and not self._seen[place]:
-            self.is_fresh |= self._place >= 0
+        if is_new:
+            self._changed = totals[0]
+        if place is not None or totals[0] - self._changed > MIN_DISTANCE:
+            self.bridge = 0.0
+        elif is_new and is_judged:
+            self.bridge = BRIDGE_TIME
+        if place is not None and self.is_changed and not self._seen[place]:
+            self.is_fresh |= self._place >= 0 and totals[0] > self._rested
             self._see(place)
-            self._totals = totals
+            self._totals, self.is_changed = totals, False
         elif self.is_due(totals, speed):
             self.is_missing = True
 
@@ -154,46 +168,41 @@ class MotionEvidence:
 
 class OdometryComparison:
     """
-    The motion of the wheels, by the positions of odometry.
+    The motion of the wheels, by the poses of odometry.
 
-    :param max_speed: m/s; faster positions are jumps.
+    :param max_speed: m/s; faster poses are jumps.
 
-    ``received``: when the latest valid position came; ``meters`` since :meth:`take_meters`;
+    ``received``: when the latest valid pose came; ``meters`` since :meth:`take_meters`;
     ``commanded``: meters that were commanded until the robot moved last.
     """
 
     def __init__(self, max_speed: float) -> None:
         self._max_speed = max_speed
-        self._last: tuple[str, float] | None = None
-        self._pose = self._from = np.zeros(3)
+        self._last: tuple[str, float, np.ndarray] | None = None
+        self._from = np.zeros(7)
         self.meters, self.received, self.commanded = 0.0, -math.inf, 0.0
         self._judged = self.received
 
-    def take(self, frame: str, stamp: float, pose: np.ndarray, now: float) -> str:
+    def take(self, frame: str, stamp: float, pose: np.ndarray, now: float) -> None:
         """
         Take a pose.
 
-        :param pose: x, y (meters) and yaw (radians), shape (3,).
-        :returns: why it is not valid; empty if it is.
+        :param pose: x y z (meters) and quaternion x y z w, shape (7,).
+        :raises InputError: it is not valid, or no motion from the one before; it does not count.
         """
-        if not (math.isfinite(stamp) and np.isfinite(pose).all()):
-            return f'pose {pose.tolist()}: expected finite numbers'
-        before, step = self._last, _length(pose - self._pose)
-        self._last, self._pose = (frame, stamp), pose
-        if before is None:
+        last, self._last = self._last, (frame, stamp, pose := checked_pose(pose))
+        if last is not None:
+            seconds, step = stamp - last[1], _length(last[2], pose)
+            is_motion = step <= 2 * self._max_speed * seconds + JUMP
+            if last[0] == frame and 0 < seconds <= MAX_SECONDS and is_motion:
+                self.meters, self.received = self.meters + step, now
+                return
             self._from = pose
-            return ''
-        seconds = stamp - before[1]
-        if before[0] != frame or not 0 < seconds <= MAX_SECONDS:
-            self._from = pose
-            return (
-                f'frame {frame!r}, {seconds:.3f} s after frame {before[0]!r}: expected one frame'
+            raise InputError(
+                f'{step:.2f} m and {seconds:.3f} s from frame {last[0]!r} to {frame!r}: expected '
+                f'one frame, up to {MAX_SECONDS:g} s, and {self._max_speed:g} m/s'
             )
-        if step > 2 * self._max_speed * seconds + JUMP:
-            self._from = pose
-            return f'{step:.2f} m in {seconds:.3f} s is a jump'
-        self.meters, self.received = self.meters + step, now
-        return ''
+        self._from = pose
 
     def take_meters(self) -> float:
         """Return the meters since the last call."""
@@ -207,11 +216,11 @@ class OdometryComparison:
         :param commanded: meters until now.
         """
         is_later, self._judged = self._judged != self.received, self.received
-        if _length(self._pose - self._from) >= MIN_MOTION:
-            self._from, self.commanded = self._pose, commanded
+        if is_later and self._last and _length(self._from, self._last[2]) >= MIN_MOTION:
+            self._from, self.commanded = self._last[2], commanded
         return is_later and commanded - self.commanded > STILL_DISTANCE
 
 
-def _length(step: np.ndarray) -> float:
+def _length(a: np.ndarray, b: np.ndarray) -> float:
     """Return the meters of the path between two poses."""
-    return float(path_speed(math.hypot(*step[:2]), math.remainder(step[2], 2 * math.pi)))
+    return max(distance(a, b), ARM * math.radians(rotation(a, b)))

@@ -25,7 +25,7 @@ from functools import cached_property
 import math
 
 import numpy as np
-from stavpr_nav.evidence import MotionEvidence, OdometryComparison, path_speed
+from stavpr_nav.evidence import BRIDGE_TIME, MotionEvidence, OdometryComparison, path_speed
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.relative_pose.offset import Offset
 
@@ -36,7 +36,7 @@ WITHOUT_OFFSET = 0.5  # share of the speed while the offset is not valid
 MAX_STEER, MAX_APPROACH = 0.2, 0.1
 INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image, of summands too
 BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
-BRIDGE_TIME, BRIDGE_SHARE = 6.0, 0.5  # seconds of the taught run without a match; share of speed
+BRIDGE_SHARE = 0.5  # share of the speed without a match
 CREEP = 0.3  # m/s from a standstill to the first evidence of motion
 MAX_STEP = 0.5  # seconds between two commands; beyond it the program or the clock has jumped
 NO_EVIDENCE = 'no evidence of motion: press the dead-man switch again, or call ~/start'
@@ -206,7 +206,7 @@ class RouteFollower:
         self._anchor: tuple[int, float] | None = None
         steps = path_speed(taught.speeds[:-1], taught.turns[:-1]) * np.diff(taught.times)
         path = np.concatenate([[0.0], np.cumsum(steps)])
-        self._evidence = MotionEvidence(path, taught.seam, self._settings.max_age)
+        self.evidence = MotionEvidence(path, taught.seam, self._settings.max_age)
         self._odometry = odometry
         if odometry is not None:
             odometry.commanded = 0.0  # of this drive
@@ -222,27 +222,13 @@ class RouteFollower:
         """Set the place of a robot at rest; otherwise it moves after its first match."""
         totals = self._totals[-1][1]
         self._anchor = place, float(totals[2])
-        self._evidence.restart(totals, place)
+        self.evidence.restart(totals, place)
 
     def restart(self) -> None:
         """Go on after a stop by missing evidence of motion: an operator has looked."""
-        self._evidence.restart(self._totals[-1][1], self._newest.place if self._newest else -1)
+        self.evidence.restart(self._totals[-1][1], self._newest.place if self._newest else -1)
         if self._odometry is not None:
             self._odometry.commanded = float(self._totals[-1][1][0])
-
-    @property
-    def is_blocked(self) -> bool:
-        """Whether evidence of motion is missing, until :meth:`restart`."""
-        return self._evidence.is_missing
-
-    @property
-    def has_place(self) -> bool:
-        """Whether the place of the robot was stated or matched."""
-        return self._anchor is not None
-
-    def block(self) -> None:
-        """Count evidence of motion as missing."""
-        self._evidence.is_missing = True
 
     def expected_place(self) -> int:
         """Return the place of an image soon after the last match; -1 = unknown."""
@@ -257,6 +243,7 @@ class RouteFollower:
 
     def observe(self, observation: Observation, now: float) -> None:
         """Take the result of an image; one that is out of order, or of later, is not used."""
+        self.evidence.is_changed |= observation.is_new
         late = now - observation.stamp
         is_earlier = observation.stamp <= self._stamp
         if late < -self._settings.max_delay or (is_earlier and late <= self._settings.max_delay):
@@ -269,14 +256,14 @@ class RouteFollower:
         if observation.is_confirmed and not self._falls(observation):
             self._newest, self._confirmed = observation, now
             self._successive += 1
-            totals, matched, bridge = self._until(observation.stamp), None, 0.0
+            totals, place = self._until(observation.stamp), None
             if observation.is_matched:
-                self._anchor = observation.place, float(totals[2])
-                matched = observation.place if observation.is_new else None
-            elif observation.is_new and observation.is_judged:
-                bridge = BRIDGE_TIME
-            speed, is_judged = self._last.speed, observation.is_judged
-            self._evidence.take(observation.stamp, matched, totals, speed, is_judged, bridge)
+                place = observation.place
+                self._anchor = place, float(totals[2])
+            self.evidence.take(
+                observation.stamp, place, totals, self._last.speed, observation.is_new,
+                observation.is_judged,
+            )  # fmt: skip
         elif now - self._confirmed > self._settings.max_unconfirmed:
             self._successive = 0
 
@@ -291,7 +278,7 @@ class RouteFollower:
     def halt(self, now: float, reason: str) -> Command:
         """Halt for now; the robot accelerates from rest afterwards."""
         self._time, self._last = now, Command(0.0, 0.0, reason)
-        self._evidence.is_fresh = False
+        self.evidence.rest(self._totals[-1][1])
         return self._last
 
     def command(self, now: float) -> Command:
@@ -300,23 +287,23 @@ class RouteFollower:
         self._time = now
         if not 0 <= step <= MAX_STEP:
             self._rest(self._totals[-1][1])
+            self.evidence.rest(self._totals[-1][1])
             self._stamp = self._stamp if step > 0 else -math.inf
             step = 0.0
         self._count(step)
         self._last = self._limited(self._wanted(now), step)
         if self._last.reason:
-            self._evidence.is_fresh = False
+            self.evidence.rest(self._totals[-1][1])
         return self._last
 
     def _stop_reason(self, now: float) -> str:
         """Return why the robot must not move; empty = it may."""
-        is_due = self._evidence.is_due(self._totals[-1][1], self._last.speed, self._delay)
-        odometry = self._odometry
-        if odometry is not None and odometry.stands(float(self._totals[-1][1][0])):
-            self.block()
-        if is_due and self._evidence.bridge:  # at its end
-            self.block()
-        if self.is_blocked:
+        evidence, odometry, totals = self.evidence, self._odometry, self._totals[-1][1]
+        is_due = evidence.is_due(totals, self._last.speed, self._delay)
+        stands = odometry is not None and odometry.stands(float(totals[0]))
+        if stands or (is_due and evidence.bridge):  # at the end of the bridge
+            evidence.is_missing = True
+        if evidence.is_missing:
             return NO_EVIDENCE
         if odometry is not None and not 0 <= now - odometry.received <= self._settings.max_age:
             return 'no odometry'
@@ -350,7 +337,7 @@ class RouteFollower:
         share = (self._probability - UNCERTAIN) / (CERTAIN - UNCERTAIN)
         share = BRIDGE_SHARE if math.isnan(share) else min(max(share, SLOWEST), 1.0)
         share *= 1 if offset.is_valid else WITHOUT_OFFSET
-        most = settings.max_speed if self._evidence.is_fresh else min(CREEP, settings.max_speed)
+        most = settings.max_speed if self.evidence.is_fresh else min(CREEP, settings.max_speed)
         share = min(share, most / max(abs(speed), 1e-9))
         speed, turn = share * speed, share * turn
         self._steer = 0.0

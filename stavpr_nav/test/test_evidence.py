@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evidence of motion: which images are new, which matches show motion, what odometry adds."""
 
+import contextlib
 import math
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 from stavpr_nav.driver import DEADMAN_AGE, Driver, Goal, PAUSED
 from stavpr_nav.evidence import ImageComparison, MotionEvidence, OdometryComparison
 from stavpr_nav.follower import NO_EVIDENCE, Observation
+from stavpr_ros.errors import InputError
 from test_driver import Drive
 from test_follower import FAST, Run, STEP, STRAIGHT, taught
 
@@ -67,7 +69,8 @@ def evidence(places, meters=None, seam=None):
     meters = np.arange(100) * 0.25 if meters is None else meters
     motion, count = MotionEvidence(meters, seam, 0.5), 0
     for k, place in enumerate(places):
-        motion.is_fresh = False
+        motion.rest(np.full(3, -1.0))
+        motion.is_changed = True
         motion.take(k * 0.1, place, np.zeros(3), 1.0)
         count += motion.is_fresh
     return count
@@ -163,6 +166,22 @@ def test_skipped_images_keep_the_speed_and_are_no_evidence():
     assert run.follower.command(run.time).speed == 0
 
 
+def test_bridge_of_slow_motion_includes_skipped_and_equal_images_and_no_frozen_ones():
+    run, moved = Run(run=taught(400)), 0.0
+    run.follower.start(5)
+    for k in range(400):
+        if k == 200:
+            moved = run.follower._totals[-1][1][0]
+        run.follower.observe(Observation(
+            run.time, run.follower.expected_place(), math.nan, STRAIGHT,
+            is_new=k % 6 == 0 and k < 200, is_judged=k % 3 == 0,
+        ), run.time)  # fmt: skip
+        run.drive(STEP, images=False)
+    assert moved == pytest.approx(0.3 * 200 * STEP, abs=0.1)  # beyond the next place
+    assert moved + 0.1 < run.follower._totals[-1][1][0] < moved + 0.4
+    assert run.follower.command(run.time).reason == NO_EVIDENCE
+
+
 def test_images_out_of_order_or_of_the_future_are_not_used():
     run = Run()
     run.drive(4)
@@ -193,7 +212,8 @@ def odometry_drive(pose, seconds=8.0, frame='odom', stamp=lambda time: time):
         x, now = drive.place * 0.4, drive.time
         if pose(x, now) is not None:
             name = frame if isinstance(frame, str) else frame(now)
-            odometry.take(name, stamp(now), np.array(pose(x, now), float), now)
+            with contextlib.suppress(InputError):
+                odometry.take(name, stamp(now), np.array([*pose(x, now), 0, 0, 0, 1]), now)
         shown = drive.go(STEP)
         reasons.append(shown[-1].reason)
     return reasons

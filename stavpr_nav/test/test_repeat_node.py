@@ -5,6 +5,7 @@
 from dataclasses import replace
 import math
 from pathlib import Path
+import signal
 import time
 from xml.etree import ElementTree
 
@@ -19,6 +20,8 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from stavpr_msgs.action import Repeat
 from stavpr_msgs.msg import MapInfo, Offset, PlaceMatch
@@ -57,39 +60,54 @@ class Rover:
         self.camera = publisher(CameraInfo, 'camera_info', 10)
         self.deadman = publisher(Bool, 'deadman', 10)
         self.commands, self.offsets, self.feedback = [], [], []
-        subscribe(kind, 'cmd_vel', self.commands.append, 10)
+        subscribe(kind, 'cmd_vel', self.obey, 10)
+        self.obeyed = -math.inf
+        self.clock_publisher = publisher(Clock, 'clock', 10)
         subscribe(Offset, 'repeat/offset', self.offsets.append, 10)
         self.client = ActionClient(self.node, Repeat, 'repeat')
         self.images, self.map_id, self.seam = images, map_id, None
         self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
         self.held = False  # by an emergency stop
+        self.silent, self.every, self.ticks, self.clock = set(), 1, 0, None
         self.starter = self.node.create_client(Trigger, 'repeat/start')
         self.node.create_timer(PERIOD, self.look)
 
     def look(self):
         """Publish what the camera shows, the match, and the switch."""
+        self.ticks += 1
         header = Header(stamp=self.node.get_clock().now().to_msg())
+        if self.clock is not None:
+            header.stamp = Time(nanoseconds=self.clock).to_msg()
+            self.clock_publisher.publish(Clock(clock=header.stamp))
         image = image_message(header, self.images[int(self.place)])
         if self.damaged:
             image.encoding = 'nonsense'
         matched = self.status == PlaceMatch.MATCH
         match = PlaceMatch(header=header, status=self.status, map_id=self.map_id)
         match.newest_index, match.probability = int(self.place) if matched else -1, 0.99
-        self.deadman.publish(Bool(data=self.pressed))
-        self.match.publish(match)
-        self.image.publish(image)
+        if 'deadman' not in self.silent:
+            self.deadman.publish(Bool(data=self.pressed))
+        if 'match' not in self.silent and self.ticks % self.every == 0:
+            self.match.publish(match)
+        if 'image' not in self.silent and self.ticks % self.every == 0:
+            self.image.publish(image)
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
-        if self.commands and not self.held and hasattr(self.commands[-1], 'linear'):
+        is_obeyed = self.commands and time.monotonic() - self.obeyed < 0.5  # by its watchdog
+        if is_obeyed and not self.held and hasattr(self.commands[-1], 'linear'):
             step = self.commands[-1].linear.x * PERIOD
             self.place += step
             last = len(self.images) - 1
             if self.place >= last:
                 self.place = last if self.seam is None else self.place - last + self.seam
 
+    def obey(self, command):
+        self.commands.append(command)
+        self.obeyed = time.monotonic()
+
     def until(self, done):
         end = time.monotonic() + TIMEOUT
         while not done():
-            assert time.monotonic() < end, (self.place, self.commands[-3:])
+            assert time.monotonic() < end, (self.place, self.commands[-1:], self.feedback[-1:])
             self.executor.spin_once(timeout_sec=0.05)
 
     def result_of(self, future):
@@ -102,6 +120,9 @@ class Rover:
         return self.result_of(self.client.send_goal_async(
             Repeat.Goal(**goal), lambda message: self.feedback.append(message.feedback)
         ))  # fmt: skip
+
+    def reason(self):
+        return self.feedback[-1].reason if self.feedback else ''
 
     def drives(self):
         return bool(self.commands) and self.commands[-1].linear.x > 0
@@ -203,11 +224,8 @@ def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repe
     rover.send(start_index=3)
     rover.until(lambda: rover.place > 5)
 
-    def is_blocked():
-        return bool(rover.feedback) and rover.feedback[-1].reason == NO_EVIDENCE
-
     rover.held = True
-    rover.until(is_blocked)
+    rover.until(lambda: rover.reason() == NO_EVIDENCE)
     rover.held = False
     rover.commands.clear()
     rover.until(lambda: len(rover.commands) > 40)
@@ -216,13 +234,83 @@ def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repe
         rover.pressed = False
         rover.commands.clear()
         rover.until(lambda: len(rover.commands) > 20)
-        assert is_blocked()
+        assert rover.reason() == NO_EVIDENCE
         rover.pressed = True
     else:
         answer = rover.result_of(rover.starter.call_async(Trigger.Request()))
         assert answer.success
         assert not rover.result_of(rover.starter.call_async(Trigger.Request())).success
     rover.until(rover.drives)
+
+
+@pytest.mark.parametrize('source', ['image', 'match', 'deadman'])
+def test_program_that_is_suspended_stops_the_robot_until_it_goes_on(rover, repeat, source):
+    repeat(give_up_after=0.0)
+    rover.send(start_index=3)
+    rover.until(lambda: rover.place > 5)
+    rover.silent = {source}
+    rover.until(rover.rests)
+    rover.silent = set()
+    rover.until(rover.drives)
+
+
+def test_node_that_is_suspended_goes_on_from_rest(rover, map_file, tmp_path):
+    values = {'map_path': map_file, 'give_up_after': 0.0} | FAST
+    words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
+    process = Process(tmp_path / 'repeat', 'repeat', '--ros-args', *words)
+    try:
+        rover.send(start_index=3)
+        rover.until(lambda: rover.place > 6)
+        process.popen.send_signal(signal.SIGSTOP)
+        rover.until(lambda: time.monotonic() - rover.obeyed > 1.0)
+        place = rover.place  # the base has stopped by itself
+        rover.until(lambda: time.monotonic() - rover.obeyed > 2.0)
+        assert rover.place == place
+        rover.commands.clear()
+        process.popen.send_signal(signal.SIGCONT)
+        rover.until(rover.drives)
+        speeds = [command.linear.x for command in rover.commands]
+        assert 0 < speeds[-1] <= 0.3, speeds
+    finally:
+        process.popen.send_signal(signal.SIGCONT)
+        process.end()
+
+
+def test_slow_camera_is_driven_with_stop_and_go_and_half_the_rate_without(rover, repeat):
+    repeat(give_up_after=0.0)
+    rover.send(start_index=3)
+    rover.until(lambda: rover.place > 5)
+    rover.every = 2
+    rover.until(lambda: rover.place > 7)
+    assert rover.drives()
+    rover.every = 10
+    rover.until(rover.rests)
+    place, ticks = rover.place, rover.ticks
+    rover.until(lambda: rover.place > place + 1)
+    images = (rover.ticks - ticks) / rover.every
+    assert (rover.place - place) / images < 0.5  # meters between two images
+
+
+def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, repeat):
+    rover.clock, step = 10**9, [round(PERIOD * 1e9)]
+
+    def advance():
+        rover.clock += step[0]
+
+    rover.node.create_timer(PERIOD, advance)
+    repeat(give_up_after=0.0, use_sim_time=True)
+    rover.send(start_index=3)
+    rover.until(lambda: rover.place > 5)
+    step[0] = 0
+    rover.until(lambda: rover.reason() == 'the clock does not advance')
+    assert rover.rests()
+    step[0] = round(PERIOD * 1e9)
+    rover.until(rover.drives)
+    for seconds in (30, -20):
+        place = rover.place
+        rover.clock += seconds * 10**9
+        rover.until(lambda place=place: rover.place > place + 2)
+        assert abs(rover.feedback[-1].place_index - rover.place) <= 2
 
 
 def test_nothing_is_published_before_the_first_match(rover, repeat):
@@ -255,7 +343,7 @@ def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
     repeat(use_odometry=True, give_up_after=0.0)
     odometry = rover.node.create_publisher(Odometry, 'odom', 10)
     rover.send(start_index=3)
-    rover.until(lambda: rover.feedback and rover.feedback[-1].reason == 'no odometry')
+    rover.until(lambda: rover.reason() == 'no odometry')
     shown = []
 
     def wheels():
@@ -266,7 +354,7 @@ def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
     rover.node.create_timer(0.05, wheels)
     rover.until(lambda: rover.place > 5)
     shown.append(rover.place)
-    rover.until(lambda: rover.feedback[-1].reason == NO_EVIDENCE)
+    rover.until(lambda: rover.reason() == NO_EVIDENCE)
 
 
 def test_two_laps_of_a_closed_map(rover, repeat, map_file, tmp_path):

@@ -106,7 +106,7 @@ def drive(
         while waiting and waiting[0][0] <= now:
             driver.observe(waiting.popleft()[1], now)
         if odometry is not None and k % ODOMETRY == 0 and (failure.odometry or not is_failed):
-            odometry.take('odom', now, np.array([x, 0.0, 0.0]), now)
+            odometry.take('odom', now, np.array([x, 0, 0, 0, 0, 0, 1]), now)
         if k % CONTROL == 0:
             driver.press(now)
             command = driver.step(now)

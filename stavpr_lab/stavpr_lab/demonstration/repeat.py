@@ -268,7 +268,7 @@ def repeat(
         robot.move(command.speed, command.turn)
         rows.append((time, *robot.pose, *taught.error(robot.pose), robot.speed))
         reasons.append(command.reason)
-        blocked_at = min(blocked_at, time) if pilot.follower.is_blocked else math.inf
+        blocked_at = min(blocked_at, time) if pilot.follower.evidence.is_missing else math.inf
         if has_operator and time - blocked_at >= PATIENCE:
             presses, blocked_at = presses + 1, math.inf
             pilot.follower.restart()

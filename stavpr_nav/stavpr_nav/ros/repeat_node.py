@@ -37,7 +37,7 @@ from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, Offset, OffsetFilter
 from stavpr_ros.ros.diagnostics import one_status
-from stavpr_ros.ros.messages import camera_of, nanoseconds
+from stavpr_ros.ros.messages import camera_of, nanoseconds, odometry_pose
 from stavpr_ros.ros.rclpy_workarounds import log_failure
 from stavpr_ros.ros.sensors import camera_info_topic
 from stavpr_ros.sources.encodings import decode_message
@@ -280,21 +280,13 @@ class RepeatNode(Node):
         return answer
 
     def _on_odometry(self, message: Odometry) -> None:
-        place, turned = message.pose.pose.position, message.pose.pose.orientation
-        yaw = math.atan2(
-            2 * (turned.w * turned.z + turned.x * turned.y),
-            turned.w**2 + turned.x**2 - turned.y**2 - turned.z**2,
-        )
-        stamp = nanoseconds(message.header.stamp) / SECOND
         assert self._odometry is not None
-        with self._lock:
-            problem = self._odometry.take(
-                message.header.frame_id, stamp, np.array([place.x, place.y, yaw]), self._now()
-            )
-        if problem:
-            self.get_logger().warning(
-                f'odometry is not used: {problem}', throttle_duration_sec=10.0
-            )
+        header, stamp = message.header, nanoseconds(message.header.stamp) / SECOND
+        try:
+            with self._lock:
+                self._odometry.take(header.frame_id, stamp, odometry_pose(message), self._now())
+        except InputError as error:
+            self.get_logger().warning(f'odometry is not used: {error}', throttle_duration_sec=10.0)
 
     def _on_goal(self, goal: Repeat.Goal) -> GoalResponse:
         """Take a goal unless there is one already, or it is not on the route."""
