@@ -26,6 +26,6 @@ setup(
         (f'lib/{NAME}', ['scripts/teach', 'scripts/repeat']),
     ],
     python_requires='>=3.11',
-    install_requires=['numpy>=1.26', 'stavpr_ros'],
+    install_requires=['numpy>=1.26', 'opencv-python-headless>=4.6', 'stavpr_ros'],
     zip_safe=False,
 )

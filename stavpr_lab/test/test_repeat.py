@@ -22,7 +22,7 @@ from stavpr_lab.demonstration.street.traverses import GOOD_LIGHT, RAINY_DUSK, Tr
 from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 
-COVERED = 18.0  # seconds
+COVERED = 20.0  # seconds
 
 
 @pytest.fixture(scope='module')

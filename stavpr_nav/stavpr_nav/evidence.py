@@ -38,7 +38,7 @@ def path_speed(speed: Any, turn: Any) -> Any:
 
 
 class ImageComparison:
-    """Tells new images from repetitions: up to noise, recompression, or a clock in the image."""
+    """Separates new images from repetitions, up to noise, compression, or a clock in them."""
 
     def __init__(self) -> None:
         self._images: deque[np.ndarray] = deque(maxlen=IMAGES)
@@ -84,16 +84,16 @@ class MotionEvidence:
         """
         Begin anew at a standstill.
 
-        :param totals: see :meth:`take`.
+        :param totals: as of :meth:`take`.
         :param place: where the robot is; -1 = unknown, at the first match.
         """
         self.is_missing = False
         self.rest(totals)
-        self._seen, self._place = np.zeros(len(self._meters), bool), -1
+        self._matched, self._place = np.zeros(len(self._meters), bool), -1
         self._totals, self._changed = totals, totals[0]
         self.bridge, self.is_changed = 0.0, True
         if place >= 0:
-            self._see(place)
+            self._mark(place)
 
     def rest(self, totals: np.ndarray) -> None:
         """Count a standstill: what an image shows that was taken before is no evidence since."""
@@ -106,7 +106,7 @@ class MotionEvidence:
         totals: np.ndarray,
         speed: float,
         is_new: bool = True,
-        is_judged: bool = True,
+        is_compared: bool = True,
     ) -> None:
         """
         Take the result of an image of the route.
@@ -115,20 +115,20 @@ class MotionEvidence:
         :param totals: meters that were commanded, meters of odometry, and seconds of the taught
             run that were repeated, until the image.
         :param speed: m/s that is commanded.
-        :param is_new, is_judged: see ``Observation``.
+        :param is_new, is_compared: as of ``Observation``.
         """
-        if is_judged:
+        if is_compared:
             self._intervals.append(min(stamp - self._stamp, self._max_period))
             self._stamp = stamp
         if is_new:
             self._changed = totals[0]
         if place is not None or totals[0] - self._changed > MIN_DISTANCE:
             self.bridge = 0.0
-        elif is_new and is_judged:
+        elif is_new and is_compared:
             self.bridge = BRIDGE_TIME
-        if place is not None and self.is_changed and not self._seen[place]:
+        if place is not None and self.is_changed and not self._matched[place]:
             self.is_fresh |= self._place >= 0 and totals[0] > self._rested
-            self._see(place)
+            self._mark(place)
             self._totals, self.is_changed = totals, False
         elif self.is_due(totals, speed):
             self.is_missing = True
@@ -137,7 +137,7 @@ class MotionEvidence:
         """
         Return whether there should have been evidence.
 
-        :param totals, speed: see :meth:`take`.
+        :param totals, speed: as of :meth:`take`.
         :param delay: seconds until an image is processed.
         """
         driven = totals - self._totals
@@ -146,23 +146,23 @@ class MotionEvidence:
         is_far = driven[:2].max() > max(MIN_DISTANCE, self._next()) + abs(speed) * seconds
         return bool(is_far and driven[2] > self.bridge)
 
-    def _see(self, place: int) -> None:
-        """Count a place as seen, and those of the far half of a lap no longer."""
+    def _mark(self, place: int) -> None:
+        """Mark a place as matched, and those of the far half of a lap no longer."""
         self._place = place
         away = abs(self._meters - self._meters[place])
         if math.isfinite(self._lap):
             around = away % self._lap
-            self._seen &= np.minimum(around, self._lap - around) < self._lap / 4
-        self._seen |= away < SAME_PLACE
+            self._matched &= np.minimum(around, self._lap - around) < self._lap / 4
+        self._matched |= away < SAME_PLACE
 
     def _next(self) -> float:
-        """Return the meters to the next place that was not seen; 0 at the end of the route."""
+        """Return the meters to the next place that was not matched; 0 at the end of the route."""
         if self._place < 0:
             return 0.0
         away = self._meters - self._meters[self._place]
         if math.isfinite(self._lap):
             away = away % self._lap
-        ahead = away[~self._seen & (away > 0)]
+        ahead = away[~self._matched & (away > 0)]
         return float(ahead.min(initial=math.inf)) if len(ahead) else 0.0
 
 
@@ -181,7 +181,7 @@ class OdometryComparison:
         self._last: tuple[str, float, np.ndarray] | None = None
         self._from = np.zeros(7)
         self.meters, self.received, self.commanded = 0.0, -math.inf, 0.0
-        self._judged = self.received
+        self._compared = self.received
 
     def take(self, frame: str, stamp: float, pose: np.ndarray, now: float) -> None:
         """
@@ -209,13 +209,13 @@ class OdometryComparison:
         meters, self.meters = self.meters, 0.0
         return meters
 
-    def stands(self, commanded: float) -> bool:
+    def is_still(self, commanded: float) -> bool:
         """
         Return whether a new pose shows that the robot stays while a speed is commanded.
 
         :param commanded: meters until now.
         """
-        is_later, self._judged = self._judged != self.received, self.received
+        is_later, self._compared = self._compared != self.received, self.received
         if is_later and self._last and _length(self._from, self._last[2]) >= MIN_MOTION:
             self._from, self.commanded = self._last[2], commanded
         return is_later and commanded - self.commanded > STILL_DISTANCE

@@ -16,7 +16,7 @@ returns at a small angle, and does not swing beyond it. The integral over the pa
 constant pull to one side, of unequal wheels or a camera that does not look straight ahead.
 
 From a standstill the robot creeps until a match of another place shows that it moves. Where such
-evidence stays away, it stops until an operator starts it again; see ``stavpr_nav.evidence``.
+evidence stays away, it stops until an operator starts it again (``stavpr_nav.evidence``).
 """
 
 from collections import deque
@@ -135,8 +135,8 @@ class Observation:
     :param place: that the image shows; -1 = unknown.
     :param probability: of the place; NaN = without a match, it is the expected place.
     :param offset: of the image against the place; None = unknown.
-    :param is_new: it differs from the images before, see ``stavpr_nav.evidence``.
-    :param is_judged: it was compared with the map; False = skipped, as no keyframe.
+    :param is_new: it differs from the images before.
+    :param is_compared: it was compared with the map; False = skipped, as no keyframe.
     """
 
     stamp: float
@@ -144,7 +144,7 @@ class Observation:
     probability: float
     offset: Offset | None
     is_new: bool = True
-    is_judged: bool = True
+    is_compared: bool = True
 
     @property
     def is_confirmed(self) -> bool:
@@ -152,7 +152,7 @@ class Observation:
         if self.place < 0 or self.offset is None:
             return False
         return self.offset.is_similar and (
-            self.is_matched or not self.is_judged or self.offset.similarity >= BRIDGE_SIMILARITY
+            self.is_matched or not self.is_compared or self.offset.similarity >= BRIDGE_SIMILARITY
         )
 
     @property
@@ -196,7 +196,7 @@ class RouteFollower:
         self._successive = 0
         self._integral = self._steer = 0.0
         self._similarity = 0.0  # mean of the latest matched images
-        self._probability = math.nan  # of the latest judged image
+        self._probability = math.nan  # of the latest compared image
         self._last, self._time = Command(0.0, 0.0), -math.inf
         # meters that were commanded, meters of odometry and seconds of the taught run that were
         # repeated, by the time of the commands
@@ -251,7 +251,7 @@ class RouteFollower:
         self._received, self._stamp, self._delay = now, observation.stamp, max(late, 0.0)
         if late > self._settings.max_delay:
             return
-        if observation.is_judged:
+        if observation.is_compared:
             self._probability = observation.probability
         if observation.is_confirmed and not self._falls(observation):
             self._newest, self._confirmed = observation, now
@@ -262,7 +262,7 @@ class RouteFollower:
                 self._anchor = place, float(totals[2])
             self.evidence.take(
                 observation.stamp, place, totals, self._last.speed, observation.is_new,
-                observation.is_judged,
+                observation.is_compared,
             )  # fmt: skip
         elif now - self._confirmed > self._settings.max_unconfirmed:
             self._successive = 0
@@ -300,8 +300,8 @@ class RouteFollower:
         """Return why the robot must not move; empty = it may."""
         evidence, odometry, totals = self.evidence, self._odometry, self._totals[-1][1]
         is_due = evidence.is_due(totals, self._last.speed, self._delay)
-        stands = odometry is not None and odometry.stands(float(totals[0]))
-        if stands or (is_due and evidence.bridge):  # at the end of the bridge
+        is_still = odometry is not None and odometry.is_still(float(totals[0]))
+        if is_still or (is_due and evidence.bridge):  # at the end of the bridge
             evidence.is_missing = True
         if evidence.is_missing:
             return NO_EVIDENCE

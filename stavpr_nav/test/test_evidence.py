@@ -151,16 +151,16 @@ def test_skipped_images_keep_the_speed_and_are_no_evidence():
     commands = []
     for k in range(300):
         if k % 2 == 0:
-            is_judged = k % 4 == 0
+            is_compared = k % 4 == 0
             run.follower.observe(Observation(
-                run.time, int(run.place) if is_judged else run.follower.expected_place(),
-                0.99 if is_judged else math.nan, STRAIGHT, is_judged=is_judged,
+                run.time, int(run.place) if is_compared else run.follower.expected_place(),
+                0.99 if is_compared else math.nan, STRAIGHT, is_compared=is_compared,
             ), run.time)  # fmt: skip
         commands += run.drive(STEP, images=False)
     assert {command.speed for command in commands[100:]} == {0.8}
     for _ in range(100):
         run.follower.observe(
-            Observation(run.time, int(run.place), math.nan, STRAIGHT, is_judged=False), run.time
+            Observation(run.time, int(run.place), math.nan, STRAIGHT, is_compared=False), run.time
         )
         run.drive(STEP, images=False)
     assert run.follower.command(run.time).speed == 0
@@ -174,7 +174,7 @@ def test_bridge_of_slow_motion_includes_skipped_and_equal_images_and_no_frozen_o
             moved = run.follower._totals[-1][1][0]
         run.follower.observe(Observation(
             run.time, run.follower.expected_place(), math.nan, STRAIGHT,
-            is_new=k % 6 == 0 and k < 200, is_judged=k % 3 == 0,
+            is_new=k % 6 == 0 and k < 200, is_compared=k % 3 == 0,
         ), run.time)  # fmt: skip
         run.drive(STEP, images=False)
     assert moved == pytest.approx(0.3 * 200 * STEP, abs=0.1)  # beyond the next place

@@ -67,7 +67,7 @@ class Rover:
         self.client = ActionClient(self.node, Repeat, 'repeat')
         self.images, self.map_id, self.seam = images, map_id, None
         self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
-        self.held = False  # by an emergency stop
+        self.is_blocked = False  # by an emergency stop
         self.silent, self.every, self.ticks, self.clock = set(), 1, 0, None
         self.starter = self.node.create_client(Trigger, 'repeat/start')
         self.node.create_timer(PERIOD, self.look)
@@ -93,7 +93,7 @@ class Rover:
             self.image.publish(image)
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
         is_obeyed = self.commands and time.monotonic() - self.obeyed < 0.5  # by its watchdog
-        if is_obeyed and not self.held and hasattr(self.commands[-1], 'linear'):
+        if is_obeyed and not self.is_blocked and hasattr(self.commands[-1], 'linear'):
             step = self.commands[-1].linear.x * PERIOD
             self.place += step
             last = len(self.images) - 1
@@ -219,14 +219,14 @@ def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rove
 
 @pytest.mark.parametrize('needs_deadman', [True, False])
 def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repeat, needs_deadman):
-    """An emergency stop that holds the wheels looks as a camera does that repeats its image."""
+    """An emergency stop that blocks the wheels looks as a camera does that repeats its image."""
     repeat(give_up_after=0.0, require_deadman=needs_deadman)
     rover.send(start_index=3)
     rover.until(lambda: rover.place > 5)
 
-    rover.held = True
+    rover.is_blocked = True
     rover.until(lambda: rover.reason() == NO_EVIDENCE)
-    rover.held = False
+    rover.is_blocked = False
     rover.commands.clear()
     rover.until(lambda: len(rover.commands) > 40)
     assert not any(command.linear.x for command in rover.commands)

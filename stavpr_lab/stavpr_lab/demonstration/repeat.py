@@ -48,7 +48,7 @@ STEP = 0.05  # seconds of the simulation, and of the control
 LATENCY, LOST = 0.15, 0.05  # seconds until an image is processed; share of images that are lost
 SLIP, SLIP_TURN = 0.05, 0.05  # deviations of the wheels' slip, shares; constant over seconds
 CONVERGENCE = 20.0  # meters at the start that are not counted
-PATIENCE = 1.0  # seconds until the operator lets a robot go on that stopped without evidence
+OPERATOR_DELAY = 1.0  # seconds until the operator lets a robot go on that stopped without evidence
 BRAKING, LAG = 5.0, 0.15  # m/s^2; time constant of the drive, seconds
 CONDITIONS = {
     'day': replace(GOOD_LIGHT, traffic=5),
@@ -269,7 +269,7 @@ def repeat(
         rows.append((time, *robot.pose, *taught.error(robot.pose), robot.speed))
         reasons.append(command.reason)
         blocked_at = min(blocked_at, time) if pilot.follower.evidence.is_missing else math.inf
-        if has_operator and time - blocked_at >= PATIENCE:
+        if has_operator and time - blocked_at >= OPERATOR_DELAY:
             presses, blocked_at = presses + 1, math.inf
             pilot.follower.restart()
         if command.reason == 'end of the route' and robot.speed < 0.01:
@@ -358,9 +358,7 @@ def stops(taught: Taught, seconds: float = CHANGED + 5) -> dict[str, float]:
         ) -> np.ndarray:
             return change(image) if time >= CHANGED else image
 
-        drive = repeat(
-            taught, GOOD_LIGHT, seconds, begin=10, change=changed, has_operator=False
-        )
+        drive = repeat(taught, GOOD_LIGHT, seconds, begin=10, change=changed, has_operator=False)
         is_later = drive.times >= CHANGED
         at_rest = np.flatnonzero(is_later & (drive.speeds < 0.05))
         result[name] = float(drive.times[at_rest[0]] - CHANGED) if len(at_rest) else math.inf

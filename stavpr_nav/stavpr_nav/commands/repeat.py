@@ -11,7 +11,8 @@ HELP = """usage: repeat --ros-args -p map_path:=FILE [-p run_path:=FILE] [-r ima
 A node that drives along a taught route. It subscribes to `image`, `camera_info`, `deadman`
 (std_msgs/Bool) and the matches of the recognition node on the same map; it serves the action
 `repeat` (stavpr_msgs/Repeat), and publishes `cmd_vel` while there is a goal, ~/offset
-(stavpr_msgs/Offset) and /diagnostics. It avoids no collisions.
+(stavpr_msgs/Offset) and /diagnostics. Where the images show no motion, it waits for a new press of
+the switch, or ~/start (std_srvs/Trigger). It avoids no collisions.
 
 parameters:
 {parameters}

@@ -49,7 +49,7 @@ PARAMETERS = REPEAT
 READ_ONLY = ParameterDescriptor(read_only=True)
 PERIOD, FEEDBACK = 0.05, 4  # s of the control; its steps of one feedback
 REMEMBERED = 20  # images and matches that wait for each other
-CLOCK_STANDS = 'the clock does not advance'
+CLOCK_IS_STILL = 'the clock does not advance'
 SHOWN = (  # SKIPPED: no keyframe, as of a robot at rest; it is at the expected place
     PlaceMatch.WARMING_UP,
     PlaceMatch.NO_MATCH,
@@ -254,8 +254,8 @@ class RepeatNode(Node):
         else:
             place = -1
             self._filter.reset()
-        stamp, is_judged = nanoseconds(image.header.stamp) / SECOND, match.status != SKIPPED
-        return Observation(stamp, place, probability, offset, is_new, is_judged)
+        stamp, is_compared = nanoseconds(image.header.stamp) / SECOND, match.status != SKIPPED
+        return Observation(stamp, place, probability, offset, is_new, is_compared)
 
     def _columns_of(self, place: int) -> np.ndarray:
         thumbnail = self._map.thumbnail(self._place(place))
@@ -370,7 +370,7 @@ class RepeatNode(Node):
                 driver.end(Outcome.CANCELED, now)
             self._clock_times.append(now)
             if self._clock_times.count(now) > DEADMAN_AGE / PERIOD:
-                command = driver.halt(now, CLOCK_STANDS)
+                command = driver.halt(now, CLOCK_IS_STILL)
             else:
                 command = driver.step(now)
             if not driver.is_waiting or driver.outcome is not None:
