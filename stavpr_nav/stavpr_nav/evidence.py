@@ -21,6 +21,7 @@ MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places 
 ARM = 0.5  # meters
 SAME_PLACE = 0.05  # meters between two places that show the same
 BRIDGE_TIME = 6.0  # seconds of the taught run without a match, of images that change
+SLIP = 1.2  # meters that are commanded per meter to the next place, of wheels that slip
 PERIODS = 1.25  # of images, after this distance or the next place
 INTERVALS = 3  # of the latest images, whose median is the period
 CELLS = (16, 12)  # columns and rows of the gray levels that are compared
@@ -143,7 +144,8 @@ class MotionEvidence:
         driven = totals - self._totals
         period = float(np.median(self._intervals)) if self._intervals else self._max_period
         seconds = PERIODS * period + delay
-        is_far = driven[:2].max() > max(MIN_DISTANCE, self._next()) + abs(speed) * seconds
+        demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds
+        is_far = driven[:2].max() > demanded
         return bool(is_far and driven[2] > self.bridge)
 
     def _mark(self, place: int) -> None:

@@ -61,7 +61,7 @@ class Rover:
         self.deadman = publisher(Bool, 'deadman', 10)
         self.commands, self.offsets, self.feedback = [], [], []
         subscribe(kind, 'cmd_vel', self.obey, 10)
-        self.obeyed = -math.inf
+        self.obeyed, self.looked = -math.inf, time.monotonic()
         self.clock_publisher = publisher(Clock, 'clock', 10)
         subscribe(Offset, 'repeat/offset', self.offsets.append, 10)
         self.client = ActionClient(self.node, Repeat, 'repeat')
@@ -75,6 +75,8 @@ class Rover:
     def look(self):
         """Publish what the camera shows, the match, and the switch."""
         self.ticks += 1
+        now = time.monotonic()
+        elapsed, self.looked = now - self.looked, now
         header = Header(stamp=self.node.get_clock().now().to_msg())
         if self.clock is not None:
             header.stamp = Time(nanoseconds=self.clock).to_msg()
@@ -94,7 +96,7 @@ class Rover:
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
         is_obeyed = self.commands and time.monotonic() - self.obeyed < 0.5  # by its watchdog
         if is_obeyed and not self.is_blocked and hasattr(self.commands[-1], 'linear'):
-            step = self.commands[-1].linear.x * PERIOD
+            step = self.commands[-1].linear.x * elapsed
             self.place += step
             last = len(self.images) - 1
             if self.place >= last:
