@@ -16,7 +16,7 @@ from numba.core.caching import (
     IndexDataCacheFile,
     UserProvidedCacheLocator,
 )
-from stavpr_ros.regular_file import open_regular
+from stavpr_ros.regular_file import ElsewhereError, open_regular
 
 READ_FAILED = 'some are damaged or cannot be read, and are compiled anew'
 WRITE_FAILED = 'they cannot be written, and are compiled again at the next start'
@@ -69,7 +69,7 @@ class _Files(IndexDataCacheFile):
         try:
             with open_regular(self._path(key)) as file:
                 content = file.readall()
-        except FileNotFoundError:
+        except (FileNotFoundError, ElsewhereError):
             return None
         head, rest = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
         if hashlib.blake2b(rest, digest_size=DIGEST_SIZE).digest() != head:

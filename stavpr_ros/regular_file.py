@@ -32,7 +32,7 @@ def elsewhere(path: str | Path) -> str:
     """Return what replaces the content of a file, and what to do; '' = it is here or unknown."""
     path = Path(path)
     if not path.exists():
-        if path.is_symlink():
+        if path.is_symlink() and not _is_loop(path):
             target = os.readlink(path)
             tool = next((tool for part, tool in TOOLS.items() if part in target), 'copy the file')
             return f'a link into nothing, {target[-LONGEST_TARGET:]}: {tool}'
@@ -45,6 +45,14 @@ def elsewhere(path: str | Path) -> str:
         content = path.read_bytes()
         return next((text for first, text in POINTERS.items() if content.startswith(first)), '')
     return ''
+
+
+def _is_loop(link: Path) -> bool:
+    try:
+        link.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False
 
 
 def home_folder() -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 import signal
 from unittest.mock import Mock
 
+from fixtures import route_images
 from pipelines import localizing, process
 from processes import node_process
 import pytest
@@ -23,7 +24,10 @@ from stavpr_ros.pipeline.saving import (
 from test_upkeep import built, OTHER, ROUTE
 
 pytestmark = pytest.mark.usefixtures('one_thread')
-DRIVES = [*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], ROUTE[20:180], ROUTE
+DRIVES = [
+    [*ROUTE[:first], *OTHER[first - 80 : first - 20], *ROUTE[first + 60 :]]
+    for first in (80, 90, 100)
+]
 NAMES = [f'drive 2023-11-14 22-{minute}' for minute in ('13-21', '30-01', '46-41')]
 
 
@@ -147,10 +151,13 @@ def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path,
     assert (current_version(path).number, waiting(path)) == (3, ['drive 1.stavpr'])
 
 
-def test_drives_of_equal_times_have_names_of_their_own(pipeline, path, recorded):
+def test_drives_of_equal_times_have_names_of_their_own(pipeline, path):
     """Stamps of a simulation begin anew; a name in the history means that the drive is there."""
     assert update_own_map(pipeline, at_once, Mock())
-    pipeline.operation.return_drives([recorded[2], recorded[2]])
+    for seed in (7, 8):
+        drive = [*ROUTE[:80], *route_images(60, seed), *ROUTE[140:]]
+        process(pipeline, drive, first=1_700_002_000)
+        pipeline.operation.reset()
     assert update_own_map(pipeline, at_once, Mock())
     assert current_version(path).number == 5
     assert current_version(path).drive == f'{NAMES[2]}-3'

@@ -17,7 +17,8 @@ class Frame:
     """
     One image of a sequence.
 
-    :param image: RGB, uint8, shape (height, width, 3), C-contiguous.
+    :param image: RGB, shape (height, width, 3), C-contiguous; uint8, or uint16 of a source that
+        leaves its range of values open.
     :param stamp: when it was taken, nanoseconds; 0 = unknown.
     :param identifier: a file name, or topic and number.
     :raises InputError: another image, a stamp that is no whole number, or an
@@ -29,7 +30,8 @@ class Frame:
     identifier: str
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'image', rgb_image(self.image, 'image of the frame'))
+        image = rgb_image(self.image, 'image of the frame', 'uint8', 'uint16')
+        object.__setattr__(self, 'image', image)
         whole = 'whole nanoseconds, as time.time_ns(); 0 = unknown'
         require_type('stamp', self.stamp, (int, np.integer), whole)
         require_type('identifier', self.identifier, str, 'a text, such as the name of the file')

@@ -392,7 +392,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     folder = arguments.output or (None if arguments.json else OUTPUT)
     if folder:
-        require_modules('jinja2')
+        require_modules('jinja2', 'matplotlib')
     if arguments.json:
         require_replaceable(arguments.json, JSON, arguments.force)
     if folder:
