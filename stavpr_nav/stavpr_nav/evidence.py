@@ -22,6 +22,8 @@ ARM = 0.5  # meters
 SAME_PLACE = 0.05  # meters between two places that show the same
 BRIDGE_TIME = 6.0  # seconds of the taught run without a match, of images that change
 SLIP = 1.2  # meters that are commanded per meter to the next place, of wheels that slip
+MIN_LEAD, MAX_LEAD = 0.5, 1.5  # meters that a match is ahead of the commanded ones, and counts
+LEAD_GAIN = 0.1  # share by which the commanded meters are corrected at a new place
 PERIODS = 1.25  # of images, after this distance or the next place
 INTERVALS = 3  # of the latest images, whose median is the period
 CELLS = (16, 12)  # columns and rows of the gray levels that are compared
@@ -79,6 +81,8 @@ class MotionEvidence:
         self._lap = math.inf if seam is None else float(meters[-1] - meters[seam])
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._stamp = -math.inf
+        # position by the commanded meters, less these; by how much the last match is ahead of it
+        self._start, self._lead = math.nan, 0.0
         self.restart(np.zeros(3))
 
     def restart(self, totals: np.ndarray, place: int = -1) -> None:
@@ -94,7 +98,7 @@ class MotionEvidence:
         self._totals, self._changed = totals, totals[0]
         self.bridge, self.is_changed = 0.0, True
         if place >= 0:
-            self._mark(place)
+            self._mark(place, totals)
 
     def rest(self, totals: np.ndarray) -> None:
         """Count a standstill: what an image shows that was taken before is no evidence since."""
@@ -129,7 +133,7 @@ class MotionEvidence:
             self.bridge = BRIDGE_TIME
         if place is not None and self.is_changed and not self._matched[place]:
             self.is_fresh |= self._place >= 0 and totals[0] > self._rested
-            self._mark(place)
+            self._mark(place, totals)
             self._totals, self.is_changed = totals, False
         elif self.is_due(totals, speed):
             self.is_missing = True
@@ -144,13 +148,20 @@ class MotionEvidence:
         driven = totals - self._totals
         period = float(np.median(self._intervals)) if self._intervals else self._max_period
         seconds = PERIODS * period + delay
-        demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds
+        demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + self._lead
         is_far = driven[:2].max() > demanded
         return bool(is_far and driven[2] > self.bridge)
 
-    def _mark(self, place: int) -> None:
+    def _mark(self, place: int, totals: np.ndarray) -> None:
         """Mark a place as matched, and those of the far half of a lap no longer."""
         self._place = place
+        if math.isnan(self._start):
+            self._start = self._meters[place] - totals[0]
+        # after a standstill matches may run ahead; they stay at a place until the robot is there
+        lead = float(self._meters[place] - self._start - totals[0])
+        lead = math.remainder(lead, self._lap) if math.isfinite(self._lap) else lead
+        self._lead = min(max(lead - MIN_LEAD, 0.0), MAX_LEAD)
+        self._start += LEAD_GAIN * lead
         away = abs(self._meters - self._meters[place])
         if math.isfinite(self._lap):
             around = away % self._lap
