@@ -41,13 +41,9 @@ def read_velocities(path: str | Path) -> tuple[np.ndarray, str]:
     :returns: stamps, speeds and turns, shape (m, 3), float64; id of the session, '' = not named.
     :raises InputError: not such a file, numbers that are not finite, stamps that decrease.
     """
-    session = ''
     try:
         with open(path, newline='', encoding='utf-8') as file:
             lines = file.readlines()
-        for line in lines:
-            if line.startswith(SESSION) and line.endswith('\n'):
-                session = line.removeprefix(SESSION).strip()
         head, *rows = csv.reader(line for line in lines if not line.startswith('#'))
     except (OSError, ValueError, csv.Error) as error:
         raise InputError(f'{path} cannot be read as a taught run: {error}') from error
@@ -64,7 +60,8 @@ def read_velocities(path: str | Path) -> tuple[np.ndarray, str]:
         )
     if not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
         raise InputError(f'{path}: numbers must be finite, and stamps must not decrease')
-    return table, session
+    named = [line for line in lines if line.startswith(SESSION) and line.endswith('\n')]
+    return table, named[-1].removeprefix(SESSION).strip() if named else ''
 
 
 def taught_places(
@@ -83,36 +80,25 @@ def taught_places(
     index, sessions = place_map.session_index, place_map.sessions
     if index is None or len(sessions) == 1:
         return np.arange(len(place_map))
-    is_taught = np.ones(len(place_map), bool)
-    if velocities is not None:
-        first, last = velocities[[0, -1], 0] + (-MARGIN, MARGIN)
-        is_taught = (place_map.stamps >= first * SECOND) & (place_map.stamps <= last * SECOND)
 
     def is_part(number: int, name: str) -> bool:
         return re.fullmatch(rf'{re.escape(name)}(-\d+)*', sessions[number].id) is not None
 
-    possible = np.unique(index[is_taught]).tolist()
-    if session:
-        possible = [number for number in possible if is_part(number, session)]
+    possible = np.unique(index[_is_covered(place_map.stamps / SECOND, velocities)]).tolist()
+    possible = [number for number in possible if not session or is_part(number, session)]
     if not possible:
         raise InputError(
             f'no session {session!r} of the map was recorded with the velocities: it has '
             f'{[each.id for each in sessions]}; correct the line {SESSION!r} of the run, or take '
             'map and run of one drive'
         )
-    whole = replace(sessions[possible[0]], id='')
-    taught, roots = np.zeros(0, np.int64), place_map.same_as
-    for number in possible:
-        places = np.flatnonzero(index == number)
-        # another drive of the same name shows the same places again
-        is_new = roots is None or not np.isin(roots[places], roots[taught]).any()
-        if (
-            replace(sessions[number], id='') == whole
-            and is_part(number, session or sessions[possible[0]].id)
-            and is_new
-        ):
-            taught = np.append(taught, places)
-    return taught
+    first = sessions[possible[0]]
+    parts = [
+        number
+        for number in possible
+        if is_part(number, session or first.id) and replace(sessions[number], id=first.id) == first
+    ]
+    return np.flatnonzero(np.isin(index, parts))
 
 
 def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
@@ -184,13 +170,17 @@ def taught_run(
 
 def _stamps(stamps: np.ndarray, velocities: np.ndarray | None) -> np.ndarray:
     """Return the stamps of places, between those beside where an update renewed the images."""
-    lowest, highest = stamps[0], stamps[-1]
-    if velocities is not None:
-        lowest, highest = velocities[[0, -1], 0] + (-MARGIN, MARGIN)
-    is_own = (stamps >= lowest) & (stamps <= highest)
+    is_own = _is_covered(stamps, velocities)
+    if velocities is None:
+        is_own = (stamps >= stamps[0]) & (stamps <= stamps[-1])
     is_own[[0, -1]] = True
-    numbers = np.arange(len(stamps))
-    return np.interp(numbers, numbers[is_own], stamps[is_own])
+    return np.interp(np.arange(len(stamps)), np.flatnonzero(is_own), stamps[is_own])
+
+
+def _is_covered(stamps: np.ndarray, velocities: np.ndarray | None) -> np.ndarray:
+    """Return which stamps are within the velocities; all without them."""
+    first, last = velocities[[0, -1], 0] if velocities is not None else (-np.inf, np.inf)
+    return np.asarray((stamps >= first - MARGIN) & (stamps <= last + MARGIN))
 
 
 def _of_poses(poses: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

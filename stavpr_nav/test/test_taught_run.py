@@ -78,30 +78,22 @@ def test_a_gap_of_the_velocities_counts_as_standing():
 
 def test_files_are_read_without_a_torn_last_line(tmp_path):
     path = tmp_path / 'run.csv'
-    path.write_text(HEAD + '1.5,0.2,0.1\n2.5,0.3,-0.1\n3.5,0.')
-    velocities, session = read_velocities(path)
-    np.testing.assert_array_equal(velocities, [[1.5, 0.2, 0.1], [2.5, 0.3, -0.1]])
-    assert session == ''
+    for note, expected in (('', ''), ('# session: my yard\n', 'my yard')):
+        for end in ('3.5,0.', '# session: torn'):
+            path.write_text(f'{HEAD}1.5,0.2,0.1\n{note}2.5,0.3,-0.1\n{end}')
+            velocities, session = read_velocities(path)
+            np.testing.assert_array_equal(velocities, [[1.5, 0.2, 0.1], [2.5, 0.3, -0.1]])
+            assert session == expected
 
 
-@pytest.mark.parametrize('before', [True, False])
-def test_files_name_the_session_of_the_run(tmp_path, before):
-    path, lines = tmp_path / 'run.csv', [HEAD, '1.5,0.2,0.1\n', '2.5,0.3,-0.1\n']
-    lines.insert(0 if before else 2, '# session: my yard\n')
-    path.write_text(''.join([*lines, '# session: torn']))
-    velocities, session = read_velocities(path)
-    assert (len(velocities), session) == (2, 'my yard')
-
-
-def two_sessions(start=100, related=True):
+def two_sessions(start=100):
     """Return two drives past 30 places; every third place of the second has no relation."""
     first, second = (
         route(at + np.arange(30) * 0.5, arc(np.arange(30) * 0.05)) for at in (0, start)
     )
     both = merge_maps([first, second], ['monday', 'tuesday'])
     same_as = np.arange(60, dtype=np.int32)
-    if related:
-        same_as[30:] = np.where(np.arange(30) % 3 == 1, same_as[30:], np.arange(30))
+    same_as[30:] = np.where(np.arange(30) % 3 == 1, same_as[30:], np.arange(30))
     return replace(both, same_as=same_as)
 
 
@@ -129,32 +121,24 @@ def test_taught_run_is_of_one_session(start, velocities, session, expected):
     assert run.seam is None
     at = positions(both, taught)
     assert at[taught].tolist() == [*range(30)]
-    other = np.delete(at, taught)
-    assert other[1:-1].tolist() == [*range(1, 29)]
-
-
-def test_places_of_a_detour_have_no_position():
-    both = two_sessions(related=False)
-    assert (positions(both, taught_places(both))[30:] == -1).all()
+    assert np.delete(at, taught)[1:-1].tolist() == [*range(1, 29)]
+    detour = replace(both, same_as=np.arange(60, dtype=np.int32))
+    assert (np.delete(positions(detour, taught), taught) == -1).all()
 
 
 def test_session_that_an_update_has_divided_and_renewed_is_one_run():
-    """Renewed places have the stamps of another drive; a drive of the same name is no part."""
+    """Renewed places have the stamps of another drive."""
     both = two_sessions()
     both = replace(both, stamps=both.stamps + 10**9)
     stamps = both.stamps.copy()
     stamps[5:9] = np.arange(4) + 10**18
     divided = keep_places(replace(both, stamps=stamps), np.delete(np.arange(60), range(14, 17)))
-    assert [each.id for each in divided.sessions] == ['monday', 'monday-2', 'tuesday']
     for velocities in (None, velocities_from(1)):
         taught = taught_places(divided, velocities, 'monday')
         assert taught.tolist() == [*range(27)]
         run = taught_run(divided, velocities, taught)
         assert run.distances[-1] == pytest.approx(2.9, 0.05)
         np.testing.assert_allclose(np.diff(run.times[:14]), 0.5)
-    alike = merge_maps([route(np.arange(1, 20)), route(np.arange(1, 20))], ['monday'] * 2)
-    alike = replace(alike, same_as=np.tile(np.arange(19), 2).astype(np.int32))
-    assert taught_places(alike).tolist() == [*range(19)]
 
 
 def test_session_that_the_map_lacks_is_named():
