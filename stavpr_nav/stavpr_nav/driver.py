@@ -102,7 +102,7 @@ class Driver:
 
     def press(self, now: float) -> None:
         """Count the dead-man switch as pressed; a new press ends a stop without evidence."""
-        if self._is_released(now):
+        if now - self._held > DEADMAN_AGE and now - self._time <= DEADMAN_AGE:  # not suspended
             self.restart()
         self._pressed = self._held = now
 
@@ -110,14 +110,9 @@ class Driver:
         """Count the dead-man switch as released."""
         self._pressed = self._held = -math.inf
 
-    def _is_released(self, now: float) -> bool:
-        """Whether the switch was released, and this program and the clock ran on."""
-        return now - self._held > DEADMAN_AGE and now - self._time <= DEADMAN_AGE
-
     def restart(self) -> bool:
         """Go on after a stop without evidence of motion; return whether there was one."""
-        was_blocked = self.is_blocked
-        if was_blocked:
+        if was_blocked := self.is_blocked:
             self._follower.restart()
         return was_blocked
 

@@ -10,12 +10,15 @@ Meters of the path include turns: a radian counts as ``ARM`` meters, where this 
 
 from collections import deque
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
+
+if TYPE_CHECKING:
+    from stavpr_nav.follower import Observation
 
 MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places are dense
 ARM = 0.5  # meters
@@ -72,8 +75,8 @@ class MotionEvidence:
     :param max_period: seconds, the largest period of images that counts.
 
     ``is_missing`` stays until :meth:`restart`; ``is_fresh``: there was evidence since the last
-    standstill; ``bridge``: seconds of the taught run that the
-    images permit without evidence; ``is_changed``: there was a new image since the last evidence.
+    standstill; ``bridge``: seconds of the taught run that the images permit without evidence;
+    ``is_changed``: there was a new image since the last evidence.
     """
 
     def __init__(self, meters: np.ndarray, seam: int | None, max_period: float) -> None:
@@ -104,53 +107,41 @@ class MotionEvidence:
         """Count a standstill: what an image shows that was taken before is no evidence since."""
         self.is_fresh, self._rested = False, totals[0]
 
-    def take(
-        self,
-        stamp: float,
-        place: int | None,
-        totals: np.ndarray,
-        speed: float,
-        is_new: bool = True,
-        is_compared: bool = True,
-    ) -> None:
+    def take(self, image: 'Observation', totals: np.ndarray, speed: float) -> None:
         """
         Take the result of an image of the route.
 
-        :param place: of a match; None = the image resembles the expected place.
         :param totals: meters that were commanded, meters of odometry, and seconds of the taught
             run that were repeated, until the image.
         :param speed: m/s that is commanded.
-        :param is_new, is_compared: as of ``Observation``.
         """
-        if is_compared:
-            self._intervals.append(min(stamp - self._stamp, self._max_period))
-            self._stamp = stamp
-        if is_new:
+        if image.is_compared:
+            self._intervals.append(min(image.stamp - self._stamp, self._max_period))
+            self._stamp = image.stamp
+        if image.is_new:
             self._changed = totals[0]
-        if place is not None or totals[0] - self._changed > MIN_DISTANCE:
+        if image.is_matched or totals[0] - self._changed > MIN_DISTANCE:
             self.bridge = 0.0
-        elif is_new and is_compared:
+        elif image.is_new and image.is_compared:
             self.bridge = BRIDGE_TIME
-        if place is not None and self.is_changed and not self._matched[place]:
+        if image.is_matched and self.is_changed and not self._matched[image.place]:
             self.is_fresh |= self._place >= 0 and totals[0] > self._rested
-            self._mark(place, totals)
+            self._mark(image.place, totals)
             self._totals, self.is_changed = totals, False
         elif self.is_due(totals, speed):
             self.is_missing = True
 
     def is_due(self, totals: np.ndarray, speed: float, delay: float = 0.0) -> bool:
         """
-        Return whether there should have been evidence.
+        Return whether there should have been evidence; totals, speed: as of :meth:`take`.
 
-        :param totals, speed: as of :meth:`take`.
         :param delay: seconds until an image is processed.
         """
         driven = totals - self._totals
         period = float(np.median(self._intervals)) if self._intervals else self._max_period
         seconds = PERIODS * period + delay
         demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + self._lead
-        is_far = driven[:2].max() > demanded
-        return bool(is_far and driven[2] > self.bridge)
+        return bool(driven[:2].max() > demanded and driven[2] > self.bridge)
 
     def _mark(self, place: int, totals: np.ndarray) -> None:
         """Mark a place as matched, and those of the far half of a lap no longer."""
@@ -158,14 +149,12 @@ class MotionEvidence:
         if math.isnan(self._start):
             self._start = self._meters[place] - totals[0]
         # after a standstill matches may run ahead; they stay at a place until the robot is there
-        lead = float(self._meters[place] - self._start - totals[0])
-        lead = math.remainder(lead, self._lap) if math.isfinite(self._lap) else lead
+        lead = math.remainder(self._meters[place] - self._start - totals[0], self._lap)
         self._lead = min(max(lead - MIN_LEAD, 0.0), MAX_LEAD)
         self._start += LEAD_GAIN * lead
         away = abs(self._meters - self._meters[place])
-        if math.isfinite(self._lap):
-            around = away % self._lap
-            self._matched &= np.minimum(around, self._lap - around) < self._lap / 4
+        around = away % self._lap
+        self._matched &= np.minimum(around, self._lap - around) < self._lap / 4
         self._matched |= away < SAME_PLACE
 
     def _next(self) -> float:
@@ -176,7 +165,7 @@ class MotionEvidence:
         if math.isfinite(self._lap):
             away = away % self._lap
         ahead = away[~self._matched & (away > 0)]
-        return float(ahead.min(initial=math.inf)) if len(ahead) else 0.0
+        return float(ahead.min()) if len(ahead) else 0.0
 
 
 class OdometryComparison:
@@ -204,18 +193,18 @@ class OdometryComparison:
         :raises InputError: it is not valid, or no motion from the one before; it does not count.
         """
         last, self._last = self._last, (frame, stamp, pose := checked_pose(pose))
-        if last is not None:
-            seconds, step = stamp - last[1], _length(last[2], pose)
-            is_motion = step <= 2 * self._max_speed * seconds + JUMP
-            if last[0] == frame and 0 < seconds <= MAX_SECONDS and is_motion:
-                self.meters, self.received = self.meters + step, now
-                return
+        if last is None:
+            self._from = pose
+            return
+        seconds, step = stamp - last[1], _length(last[2], pose)
+        is_motion = step <= 2 * self._max_speed * seconds + JUMP
+        if last[0] != frame or not 0 < seconds <= MAX_SECONDS or not is_motion:
             self._from = pose
             raise InputError(
                 f'{step:.2f} m and {seconds:.3f} s from frame {last[0]!r} to {frame!r}: expected '
                 f'one frame, up to {MAX_SECONDS:g} s, and {self._max_speed:g} m/s'
             )
-        self._from = pose
+        self.meters, self.received = self.meters + step, now
 
     def take_meters(self) -> float:
         """Return the meters since the last call."""

@@ -200,8 +200,7 @@ class RouteFollower:
         self._last, self._time = Command(0.0, 0.0), -math.inf
         # meters that were commanded, meters of odometry and seconds of the taught run that were
         # repeated, by the time of the commands
-        self._totals: deque[tuple[float, np.ndarray]] = deque(maxlen=HISTORY)
-        self._rest(np.zeros(3))
+        self._totals: deque[tuple[float, np.ndarray]] = deque([(-math.inf, np.zeros(3))], HISTORY)
         # the last match, and the seconds that were repeated until then
         self._anchor: tuple[int, float] | None = None
         steps = path_speed(taught.speeds[:-1], taught.turns[:-1]) * np.diff(taught.times)
@@ -212,30 +211,28 @@ class RouteFollower:
             odometry.commanded = 0.0  # of this drive
         self.end: int | None = None  # a place before the last at which the route ends
 
-    def _rest(self, totals: np.ndarray) -> None:
-        """Begin from rest: where the robot was before is unknown."""
-        self._totals.clear()
-        self._totals.append((-math.inf, totals))
-        self._last = Command(0.0, 0.0, self._last.reason)
+    @property
+    def _now(self) -> np.ndarray:
+        """The totals at the latest command."""
+        return self._totals[-1][1]
 
     def start(self, place: int) -> None:
         """Set the place of a robot at rest; otherwise it moves after its first match."""
-        totals = self._totals[-1][1]
-        self._anchor = place, float(totals[2])
-        self.evidence.restart(totals, place)
+        self._anchor = place, float(self._now[2])
+        self.evidence.restart(self._now, place)
 
     def restart(self) -> None:
         """Go on after a stop by missing evidence of motion: an operator has looked."""
-        self.evidence.restart(self._totals[-1][1], self._newest.place if self._newest else -1)
+        self.evidence.restart(self._now, self._newest.place if self._newest else -1)
         if self._odometry is not None:
-            self._odometry.commanded = float(self._totals[-1][1][0])
+            self._odometry.commanded = float(self._now[0])
 
     def expected_place(self) -> int:
         """Return the place of an image soon after the last match; -1 = unknown."""
         if self._anchor is None:
             return -1
         place, before = self._anchor
-        done, times = float(self._totals[-1][1][2]) - before, self._taught.times
+        done, times = float(self._now[2]) - before, self._taught.times
         if done > BRIDGE_TIME:
             return -1
         time = self._taught.on_lap(float(times[place]) + done)
@@ -256,14 +253,10 @@ class RouteFollower:
         if observation.is_confirmed and not self._falls(observation):
             self._newest, self._confirmed = observation, now
             self._successive += 1
-            totals, place = self._until(observation.stamp), None
+            totals = self._until(observation.stamp)
             if observation.is_matched:
-                place = observation.place
-                self._anchor = place, float(totals[2])
-            self.evidence.take(
-                observation.stamp, place, totals, self._last.speed, observation.is_new,
-                observation.is_compared,
-            )  # fmt: skip
+                self._anchor = observation.place, float(totals[2])
+            self.evidence.take(observation, totals, self._last.speed)
         elif now - self._confirmed > self._settings.max_unconfirmed:
             self._successive = 0
 
@@ -278,29 +271,30 @@ class RouteFollower:
     def halt(self, now: float, reason: str) -> Command:
         """Halt for now; the robot accelerates from rest afterwards."""
         self._time, self._last = now, Command(0.0, 0.0, reason)
-        self.evidence.rest(self._totals[-1][1])
+        self.evidence.rest(self._now)
         return self._last
 
     def command(self, now: float) -> Command:
         """Return the velocities for now; to be called at a steady rate, above 10 Hz."""
         step = now - self._time
         self._time = now
-        if not 0 <= step <= MAX_STEP:
-            self._rest(self._totals[-1][1])
-            self.evidence.rest(self._totals[-1][1])
+        if not 0 <= step <= MAX_STEP:  # from rest: where the robot was before is unknown
+            self._totals = deque([(-math.inf, self._now)], HISTORY)
+            self._last = Command(0.0, 0.0, self._last.reason)
+            self.evidence.rest(self._now)
             self._stamp = self._stamp if step > 0 else -math.inf
             step = 0.0
         self._count(step)
         self._last = self._limited(self._wanted(now), step)
         if self._last.reason:
-            self.evidence.rest(self._totals[-1][1])
+            self.evidence.rest(self._now)
         return self._last
 
     def _stop_reason(self, now: float) -> str:
         """Return why the robot must not move; empty = it may."""
-        evidence, odometry, totals = self.evidence, self._odometry, self._totals[-1][1]
-        is_due = evidence.is_due(totals, self._last.speed, self._delay)
-        is_still = odometry is not None and odometry.is_still(float(totals[0]))
+        evidence, odometry = self.evidence, self._odometry
+        is_due = evidence.is_due(self._now, self._last.speed, self._delay)
+        is_still = odometry is not None and odometry.is_still(float(self._now[0]))
         if is_still or (is_due and evidence.bridge):  # at the end of the bridge
             evidence.is_missing = True
         if evidence.is_missing:
@@ -353,7 +347,7 @@ class RouteFollower:
 
     def _since(self, stamp: float) -> float:
         """Return the seconds of the taught run that were repeated since a time."""
-        return float(self._totals[-1][1][2] - self._until(stamp)[2])
+        return float(self._now[2] - self._until(stamp)[2])
 
     def _count(self, step: float) -> None:
         """Count what the last command has repeated in the seconds since."""
@@ -364,7 +358,7 @@ class RouteFollower:
         taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
         done = last.speed / taught * step if abs(taught) > 1e-3 else step
         added = np.array([path_speed(last.speed, last.turn) * step, moved, done])
-        self._totals.append((self._time, self._totals[-1][1] + added))
+        self._totals.append((self._time, self._now + added))
 
     def _limited(self, wanted: Command, step: float) -> Command:
         """Limit velocities and accelerations, but no stop."""
@@ -376,8 +370,8 @@ class RouteFollower:
         turning = settings.max_turn_acceleration * step
         turn = min(max(wanted.turn, self._last.turn - turning), self._last.turn + turning)
         turn = _limit(turn, settings.max_turn)
-        more = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
-        self._integral = _limit(self._integral + more, MAX_INTEGRAL)
+        added = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
+        self._integral = _limit(self._integral + added, MAX_INTEGRAL)
         return Command(speed, turn)
 
 

@@ -76,7 +76,7 @@ def test_only_places_that_were_not_matched_are_evidence(places, count, meters, s
     for k, place in enumerate(places):
         motion.rest(np.full(3, -1.0))
         motion.is_changed = True
-        motion.take(k * 0.1, place, np.zeros(3), 1.0)
+        motion.take(Observation(k * 0.1, place, 1.0, STRAIGHT), np.zeros(3), 1.0)
         fresh += motion.is_fresh
     assert fresh == count
 

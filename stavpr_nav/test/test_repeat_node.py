@@ -5,7 +5,6 @@
 from dataclasses import replace
 import math
 from pathlib import Path
-import signal
 import time
 from xml.etree import ElementTree
 
@@ -67,18 +66,18 @@ class Rover:
         self.client = ActionClient(self.node, Repeat, 'repeat')
         self.images, self.map_id, self.seam = images, map_id, None
         self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
-        self.is_blocked = False  # by an emergency stop
-        self.silent, self.every, self.ticks, self.clock = set(), 1, 0, None
+        self.is_blocked = self.is_paused = False  # by an emergency stop; of the clock
+        self.silent, self.clock = '', None
         self.starter = self.node.create_client(Trigger, 'repeat/start')
         self.node.create_timer(PERIOD, self.look)
 
     def look(self):
         """Publish what the camera shows, the match, and the switch."""
-        self.ticks += 1
         now = time.monotonic()
         elapsed, self.looked = now - self.looked, now
         header = Header(stamp=self.node.get_clock().now().to_msg())
         if self.clock is not None:
+            self.clock += round(PERIOD * 1e9) * (not self.is_paused)
             header.stamp = Time(nanoseconds=self.clock).to_msg()
             self.clock_publisher.publish(Clock(clock=header.stamp))
         image = image_message(header, self.images[int(self.place)])
@@ -87,12 +86,11 @@ class Rover:
         matched = self.status == PlaceMatch.MATCH
         match = PlaceMatch(header=header, status=self.status, map_id=self.map_id)
         match.newest_index, match.probability = int(self.place) if matched else -1, 0.99
-        if 'deadman' not in self.silent:
-            self.deadman.publish(Bool(data=self.pressed))
-        if 'match' not in self.silent and self.ticks % self.every == 0:
-            self.match.publish(match)
-        if 'image' not in self.silent and self.ticks % self.every == 0:
-            self.image.publish(image)
+        for name, message in (
+            ('deadman', Bool(data=self.pressed)), ('match', match), ('image', image)
+        ):  # fmt: skip
+            if name != self.silent:
+                getattr(self, name).publish(message)
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
         is_obeyed = self.commands and time.monotonic() - self.obeyed < 0.5  # by its watchdog
         if is_obeyed and not self.is_blocked and hasattr(self.commands[-1], 'linear'):
@@ -196,6 +194,7 @@ def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rove
         ('damaged', True),
         ('map_id', 'other'),
         ('status', PlaceMatch.INVALID_IMAGE),
+        *(('silent', source) for source in ('deadman', 'match', 'image')),
     ):
         right = getattr(rover, name)
         rover.until(rover.drives)
@@ -225,88 +224,31 @@ def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repe
     repeat(give_up_after=0.0, require_deadman=needs_deadman)
     rover.send(start_index=3)
     rover.until(lambda: rover.place > 5)
-
     rover.is_blocked = True
     rover.until(lambda: rover.reason() == NO_EVIDENCE)
     rover.is_blocked = False
-    rover.commands.clear()
-    rover.until(lambda: len(rover.commands) > 40)
-    assert not any(command.linear.x for command in rover.commands)
-    if needs_deadman:
-        rover.pressed = False
+    for rover.pressed in (True, not needs_deadman):
         rover.commands.clear()
         rover.until(lambda: len(rover.commands) > 20)
+        assert not any(command.linear.x for command in rover.commands)
         assert rover.reason() == NO_EVIDENCE
-        rover.pressed = True
-    else:
-        answer = rover.result_of(rover.starter.call_async(Trigger.Request()))
-        assert answer.success
-        assert not rover.result_of(rover.starter.call_async(Trigger.Request())).success
+    rover.pressed = True
+    if not needs_deadman:
+        for success in (True, False):
+            answer = rover.result_of(rover.starter.call_async(Trigger.Request()))
+            assert answer.success is success
     rover.until(rover.drives)
-
-
-@pytest.mark.parametrize('source', ['image', 'match', 'deadman'])
-def test_program_that_is_suspended_stops_the_robot_until_it_goes_on(rover, repeat, source):
-    repeat(give_up_after=0.0)
-    rover.send(start_index=3)
-    rover.until(lambda: rover.place > 5)
-    rover.silent = {source}
-    rover.until(rover.rests)
-    rover.silent = set()
-    rover.until(rover.drives)
-
-
-def test_node_that_is_suspended_goes_on_from_rest(rover, map_file, tmp_path):
-    values = {'map_path': map_file, 'give_up_after': 0.0} | FAST
-    words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
-    process = Process(tmp_path / 'repeat', 'repeat', '--ros-args', *words)
-    try:
-        rover.send(start_index=3)
-        rover.until(lambda: rover.place > 6)
-        process.popen.send_signal(signal.SIGSTOP)
-        rover.until(lambda: time.monotonic() - rover.obeyed > 1.0)
-        place = rover.place  # the base has stopped by itself
-        rover.until(lambda: time.monotonic() - rover.obeyed > 2.0)
-        assert rover.place == place
-        rover.commands.clear()
-        process.popen.send_signal(signal.SIGCONT)
-        rover.until(rover.drives)
-        speeds = [command.linear.x for command in rover.commands]
-        assert 0 < speeds[-1] <= 0.3, speeds
-    finally:
-        process.popen.send_signal(signal.SIGCONT)
-        process.end()
-
-
-def test_slow_camera_is_driven_with_stop_and_go_and_half_the_rate_without(rover, repeat):
-    repeat(give_up_after=0.0)
-    rover.send(start_index=3)
-    rover.until(lambda: rover.place > 5)
-    rover.every = 2
-    rover.until(lambda: rover.place > 7)
-    assert rover.drives()
-    rover.every = 10
-    rover.until(rover.rests)
-    place, ticks = rover.place, rover.ticks
-    rover.until(lambda: rover.place > place + 1)
-    images = (rover.ticks - ticks) / rover.every
-    assert (rover.place - place) / images < 0.5  # meters between two images
 
 
 def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, repeat):
-    rover.clock, step = 10**9, [round(PERIOD * 1e9)]
-
-    def advance():
-        rover.clock += step[0]
-
-    rover.node.create_timer(PERIOD, advance)
+    rover.clock = 10**9
     repeat(give_up_after=0.0, use_sim_time=True)
     rover.send(start_index=3)
     rover.until(lambda: rover.place > 5)
-    step[0] = 0
+    rover.is_paused = True
     rover.until(lambda: rover.reason() == 'the clock does not advance')
     assert rover.rests()
-    step[0] = round(PERIOD * 1e9)
+    rover.is_paused = False
     rover.until(rover.drives)
     for seconds in (30, -20):
         place = rover.place
@@ -332,13 +274,9 @@ def test_other_type_of_velocity_rejects_the_goal(rover, repeat, capfd):
     base.create_subscription(TwistStamped, 'cmd_vel', print, 10)
     rover.until(lambda: len(node.get_subscriptions_info_by_topic('cmd_vel')) == 2)
     assert not rover.send(start_index=3).accepted
-    error = capfd.readouterr().err
-    for word in ('msg/TwistStamped, this node publishes', 'msg/Twist: set the parameter stamped'):
-        assert word in error
+    assert 'msg/Twist: set the parameter stamped to True' in capfd.readouterr().err
     base.destroy_node()
     rclpy.shutdown(context=other)
-    rover.until(lambda: len(node.get_subscriptions_info_by_topic('cmd_vel')) == 1)
-    assert rover.send(start_index=3).accepted
 
 
 def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
@@ -346,16 +284,13 @@ def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
     odometry = rover.node.create_publisher(Odometry, 'odom', 10)
     rover.send(start_index=3)
     rover.until(lambda: rover.reason() == 'no odometry')
-    shown = []
 
     def wheels():
         message = Odometry(header=Header(stamp=rover.node.get_clock().now().to_msg()))
-        message.pose.pose.position.x = shown[0] if shown else rover.place
+        message.pose.pose.position.x = min(rover.place, 8.0)  # and they stand
         odometry.publish(message)
 
     rover.node.create_timer(0.05, wheels)
-    rover.until(lambda: rover.place > 5)
-    shown.append(rover.place)
     rover.until(lambda: rover.reason() == NO_EVIDENCE)
 
 
@@ -402,16 +337,13 @@ def test_map_of_several_sessions_is_repeated_by_matches_of_any(rover, repeat, ma
 @pytest.mark.parametrize(
     ('remapped', 'topic'),
     [
-        (('image:=/front/image_raw',), '/front/camera_info'),
         (('image:=/front/image_raw', 'camera_info:=/rear/info'), '/rear/info'),
         (('camera_info:=camera_info', 'image:=left/image'), '/left/camera_info'),
-        ((), '/camera_info'),
     ],
 )
 def test_intrinsics_are_beside_the_images(context, map_file, remapped, topic):
-    words = [word for rule in remapped for word in ('-r', rule)]
-    options = {'cli_args': ['--ros-args', *words]} if words else {}
-    node = RepeatNode(context=context, **overrides(map_path=map_file), **options)
+    words = ['--ros-args', *(word for rule in remapped for word in ('-r', rule))]
+    node = RepeatNode(context=context, **overrides(map_path=map_file), cli_args=words)
     topics = [name for name, _ in node.get_subscriber_names_and_types_by_node('repeat', '/')]
     node.destroy_node()
     assert topic in topics
