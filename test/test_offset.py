@@ -5,6 +5,7 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from stavpr_ros.errors import ImageError, InputError
 from stavpr_ros.mapping import thumbnail_of
 from stavpr_ros.relative_pose import offset as module
@@ -64,38 +65,22 @@ def plain_evidence(query, place):
     evidence, is_enough = np.zeros((2, len(A), len(SHIFTS)))
     centers = (np.arange(BLOCKS) + 0.5) / BLOCKS * 2 - 1
     for model, (a, b) in enumerate(zip(A, B, strict=True)):
-        pixels = (a * centers * abs(centers) + b * abs(centers)) * WIDTH / 2
-        beside = np.rint(pixels * PARTS) / PARTS
+        beside = np.rint((a * centers + b) * abs(centers) * WIDTH / 2 * PARTS) / PARTS
+        at = beside[:, None] + np.arange(len(SHIFTS))
+        shown = np.array([plain_mean(*each) for each in zip(means, at, strict=True)])
         for k in range(len(SHIFTS)):
-            used = [
-                plain_mean(row, k + each)
-                for row, each in zip(means, beside, strict=True)
-                if not np.isnan(row[k])
-            ]
-            if used:
-                evidence[model, k] = EVIDENCE * np.sum(used) / np.sqrt(BLOCKS * len(used))
+            used = shown[~np.isnan(means[:, k]), k]
+            if len(used):
+                evidence[model, k] = EVIDENCE * used.sum() / np.sqrt(BLOCKS * len(used))
             is_enough[model, k] = len(used) >= MIN_OVERLAP * BLOCKS
     return evidence, is_enough
 
 
 def plain_mean(row, at):
-    """
-    Return a mean between pixels, by the cubic through them with the slopes of neighbors.
-
-    Beside the shifts at which the block overlaps, it is the last one.
-    """
-    first, last = np.flatnonzero(~np.isnan(row))[[0, -1]]
-    at = min(max(at, first), last)
-    k = min(int(np.floor(at)), last - 1)
-
-    def slope(i):
-        is_inside = first < i < last
-        return (row[i + 1] - row[i - 1]) / 2 if is_inside else row[k + 1] - row[k]
-
-    t = at - k
-    left, right = 2 * t**3 - 3 * t**2 + 1, 3 * t**2 - 2 * t**3
-    rising, falling = t**3 - 2 * t**2 + t, t**3 - t**2
-    return left * row[k] + right * row[k + 1] + rising * slope(k) + falling * slope(k + 1)
+    """Return a mean between pixels; beside the shifts at which the block overlaps, the last."""
+    covered = np.flatnonzero(~np.isnan(row))
+    cubic = CubicHermiteSpline(covered, row[covered], np.gradient(row[covered]))
+    return cubic(np.clip(at, covered[0], covered[-1]))
 
 
 def plain_drifted(earlier):

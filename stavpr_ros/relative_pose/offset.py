@@ -225,11 +225,12 @@ def block_evidence(
                 total += _dot(place[x], query[x + k - REACH])
             if 2 * (last - first) >= size:
                 means[block, k], is_covered[block, k] = total / (last - first), True
-    parts = _in_between(means, is_covered)
-    firsts, lasts = np.zeros(BLOCKS, np.int64), np.zeros(BLOCKS, np.int64)
+    parts = np.empty((BLOCKS, PARTS * (shifts - 1) + 1))
     for block in range(BLOCKS):
         covered = np.flatnonzero(is_covered[block])
-        firsts[block], lasts[block] = PARTS * covered[0], PARTS * covered[-1]
+        first, last = PARTS * covered[0], PARTS * covered[-1]
+        parts[block, first : last + 1] = _in_between(means[block, covered])
+        parts[block, :first], parts[block, last:] = parts[block, first], parts[block, last]
     evidence, is_enough = np.zeros((models, shifts)), np.zeros((models, shifts), np.bool_)
     for model in range(models):
         for k in range(shifts):
@@ -237,7 +238,7 @@ def block_evidence(
             for block in range(BLOCKS):
                 if is_covered[block, k]:
                     shift = PARTS * k + beside[model, block]
-                    total += parts[block, min(max(shift, firsts[block]), lasts[block])]
+                    total += parts[block, min(max(shift, 0), PARTS * (shifts - 1))]
                     count += 1
             evidence[model, k] = EVIDENCE / BLOCKS * total * np.sqrt(BLOCKS / max(count, 1))
             is_enough[model, k] = count >= MIN_OVERLAP * BLOCKS
@@ -245,32 +246,22 @@ def block_evidence(
 
 
 @kernel
-def _in_between(means: np.ndarray, is_covered: np.ndarray) -> np.ndarray:
+def _in_between(means: np.ndarray) -> np.ndarray:
     """
-    Return the means at parts of a pixel, by cubic (Catmull-Rom) interpolation; NaN = unknown.
+    Return the means at parts of a pixel, by cubic (Catmull-Rom) interpolation.
 
     Linear interpolation lowers a peak between two pixels: small shifts would be zero.
     """
-    blocks, shifts = means.shape
-    parts = np.full((blocks, PARTS * (shifts - 1) + 1), np.nan)
-    for block in range(blocks):
-        for k in range(shifts):
-            if is_covered[block, k]:
-                parts[block, PARTS * k] = means[block, k]
-        for k in range(shifts - 1):
-            if not (is_covered[block, k] and is_covered[block, k + 1]):
-                continue
-            p1, p2 = means[block, k], means[block, k + 1]
-            p0, p3 = 2 * p1 - p2, 2 * p2 - p1
-            if k > 0 and is_covered[block, k - 1]:
-                p0 = means[block, k - 1]
-            if k + 2 < shifts and is_covered[block, k + 2]:
-                p3 = means[block, k + 2]
-            for part in range(1, PARTS):
-                t = part / PARTS
-                square = 2 * p0 - 5 * p1 + 4 * p2 - p3
-                slope = p2 - p0 + t * (square + t * (3 * (p1 - p2) + p3 - p0))
-                parts[block, PARTS * k + part] = p1 + t / 2 * slope
+    padded = np.empty(len(means) + 2)
+    padded[0], padded[-1] = 2 * means[0] - means[1], 2 * means[-1] - means[-2]
+    padded[1:-1] = means
+    parts = np.full(PARTS * (len(means) - 1) + 1, means[-1])
+    for k in range(len(means) - 1):
+        p0, p1, p2, p3 = padded[k], padded[k + 1], padded[k + 2], padded[k + 3]
+        for part in range(PARTS):
+            t = part / PARTS
+            slope = p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0))
+            parts[PARTS * k + part] = p1 + t / 2 * slope
     return parts
 
 
