@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 import difflib
 import os
 import sys
-from types import MappingProxyType
 from typing import Any
 
 from launch import LaunchContext, LaunchDescription
@@ -43,9 +42,9 @@ def other_node(
     package: str,
     executable: str,
     name: str,
-    table: Mapping[str, tuple[Any, str]] = MappingProxyType({}),
-    fixed: Mapping[str, object] = MappingProxyType({}),
-    renamed: Mapping[str, str] = MappingProxyType({}),
+    table: Mapping[str, tuple[Any, str]] | None = None,
+    fixed: Mapping[str, object] | None = None,
+    renamed: Mapping[str, str] | None = None,
 ) -> list[Any]:
     """
     Describe a node beside the recognition node: its arguments, and the action that starts it.
@@ -58,25 +57,14 @@ def other_node(
     :param renamed: parameters whose arguments have other names, since the recognition node has a
         parameter of this name: always given, whatever ``params_file`` has for that.
     """
+    table, renamed = table or {}, renamed or {}
+    types = {argument: type(default) for argument, (default, _) in table.items()}
+    types['use_sim_time'] = bool
 
     def start(context: LaunchContext) -> list[Node]:
-        values = {}
-        for argument, (default, _) in {**table, 'use_sim_time': (False, '')}.items():
-            if text := LaunchConfiguration(argument).perform(context):
-                value = value_of(argument, text, type(default))
-                parameter = renamed.get(argument, argument)
-                values[parameter] = ParameterValue(value, value_type=type(default))
-        return [
-            Node(
-                package=package,
-                executable=executable,
-                name=name,
-                namespace=LaunchConfiguration('namespace'),
-                output='screen',
-                remappings=remappings(),
-                parameters=[LaunchConfiguration('params_file'), {**values, **fixed}],
-            )
-        ]
+        texts = {argument: LaunchConfiguration(argument).perform(context) for argument in types}
+        values = {renamed.get(n, n): value for n, value in _values(texts, types).items()}
+        return [_node(package, executable, {**values, **(fixed or {})}, name=name)]
 
     own = [
         DeclareLaunchArgument(
@@ -116,7 +104,14 @@ def node_launch(
     def start(context: LaunchContext) -> list[Node]:
         names = [''] if cameras is None else cameras.perform(context).replace(' ', '').split(',')
         texts = {n: LaunchConfiguration(n).perform(context) for n in TYPES if n not in fixed}
-        return [_node(texts, fixed, camera) for camera in names]
+        end = LaunchConfiguration('sigkill_timeout', default=END_SECONDS)
+        return [
+            _node(
+                PACKAGE, 'node', _values(texts, TYPES, camera) | fixed, camera, name='stavpr',
+                sigkill_timeout=end,
+            )
+            for camera in names
+        ]  # fmt: skip
 
     return LaunchDescription([*arguments, check, OpaqueFunction(function=start), *actions])
 
@@ -136,18 +131,17 @@ def unknown_arguments(words: Iterable[str], names: Iterable[str]) -> list[str]:
     return problems
 
 
-def value_of(name: str, text: str, kind: type | None = None) -> bool | float | str:
-    """
-    Return the value of an argument that is a parameter.
-
-    :param kind: its type; None = of the parameter of the recognition node.
-    :raises RuntimeError: a text of another type; names the parameter.
-    """
-    kind = kind or TYPES[name]
-    try:
-        return {'true': True, 'false': False}[text.lower()] if kind is bool else kind(text)
-    except (KeyError, ValueError):
-        raise RuntimeError(f'{name} = {text!r}: expected {EXPECTED[kind]}') from None
+def _values(texts: dict[str, str], types: dict[str, type], camera: str = '') -> dict[str, object]:
+    """Return the values of arguments that are parameters, but those of empty arguments."""
+    values: dict[str, object] = {}
+    for name, text in ((n, text.replace(CAMERA, camera)) for n, text in texts.items() if text):
+        kind = types[name]
+        try:
+            value = {'true': True, 'false': False}[text.lower()] if kind is bool else kind(text)
+        except (KeyError, ValueError):
+            raise RuntimeError(f'{name} = {text!r}: expected {EXPECTED[kind]}') from None
+        values[name] = ParameterValue(value, value_type=kind)
+    return values
 
 
 def _check(names: list[str], needs: str) -> OpaqueFunction:
@@ -203,20 +197,16 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
     ]
 
 
-def _node(texts: dict[str, str], fixed: dict[str, object], camera: str) -> Node:
+def _node(
+    package: str, executable: str, values: dict[str, object], camera: str = '', **options: Any
+) -> Node:
     namespace = LaunchConfiguration('namespace')
-    values = {
-        name: ParameterValue(value_of(name, text.replace(CAMERA, camera)), value_type=TYPES[name])
-        for name, text in texts.items()
-        if text
-    }
     return Node(
-        package=PACKAGE,
-        executable='node',
-        name='stavpr',
+        package=package,
+        executable=executable,
         namespace=[namespace, '/', camera] if camera else namespace,
         output='screen',
         remappings=remappings(),
-        parameters=[LaunchConfiguration('params_file'), values | fixed],
-        sigkill_timeout=LaunchConfiguration('sigkill_timeout', default=END_SECONDS),
+        parameters=[LaunchConfiguration('params_file'), values],
+        **options,
     )
