@@ -23,7 +23,7 @@ SPEED, STEP, LATENCY, BRAKING = 1.0, 0.01, 0.05, 5.0  # m/s, seconds, seconds, m
 CONTROL, ODOMETRY = 5, 2  # steps between two commands, and between two odometry messages
 PHASES = 20
 BEFORE, AFTER = 12.0, 30.0  # meters before, seconds after the failure
-LIKE, UNLIKE = (Offset(0.0, 0.01, 0.0, 1e6, similarity) for similarity in (0.6, 0.0))
+LIKE = Offset(0.0, 0.01, 0.0, 1e6, 0.6)  # of an image of its place
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,15 @@ FAILURES = {
     'the same, with odometry': Failure(is_new=True, wheels=False, odometry=True),
     'odometry ends: meters after it': Failure(rate=5.0, odometry=False),
     'the camera ends': Failure(images=False),
+    'the bridge: other images, without a match': Failure(is_new=True, is_matched=False),
+    'the camera falls to half its rate: meters between images': Failure(rate=5.0),
+    'the camera falls to 1 image/s: meters between images': Failure(rate=1.0),
 }
-BRIDGE = Failure(is_new=True, is_matched=False)
-SLOW = {
-    'the camera falls to half its rate': Failure(rate=5.0),
-    'the camera falls to 1 image/s': Failure(rate=1.0),
-}
+
+
+def is_slow(failure: Failure) -> bool:
+    """Return whether good images go on, slowly, and nothing else fails."""
+    return failure.rate > 0 and failure.odometry is None
 
 
 def drive(
@@ -78,30 +81,29 @@ def drive(
     """
     count = round((BEFORE + SPEED * AFTER) / spacing) + 10
     run = TaughtRun(np.arange(count) * spacing / SPEED, np.full(count, SPEED), np.zeros(count))
-    settings = FollowerSettings(max_acceleration=1.0)
     odometry = None if failure.odometry is None else OdometryComparison(SPEED)
+    settings = FollowerSettings(max_acceleration=1.0)
     driver = Driver(run, Goal(start=0), 0.0, settings, odometry=odometry)
     waiting: deque[tuple[float, Observation]] = deque()
-    x = speed = commanded = 0.0
+    x = speed = commanded = failed = evidence = next_image = 0.0
     failed_at = stopped_at = math.inf
-    failed = 0.0
-    best, evidence, shown, next_image = 0, 0.0, 0, 0.0
-    for k in range(round(60 / STEP)):
-        now, is_failed = k * STEP, failed_at < math.inf
-        if not is_failed and x >= BEFORE + phase * spacing:
-            failed_at, is_failed, failed = now, True, commanded
+    best = shown = k = 0
+    while (now := k * STEP) <= min(failed_at + AFTER, 60):
+        if failed_at == math.inf and x >= BEFORE + phase * spacing:
+            failed_at, failed = now, commanded
+        is_failed = failed_at < math.inf
         if now >= next_image - 1e-9 and (failure.images or not is_failed):
-            next_image += 1 / (failure.rate if is_failed and failure.rate else rate)
+            is_good = not is_failed or failure.rate > 0
             has_place = not is_failed or failure.is_matched
-            if not is_failed or failure.rate:
-                shown = int(x / spacing + 1e-9)
-                if shown > best and stopped_at == math.inf:
-                    best, evidence = shown, commanded
+            next_image += 1 / (failure.rate if is_failed and failure.rate else rate)
+            shown = int(x / spacing + 1e-9) if is_good else shown
+            if shown > best and stopped_at == math.inf:
+                best, evidence = shown, commanded
             swing = failure.swing * (round(now * rate) % 2) if is_failed else 0
             place = shown - swing if has_place else driver.expected_place(failure.is_new)
             waiting.append((now + LATENCY, Observation(
                 now, place, 0.99 if has_place else math.nan, LIKE if place >= 0 else None,
-                not is_failed or failure.is_new or failure.rate > 0,
+                is_good or failure.is_new,
             )))  # fmt: skip
         while waiting and waiting[0][0] <= now:
             driver.observe(waiting.popleft()[1], now)
@@ -113,10 +115,9 @@ def drive(
         speed = max(command.speed, speed - BRAKING * STEP)
         commanded += speed * STEP
         x += speed * STEP * (failure.wheels or not is_failed)
-        if is_failed and speed == 0 and command.reason and stopped_at == math.inf:
-            stopped_at = commanded
-        if now > failed_at + AFTER:
-            break
+        if is_failed and speed == 0 and command.reason:
+            stopped_at = min(stopped_at, commanded)
+        k += 1
     return stopped_at - evidence, command.reason, commanded - stopped_at, commanded - failed
 
 
@@ -128,18 +129,18 @@ def table() -> list[str]:
         + ' | '.join(f'{spacing:g} m, {rate:g}/s' for spacing, rate in columns) + ' | reason |',
         '|---' * (len(columns) + 2) + '|',
     ]  # fmt: skip
-    for name, failure in (
-        FAILURES | {'the bridge: other images, without a match': BRIDGE}
-    ).items():
+    for name, failure in FAILURES.items():
         cells, reasons = [], set()
-        for spacing, rate in columns:
-            drives = [drive(failure, spacing, rate, k / PHASES) for k in range(PHASES)]
-            cells.append(f'{max(each[3 if failure.rate else 0] for each in drives):.2f} m')
-            reasons |= {each[1].split(':')[0] for each in drives}
+        for each in columns:
+            if is_slow(failure):
+                meters = meters_per_image(failure, *each)
+                reasons = {'it goes on'}
+            else:
+                drives = [drive(failure, *each, k / PHASES) for k in range(PHASES)]
+                meters = max(one[3 if failure.rate else 0] for one in drives)
+                reasons |= {one[1].split(':')[0] for one in drives}
+            cells.append(f'{meters:.2f} m')
         lines.append(f'| {name} | {" | ".join(cells)} | {", ".join(sorted(reasons))} |')
-    for name, failure in SLOW.items():
-        cells = [f'{meters_per_image(failure, spacing, rate):.2f} m' for spacing, rate in columns]
-        lines.append(f'| {name}: meters between images | {" | ".join(cells)} | it goes on |')
     return lines
 
 
@@ -148,10 +149,5 @@ def meters_per_image(failure: Failure, spacing: float, rate: float) -> float:
     return drive(failure, spacing, rate, 0.5)[3] / AFTER / failure.rate
 
 
-def main() -> None:
-    """Print the table."""
-    print('\n'.join(table()))
-
-
 if __name__ == '__main__':
-    main()
+    print('\n'.join(table()))
