@@ -137,7 +137,7 @@ def table() -> list[str]:
                 reasons = {'it goes on'}
             else:
                 drives = [drive(failure, *each, k / PHASES) for k in range(PHASES)]
-                meters = max(one[3 if failure.rate else 0] for one in drives)
+                meters = max(one[3] if failure.rate else one[0] for one in drives)
                 reasons |= {one[1].split(':')[0] for one in drives}
             cells.append(f'{meters:.2f} m')
         lines.append(f'| {name} | {" | ".join(cells)} | {", ".join(sorted(reasons))} |')
