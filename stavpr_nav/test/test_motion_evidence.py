@@ -169,16 +169,6 @@ def test_images_out_of_order_or_of_the_future_are_not_used():
         assert run.follower.expected_place() == pytest.approx(place, abs=1)
 
 
-def test_clock_that_is_set_back_far_does_not_move_the_place():
-    run = Run(run=taught(60))
-    run.drive(15)
-    run.time -= 3600
-    commands = run.drive(4)
-    assert commands[0].reason == 'no new image'
-    assert commands[-1].speed == pytest.approx(0.8)
-    assert run.follower.expected_place() == pytest.approx(run.place, abs=1)
-
-
 @pytest.mark.parametrize(
     ('x', 'reason', 'options'),
     [
