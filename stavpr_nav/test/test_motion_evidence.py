@@ -191,3 +191,14 @@ def test_odometry_that_disagrees_or_ends_stops_the_robot(x, reason, options):
             odometry.take(frame(now), stamp(now), pose, now)
         last = drive.go(STEP)[-1]
     assert last.reason == reason
+
+
+@pytest.mark.parametrize(('place', 'added'), [(5, 0.0), (9, 0.5), (19, 1.5)])
+def test_match_ahead_of_the_commanded_meters_allows_for_the_distance(place, added):
+    """Up to a limit: after 1.25 m, the match of a place at 1.25, 2.25 or 4.75 m."""
+    evidence = MotionEvidence(0.25 * np.arange(25), None, 0.1)
+    evidence.restart(np.zeros(3), 0)
+    evidence.take(Observation(1.0, place, 0.9, None), np.array([1.25, 0, 1.25]), 0.0)
+    for margin in (-0.01, 0.01):
+        meters = 1.25 + 0.3 + added + margin
+        assert evidence.is_due(np.array([meters, 0, meters]), 0.0) == (margin > 0)

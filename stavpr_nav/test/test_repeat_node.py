@@ -5,6 +5,7 @@
 from dataclasses import replace
 import math
 from pathlib import Path
+import signal
 import time
 from xml.etree import ElementTree
 
@@ -67,12 +68,13 @@ class Rover:
         self.images, self.map_id, self.seam = images, map_id, None
         self.status, self.place, self.pressed, self.damaged = PlaceMatch.MATCH, 3.0, True, False
         self.is_blocked = self.is_paused = False  # by an emergency stop; of the clock
-        self.silent, self.clock = '', None
+        self.silent, self.every, self.ticks, self.clock = '', 1, 0, None
         self.starter = self.node.create_client(Trigger, 'repeat/start')
         self.node.create_timer(PERIOD, self.look)
 
     def look(self):
         """Publish what the camera shows, the match, and the switch."""
+        self.ticks += 1
         now = time.monotonic()
         elapsed, self.looked = now - self.looked, now
         header = Header(stamp=self.node.get_clock().now().to_msg())
@@ -89,7 +91,7 @@ class Rover:
         for name, message in (
             ('deadman', Bool(data=self.pressed)), ('match', match), ('image', image)
         ):  # fmt: skip
-            if name != self.silent:
+            if name != self.silent and (name == 'deadman' or self.ticks % self.every == 0):
                 getattr(self, name).publish(message)
         self.camera.publish(CameraInfo(width=128, height=96, k=[64.0, 0, 64, 0, 64, 48, 0, 0, 1]))
         is_obeyed = self.commands and time.monotonic() - self.obeyed < 0.5  # by its watchdog
@@ -241,6 +243,41 @@ def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repe
             answer = rover.result_of(rover.starter.call_async(Trigger.Request()))
             assert answer.success is success
     rover.until(rover.drives)
+
+
+def test_node_that_is_suspended_goes_on_from_rest(rover, map_file, tmp_path):
+    values = {'map_path': map_file, 'give_up_after': 0.0} | FAST
+    words = [word for name, value in values.items() for word in ('-p', f'{name}:={value}')]
+    process = Process(tmp_path / 'repeat', 'repeat', '--ros-args', *words)
+    try:
+        rover.begin()
+        process.popen.send_signal(signal.SIGSTOP)
+        rover.until(lambda: time.monotonic() - rover.obeyed > 1.0)
+        place = rover.place  # the base has stopped by itself
+        rover.until(lambda: time.monotonic() - rover.obeyed > 2.0)
+        assert rover.place == place
+        rover.commands.clear()
+        process.popen.send_signal(signal.SIGCONT)
+        rover.until(rover.drives)
+        speeds = [command.linear.x for command in rover.commands]
+        assert 0 < speeds[-1] <= 0.3, speeds
+    finally:
+        process.popen.send_signal(signal.SIGCONT)
+        process.end()
+
+
+def test_slow_camera_is_driven_with_stop_and_go_and_half_the_rate_without(rover, repeat):
+    repeat(give_up_after=0.0)
+    rover.begin()
+    rover.every = 2
+    rover.until(lambda: rover.place > 7)
+    assert rover.drives()
+    rover.every = 10
+    rover.until(rover.rests)
+    place, ticks = rover.place, rover.ticks
+    rover.until(lambda: rover.place > place + 1)
+    images = (rover.ticks - ticks) / rover.every
+    assert (rover.place - place) / images < 0.5  # meters between two images
 
 
 def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, repeat):
