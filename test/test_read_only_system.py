@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A system whose folders cannot be written: it works where it can, and else says why."""
+"""A system whose folders cannot be written: it works where it can, and else states why."""
 
 import os
 from pathlib import Path
@@ -51,7 +51,7 @@ def test_bag_with_a_log_names_the_room_for_its_copy(bag, monkeypatch, tmp_path):
     database.close()
 
 
-def test_command_that_cannot_write_says_where(capsys):
+def test_command_that_cannot_write_names_the_folder(capsys):
     assert run_program('work', lambda: os.mkdir('/proc/none')) == 1
     assert "'/proc/none'; expected folders that can be written" in capsys.readouterr().err
 
@@ -65,13 +65,15 @@ with ros_node(lambda: rclpy.create_node('n'), []) as node:
 """
 
 
+def run(program, without, **variables):
+    environment = {name: os.environ[name] for name in os.environ.keys() - without} | variables
+    command = [sys.executable, '-c', program]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+
+
 @pytest.mark.parametrize('variable', ['ROS_LOG_DIR', 'ROS_HOME', 'HOME'])
 def test_node_runs_without_a_log_folder(variable):
-    names = os.environ.keys() - {'ROS_LOG_DIR', 'ROS_HOME', 'HOME'}
-    environment = {name: os.environ[name] for name in names} | {variable: '/proc/none'}
-    done = subprocess.run(
-        [sys.executable, '-c', NODE], env=environment, capture_output=True, text=True, check=True
-    )
+    done = run(NODE, {'ROS_LOG_DIR', 'ROS_HOME', 'HOME'}, **{variable: '/proc/none'})
     assert 'no log is written to /proc/none' in done.stderr
     assert 'runs' in done.stderr
 
@@ -82,16 +84,7 @@ def test_node_without_shared_memory_uses_udp(tmp_path, size):
     if size:
         (tmp_path / 'shm').mkdir()
     program = f'from stavpr_ros.ros import process\n{names}\n{NODE}\nprint(process.os.environ)'
-    names = os.environ.keys() - {'FASTRTPS_DEFAULT_PROFILES_FILE'}
-    environment = {name: os.environ[name] for name in names}
-    done = subprocess.run(
-        [sys.executable, '-c', program],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert 'shm (' in done.stderr
+    done = run(program, {'FASTRTPS_DEFAULT_PROFILES_FILE'})
     assert 'sent by UDP' in done.stderr
     assert 'config/fastdds_udp.xml' in done.stdout
 

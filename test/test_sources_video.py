@@ -256,7 +256,7 @@ def test_video_that_ends_early_is_reported_once(tmp_path):
     assert len(errors) == 1
 
 
-@pytest.mark.parametrize('sounds', [[(0, 8)], [(5, 9)], [(0, 1)], [(0, 1), (3, 6)]])
+@pytest.mark.parametrize('sounds', [[(0, 8)], [(5, 9)], [(0, 1), (3, 6)]])
 @pytest.mark.parametrize(
     ('name', 'codec', 'voice'),
     [
@@ -276,22 +276,15 @@ def test_sound_may_have_another_length(tmp_path, name, codec, voice, sounds):
 
 @pytest.mark.parametrize('suffix', ['mkv', 'flv', 'mov'])
 def test_video_with_sound_that_is_cut_is_reported(tmp_path, suffix):
-    fast = {'movflags': 'faststart'} if suffix == 'mov' else {}
+    whole = write_video(tmp_path / f'whole.{suffix}', codec='libx264', sounds=[(0, 2)])
     path = tmp_path / f'cut.{suffix}'
-    with av.open(str(path), 'w', options=fast) as container:
-        stream, sound = (
-            container.add_stream('libx264', rate=30),
-            container.add_stream('aac', 48000),
-        )
-        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, 'yuv420p'
-        for i, image in enumerate(colored_images()):
-            frame = av.VideoFrame.from_ndarray(image, format='rgb24')
-            container.mux(stream.encode(frame))
-            voice = av.AudioFrame.from_ndarray(np.zeros((1, 1600), np.float32), 'fltp', 'mono')
-            voice.sample_rate, voice.pts = 48000, 1600 * i
-            container.mux(sound.encode(voice))
-        container.mux(stream.encode(None))
-        container.mux(sound.encode(None))
+    fast = {'movflags': 'faststart'} if suffix == 'mov' else {}
+    with av.open(str(whole)) as source, av.open(str(path), 'w', options=fast) as target:
+        streams = [target.add_stream_from_template(each) for each in source.streams]
+        for packet in source.demux():
+            if packet.dts is not None:
+                packet.stream = streams[packet.stream_index]
+                target.mux(packet)
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
     with pytest.raises(ImageError, match='ends early'):
         list(open_source(path))

@@ -186,15 +186,10 @@ def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -
             f'{path} has {len(nonempty)} image topics, choose one (--topic): {_listed(nonempty)}'
         )
     expected = ', '.join([RAW, COMPRESSED, *sorted(VIDEO)])
-    remedy = ''
+    text = f'{path} has no images (expected {expected}): there are {_listed(topics)}'
     if any('Packet' in kind or 'Compressed' in kind for kind, _ in topics.values()):
-        remedy = (
-            '; while it is played, `ros2 run image_transport republish TRANSPORT raw` makes '
-            'images of another transport, such as theora'
-        )
-    raise SourceError(
-        f'{path} has no images (expected {expected}): there are {_listed(topics)}{remedy}'
-    )
+        text += '; `ros2 run image_transport republish TRANSPORT raw` converts it while played'
+    raise SourceError(text)
 
 
 def _named(path: Path, topics: dict[str, tuple[str, int]], topic: str, kinds: set[str]) -> str:

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens bag files of every kind with rosbags, without writing beside them."""
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, ExitStack
+from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
 from heapq import merge
-from itertools import pairwise
 import math
 import os
 from pathlib import Path, PureWindowsPath
@@ -34,7 +33,6 @@ from stavpr_ros.sources.bag_path import (
     reading,
     storage_files,
     storage_kind,
-    STORAGE_SUFFIXES,
     ZSTD,
 )
 from stavpr_ros.sources.mcap import with_end
@@ -44,9 +42,6 @@ from stavpr_ros.units import SECOND
 
 LOG_SUFFIXES = ('-wal', '-journal')
 """Files of SQLite beside a database with writes that are not in the database yet."""
-WAL_HEADER = 32  # bytes; others mean that the log began anew
-OVERLAP = SECOND // 2  # parts of a split bag follow each other, but for messages out of order
-COMPRESSIONS = {'', 'lz4', 'zstd'}  # of chunks of MCAP
 
 
 @dataclass(frozen=True)
@@ -55,12 +50,15 @@ class OpenBag:
     A bag that is open for reading.
 
     :param readers: of its files.
-    :param is_ros1: whether its messages are of ROS 1.
     """
 
     path: Path
     readers: list[Any]
-    is_ros1: bool
+
+    @property
+    def is_ros1(self) -> bool:
+        """Whether its messages are of ROS 1."""
+        return all(isinstance(each, Ros1Reader) for each in self.readers)
 
     @property
     def topics(self) -> dict[str, list[Connection]]:
@@ -89,7 +87,8 @@ class OpenBag:
         :param duration: seconds from there on.
         """
         with reading(self.path):
-            first = min(_span(each)[0] for each in self.readers) + round(start * SECOND)
+            starts = (getattr(each, 'metadata', each).start_time for each in self.readers)
+            first = min(starts) + round(start * SECOND)
             last = None if math.isinf(duration) else first + round(duration * SECOND)
             wanted = [[c for c in each.connections if c.topic in topics] for each in self.readers]
             parts = [
@@ -100,6 +99,12 @@ class OpenBag:
             for connection, time_ns, raw in merge(*parts, key=lambda each: each[1]):
                 is_packed = not self.is_ros1 and bytes(raw[:4]) in MAGIC  # ZSTD; no start of CDR
                 yield connection, time_ns, zstd.decompress(raw) if is_packed else raw
+
+
+def _read(reader: Any) -> Any:
+    """Return what yields the messages of a file, of MCAP without an index as they were written."""
+    has_no_index = isinstance(reader, McapReader) and not reader.chunks
+    return reader.messages_scan if has_no_index else reader.messages
 
 
 def message_type(connection: Connection) -> str:
@@ -123,52 +128,23 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     with ExitStack() as stack:
         with reading(path):
             names, counts = _stated(path) if path.is_dir() else ([], {})
-            files, missing = _files(path, names) if path.is_dir() else ([path], [])
-            readers, kinds, damaged = [], set(), []
+            files = _files(path, names) if path.is_dir() else [path]
+            readers, damaged = [], []
             for file in files:
                 try:
                     with reading(file):
-                        reader, kind = _open_file(file, stack)
+                        readers.append(_open_file(file, stack))
                 except SourceError as error:  # the other parts of the bag may be whole
                     damaged.append(error)
-                    continue
-                readers.append(reader)
-                kinds.add(kind)
+            if not readers:
+                raise damaged[0]
             for reason in damaged:
-                if not readers:
-                    raise reason
                 note_once(f'a part of {path} is left out: {reason}')
-            if len(kinds) > 1 or (len(files) > 1 and not names and '.bag' not in kinds):
-                _require_parts(path, files, readers)
-            bag = OpenBag(path, readers, '.bag' in kinds)
-            _note_missing(bag, missing, counts)
+            bag = OpenBag(path, readers)
+            if not (names or bag.is_ros1):
+                _require_parts(path, files)
+            _note_missing(bag, names, files, counts)
         yield bag
-
-
-def _open_file(file: Path, stack: ExitStack) -> tuple[Any, str]:
-    """Return an open reader of one file, and its kind."""
-    reader, kind = _reader(file, stack)
-    reader.open()
-    stack.callback(reader.close)
-    unknown = {each.compression for each in reader.chunks} if kind == '.mcap' else set()
-    if unknown := unknown - COMPRESSIONS:
-        raise SourceError(
-            f'{file} is compressed by {", ".join(sorted(unknown))}: expected lz4 or zstd; convert '
-            'it with the program that wrote it'
-        )
-    return reader, kind
-
-
-def _read(reader: Any) -> Callable[..., Iterator[tuple[Connection, int, bytes]]]:
-    """Return what yields the messages of a file, of MCAP without an index as they were written."""
-    has_no_index = isinstance(reader, McapReader) and not reader.chunks
-    return reader.messages_scan if has_no_index else reader.messages
-
-
-def _span(reader: Any) -> tuple[int, int]:
-    """Return the times of the first and last message, ns; the first is larger if there is none."""
-    of = getattr(reader, 'metadata', reader)  # only readers of ROS 1 have the times themselves
-    return of.start_time, of.end_time
 
 
 def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
@@ -189,33 +165,24 @@ def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
     return names, counts
 
 
-def _files(folder: Path, names: list[str]) -> tuple[list[Path], list[str]]:
-    """Return the files of a bag, and the names of the ones that are missing."""
-    present = {file.name.lower(): file for file in sorted(folder.iterdir())}
-    files = [present[name.lower()] for name in names if name.lower() in present]
-    missing = [name for name in names if name.lower() not in present]
-    if missing or not names:  # perhaps renamed
-        others = storage_files(folder)
-        others += [
-            file
-            for file in present.values()
-            if names and file.is_file() and storage_kind(file) in STORAGE_SUFFIXES
-        ]
-        files += [file for file in dict.fromkeys(others) if file not in files]
+def _files(folder: Path, names: list[str]) -> list[Path]:
+    """Return the files of a bag that are present."""
+    stated = {name.lower() for name in names}
+    files = {file for file in folder.iterdir() if file.name.lower() in stated}
+    if len(files) < len(names) or not names:  # perhaps renamed
+        files.update(storage_files(folder))
     if not files:
-        listed = f' with {", ".join(missing)}' if missing else ''
+        listed = f' with {", ".join(names)}' if names else ''
         raise SourceError(
             f'{folder} is no bag: expected a folder{listed}, or a .db3 or .mcap file; copy the '
             'files of the bag beside its metadata.yaml'
         )
-    return files, missing
+    return sorted(files)
 
 
-def _require_parts(folder: Path, files: list[Path], readers: list[Any]) -> None:
-    """Reject files without metadata that are not the parts of one bag: other names or times."""
-    spans = sorted(map(_span, readers))
-    apart = all(one[1] <= two[0] + OVERLAP for one, two in pairwise(spans))
-    if len({re.sub(r'_\d+\.', '.', file.name.lower()) for file in files}) > 1 or not apart:
+def _require_parts(folder: Path, files: list[Path]) -> None:
+    """Reject files without metadata that are not the parts of one bag, by their names."""
+    if len({re.sub(r'_\d+\.', '.', file.name.lower()) for file in files}) > 1:
         raise SourceError(
             f'{folder} has no {METADATA} that can be read: expected exactly one .db3 or .mcap '
             f'file then, or the parts of one bag, found {", ".join(each.name for each in files)}; '
@@ -223,85 +190,71 @@ def _require_parts(folder: Path, files: list[Path], readers: list[Any]) -> None:
         )
 
 
-def _note_missing(bag: OpenBag, missing: list[str], counts: dict[str, int]) -> None:
+def _note_missing(
+    bag: OpenBag, names: list[str], files: list[Path], counts: dict[str, int]
+) -> None:
     """Log in one line what the metadata state and the files do not have."""
-    topics, notes = bag.topics, [f'{name} is missing' for name in missing]
+    topics, present = bag.topics, {file.name.lower() for file in files}
+    notes = [f'{name} is missing' for name in names if name.lower() not in present]
     for topic, count in counts.items():
-        present = sum(each.msgcount for each in topics.get(topic, []))
-        if present < count:
-            notes.append(f'{topic} has {present} of {count} messages')
+        total = sum(each.msgcount for each in topics.get(topic, []))
+        if total < count:
+            notes.append(f'{topic} has {total} of {count} messages')
     if notes:
         note_once(f'{bag.path} has less than its {METADATA} states: {", ".join(notes)}')
 
 
-def _reader(file: Path, stack: ExitStack) -> tuple[Any, str]:
+def _open_file(file: Path, stack: ExitStack) -> Any:
     """
-    Return a reader of one file, not open yet, and its kind; with copies as long as the stack is.
+    Return an open reader of one file, which the stack closes, with a temporary copy if needed.
 
     rosbags opens databases as immutable: it writes nothing, but ignores the logs of SQLite; and it
     does not quote file names.
     """
-    kind = storage_kind(file)
-    source = file
-    if kind == ZSTD:
-        with _scratch(file, 'it is compressed', file.stat().st_size, stack) as folder:
-            source = folder / 'bag'
-            with (
-                file.open('rb') as packed,
-                zstd.open(packed) as whole,
-                source.open('wb') as target,
-            ):
-                shutil.copyfileobj(whole, target)
-        kind = storage_kind(source)
-    if kind == '.bag':
-        return Ros1Reader(source), kind
-    if kind == '.mcap':
-        return McapReader(with_end(source, file)), kind
-    if kind != '.db3':
-        raise SourceError(f'{file} is no bag: expected a database of SQLite, MCAP or ROS 1 .bag')
+    source, kind = file, storage_kind(file)
     logs = [log for end in LOG_SUFFIXES if _has_bytes(log := Path(f'{file}{end}'))]
-    if logs:
-        size = sum(each.stat().st_size for each in (file, *logs))
-        reason = f'{logs[0].name} has writes that are not in it, as while it is recorded'
-        with _scratch(file, reason, size, stack) as folder:
-            source = _with_logs(file, logs, folder / 'bag')
-    return Sqlite3Reader(Path(quote(os.fsencode(source)))), kind
+    if logs or kind == ZSTD:
+        source = _copied(file, logs, stack)
+        kind = storage_kind(source)
+    reader: Any
+    if kind == '.bag':
+        reader = Ros1Reader(source)
+    elif kind == '.mcap':
+        reader = McapReader(with_end(source, file))
+    elif kind == '.db3':
+        reader = Sqlite3Reader(Path(quote(os.fsencode(source))))
+    else:
+        raise SourceError(f'{file} is no bag: expected a database of SQLite, MCAP or ROS 1 .bag')
+    reader.open()
+    stack.callback(reader.close)
+    return reader
 
 
 def _has_bytes(file: Path) -> bool:
     return file.exists() and file.stat().st_size > 0
 
 
-@contextmanager
-def _scratch(file: Path, reason: str, size: int, stack: ExitStack) -> Iterator[Path]:
-    """Make a temporary folder for a copy; an error names how much room it needs, and why."""
+def _copied(file: Path, logs: list[Path], stack: ExitStack) -> Path:
+    """Return a copy of a file: with the writes of its logs, else decompressed."""
     try:
-        yield Path(stack.enter_context(TemporaryDirectory(prefix='stavpr_bag_')))
+        target = Path(stack.enter_context(TemporaryDirectory(prefix='stavpr_bag_')), 'bag')
+        if not logs:
+            with zstd.open(file) as whole, target.open('wb') as copy:
+                shutil.copyfileobj(whole, copy)
+            return target
+        for each in (file, *logs):
+            shutil.copyfile(each, f'{target}{each.name.removeprefix(file.name)}')
+        with closing(sqlite3.connect(target)) as database:
+            # opening rolls a journal back; this writes a write-ahead log into the database
+            database.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
+        return target
     except OSError as error:
+        size = sum(each.stat().st_size for each in (file, *logs))
+        writes = f'{logs[0].name} has writes that are not in it' if logs else 'it is compressed'
         raise SourceError(
-            f'{file} needs a temporary copy of {size / 1e6:.0f} MB or more, as {reason}: '
+            f'{file} needs a temporary copy of {size / 1e6:.0f} MB or more, as {writes}: '
             f'{error.strerror}; set TMPDIR to a folder with so much room that can be written'
         ) from error
-
-
-def _with_logs(file: Path, logs: list[Path], target: Path) -> Path:
-    """Copy a database and its logs, and write them into the copy."""
-    for _ in range(3):  # a recorder may write the log into the database and begin it anew
-        before = [log.read_bytes()[:WAL_HEADER] for log in logs]
-        shutil.copyfile(file, target)
-        copies = [
-            Path(shutil.copyfile(log, f'{target}{log.name.removeprefix(file.name)}'))
-            for log in logs
-        ]
-        if before == [copy.read_bytes()[:WAL_HEADER] for copy in copies]:
-            break
-    database = sqlite3.connect(target)
-    try:
-        # opening rolls a journal back; this writes a write-ahead log into the database
-        database.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
-    finally:
-        database.close()
-    return target
 
 
 @cache

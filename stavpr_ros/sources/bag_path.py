@@ -30,9 +30,14 @@ def is_bag(path: Path) -> bool:
     :raises SourceError: the folder cannot be listed.
     """
     with reading(path):
-        if path.is_dir():
-            return _is_folder_of_bag(path)
-        return _is_storage(path) or (path.is_file() and storage_kind(path) in STORAGE_SUFFIXES)
+        if not path.is_dir():
+            return _is_storage(path) or (path.is_file() and storage_kind(path) in STORAGE_SUFFIXES)
+        metadata = path / METADATA
+        if metadata.is_file() and IN_METADATA in metadata.read_bytes():
+            return True
+        bags = sum(not file.is_dir() for file in storage_files(path))
+        images = sum(file.suffix.lower() in SUFFIXES for file in path.glob('[!.]*'))
+        return bags > 0 and images < max(bags, 2)
 
 
 def storage_kind(file: Path) -> str:
@@ -69,13 +74,3 @@ def storage_files(folder: Path) -> list[Path]:
 
 def _is_storage(file: Path) -> bool:
     return Path(file.name.lower().removesuffix(ZSTD)).suffix in STORAGE_SUFFIXES
-
-
-def _is_folder_of_bag(folder: Path) -> bool:
-    """Return whether a folder is a bag, by its metadata, or since it has few images."""
-    metadata = folder / METADATA
-    if metadata.is_file() and IN_METADATA in metadata.read_bytes():
-        return True
-    bags = sum(not file.is_dir() for file in storage_files(folder))
-    images = sum(file.suffix.lower() in SUFFIXES for file in folder.glob('[!.]*'))
-    return bags > 0 and images < max(bags, 2)

@@ -21,7 +21,7 @@ MAX_SPEED = 80.0  # m/s
 
 
 def source_of(message: Any) -> str:
-    """Return what tells cameras on one topic apart: frame, and size of raw images."""
+    """Return what differs between cameras on one topic: frame, and size of raw images."""
     size = f' {message.width}x{message.height}' if hasattr(message, 'width') else ''
     return f'{message.header.frame_id!r}{size}'
 

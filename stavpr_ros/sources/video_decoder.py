@@ -77,30 +77,23 @@ def _open(path: str) -> Any:
 
 
 def _tracks(container: Any) -> list[Any]:
-    """Return the tracks of video, without covers and thumbnails."""
+    """Return the tracks of video, without covers and thumbnails if there are others."""
     from av.stream import Disposition
 
-    stills, best = Disposition.attached_pic | Disposition.timed_thumbnails, _best(container)
+    stills = Disposition.attached_pic | Disposition.timed_thumbnails
+    tracks = [each for each in container.streams.video if each.codec_context is not None]
     return [
-        each
-        for each in container.streams.video
-        if each is best
-        or (each.codec_context and not each.disposition & stills and each.frames != 1)
-    ]
-
-
-def _best(container: Any) -> Any:
-    stream = container.streams.best('video')
-    if stream is None or stream.codec_context is None:
-        sys.exit(NOT_OPENED)
-    return stream
+        each for each in tracks if not each.disposition & stills and each.frames != 1
+    ] or tracks
 
 
 def _video(container: Any) -> Any:
-    stream = _tracks(container)[0]
-    if stream.width * stream.height > MAX_PIXELS:
+    tracks = _tracks(container)
+    if not tracks:
+        sys.exit(NOT_OPENED)
+    if tracks[0].width * tracks[0].height > MAX_PIXELS:
         sys.exit(TOO_LARGE)
-    return stream
+    return tracks[0]
 
 
 def _facts(container: Any) -> tuple[float, float, float, int, int, int]:
@@ -116,43 +109,33 @@ def _facts(container: Any) -> tuple[float, float, float, int, int, int]:
 
 
 def _duration(container: Any, stream: Any, rate: Any) -> float:
-    """Return the duration of the pictures, or of the file if it has no other, s; 0 = unknown."""
+    """Return the duration of the track, or of the file where none is stated, s; 0 = unknown."""
     if container.format.flags & NO_TIMES:
         return 0.0
     if container.format.name == 'avi':  # FFmpeg shortens the duration of a file that is cut off
         return float(stream.frames / rate)
     if stream.duration:
         return float(stream.duration * stream.time_base)
-    file = (container.duration or 0) / 1e6
-    if not container.format.name.startswith('matroska'):
-        return file
-    with suppress(ValueError):  # both are the last time
-        hours, minutes, seconds = map(float, stream.metadata.get('DURATION', '').split(':'))
-        start = float((stream.start_time or 0) * stream.time_base)
-        return hours * 3600 + minutes * 60 + seconds - start
-    return file - max(container.start_time or 0, 0) / 1e6
+    duration = (container.duration or 0) / 1e6
+    if container.format.name.startswith('matroska'):  # it states the last time
+        duration -= max(container.start_time or 0, 0) / 1e6
+    return duration
 
 
 class _Packets:
-    """
-    The packets of the pictures; ``begin`` and ``end`` are of all tracks, s.
-
-    Sound or text may be longer than the pictures, and is what the duration of most files is of;
-    MP4 states one of each track.
-    """
+    """Packets of a video; ``begin`` and ``end``, s, are of all tracks: sound may be longer."""
 
     def __init__(self, container: Any) -> None:
-        self._container, self._stream = container, _video(container)
+        self._container, self._index = container, _video(container).index
         self.begin, self.end = math.inf, -math.inf
 
     def __iter__(self) -> Iterator[Any]:
-        own = [self._stream] if self._container.format.name.startswith('mov') else []
-        for packet in self._container.demux(*own):
+        for packet in self._container.demux():
             if packet.pts is not None and packet.time_base:
                 self.begin = min(self.begin, float(packet.pts * packet.time_base))
                 end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
                 self.end = max(self.end, end)
-            if packet.stream_index == self._stream.index:
+            if packet.stream_index == self._index:
                 yield packet
 
 
