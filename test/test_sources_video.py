@@ -5,7 +5,6 @@
 from contextlib import suppress
 import time
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -276,15 +275,7 @@ def test_sound_may_have_another_length(tmp_path, name, codec, voice, sounds):
 
 @pytest.mark.parametrize('suffix', ['mkv', 'flv', 'mov'])
 def test_video_with_sound_that_is_cut_is_reported(tmp_path, suffix):
-    whole = write_video(tmp_path / f'whole.{suffix}', codec='libx264', sounds=[(0, 2)])
-    path = tmp_path / f'cut.{suffix}'
-    fast = {'movflags': 'faststart'} if suffix == 'mov' else {}
-    with av.open(str(whole)) as source, av.open(str(path), 'w', options=fast) as target:
-        streams = [target.add_stream_from_template(each) for each in source.streams]
-        for packet in source.demux():
-            if packet.dts is not None:
-                packet.stream = streams[packet.stream_index]
-                target.mux(packet)
+    path = write_video(tmp_path / f'cut.{suffix}', codec='libx264', sounds=[(0, 2)])
     path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
     with pytest.raises(ImageError, match='ends early'):
         list(open_source(path))

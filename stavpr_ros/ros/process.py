@@ -11,7 +11,6 @@ from shutil import disk_usage
 import signal
 import socket
 import sys
-from tempfile import TemporaryFile
 import threading
 import time
 import traceback
@@ -52,7 +51,7 @@ ROS_OPTIONS = ('enclave', 'log-level', 'param', 'params-file', 'remap')
 AnyNode = TypeVar('AnyNode', bound=Node)
 
 
-def prepare_transport() -> None:
+def prepare_transport(size: int = LARGE_SEGMENT, profiles_file: str = PROFILES_FILE) -> None:
     """
     Give this process shared memory for images; to be called before ``rclpy.init``.
 
@@ -60,26 +59,17 @@ def prepare_transport() -> None:
     segment is the one that counts. Without room, images are sent by UDP: Fast DDS would crash. A
     profile set by the user stays; other middlewares ignore it.
 
+    :param size: of the room, bytes.
+    :param profiles_file: the profile of shared memory, '' = the default.
     :raises UnavailableError: the package's share folder is not found.
     """
-    _choose_transport(LARGE_SEGMENT, PROFILES_FILE)
-
-
-def _choose_transport(size: int, profiles_file: str = '') -> None:
-    """Use a profile if shared memory has room for so many bytes, else the one of UDP."""
     if os.environ.get(PROFILES_VARIABLE):
         return
-    folder = Path(SHARED_MEMORY)
-    try:
-        TemporaryFile(dir=folder).close()
-        reason = '' if disk_usage(folder).free > size else f'less than {size / 1e6:.1f} MB free'
-    except OSError as error:
-        reason = str(error.strerror)
-    if reason:
+    if not os.access(SHARED_MEMORY, os.W_OK) or disk_usage(SHARED_MEMORY).free < size:
         profiles_file = UDP_FILE
         print(
-            f'images are not shared in {folder} ({reason}), but sent by UDP, which is slower: '
-            'make room (docker run --shm-size)',
+            f'images are not shared in {SHARED_MEMORY} ({size / 1e6:.1f} MB cannot be written), '
+            'but sent by UDP, which is slower: make room (docker run --shm-size)',
             file=sys.stderr,
         )
     if not profiles_file:
@@ -112,9 +102,7 @@ def own_arguments(arguments: Sequence[str]) -> list[str]:
 
 def _texts(arguments: Sequence[str]) -> list[str]:
     """Return arguments as ROS takes them; bytes that are no UTF-8 are replaced."""
-    return [
-        word.encode('utf-8', 'surrogateescape').decode('utf-8', 'replace') for word in arguments
-    ]
+    return [each.encode(errors='surrogateescape').decode(errors='replace') for each in arguments]
 
 
 @contextmanager
@@ -128,7 +116,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
     :param arguments: without the program's name; the process's own if None.
     :raises SettingsError: the arguments after ``--ros-args`` are invalid.
     """
-    _choose_transport(SEGMENT)
+    prepare_transport(SEGMENT, '')
     with ros_arguments_checked():
         texts = with_log_files(_texts(sys.argv[1:] if arguments is None else arguments))
         rclpy.init(args=texts, signal_handler_options=SignalHandlerOptions.NO)

@@ -13,7 +13,6 @@ from contextlib import contextmanager, ExitStack, suppress
 import os
 from pathlib import Path
 import sys
-from tempfile import TemporaryFile
 import threading
 import time
 import traceback
@@ -91,14 +90,12 @@ def with_log_files(arguments: list[str]) -> list[str]:
     No upstream issue was found: on a read-only system, ``rclpy.init`` raises a RuntimeError.
     """
     folder = _log_folder()
-    try:
+    with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=folder).close()
-    except OSError as error:
-        reason = f'no log is written to {folder} ({error.strerror}): set ROS_LOG_DIR to change it'
-        print(reason, file=sys.stderr)
-        return [*arguments, '--ros-args', '--disable-external-lib-logs']
-    return arguments
+    if os.access(folder, os.W_OK):
+        return arguments
+    print(f'no log is written to {folder}: set ROS_LOG_DIR to change it', file=sys.stderr)
+    return [*arguments, '--ros-args', '--disable-external-lib-logs']
 
 
 _warning_filters = threading.Lock()  # they belong to the process

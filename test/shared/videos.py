@@ -43,7 +43,7 @@ def write_video(
     :param high_dynamic_range: state BT.2020 and SMPTE ST 2084; the images are not changed.
     """
     images = colored_images() if images is None else images
-    with av.open(str(path), 'w') as container:
+    with av.open(str(path), 'w', options={'movflags': 'faststart'}) as container:
         container.metadata.update(metadata or {})
         streams = [
             container.add_stream(codec, rate=rate, options=options or {}) for _ in range(tracks)
