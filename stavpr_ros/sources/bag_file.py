@@ -75,7 +75,11 @@ class OpenBag:
         Only types of ``sensor_msgs`` and ``nav_msgs`` are read, equal in every distribution, and
         the ones of video topics, of which fields may follow: no definition in the bag is needed.
         """
-        return _ros1_store().deserialize_ros1(raw, kind) if self.is_ros1 else _read_cdr(raw, kind)
+        return (
+            _ros1_store().deserialize_ros1(raw, kind)
+            if self.is_ros1
+            else _deserialize_cdr(raw, kind)
+        )
 
     def messages(
         self, topics: Collection[str], start: float = 0.0, duration: float = math.inf
@@ -141,8 +145,6 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
             for reason in damaged:
                 note_once(f'a part of {path} is left out: {reason}')
             bag = OpenBag(path, readers)
-            if not (names or bag.is_ros1):
-                _require_parts(path, files)
             _note_missing(bag, names, files, counts)
         yield bag
 
@@ -166,28 +168,19 @@ def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
 
 
 def _files(folder: Path, names: list[str]) -> list[Path]:
-    """Return the files of a bag that are present."""
+    """Return the files of a bag that are present; without metadata, they are alike in name."""
     stated = {name.lower() for name in names}
     files = {file for file in folder.iterdir() if file.name.lower() in stated}
     if len(files) < len(names) or not names:  # perhaps renamed
         files.update(storage_files(folder))
-    if not files:
-        listed = f' with {", ".join(names)}' if names else ''
+    others = {file.name.lower() for file in files if file.suffix.lower() != '.bag'}
+    if not files or (not names and len({re.sub(r'_\d+\.', '.', each) for each in others}) > 1):
         raise SourceError(
-            f'{folder} is no bag: expected a folder{listed}, or a .db3 or .mcap file; copy the '
-            'files of the bag beside its metadata.yaml'
+            f'{folder} has no {METADATA} with the names of its files: expected exactly one .db3 '
+            'or .mcap file then, or the parts of one bag, found '
+            f'{", ".join(sorted(each.name for each in files)) or "none"}; name one of the files'
         )
     return sorted(files)
-
-
-def _require_parts(folder: Path, files: list[Path]) -> None:
-    """Reject files without metadata that are not the parts of one bag, by their names."""
-    if len({re.sub(r'_\d+\.', '.', file.name.lower()) for file in files}) > 1:
-        raise SourceError(
-            f'{folder} has no {METADATA} that can be read: expected exactly one .db3 or .mcap '
-            f'file then, or the parts of one bag, found {", ".join(each.name for each in files)}; '
-            'name one of the files'
-        )
 
 
 def _note_missing(
@@ -212,7 +205,8 @@ def _open_file(file: Path, stack: ExitStack) -> Any:
     does not quote file names.
     """
     source, kind = file, storage_kind(file)
-    logs = [log for end in LOG_SUFFIXES if _has_bytes(log := Path(f'{file}{end}'))]
+    logs = [Path(f'{file}{end}') for end in LOG_SUFFIXES]
+    logs = [log for log in logs if log.exists() and log.stat().st_size]
     if logs or kind == ZSTD:
         source = _copied(file, logs, stack)
         kind = storage_kind(source)
@@ -228,10 +222,6 @@ def _open_file(file: Path, stack: ExitStack) -> Any:
     reader.open()
     stack.callback(reader.close)
     return reader
-
-
-def _has_bytes(file: Path) -> bool:
-    return file.exists() and file.stat().st_size > 0
 
 
 def _copied(file: Path, logs: list[Path], stack: ExitStack) -> Path:
@@ -273,7 +263,7 @@ def _ros2_store() -> Typestore:
     return store
 
 
-def _read_cdr(raw: bytes, kind: str) -> Any:
+def _deserialize_cdr(raw: bytes, kind: str) -> Any:
     store = _ros2_store()
     if kind != FOXGLOVE:
         return store.deserialize_cdr(raw, kind)

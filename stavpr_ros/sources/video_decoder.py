@@ -97,46 +97,33 @@ def _video(container: Any) -> Any:
 
 
 def _facts(container: Any) -> tuple[float, float, float, int, int, int]:
-    stream, created = _video(container), 0.0
+    stream, duration, created = _video(container), (container.duration or 0) / 1e6, 0.0
     bare = container.format.flags & NO_TIMES
     rate = (not bare and stream.average_rate) or stream.guessed_rate or RATE
     with suppress(ValueError):
         stated = datetime.fromisoformat(container.metadata.get('creation_time', ''))
         created = stated.replace(tzinfo=stated.tzinfo or UTC).timestamp()
         created *= 0 < created < 2**31  # the range of stamps in ROS
-    duration, tracks = _duration(container, stream, rate), len(_tracks(container))
+    if container.format.name == 'avi':  # FFmpeg shortens the duration of a file that is cut off
+        duration = float(stream.frames / rate)
+    elif stream.duration:
+        duration = float(stream.duration * stream.time_base)
+    elif container.format.name.startswith('matroska'):  # it states the last time
+        duration -= max(container.start_time or 0, 0) / 1e6
+    duration, tracks = (0.0 if bare else duration), len(_tracks(container))
     return duration, float(rate), created, tracks, stream.height, stream.width
 
 
-def _duration(container: Any, stream: Any, rate: Any) -> float:
-    """Return the duration of the track, or of the file where none is stated, s; 0 = unknown."""
-    if container.format.flags & NO_TIMES:
-        return 0.0
-    if container.format.name == 'avi':  # FFmpeg shortens the duration of a file that is cut off
-        return float(stream.frames / rate)
-    if stream.duration:
-        return float(stream.duration * stream.time_base)
-    duration = (container.duration or 0) / 1e6
-    if container.format.name.startswith('matroska'):  # it states the last time
-        duration -= max(container.start_time or 0, 0) / 1e6
-    return duration
-
-
-class _Packets:
-    """Packets of a video; ``begin`` and ``end``, s, are of all tracks: sound may be longer."""
-
-    def __init__(self, container: Any) -> None:
-        self._container, self._index = container, _video(container).index
-        self.begin, self.end = math.inf, -math.inf
-
-    def __iter__(self) -> Iterator[Any]:
-        for packet in self._container.demux():
-            if packet.pts is not None and packet.time_base:
-                self.begin = min(self.begin, float(packet.pts * packet.time_base))
-                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                self.end = max(self.end, end)
-            if packet.stream_index == self._index:
-                yield packet
+def _packets(container: Any, span: list[float]) -> Iterator[Any]:
+    """Yield the packets of the video; widen a span, s, by all tracks, as sound may be longer."""
+    index = _video(container).index
+    for packet in container.demux():
+        if packet.pts is not None and packet.time_base:
+            end = packet.pts + (packet.duration or 0)
+            span[0] = min(span[0], float(packet.pts * packet.time_base))
+            span[1] = max(span[1], float(end * packet.time_base))
+        if packet.stream_index == index:
+            yield packet
 
 
 def decode(fps: float, paths: list[str], output: Connection) -> None:
@@ -147,8 +134,8 @@ def decode(fps: float, paths: list[str], output: Connection) -> None:
     for file, path in enumerate(paths):
         with _open(path) as container:
             start, (duration, rate, *_) = end, _facts(container)
-            packets = _Packets(container)
-            for seconds, frame, jump in _frames(container, packets, start, 1 / rate):
+            span = [math.inf, -math.inf]
+            for seconds, frame, jump in _frames(container, span, start, 1 / rate):
                 if jump:
                     output.send_bytes(FRAME.pack(jump, file, 0, JUMP))
                 number = (seconds + EARLY) * fps
@@ -160,12 +147,12 @@ def decode(fps: float, paths: list[str], output: Connection) -> None:
                     output.send_bytes(image.reshape(-1).data)
                     due = math.floor(number) + 1
                 end = seconds + 1 / rate
-            if max(end - start, packets.end - packets.begin) < COMPLETE * duration:
+            if max(end - start, span[1] - span[0]) < COMPLETE * duration:
                 output.send_bytes(FRAME.pack(end - start, file, 0, CUT_OFF))
 
 
 def _frames(
-    container: Any, packets: _Packets, start: float, period: float
+    container: Any, span: list[float], start: float, period: float
 ) -> Iterator[tuple[float, Any, float]]:
     """
     Yield the frames with increasing times, the first one at ``start``, and jumps of the clock, s.
@@ -183,7 +170,7 @@ def _frames(
     ahead = AHEAD * max(1, period)
     ahead = ahead if container.format.flags & DISCONTINUOUS else math.inf
     with suppress(FFmpegError):  # cut off
-        for packet in packets:
+        for packet in _packets(container, span):
             with suppress(InvalidDataError):  # damaged: players skip it, too
                 for frame in packet.decode():
                     ticks = frame.dts if avi or frame.pts is None else frame.pts
