@@ -78,11 +78,9 @@ def test_node_runs_without_a_log_folder(variable):
     assert 'runs' in done.stderr
 
 
-@pytest.mark.parametrize('size', [0, 10**15])
-def test_node_without_shared_memory_uses_udp(tmp_path, size):
-    names = f'process.SHARED_MEMORY, process.SEGMENT = {str(tmp_path / "shm")!r}, {size}'
-    if size:
-        (tmp_path / 'shm').mkdir()
+@pytest.mark.parametrize(('folder', 'size'), [('/proc/none', 0), ('/dev/shm', 10**15)])
+def test_node_without_shared_memory_uses_udp(folder, size):
+    names = f'process.SHARED_MEMORY, process.SEGMENT = {folder!r}, {size}'
     program = f'from stavpr_ros.ros import process\n{names}\n{NODE}\nprint(process.os.environ)'
     done = run(program, {'FASTRTPS_DEFAULT_PROFILES_FILE'})
     assert 'sent by UDP' in done.stderr

@@ -191,33 +191,22 @@ def test_video_in_compressed_images_of_a_bag_is_decoded(tmp_path, codec, encoded
     assert len(list(BagSource(path).records())) == COUNT
 
 
+@pytest.mark.parametrize('image_input', ['compressed'], indirect=True)
 @pytest.mark.parametrize('has_pyav', [True, False])
-def test_node_decodes_video_in_compressed_images(context, monkeypatch, encoded, codec, has_pyav):
+def test_node_decodes_video_in_compressed_images(
+    image_input, monkeypatch, encoded, codec, has_pyav
+):
     if not has_pyav:
         monkeypatch.setitem(sys.modules, 'av.video.reformatter', None)
-    node, queue = ManagedNode('n', context=context), []
-    settings = SimpleNamespace(image_transport='compressed', max_rate=0.0, max_stamp_gap=2.0)
-    images = ros_input.ImageInput(
-        node,
-        settings,
-        Statistics(),
-        lambda message, arrival: queue.append(message),
-        lambda message, reason: None,
-        lambda reason: None,
-    )
-    try:
-        for i, packet in enumerate(encoded):
-            header, data = Header(stamp=Time(sec=i + 1)), bytes(packet)
-            images.on_image(CompressedImage(header=header, format=CODECS[codec][1], data=data))
-        assert [each.header.stamp.sec for each in queue] == list(range(1, COUNT + 1))
-        if has_pyav:
-            check(list(map(decode_message, queue)))
-        else:
-            with pytest.raises(ImageError, match='pip install av'):
-                decode_message(queue[0])
-    finally:
-        images.close()
-        node.destroy_node()
+    for i, packet in enumerate(encoded):
+        header, data = Header(stamp=Time(sec=i + 1)), bytes(packet)
+        image_input.on_image(CompressedImage(header=header, format=CODECS[codec][1], data=data))
+    assert [each.header.stamp.sec for each in image_input.passed] == list(range(1, COUNT + 1))
+    if has_pyav:
+        check(list(map(decode_message, image_input.passed)))
+    else:
+        with pytest.raises(ImageError, match='pip install av'):
+            decode_message(image_input.passed[0])
 
 
 def test_topics_of_other_transports_have_a_remedy(tmp_path):

@@ -5,6 +5,7 @@
 from collections import OrderedDict
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 from domain import DOMAIN
 from hypothesis import settings
@@ -113,6 +114,23 @@ def context():
     rclpy.init(context=context, domain_id=DOMAIN)
     yield context
     rclpy.try_shutdown(context=context)
+
+
+@pytest.fixture
+def image_input(context, request):
+    """Return the input of a node, by its transport: images are given to it and ``passed`` on."""
+    from stavpr_ros.pipeline.statistics import Statistics
+    from stavpr_ros.ros.input import ImageInput
+    from stavpr_ros.ros.rclpy_workarounds import ManagedNode
+
+    node, transport = ManagedNode('n', context=context), getattr(request, 'param', 'raw')
+    settings = SimpleNamespace(image_transport=transport, max_rate=0.0, max_stamp_gap=2.0)
+    calls = (lambda message, _: images.passed.append(message)), print, print
+    images = ImageInput(node, settings, Statistics(), *calls)
+    images.passed = []
+    yield images
+    images.close()
+    node.destroy_node()
 
 
 @pytest.fixture
