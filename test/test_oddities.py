@@ -49,10 +49,8 @@ def test_clocks_that_jump_are_named_in_commands_and_node(
     tmp_path, caplog, image_input, monkeypatch, name
 ):
     stamps, text = CLOCKS[name]
-    expected = [True] * bool(text)
-    assert [
-        text in line and '/raw: ' in line for line in notes(caplog, tmp_path, stamps)
-    ] == expected
+    lines, expected = notes(caplog, tmp_path, stamps), [True] * bool(text)
+    assert [text in line and '/raw: ' in line for line in lines] == expected
     clock = iter(np.array(STEADY) / SECOND)
     monkeypatch.setattr(ros_input.time, 'monotonic', lambda: next(clock))
     for stamp in stamps:

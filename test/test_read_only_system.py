@@ -5,7 +5,6 @@
 import os
 from pathlib import Path
 import pwd
-import sqlite3
 import subprocess
 import sys
 import tempfile
@@ -36,19 +35,11 @@ def test_map_of_a_bag_needs_no_temporary_folder(bag, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ['a.stavpr', 'bag']
 
 
-def test_bag_with_a_log_names_the_room_for_its_copy(bag, monkeypatch, tmp_path):
-    with sqlite3.connect(bag / 'bag.db3') as database:
-        database.execute('PRAGMA journal_mode=WAL')
-        database.execute('PRAGMA wal_autocheckpoint=0')
-        database.execute('UPDATE messages SET timestamp = timestamp + 1')
-        database.commit()
-        match = r'bag\.db3 needs a temporary copy of \d MB or more, as bag\.db3-wal .*set TMPDIR'
-        with pytest.raises(SourceError, match=match):
-            open_source(bag)
-        (tmp_path / 'room').mkdir()
-        monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'room'))
-        assert len(list(open_source(bag))) == 24
-    database.close()
+def test_bag_with_a_log_names_the_room_for_its_copy(bag):
+    (bag / 'bag.db3-wal').write_bytes(b'a log')
+    match = r'bag\.db3 needs a temporary copy of \d MB or more, as bag\.db3-wal .*set TMPDIR'
+    with pytest.raises(SourceError, match=match):
+        open_source(bag)
 
 
 def test_command_that_cannot_write_names_the_folder(capsys):

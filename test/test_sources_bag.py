@@ -127,11 +127,9 @@ def test_bag_raw_and_compressed_images_are_equal(tmp_path, ros1):
             assert (record.encoding, record.frame_id) == ('rgb8', 'camera')
 
 
-@pytest.mark.parametrize('ros1', [False, True])
 @pytest.mark.parametrize('seconds', [2**31, 2**32 - 1])
-def test_stamps_from_2038_on_are_no_times_before_1970(tmp_path, ros1, seconds):
-    path = tmp_path / 'mixed.bag'
-    with writing(path, ros1) as bag:
+def test_stamps_from_2038_on_are_no_times_before_1970(tmp_path, seconds):
+    with writing(path := tmp_path / 'drive') as bag:
         header = bag.header((seconds - 2**32) * SECOND + 7)  # the same 32 bits
         bag.write('/raw', RAW, T0, header, 1, 2, 'rgb8', 0, 6, np.zeros(6, np.uint8))
     (frame,), (record,) = open_source(path), open_source(path).records()
