@@ -53,7 +53,7 @@ class BagSource:
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
         self.least: tuple[int, int] | None = None
-        self._noted: set[str] = set()  # oddities
+        self._noted: dict[str, str] = {}  # oddities, by their first words
         with open_bag(self.path) as bag:
             topics = _topics(bag)
         self.topic = _choose(self.path, topics, topic)
@@ -142,10 +142,8 @@ class BagSource:
 
     def _note(self, watch: StreamWatch) -> None:
         for text in watch.oddities():
-            kind = text.split(maxsplit=1)[0]  # the numbers of each are of the last images
-            if kind not in self._noted:
-                self._noted.add(kind)
-                note_once(f'{self.path}, {self.topic}: {text}')
+            first = self._noted.setdefault(text.split()[0], text)  # later ones have other numbers
+            note_once(f'{self.path}, {self.topic}: {first}')
 
     def _message(self, bag: OpenBag, raw: bytes) -> Any:
         try:

@@ -94,21 +94,16 @@ class OpenBag:
             starts = (getattr(each, 'metadata', each).start_time for each in self.readers)
             first = min(starts) + round(start * SECOND)
             last = None if math.isinf(duration) else first + round(duration * SECOND)
-            wanted = [[c for c in each.connections if c.topic in topics] for each in self.readers]
-            parts = [
-                _read(reader)(connections, first if start else None, last)
-                for reader, connections in zip(self.readers, wanted, strict=True)
-                if connections  # none would be all
-            ]
+            parts = []
+            for reader in self.readers:
+                has_index = not isinstance(reader, McapReader) or reader.chunks
+                read = reader.messages if has_index else reader.messages_scan
+                wanted = [each for each in reader.connections if each.topic in topics]
+                if wanted:  # none would be all
+                    parts.append(read(wanted, first if start else None, last))
             for connection, time_ns, raw in merge(*parts, key=lambda each: each[1]):
                 is_packed = not self.is_ros1 and bytes(raw[:4]) in MAGIC  # ZSTD; no start of CDR
                 yield connection, time_ns, zstd.decompress(raw) if is_packed else raw
-
-
-def _read(reader: Any) -> Any:
-    """Return what yields the messages of a file, of MCAP without an index as they were written."""
-    has_no_index = isinstance(reader, McapReader) and not reader.chunks
-    return reader.messages_scan if has_no_index else reader.messages
 
 
 def message_type(connection: Connection) -> str:
