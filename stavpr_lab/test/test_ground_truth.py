@@ -287,6 +287,25 @@ def test_from_text_of_names_is_of_the_images_that_it_names(tmp_path, text):
 
 
 @pytest.mark.parametrize(
+    ('text', 'reason'),
+    [
+        ('query,place\nb.jpg\na.jpg,0\n', 'different numbers of columns'),
+        ('b.jpg,2\na.jpg\n', 'different numbers of columns'),
+        ('b.jpg,\na.jpg,2\n', "'' is the name of no image"),
+        ('b.jpg,nan\n', "'nan' is the name of no image"),
+        ('z\n', "'z' is the name of no image"),
+        ('place\n2.png\n', 'a place for 1 queries, but there are 3'),
+    ],
+)
+def test_from_text_of_names_with_missing_cells_is_named(tmp_path, text, reason):
+    (tmp_path / 'truth.csv').write_text(text)
+    with pytest.raises((SourceError, InputError), match=reason):
+        GroundTruth.from_file(
+            tmp_path / 'truth.csv', 3, 3, names=(['a.jpg', 'b.jpg', 'c.jpg'], ['0.png', '2.png'])
+        )
+
+
+@pytest.mark.parametrize(
     ('truth', 'doubt'),
     [
         (GroundTruth.identity(20, 20, 20), '100% of the 20 places for an image'),

@@ -52,16 +52,14 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
         names = roles if len(roles) > 1 else streams
         choice = f'expected one of {_listed(names)}' if len(names) > 1 else 'leave it out'
         raise SourceError(f'{top} has no camera {camera!r}: {choice}')
-    stamped = {
-        name: {file: own for file, own in group.items() if own and own[0] >= STAMPS}
-        for name, group in streams.items()
-    }
-    if several := _parallel(roles, len(files)) or _parallel(stamped, len(files)):
-        raise SourceError(
-            f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
-            'choose it, --camera NAME; parts of one drive need other names'
-        )
-    if several := _parallel(streams, len(files)):
+    for groups in (roles, streams):
+        several = _parallel(groups, len(files))
+        if several and (groups is roles or _is_stamped(several)):
+            raise SourceError(
+                f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
+                'choose it, --camera NAME; parts of one drive need other names'
+            )
+    if several:
         note_once(
             f'{top} has images of the same numbers, {_listed(several)}: they are taken for parts '
             'of one drive; if they are of several cameras or drives, choose one, --camera NAME'
@@ -102,14 +100,14 @@ def _words(name: str, is_file: bool = False) -> list[str]:
 
 def _stream(path: Path) -> tuple[str, str]:
     """Return the folder and the words of a name, and its numbers."""
-    words = [word for word in WORD.findall(path.stem.casefold()) if word not in ('am', 'pm')]
-    numbers = path.stem if _first(path.stem) >= STAMPS else str(path.with_suffix(''))
-    return '/'.join(filter(None, [*path.parts[:-1], '_'.join(words)])), numbers
+    stem, words = path.stem, WORD.findall(path.stem.casefold())
+    is_stamp = int('0' + ''.join(re.findall(r'\d+', stem)[:1])) >= STAMPS
+    name = '/'.join(filter(None, [*path.parts[:-1], '_'.join(words)]))
+    return name, stem if is_stamp else str(path.with_suffix(''))
 
 
-def _first(stem: str) -> int:
-    number = re.search(r'\d+', stem)
-    return int(number[0]) if number else 0
+def _is_stamped(groups: Groups) -> bool:
+    return all(own >= (STAMPS,) for group in groups.values() for own in group.values())
 
 
 def _parallel(groups: Groups, count: int) -> Groups:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The order of image files: by the kind of number in their names, checked with times in EXIF."""
 
-import calendar
 from collections.abc import Sequence
 from contextlib import suppress
 from decimal import Decimal
@@ -10,6 +9,7 @@ from itertools import pairwise
 import os
 from pathlib import Path
 import re
+from string import digits
 from typing import Any
 import warnings
 
@@ -19,16 +19,10 @@ NaturalKey = tuple[list[str | int], list[str | int], str]
 Sorted = tuple[list[Any], str] | None
 """What names are sorted by, and what was guessed; None = names of another kind."""
 
-REAL = re.compile(r'(-?)(\d+)(?:\.(\d+))?(e[+-]\d+)?')
-MONTHS = {name.casefold(): f'{i}' for i, name in enumerate(calendar.month_abbr) if i}
-DATE = re.compile(
-    rf'(?<!\d)(\d\d?)([-_. ]?)(\d\d?|{"|".join(MONTHS)})[a-z]*\2((?:19|20)\d\d)(?!\d)'
-)
-CLOCK = re.compile(r'(?<!\d)(\d\d?)(?=(?:\D?\d\d){0,2}\s?[_-]?([ap])\.?m(?![a-z]))')
-JOINED, MAX_SECONDS = re.compile(r'([12]\d{9})(\d{1,9})'), 1e6
+REAL = re.compile(r'(-?)(\d+)(?:\.(\d+))?')
+DATE = re.compile(r'(?<!\d)(\d\d?)([-_. ]?)(\d\d?)\2((?:19|20)\d\d)(?!\d)')
 SPANS = 2**8, 2**16, 2**31, 2**32  # of counters, beside powers of ten
 DIGITS = 7  # of a fraction of seconds since 1970, as a float; more are nanoseconds
-SAMPLE = 100  # files whose times are compared with their order
 EXIF, TAKEN, FRACTION, CHANGED = 0x8769, 0x9003, 0x9291, 0x0132  # tags
 TIME = re.compile(r'\d{4}:\d\d:\d\d \d\d:\d\d:\d\d')
 
@@ -45,8 +39,8 @@ def in_order(files: Sequence[Path], top: Path) -> list[Path]:
     """
     Sort the images of a folder and its sub-folders; print a line where the order is a guess.
 
-    Names are in natural order, or by decimal, negative or hexadecimal numbers, dates, clocks of
-    twelve hours, and counters that began again. Times in EXIF count more, unless a clock was set.
+    Names are in natural order, or by decimal, negative or hexadecimal numbers, dates, and counters
+    that began again. Times in EXIF count more, unless a clock was set.
     """
     parts = {file: file.relative_to(top).parts for file in files}
     names: dict[tuple[str, ...], set[str]] = {}
@@ -71,7 +65,7 @@ def _keys(names: list[str]) -> tuple[dict[str, Any], str]:
     """Return what the names of one folder are sorted by, and what was guessed."""
     natural = {name: natural_key(name) for name in names}
     stems = [re.sub(r'\.[a-z]\w*$', '', name.casefold()) for name in names]
-    for read in (_real, _hexadecimal, _dated, _joined, _continued) if len(names) > 1 else ():
+    for read in (_real, _hexadecimal, _dated, _continued) if len(names) > 1 else ():
         if values := read(stems):
             keys = {n: (value, natural[n]) for n, value in zip(names, values[0], strict=True)}
             differ = sorted(names, key=keys.__getitem__) != sorted(names, key=natural.__getitem__)
@@ -81,7 +75,7 @@ def _keys(names: list[str]) -> tuple[dict[str, Any], str]:
 
 def _tails(stems: list[str], kept: str = '') -> list[str]:
     """Return what differs: behind a common begin, which lacks its last ``kept``."""
-    begin = re.sub(f'[{kept}]*$', '', _begin(stems)) if kept else _begin(stems)
+    begin = _begin(stems).rstrip(kept)
     tails = [stem[len(begin) :] for stem in stems]
     end = re.sub(r'\d.*', '', _begin([tail[::-1] for tail in tails]))
     return [tail[: len(tail) - len(end)] for tail in tails]
@@ -93,71 +87,47 @@ def _begin(texts: list[str]) -> str:
 
 
 def _real(stems: list[str]) -> Sorted:
-    """Read decimal numbers of unequal length, exponents, and numbers of both signs."""
-    parts = [REAL.fullmatch(tail) for tail in _tails(stems, r'\d.-')]
-    rows = [part.groups('') for part in parts if part]
-    fractions, signs = [row[2] for row in rows], {row[0] for row in rows}
-    is_certain = len(signs) > 1 or any(row[3] for row in rows)
-    if len(rows) < len(stems) or (len({*map(len, fractions)}) == 1 and not is_certain):
+    """Read decimal numbers of unequal length, and numbers of both signs."""
+    rows = [part.groups('') for part in map(REAL.fullmatch, _tails(stems, f'{digits}.-')) if part]
+    fractions, is_signed = [row[2] for row in rows], len({row[0] for row in rows}) > 1
+    if len(rows) < len(stems) or not (is_signed or len({*map(len, fractions)}) > 1):
         return None
-    if not (is_certain or any(len(f) > 1 and f[0] == '0' for f in fractions)):
+    guess = ''
+    if not (is_signed or any(len(f) > 1 and f[0] == '0' for f in fractions)):
         # 1.10 behind 1.9: a second counter, or nanoseconds without zeros before them
         is_long = len(rows[0][1]) > 8 and max(map(len, fractions)) > DIGITS
         if is_long or any(len(f) > 1 and f[-1] == '0' for f in fractions):
             return None
         guess = 'the numbers in the names are taken for decimal ones, 1.25 before 1.5'
-    else:
-        guess = ''
-    minus = '-' if len(signs) > 1 else ''
     return [
-        Decimal(f'{sign and minus}{whole}.{fraction or 0}{exponent}')
-        for sign, whole, fraction, exponent in rows
+        Decimal(f'{sign if is_signed else ""}{whole}.{fraction or 0}')
+        for sign, whole, fraction in rows
     ], guess
 
 
 def _hexadecimal(stems: list[str]) -> Sorted:
-    tails = [tail.replace('-', '') for tail in _tails(stems, r'\d')]
+    tails = [tail.replace('-', '') for tail in _tails(stems, digits)]
     if not all(re.fullmatch('[0-9a-f]+', tail) for tail in tails) or ''.join(tails).isdigit():
         return None
     values = [int(tail, 16) for tail in tails]
     if max(values) - min(values) < 2 * len(values):
         return values, ''
-    if min(map(len, tails)) < 8:
-        return None
-    return values, 'the names are no counter, and are taken for hexadecimal numbers'
+    guess = 'the names are no counter, and are taken for hexadecimal numbers'
+    return (values, guess) if min(map(len, tails)) >= 8 else None
 
 
 def _dated(stems: list[str]) -> Sorted:
-    """Read days before months and years, and hours before am and pm."""
+    """Read days and months before years."""
     dates = [match for match in map(DATE.search, stems) if match]
-    clocks = all(map(CLOCK.search, stems))
-    guess = ''
-    if len(dates) == len(stems):
-        days = [(d[1], MONTHS.get(d[3], d[3])) for d in dates]
-        largest = [max(map(int, column)) for column in zip(*days, strict=True)]
-        if max(largest) <= 12 and not dates[0][3].isalpha():
-            guess = 'days and months in the names are ambiguous, and are taken for day-month-year'
-        day, month = (0, 1) if largest[1] <= 12 else (1, 0)
-        stems = [
-            f'{d[4]} {own[month]} {own[day]} {DATE.sub(" ", d.string, 1)}'
-            for d, own in zip(dates, days, strict=True)
-        ]
-    elif not clocks:
+    if len(dates) < len(stems):
         return None
-    if clocks:
-        stems = [
-            CLOCK.sub(lambda c: f'{int(c[1]) % 12 + 12 * (c[2] == "p")}', stem).replace('am', 'pm')
-            for stem in stems
-        ]
-    return [natural_key(f'{stem}.') for stem in stems], guess
-
-
-def _joined(stems: list[str]) -> Sorted:
-    """Read seconds since 1970 and, without a mark, nanoseconds that lack zeros before them."""
-    tails = [*map(JOINED.fullmatch, _tails(stems, r'\d'))]
-    values = [(int(tail[1]), int(tail[2])) for tail in tails if tail]
-    is_one_drive = len(values) == len(stems) and max(values)[0] - min(values)[0] < MAX_SECONDS
-    return (values, '') if is_one_drive and len({*map(len, stems)}) > 1 else None
+    first, second = (max(int(date[i]) for date in dates) for i in (1, 3))
+    day, month = (1, 3) if second <= 12 else (3, 1)
+    guess = 'days and months in the names are ambiguous, and are taken for day-month-year'
+    return [
+        natural_key(f'{date[4]} {date[month]} {date[day]} {DATE.sub(" ", date.string, 1)}.')
+        for date in dates
+    ], guess if max(first, second) <= 12 else ''
 
 
 def _continued(stems: list[str]) -> Sorted:
@@ -180,18 +150,14 @@ def _continued(stems: list[str]) -> Sorted:
 
 def _by_times(files: list[Path], guesses: list[str]) -> tuple[list[Path], list[str]]:
     """Compare an order with the times in EXIF, if the files have them."""
-    if not (files and _taken(files[0])):
-        return files, guesses
-    sample = files if guesses else [*files[:: len(files) // SAMPLE + 1], files[-1]]
-    times = [*map(_taken, sample)]
+    times = [*map(_taken, files)] if files and _taken(files[0]) else ['']
     if not all(times):
         return files, guesses
-    if times == sorted(times):
-        return files, []
-    times = [*map(_taken, files)]
     falls = [i for i in range(1, len(files)) if times[i] < times[i - 1]]
-    if not all(times) or all(_follows(files[i - 1], files[i]) for i in falls):
-        where = files[falls[0]].name if falls else 'several'
+    if not falls:
+        return files, []
+    if all(_follows(files[i - 1], files[i]) for i in falls):
+        where = files[falls[0]].name
         return files, [*guesses, f'the times in EXIF go back at {where}: the names count']
     order = sorted(range(len(files)), key=lambda i: (times[i], i))
     return [files[i] for i in order], ['the names contradict the times in EXIF, which count']

@@ -74,48 +74,40 @@ def _columns(table: Table, names: list[str], width: int) -> tuple[int | None, in
     raise table.error(f'it has {width} columns, without a header of these names')
 
 
-def _of_names(table: Table, names: Names, N: int) -> Pairs | None:
-    """Return the pairs of a table that names files; None = it has numbers."""
-    first, *rows = table.cells()
-    ids = [*names[0], *names[1]]
-    if not any(map(is_name, (rows or [first])[0])):
+def _of_names(table: Table, names: Names) -> np.ndarray | None:
+    """Return the places, or queries and places, of a table of names; None = it has numbers."""
+    rows, ids, header = table.cells(), [*names[0], *names[1]], []
+    if len(rows) > 1 and all(by_name([cell], ids)[0] < 0 for cell in rows[0]):
+        header = rows.pop(0) if any(map(is_name, rows[0])) else []
+    if not any(map(is_name, rows[0])):
         return None
-    is_header = any(map(is_name, first)) and not any(
-        by_name([cell], ids)[0] >= 0 for cell in first
-    )
-    columns = _columns(table, first if is_header else [], len(first))
-    rows = rows if is_header else [first, *rows]
-    pairs = [np.arange(N), np.arange(N)]
-    if not any(is_name(rows[0][column]) for column in columns if column is not None):
+    columns = [i for i in _columns(table, header, len(rows[0])) if i is not None]
+    if min(map(len, rows)) <= max(columns):
+        raise table.error('its lines have different numbers of columns')
+    if not any(is_name(rows[0][column]) for column in columns):
         return None
-    for i, column in enumerate(columns):
-        cells = [] if column is None else [row[column] for row in rows]
-        values = by_name(cells, names[i])
+    pairs = []
+    for column, own in zip(columns, names[-len(columns) :], strict=True):
+        cells = [row[column] for row in rows]
+        pairs.append(by_name(cells, own))
         for row, cell in enumerate(cells):
-            if values[row] < 0 and not is_name(cell):
-                values[row] = float(cell)
-            elif values[row] < 0:
-                raise table.error(f'{cell} is the name of no image')
-        pairs[i] = values if cells else pairs[i]
-    return pairs[0], pairs[1]
+            if pairs[-1][row] < 0:
+                value = np.nan if is_name(cell) else float(cell or 'nan')
+                if not (abs(value) < LARGEST and value.is_integer()):
+                    raise table.error(f'{cell!r} is the name of no image, and no whole number')
+                pairs[-1][row] = value
+    return np.transpose(pairs)
 
 
 def _from_text(path: Path, N: int, names: Names) -> Pairs:
     table = Table(path, 'ground truth', 'two columns, query and place, whole numbers from 0')
-    named = _of_names(table, names, N)
-    if named is not None:
-        return named
-    query_column, place_column = _columns(table, table.names, table.width)
-    columns = [place_column] if query_column is None else [query_column, place_column]
-    rows = table.numbers(columns)
-    for column, values in zip(columns, rows.T, strict=True):
-        whole = (abs(values) < LARGEST) & (values == np.floor(values))
-        if not whole.all():
-            row = int(np.argmin(whole))
-            raise table.error(f'column {column + 1} has no whole number, {values[row]:g}', row)
-        if is_stamps(values):
-            raise table.error(f'column {column + 1} has stamps instead of the numbers of images')
-    if query_column is None:
+    rows = _of_names(table, names)
+    if rows is None:
+        query_column, place_column = _columns(table, table.names, table.width)
+        columns = [place_column] if query_column is None else [query_column, place_column]
+        rows = table.numbers(columns)
+        _check_numbers(table, rows, columns)
+    if rows.shape[1] == 1:
         if len(rows) != N:
             raise InputError(
                 f'ground truth {path} has a place for {len(rows)} queries, but there are {N}'
@@ -123,6 +115,16 @@ def _from_text(path: Path, N: int, names: Names) -> Pairs:
         rows = np.column_stack([np.arange(N), rows])
     pairs = rows.astype(np.int64)
     return pairs[:, 0], pairs[:, 1]
+
+
+def _check_numbers(table: Table, rows: np.ndarray, columns: list[int]) -> None:
+    for column, values in zip(columns, rows.T, strict=True):
+        whole = (abs(values) < LARGEST) & (values == np.floor(values))
+        if not whole.all():
+            row = int(np.argmin(whole))
+            raise table.error(f'column {column + 1} has no whole number, {values[row]:g}', row)
+        if is_stamps(values):
+            raise table.error(f'column {column + 1} has stamps instead of the numbers of images')
 
 
 # ------------------------------------------------------------------------------------------ arrays
