@@ -137,45 +137,31 @@ def test_decode_compressed_of_16_bits_takes_the_upper_byte_as_opencv_does(suffix
     np.testing.assert_array_equal(decode_compressed(data), expected)
 
 
-RAMP = np.tile(np.linspace(0, 1, 160), (120, 1))
-COLORS = np.dstack([RAMP, RAMP**2, 1 - RAMP])
-
-
-@pytest.mark.parametrize('maximum', [1, 4, 100, 255, 1023, 4095, 65535])
-@pytest.mark.parametrize('kind', ['P5', 'P6', 'P2'])
-def test_decode_compressed_of_pnm_scales_its_largest_value_to_white(kind, maximum):
-    values = np.round((COLORS if kind == 'P6' else RAMP) * maximum).astype(np.uint16)
-    head = f'{kind}\n# by hand\n160 120\n{maximum}\n'.encode()
-    if kind == 'P2':
-        pixels = ' '.join(map(str, values.ravel())).encode() + b'\n'
-    else:
-        pixels = values.astype('>u2' if maximum > 255 else np.uint8).tobytes()
-    image = decode_compressed(head + pixels)
-    expected = np.broadcast_to(values.T, (3, 160, 120)).T if kind != 'P6' else values
-    assert np.abs(image - expected * (255 / maximum)).max() <= 1
-    with pytest.raises(ImageError, match='is damaged or cut off'):
-        decode_compressed(head + pixels[:-300])
-
-
 @pytest.mark.parametrize(
-    ('mode', 'kinds'),
+    ('kind', 'maximum'),
     [
-        ('1', ('PNG', 'TIFF', 'BMP', 'PPM')),
-        ('L', ('PNG', 'TIFF', 'WEBP', 'JPEG')),
-        ('LA', ('PNG',)),
-        ('P', ('PNG', 'TIFF', 'BMP')),
-        ('RGBA', ('PNG', 'WEBP')),
-        ('CMYK', ('JPEG', 'TIFF')),
-        ('YCbCr', ('JPEG', 'TIFF')),
+        ('P5', 1),
+        ('P5', 100),
+        ('P5', 255),
+        ('P5', 4095),
+        ('P6', 4),
+        ('P6', 1023),
+        ('P6', 65535),
+        ('P2', 100),
     ],
 )
-def test_decode_compressed_of_all_modes_is_as_pillow_decodes_them(mode, kinds):
-    image = Image.fromarray(np.round(COLORS * 255).astype(np.uint8)).convert(mode)
-    for kind in kinds:
-        file, options = BytesIO(), {'transparency': 3} if (mode, kind) == ('P', 'PNG') else {}
-        image.save(file, kind, quality=98, lossless=True, **options)
-        difference = decode_compressed(file.getvalue()).astype(int) - image.convert('RGB')
-        assert np.abs(difference).max() <= (16 if kind == 'JPEG' else 4), kind
+def test_decode_compressed_of_pnm_scales_its_largest_value_to_white(kind, maximum):
+    ramp = np.tile(np.linspace(0, 1, 160), (120, 1))
+    colors = np.dstack([ramp, ramp**2, 1 - ramp] if kind == 'P6' else [ramp] * 3)
+    colors = np.round(colors * maximum).astype(np.uint16)
+    values = colors if kind == 'P6' else colors[..., 0]
+    head = f'{kind}\n# by hand\n160 120\n{maximum}\n'.encode()
+    pixels = values.astype('>u2' if maximum > 255 else np.uint8).tobytes()
+    pixels = ' '.join(map(str, values.ravel())).encode() + b'\n' if kind == 'P2' else pixels
+    image = decode_compressed(head + pixels)
+    assert np.abs(image - colors * (255 / maximum)).max() <= 1
+    with pytest.raises(ImageError, match='is damaged or cut off'):
+        decode_compressed(head + pixels[:-300])
 
 
 @pytest.mark.parametrize('compression', [None, 'tiff_lzw', 'tiff_deflate', 'packbits'])
@@ -328,9 +314,8 @@ def test_compressed_message_of_depth_is_rejected(transport):
     assert caught.value.kind == 'depth'
 
 
-@pytest.mark.parametrize('transport', ['avif', 'bgr8; jxl compressed bgr8', 'JPEG2000'])
-def test_compressed_message_of_another_format_has_a_remedy(transport):
-    message = SimpleNamespace(format=transport, data=bytes(99))
+def test_compressed_message_of_another_format_has_a_remedy():
+    message = SimpleNamespace(format='bgr8; JXL compressed bgr8', data=bytes(99))
     with pytest.raises(ImageError, match='set the format of the publisher to jpeg') as caught:
         decode_message(message)
     assert caught.value.kind == 'format'

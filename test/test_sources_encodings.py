@@ -34,23 +34,18 @@ def test_decode_image_of_every_encoding_is_exact(encoding, big, height, width, p
     assert image.flags.writeable
 
 
-@pytest.mark.parametrize('encoding', ['rgb8', 'RGB8', 'Bgra8', '8uc3', 'mono16'])
-def test_encoding_in_another_case_and_a_step_of_0_are_read(encoding):
-    name = next(each for each in ENCODINGS if each.lower() == encoding.lower())
+@pytest.mark.parametrize('name', ['rgb8', '8UC3', 'mono16'])
+def test_encoding_in_another_case_and_a_step_of_0_are_read(name):
     _, data, expected = message(name, 4, 6)
-    image = decode_image(4, 6, encoding, False, 0, data)
-    np.testing.assert_array_equal(image, expected)
+    np.testing.assert_array_equal(decode_image(4, 6, name.swapcase(), False, 0, data), expected)
 
 
-@pytest.mark.parametrize('encoding', ['jpeg', 'MJPEG', 'png'])
-def test_raw_message_with_the_bytes_of_a_file_is_read(encoding):
-    suffix, pixels = '.png' if encoding == 'png' else '.jpg', np.full((8, 8, 3), 90, np.uint8)
+@pytest.mark.parametrize(('encoding', 'suffix'), [('MJPEG', '.jpg'), ('png', '.png')])
+def test_raw_message_with_the_bytes_of_a_file_is_read(encoding, suffix):
+    pixels = np.full((8, 8, 3), 90, np.uint8)
     data = cv2.imencode(suffix, pixels)[1].tobytes()
     raw = SimpleNamespace(height=8, width=8, encoding=encoding, is_bigendian=0, step=0, data=data)
     np.testing.assert_allclose(decode_message(raw), pixels, atol=2)
-    raw.data = pixels.tobytes()
-    with pytest.raises(ImageError, match='are no image'):
-        decode_message(raw)
 
 
 @pytest.mark.parametrize(
