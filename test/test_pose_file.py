@@ -28,6 +28,7 @@ EUROC = (
         'sep=;\n0,0;0,0;0,0\n10,0;0,5;-1,25\n',
         '0,0\t0,0\t0,0\n10,0\t0,5\t-1,25\n',
         '  0  0 0\n 10 .5   -1.25',
+        '0,0 0,0 0,0\n10,0 0,5 -1,25\n',
         ',x,y,z\n0,0,0,0\n1,10,.5,-1.25\n',
         'name;z;y;x\na 1.png;0;0;0\na 2.png;-1.25;.5;10\n',
         ',0,1,2\n0,0,0,0\n1,10,.5,-1.25\n',
@@ -170,8 +171,3 @@ def test_poses_of_another_unit_are_named_in_one_line(tmp_path, rows, doubt, capl
     np.savetxt(tmp_path / 'poses.csv', rows, delimiter=',', fmt='%.12g')
     assert len(read_poses(tmp_path / 'poses.csv')[0]) == 20
     assert [doubt in record.getMessage() for record in caplog.records] == [True] * bool(doubt)
-
-
-def test_decimal_commas_between_blanks(tmp_path):
-    (tmp_path / 'poses.txt').write_text('0,0 0,0 0,0\n10,0 0,5 -1,25\n')
-    assert read_poses(tmp_path / 'poses.txt')[0][:, :3].tolist() == POSITIONS

@@ -3,7 +3,6 @@
 """Ground truth: accepted places by hand, and every kind of file."""
 
 import pickle
-import re
 import zipfile
 
 import cv2
@@ -265,57 +264,49 @@ def test_from_poses_never_accepts_places_with_unknown_pose():
         GroundTruth.from_poses(np.array([unknown, pose(5), unknown]), places, 1)
 
 
+FILES = ['a.jpg', 'b.jpg', 'c.jpg'], [f'x/{i}.png' for i in range(4)]
+
+
 @pytest.mark.parametrize(
     'text',
     [
         'query,place\nb.jpg,2.png\na.jpg,0.png\n',
-        'b.jpg,x/2.png\na.jpg,x/0.png\n',
         'place;query\n2;b\n0;a\n',
         'b.jpg,2\na.jpg,0\nc.jpg,-1\n',
     ],
 )
 def test_from_text_of_names_is_of_the_images_that_it_names(tmp_path, text):
-    names = ['a.jpg', 'b.jpg', 'c.jpg'], [f'x/{i}.png' for i in range(4)]
-    path = tmp_path / 'truth.csv'
-    path.write_text(text)
-    truth = GroundTruth.from_file(path, 3, 4, names=names)
+    (tmp_path / 'truth.csv').write_text(text)
+    truth = GroundTruth.from_file(tmp_path / 'truth.csv', 3, 4, names=FILES)
     assert truth.pairs.tolist() == [[0, 0], [1, 2]]
     assert truth.is_stated.tolist() == [True, True, '-1' in text]
-    path.write_text(re.sub(r'\ba\b', 'z', text))
-    with pytest.raises(SourceError, match=r'z.* is the name of no image'):
-        GroundTruth.from_file(path, 3, 4, names=names)
 
 
 @pytest.mark.parametrize(
     ('text', 'reason'),
     [
+        ('query,place\nb.jpg,2.png\nz.jpg,0.png\n', "'z.jpg' is the name of no image"),
         ('query,place\nb.jpg\na.jpg,0\n', 'different numbers of columns'),
         ('b.jpg,2\na.jpg\n', 'different numbers of columns'),
         ('b.jpg,\na.jpg,2\n', "'' is the name of no image"),
         ('b.jpg,nan\n', "'nan' is the name of no image"),
-        ('z\n', "'z' is the name of no image"),
         ('place\n2.png\n', 'a place for 1 queries, but there are 3'),
     ],
 )
-def test_from_text_of_names_with_missing_cells_is_named(tmp_path, text, reason):
+def test_from_text_of_other_names_or_missing_cells_raises(tmp_path, text, reason):
     (tmp_path / 'truth.csv').write_text(text)
     with pytest.raises((SourceError, InputError), match=reason):
-        GroundTruth.from_file(
-            tmp_path / 'truth.csv', 3, 3, names=(['a.jpg', 'b.jpg', 'c.jpg'], ['0.png', '2.png'])
-        )
+        GroundTruth.from_file(tmp_path / 'truth.csv', 3, 4, names=FILES)
 
 
 @pytest.mark.parametrize(
     ('truth', 'doubt'),
     [
-        (GroundTruth.identity(20, 20, 20), '100% of the 20 places for an image'),
         (GroundTruth.identity(20, 20, 10), '78% of the 20 places'),
         (GroundTruth.identity(20, 20, 3), ''),
-        (GroundTruth.unknown(20, 20), ''),
         (by_hand([(0, i) for i in range(5)]), '100% of the 5 places'),
         (by_hand([(0, -1), (1, -1), (2, -1)]), 'no place for any of 3 images'),
         (GroundTruth.from_poses(*[[pose(i) for i in range(9)]] * 2, 100), '100% of the 9 places'),
-        (GroundTruth.from_poses([pose(900)], [pose(0), pose(1)], 5), 'no place for any of 1 im'),
     ],
 )
 def test_truth_that_cannot_be_wrong_or_right_is_named(truth, doubt):
