@@ -47,17 +47,14 @@ def test_names_are_in_the_order_of_their_kind_of_number(tmp_path, names, guesses
     assert len(caplog.records) == guesses
 
 
-@pytest.mark.parametrize(
-    ('names', 'step', 'note'),
-    [
-        ([f'DSC_{i}.JPG' for i in counter(9989, 10000, width=4, zero=1)], 7, None),
-        ([f'{100 + i // 11}MEDIA/{n}.jpg' for i, n in enumerate(counter(9989, 10000))], 7, None),
-        ([f'{(999, 100)[i // 12]}MEDIA/DJI_{i:04d}.jpg' for i in range(24)], 7, 'contradict'),
-        ([f'{i * 7919 % 997:03d} x.jpg' for i in range(24)], 0.25, 'contradict'),
-        ([f'{("phone", "camera")[i % 2]}_{i}.jpg' for i in range(24)], 7, 'contradict'),
-        ([f'{i:04d}.jpg' for i in range(24)], 7, 'go back at 0010.jpg: the names count'),
-    ],
-)
+@pytest.mark.parametrize(('names', 'step', 'note'), [
+    ([f'DSC_{i}.JPG' for i in counter(9989, 10000, width=4, zero=1)], 7, None),
+    ([f'{100 + i // 11}MEDIA/{n}.jpg' for i, n in enumerate(counter(9989, 10000))], 7, None),
+    ([f'{(999, 100)[i // 12]}MEDIA/DJI_{i:04d}.jpg' for i in range(24)], 7, 'contradict'),
+    ([f'{i * 7919 % 997:03d} x.jpg' for i in range(24)], 0.25, 'contradict'),
+    ([f'{("phone", "camera")[i % 2]}_{i}.jpg' for i in range(24)], 7, 'contradict'),
+    ([f'{i:04d}.jpg' for i in range(24)], 7, 'go back at 0010.jpg: the names count'),
+])  # fmt: skip
 def test_times_in_exif_decide_unless_a_clock_was_set(tmp_path, names, step, note, caplog):
     """Also within a second, where the file has its fractions."""
     expected = [tmp_path / name for name in names]

@@ -137,31 +137,16 @@ def test_decode_compressed_of_16_bits_takes_the_upper_byte_as_opencv_does(suffix
     np.testing.assert_array_equal(decode_compressed(data), expected)
 
 
-@pytest.mark.parametrize(
-    ('kind', 'maximum'),
-    [
-        ('P5', 1),
-        ('P5', 100),
-        ('P5', 255),
-        ('P5', 4095),
-        ('P6', 4),
-        ('P6', 1023),
-        ('P6', 65535),
-        ('P2', 100),
-    ],
-)
+@pytest.mark.parametrize('maximum', [1, 100, 255, 4095, 65535])
+@pytest.mark.parametrize('kind', ['P5', 'P6'])
 def test_decode_compressed_of_pnm_scales_its_largest_value_to_white(kind, maximum):
-    ramp = np.tile(np.linspace(0, 1, 160), (120, 1))
-    colors = np.dstack([ramp, ramp**2, 1 - ramp] if kind == 'P6' else [ramp] * 3)
-    colors = np.round(colors * maximum).astype(np.uint16)
-    values = colors if kind == 'P6' else colors[..., 0]
+    shape = (120, 160, 1 if kind == 'P5' else 3)
+    values = np.round(np.linspace(0, maximum, np.prod(shape))).reshape(shape)
     head = f'{kind}\n# by hand\n160 120\n{maximum}\n'.encode()
-    pixels = values.astype('>u2' if maximum > 255 else np.uint8).tobytes()
-    pixels = ' '.join(map(str, values.ravel())).encode() + b'\n' if kind == 'P2' else pixels
-    image = decode_compressed(head + pixels)
-    assert np.abs(image - colors * (255 / maximum)).max() <= 1
+    data = head + values.astype('>u2' if maximum > 255 else np.uint8).tobytes()
+    assert np.abs(decode_compressed(data) - values * (255 / maximum)).max() <= 1
     with pytest.raises(ImageError, match='is damaged or cut off'):
-        decode_compressed(head + pixels[:-300])
+        decode_compressed(data[:-300])
 
 
 @pytest.mark.parametrize('compression', [None, 'tiff_lzw', 'tiff_deflate', 'packbits'])

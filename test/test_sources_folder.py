@@ -166,17 +166,14 @@ def test_photos_of_a_telephone_with_a_video_each_are_the_drive(tmp_path):
 LFS = b'version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 48213\n'
 
 
-@pytest.mark.parametrize(
-    ('content', 'reason'),
-    [
-        (LFS, 'a pointer of Git LFS instead of the content: run `git lfs pull`'),
-        (b'/annex/objects/SHA256E-s48213--00.jpg\n', 'run `git annex get`'),
-        ('../.git/annex/objects/Xj/q5/00.jpg', 'a link into nothing, .*: run `git annex get`'),
-        ('/home/me/.cache/dvc/files/md5/00', 'a link into nothing, .*: run `dvc pull`'),
-        ('/mnt/disk/2.png', 'a link into nothing, /mnt/disk/2.png: copy the file'),
-        (b'', '0 bytes: a placeholder of a cloud'),
-    ],
-)
+@pytest.mark.parametrize(('content', 'reason'), [
+    (LFS, 'a pointer of Git LFS instead of the content: run `git lfs pull`'),
+    (b'/annex/objects/SHA256E-s48213--00.jpg\n', 'run `git annex get`'),
+    ('../.git/annex/objects/Xj/q5/00.jpg', 'a link into nothing, .*: run `git annex get`'),
+    ('/home/me/.cache/dvc/files/md5/00', 'a link into nothing, .*: run `dvc pull`'),
+    ('/mnt/disk/2.png', 'a link into nothing, /mnt/disk/2.png: copy the file'),
+    (b'', '0 bytes: a placeholder of a cloud'),
+])  # fmt: skip
 def test_images_whose_content_is_elsewhere_are_named(tmp_path, content, reason):
     """Not called damaged, nor left out in silence."""
     fill(tmp_path, ['1.png', '3.png'])
@@ -191,31 +188,25 @@ def test_images_whose_content_is_elsewhere_are_named(tmp_path, content, reason):
 
 
 @pytest.mark.parametrize('name', ['drive.mp4', 'drive.mcap', 'drive.bag', 'drive'])
-@pytest.mark.parametrize(
-    ('form', 'reason'),
-    [
-        ('{}', 'a pointer of Git LFS .*: run `git lfs pull`'),
-        ('{}.dvc', 'of DVC, .*: run `dvc pull`'),
-        ('.{}.icloud', 'in iCloud only: download it'),
-    ],
-)
+@pytest.mark.parametrize(('form', 'reason'), [
+    ('{}', 'a pointer of Git LFS .*: run `git lfs pull`'),
+    ('{}.dvc', 'of DVC, .*: run `dvc pull`'),
+    ('.{}.icloud', 'in iCloud only: download it'),
+])  # fmt: skip
 def test_sources_whose_content_is_elsewhere_are_named(tmp_path, name, form, reason):
     (tmp_path / form.format(name)).write_bytes(LFS)
     with pytest.raises(SourceError, match=f'is {reason}'):
         open_source(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    ('names', 'counts'),
-    [
-        (['.3.png.icloud', '4.png.dvc', '5.png - Shortcut.lnk', '._1.png'], {'elsewhere': 3}),
-        (['a.gif', 'b.ico', 'c.avifs'], {'format': 3}),
-        (['notes.bag'], {'bag': 1}),
-        (['drive_0.db3'], {'bag': 1}),
-        (['drive_0.mcap'], {'bag': 1}),
-        (['metadata.yaml'], {}),
-    ],
-)
+@pytest.mark.parametrize(('names', 'counts'), [
+    (['.3.png.icloud', '4.png.dvc', '5.png - Shortcut.lnk', '._1.png'], {'elsewhere': 3}),
+    (['a.gif', 'b.ico', 'c.avifs'], {'format': 3}),
+    (['notes.bag'], {'bag': 1}),
+    (['drive_0.db3'], {'bag': 1}),
+    (['drive_0.mcap'], {'bag': 1}),
+    (['metadata.yaml'], {}),
+])  # fmt: skip
 def test_files_of_other_kinds_beside_images_are_counted(tmp_path, names, counts):
     """Bags that are cut off, and metadata of another program, are no bag of images."""
     fill(tmp_path, ['1.png', '2.png'])

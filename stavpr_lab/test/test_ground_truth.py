@@ -267,14 +267,11 @@ def test_from_poses_never_accepts_places_with_unknown_pose():
 FILES = ['a.jpg', 'b.jpg', 'c.jpg'], [f'x/{i}.png' for i in range(4)]
 
 
-@pytest.mark.parametrize(
-    'text',
-    [
-        'query,place\nb.jpg,2.png\na.jpg,0.png\n',
-        'place;query\n2;b\n0;a\n',
-        'b.jpg,2\na.jpg,0\nc.jpg,-1\n',
-    ],
-)
+@pytest.mark.parametrize('text', [
+    'query,place\nb.jpg,2.png\na.jpg,0.png\n',
+    'place;query\n2;b\n0;a\n',
+    'b.jpg,2\na.jpg,0\nc.jpg,-1\n',
+])  # fmt: skip
 def test_from_text_of_names_is_of_the_images_that_it_names(tmp_path, text):
     (tmp_path / 'truth.csv').write_text(text)
     truth = GroundTruth.from_file(tmp_path / 'truth.csv', 3, 4, names=FILES)
@@ -282,33 +279,27 @@ def test_from_text_of_names_is_of_the_images_that_it_names(tmp_path, text):
     assert truth.is_stated.tolist() == [True, True, '-1' in text]
 
 
-@pytest.mark.parametrize(
-    ('text', 'reason'),
-    [
-        ('query,place\nb.jpg,2.png\nz.jpg,0.png\n', "'z.jpg' is the name of no image"),
-        ('query,place\nb.jpg\na.jpg,0\n', 'different numbers of columns'),
-        ('b.jpg,2\na.jpg\n', 'different numbers of columns'),
-        ('b.jpg,\na.jpg,2\n', "'' is the name of no image"),
-        ('b.jpg,nan\n', "'nan' is the name of no image"),
-        ('place\n2.png\n', 'a place for 1 queries, but there are 3'),
-    ],
-)
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('query,place\nb.jpg,2.png\nz.jpg,0.png\n', "'z.jpg' is the name of no image"),
+    ('query,place\nb.jpg\na.jpg,0\n', 'different numbers of columns'),
+    ('b.jpg,2\na.jpg\n', 'different numbers of columns'),
+    ('b.jpg,\na.jpg,2\n', "'' is the name of no image"),
+    ('b.jpg,nan\n', "'nan' is the name of no image"),
+    ('place\n2.png\n', 'a place for 1 queries, but there are 3'),
+])  # fmt: skip
 def test_from_text_of_other_names_or_missing_cells_raises(tmp_path, text, reason):
     (tmp_path / 'truth.csv').write_text(text)
     with pytest.raises((SourceError, InputError), match=reason):
         GroundTruth.from_file(tmp_path / 'truth.csv', 3, 4, names=FILES)
 
 
-@pytest.mark.parametrize(
-    ('truth', 'doubt'),
-    [
-        (GroundTruth.identity(20, 20, 10), '78% of the 20 places'),
-        (GroundTruth.identity(20, 20, 3), ''),
-        (by_hand([(0, i) for i in range(5)]), '100% of the 5 places'),
-        (by_hand([(0, -1), (1, -1), (2, -1)]), 'no place for any of 3 images'),
-        (GroundTruth.from_poses(*[[pose(i) for i in range(9)]] * 2, 100), '100% of the 9 places'),
-    ],
-)
+@pytest.mark.parametrize(('truth', 'doubt'), [
+    (GroundTruth.identity(20, 20, 10), '78% of the 20 places'),
+    (GroundTruth.identity(20, 20, 3), ''),
+    (by_hand([(0, i) for i in range(5)]), '100% of the 5 places'),
+    (by_hand([(0, -1), (1, -1), (2, -1)]), 'no place for any of 3 images'),
+    (GroundTruth.from_poses(*[[pose(i) for i in range(9)]] * 2, 100), '100% of the 9 places'),
+])  # fmt: skip
 def test_truth_that_cannot_be_wrong_or_right_is_named(truth, doubt):
     assert truth.doubt().startswith(doubt)
     assert bool(truth.doubt()) == bool(doubt)

@@ -47,8 +47,6 @@ RANGE_IMAGES, PERCENTILES = 20, (0.5, 99.5)
 """The first images of a map, and the shares of their values, that decide the range in use."""
 ORIENTATION = 0x0112  # tag of EXIF
 HEIF = re.compile(rb'....ftyp(hei[cfmsx]|hev[cmsx]|mif1|msf1)', re.DOTALL)
-PAGED = re.compile(rb'\A(II[*+]|MM\0[*+]|....ftyp)|acTL|ANIM|MPF\0', re.DOTALL)
-LONGEST_HEAD = 2**16  # bytes of a file that may state several images
 TIFF = b'II*\0', b'MM\0*', b'II+\0', b'MM\0+'  # the last two are of more than 4 GB
 WIDE_TIFF = ('TIFF', 'F'), ('TIFF', 'I')  # Pillow's modes of 32 bits, which OpenCV does not read
 
@@ -270,8 +268,6 @@ def checked_header(flat: np.ndarray, max_pixels: int) -> tuple['Image.Image', in
 
 def more_images(data: bytes) -> int:
     """Return how many pages, frames or views a file has behind its first one, which is decoded."""
-    if not PAGED.search(data[:LONGEST_HEAD]):
-        return 0
     from PIL import Image
 
     try:

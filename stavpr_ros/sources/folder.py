@@ -155,7 +155,9 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         folders[:] = [each for each in visible if not FOREIGN.fullmatch(each)]
         unread['foreign'] += len(visible) - len(folders)
         paths = [Path(name, each) for each in files if not each.startswith('.')]
-        images = [path for path in paths if path.suffix.lower() in SUFFIXES and _is_file(path)]
+        images = [path for path in paths if path.suffix.lower() in SUFFIXES]
+        # a link into nothing is an image that is missing
+        images = [path for path in images if path.is_file() or not path.exists()]
         # of an image in two formats, the one that every program reads
         names = {path.stem for path in images if path.suffix.lower() not in HEIF}
         images = [p for p in images if p.suffix.lower() not in HEIF or p.stem not in names]
@@ -169,10 +171,6 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
     is_drive = len(own) * FEW > len(below)
     unread['below' if is_drive else 'beside'] = len(below if is_drive else own)
     return own if is_drive else below, +unread
-
-
-def _is_file(path: Path) -> bool:
-    return path.is_file() or not path.exists()  # a link into nothing is an image that is missing
 
 
 def _read(

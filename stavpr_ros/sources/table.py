@@ -136,14 +136,13 @@ def by_name(names: Sequence[str], keys: Sequence[str]) -> np.ndarray:
     :returns: the last key that names the same file as each name, shape (names,); -1 = none.
     """
     best = np.full(len(names), -1)
-    paths, others = (list(map(PureWindowsPath, each)) for each in (names, keys))
     for form in (PureWindowsPath.as_posix, attrgetter('name'), attrgetter('stem')):
-        own, named = [*map(form, paths)], [*map(form, others)]
-        if len({*own}) < len({*names}) or len({*named}) < len({*keys}):
+        own, others = ([form(PureWindowsPath(each)) for each in every] for every in (names, keys))
+        if len({*own}) < len({*names}) or len({*others}) < len({*keys}):
             break  # several files of this name
-        rows = {key: row for row, key in enumerate(named)}
-        found = np.array([rows.get(name, -1) for name in own])
-        best = max(best, found, key=lambda each: np.count_nonzero(each >= 0))
+        row_of = {key: row for row, key in enumerate(others)}
+        rows = np.array([row_of.get(name, -1) for name in own])
+        best = max(best, rows, key=lambda each: np.count_nonzero(each >= 0))
     return best
 
 

@@ -55,8 +55,8 @@ def read_pairs(path: Path, N: int, n: int, names: Names = ((), ())) -> Pairs:
 # ------------------------------------------------------------------------------------------ text
 
 
-def _columns(table: Table, names: list[str], width: int) -> tuple[int | None, int]:
-    """Return the columns of query and place; None = the query is the line's number."""
+def _columns(table: Table, names: list[str], width: int) -> list[int]:
+    """Return the columns of query and place, or of the place of each line."""
     if names:
         positions = []
         for words in (QUERY_WORDS, PLACE_WORDS):
@@ -66,11 +66,9 @@ def _columns(table: Table, names: list[str], width: int) -> tuple[int | None, in
             positions.append(columns[0] if len(columns) == 1 else None)
         query, place = positions
         if place is not None and query != place:
-            return query, place
-    if width == 1:
-        return None, 0
-    if width == 2:
-        return 0, 1
+            return [place] if query is None else [query, place]
+    if width in (1, 2):
+        return [0, 1][:width]
     raise table.error(f'it has {width} columns, without a header of these names')
 
 
@@ -81,7 +79,7 @@ def _of_names(table: Table, names: Names) -> np.ndarray | None:
         header = rows.pop(0) if any(map(is_name, rows[0])) else []
     if not any(map(is_name, rows[0])):
         return None
-    columns = [i for i in _columns(table, header, len(rows[0])) if i is not None]
+    columns = _columns(table, header, len(rows[0]))
     if min(map(len, rows)) <= max(columns):
         raise table.error('its lines have different numbers of columns')
     if not any(is_name(rows[0][column]) for column in columns):
@@ -103,10 +101,16 @@ def _from_text(path: Path, N: int, names: Names) -> Pairs:
     table = Table(path, 'ground truth', 'two columns, query and place, whole numbers from 0')
     rows = _of_names(table, names)
     if rows is None:
-        query_column, place_column = _columns(table, table.names, table.width)
-        columns = [place_column] if query_column is None else [query_column, place_column]
+        columns = _columns(table, table.names, table.width)
         rows = table.numbers(columns)
-        _check_numbers(table, rows, columns)
+        for column, values in zip(columns, rows.T, strict=True):
+            whole = (abs(values) < LARGEST) & (values == np.floor(values))
+            where = f'column {column + 1} has'
+            if not whole.all():
+                row = int(np.argmin(whole))
+                raise table.error(f'{where} no whole number, {values[row]:g}', row)
+            if is_stamps(values):
+                raise table.error(f'{where} stamps instead of the numbers of images')
     if rows.shape[1] == 1:
         if len(rows) != N:
             raise InputError(
@@ -115,16 +119,6 @@ def _from_text(path: Path, N: int, names: Names) -> Pairs:
         rows = np.column_stack([np.arange(N), rows])
     pairs = rows.astype(np.int64)
     return pairs[:, 0], pairs[:, 1]
-
-
-def _check_numbers(table: Table, rows: np.ndarray, columns: list[int]) -> None:
-    for column, values in zip(columns, rows.T, strict=True):
-        whole = (abs(values) < LARGEST) & (values == np.floor(values))
-        if not whole.all():
-            row = int(np.argmin(whole))
-            raise table.error(f'column {column + 1} has no whole number, {values[row]:g}', row)
-        if is_stamps(values):
-            raise table.error(f'column {column + 1} has stamps instead of the numbers of images')
 
 
 # ------------------------------------------------------------------------------------------ arrays
