@@ -28,6 +28,7 @@ CAMERAS = {
     'euroc': files('mav0/{}/data/{}.png', 'cam0', 'cam1', step=50_000_000, first=1403636 * 10**12),
     'kitti': files('04/{}/{:06d}.png', 'image_0', 'image_1', 'image_2', 'image_3'),
     'prefix': files('{}{:04d}.png', 'left', 'right'),
+    'lost images': files('{}{:04d}.png', 'left', 'right')[:40],
     'dashcam': files('20300506_{1:06d}_{0}.jpg', 'F', 'R'),
     'scan': files('frame-{1:06d}.{0}.png', 'color', 'depth'),
     'tum': files('{}/1305031102.{:06d}.png', 'depth', 'rgb', step=33_000, lag=10_000),
@@ -45,9 +46,9 @@ def test_cameras_of_one_drive_are_listed_and_chosen(name):
     with pytest.raises(SourceError, match='choose it, --camera NAME') as caught:
         of_one_camera(CAMERAS[name], TOP)
     listed = str(caught.value).partition('cameras, ')[2].partition(': expected')[0].split(', ')
-    chosen = [of_one_camera(CAMERAS[name], TOP, text.removesuffix(' (24)')) for text in listed]
+    chosen = [of_one_camera(CAMERAS[name], TOP, text.partition(' (')[0]) for text in listed]
     assert sorted(chain(*chosen)) == sorted(CAMERAS[name])
-    assert {len(group) for group in chosen} == {len(COUNT)}
+    assert len(chosen[0]) == len(COUNT)
     with pytest.raises(SourceError, match="no camera 'none': expected one of "):
         of_one_camera(CAMERAS[name], TOP, 'none')
 
@@ -57,7 +58,6 @@ def test_cameras_of_one_drive_are_listed_and_chosen(name):
     (files('frame_{:.0s}{:x}.jpg', ''), 0),
     (files('cam_{:.0s}{}.jpg', ''), 0),
     (files('front_{:.0s}{:04d}.jpg', '') + files('rear_{:.0s}{:04d}.jpg', '', first=24), 0),
-    (files('hall_left_{:.0s}{}.jpg', '') + files('hall_right_{:.0s}{}.jpg', '')[:20], 0),
     (files('{}/{:04d}.jpg', 'monday', 'tuesday'), 1),
 ])  # fmt: skip
 def test_parts_of_one_drive_are_no_cameras(drive, warnings, caplog):
@@ -75,10 +75,8 @@ def test_commands_choose_a_camera(tmp_path, capsys, route):
     options = ['--input', str(tmp_path), '--output', str(tmp_path / 'map.stavpr')]
     assert build_map.main(options) == 1
     assert 'has images of 2 cameras, cam0 (4), cam1 (4)' in capsys.readouterr().err
-    assert build_map.main([*options, '--camera', 'cam1']) == 0
+    assert build_map.main([*options, '--camera', 'CAM1']) == 0
     assert '4 of 4 images became places' in capsys.readouterr().out
-    source = open_source(tmp_path, camera='CAM1')
-    assert [frame.identifier for frame in source] == [f'cam1/{i}.png' for i in range(4)]
     (tmp_path / 'drive.mp4').write_bytes(b'')
     for name, reason in (('cam0', "no camera 'cam1': leave it out"), ('drive.mp4', 'no folder')):
         with pytest.raises(SourceError, match=reason):

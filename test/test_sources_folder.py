@@ -207,12 +207,14 @@ def test_sources_whose_content_is_elsewhere_are_named(tmp_path, name, form, reas
     (['drive_0.mcap'], {'bag': 1}),
     (['metadata.yaml'], {}),
 ])  # fmt: skip
-def test_files_of_other_kinds_beside_images_are_counted(tmp_path, names, counts):
+@pytest.mark.parametrize('folder', ['drive', 'drive.bag', 'drive.mp4'])
+def test_files_of_other_kinds_beside_images_are_counted(tmp_path, names, counts, folder):
     """Bags that are cut off, and metadata of another program, are no bag of images."""
-    fill(tmp_path, ['1.png', '2.png'])
+    (tmp_path / folder).mkdir()
     for name in names:
-        (tmp_path / name).write_text('camera: front\nfps: 10\n')
-    source = open_source(tmp_path)
+        (tmp_path / folder / name).write_text('camera: front\nfps: 10\n')
+    fill(tmp_path / folder, ['1.png', '2.png'])
+    source = open_source(tmp_path / folder)
     assert [frame.identifier for frame in source] == ['1.png', '2.png']
     assert source.left_out == counts
 
@@ -223,14 +225,6 @@ def test_images_beside_the_metadata_of_a_bag_do_not_hide_it(tmp_path):
     (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information:\n  version: 5\n')
     with pytest.raises(SourceError, match=f'{tmp_path}.* is damaged, cut off or no bag'):
         open_source(tmp_path)
-
-
-def test_folders_named_like_files_are_folders(tmp_path):
-    for name in ('1.bag', '2.mp4', '3.jpg'):
-        (tmp_path / name).mkdir()
-        fill(tmp_path, [f'{name}/a.png', f'{name}/b.png'])
-    assert len(open_source(tmp_path)) == 6
-    assert len(open_source(tmp_path / '1.bag')) == 2
 
 
 @pytest.mark.parametrize(

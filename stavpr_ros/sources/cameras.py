@@ -28,7 +28,6 @@ TOKEN = re.compile(r'[A-Z]?[a-z]+|[A-Z]+')
 WORD = re.compile(r'(?<![^\W_])[a-f]+(?![^\W_])|[^\W\d_]*[^\W\d_a-f][^\W\d_]*')
 """Letters that are no hexadecimal digits."""
 MIN_SHARE = 0.05  # of all images, of a camera
-SAME = 0.95  # share of the same numbers, of cameras in one folder
 STAMPS = 10**7  # stamps and dates are not below
 
 Numbers = tuple[int, ...]
@@ -117,11 +116,7 @@ def _parallel(groups: Groups, count: int) -> Groups:
     for a, b in combinations(large, 2):
         small, other = sorted((large[a], large[b]), key=len)
         first, last = min(other.values()), max(other.values())
-        within, least = sum(first <= own <= last for own in small.values()), len(small) / 2
-        folders = [{file.parent for file in group} for group in (small, other)]
-        if folders[0] == folders[1] and last < (STAMPS,):  # words of a scene may be the same
-            within, least = len({*small.values()} & {*other.values()}), SAME * len(other)
-        if within >= least:
+        if sum(first <= own <= last for own in small.values()) >= len(small) / 2:
             several |= {a: large[a], b: large[b]}
     return several
 

@@ -74,7 +74,7 @@ class FolderSource:
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
         self.least: tuple[int, int] | None = None
-        self._paged: set[Path] = set()
+        self._counted: set[Path] = set()
         try:
             files, self.left_out = _images_of(self.path)
         except OSError as error:
@@ -127,17 +127,37 @@ class FolderSource:
     def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):
             try:
-                image, more = _read(file, self.least, self.to_bytes)
-                if more and file not in self._paged:
-                    self._paged.add(file)
-                    self.left_out['pages'] += more
-                frame = Frame(image, 0, text_of(file.relative_to(self.path)))
+                frame = Frame(self._read(file), 0, text_of(file.relative_to(self.path)))
             except ImageError as error:
                 if self.on_error is None:
                     raise
                 self.on_error(error)
                 continue
             yield i, frame
+
+    def _read(self, file: Path) -> np.ndarray:
+        try:
+            with open_regular(file) as content:
+                data = content.readall()
+            if not data:
+                raise ImageError(
+                    '0 bytes: a placeholder of a cloud, or an interrupted copy; download it again',
+                    kind='elsewhere',
+                )
+            image = decode_file(data, None, self.least, self.to_bytes)
+        except ElsewhereError as error:
+            raise ImageError(f'{text_of(file)}: {error.strerror}', kind='elsewhere') from error
+        except OSError as error:
+            raise ImageError(
+                f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',
+                kind='unreadable',
+            ) from error
+        except ImageError as error:
+            raise ImageError(f'{text_of(file)}: {error}', kind=error.kind) from error
+        if file not in self._counted:
+            self._counted.add(file)
+            self.left_out += Counter(pages=more_images(data))
+        return image
 
 
 def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
@@ -171,26 +191,3 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
     is_drive = len(own) * FEW > len(below)
     unread['below' if is_drive else 'beside'] = len(below if is_drive else own)
     return own if is_drive else below, +unread
-
-
-def _read(
-    file: Path, least: tuple[int, int] | None, to_bytes: ToBytes | None
-) -> tuple[np.ndarray, int]:
-    try:
-        with open_regular(file) as content:
-            data = content.readall()
-        if not data:
-            raise ImageError(
-                '0 bytes: a placeholder of a cloud, or an interrupted copy; download it again',
-                kind='elsewhere',
-            )
-        return decode_file(data, None, least, to_bytes), more_images(data)
-    except ElsewhereError as error:
-        raise ImageError(f'{text_of(file)}: {error.strerror}', kind='elsewhere') from error
-    except OSError as error:
-        raise ImageError(
-            f'{text_of(file)} cannot be read: {error.strerror}; check its permissions',
-            kind='unreadable',
-        ) from error
-    except ImageError as error:
-        raise ImageError(f'{text_of(file)}: {error}', kind=error.kind) from error
