@@ -142,87 +142,55 @@ def test_vertices_with_gaps_and_edges_to_the_one_before(tmp_path, freedom):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-PLANE = 'EDGE_SE2 0 1 {} 0 1 0 1'  # behind the pose, and the first two numbers of information
-BAD_NUMBERS = {
-    **dict.fromkeys(['nan', '-nan', 'inf', '-inf', 'Infinity', '1e999'], 'is not finite'),
-    **dict.fromkeys(['nan(ind)', '1.#INF', '1,5', '1_0', '0x10', 'one'], 'is no number'),
-}
-
-
-def edge(number, diagonal):
+def edge(number, *diagonal, pose='1 0 0 0 0 0 1'):
     """Return an edge with these numbers on the diagonal of its information."""
+    tag, size = ('EDGE_SE2', 5) if len(diagonal) == 3 else ('EDGE_SE3:QUAT', len(pose))
     information = np.diag(np.array(diagonal, object))[np.triu_indices(len(diagonal))]
-    pose = '1 0 0' if len(diagonal) == 3 else '1 0 0 0 0 0 1'
-    tag = 'EDGE_SE2' if len(diagonal) == 3 else 'EDGE_SE3:QUAT'
-    return f'{tag} {number} {number + 1} {pose} ' + ' '.join(map(str, information))
+    return ' '.join(map(str, [tag, number, number + 1, pose[:size], *information]))
+
+
+SOUND = edge(0, 1, 1, 1)
 
 
 @pytest.mark.parametrize(
     ('text', 'words'),
     [
         ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0', 'line 1: EDGE_SE2 has 10 numbers: expected 11'),
-        ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1 1', 'line 1: EDGE_SE2 has 12 numbers'),
-        ('\nEDGE_SE2', 'line 2: EDGE_SE2 has 0 numbers'),
-        ('\nEDGE_XY 0 1 1 0', 'line 2: EDGE_XY is not read: expected VERTEX_SE2'),
-        ('VERTEX_XY 1000 3 4', 'line 1: VERTEX_XY is not read'),
-        ('EDGE2 0 1 1 0 0 1 0 1 1 0 0', 'line 1: EDGE2 is not read'),
-        (edge(0, [1, 1, 1]) + '\n' + edge(2, [1, 1, 1]), 'vertices 1 and'),
-        ('', 'has no edge: expected lines of EDGE_SE2 or'),
-        ('VERTEX_SE2 0 0 0 0', 'has no edge'),
-        (PLANE.format('1 0 1e9 1 0'), 'an angle of 1e[+]09 rad: expected -pi to pi'),
-        (PLANE.format('1e9 0 0 1 0'), 'line 1: pose .* is not finite: expected meters up to'),
-        (edge(0, [1, -1, 1]), 'line 1: the information matrix is indefinite, with an eigenvalue'),
-        (edge(0, [-1, -1, -1]), 'information matrix is indefinite'),
-        (PLANE.format('1 0 0 1 5'), 'information matrix is indefinite'),
-        (PLANE.format('1 0 0 1 1'), r'information matrix .*\(semidefinite\)'),
-        (edge(0, [1, 0, 1]), 'eigenvalues of 0 to 1, .* a small information, such as 1e-3'),
-        (edge(0, [0, 0, 0]), 'information matrix'),
-        (edge(0, [1e-300, 1, 1]), r'\(semidefinite\)'),
-        (edge(0, [1e200, 1, 1]), r'\(semidefinite\)'),
-        (edge(0, [4, 4, 0, 0, 0, 25]), r'line 1: the information matrix .*\(semidefinite\)'),
-        (edge(0, [4, 4, -1, -1, -1, 25]), 'line 1: the information matrix is indefinite'),
-        ('EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 0 ' + '1 ' * 21, 'matrix .*semidefinite'),
-        (edge(0, [1] * 6).replace('0 0 0 1 1', '0 0 0 0 1', 1), 'a quaternion of norm 0:'),
-        (edge(0, [1] * 6).replace('0 0 0 1 1', '0 0 0 2 1', 1), 'a quaternion of norm 2:'),
-        (edge(0, [1, 1, 1]).replace('0 1 1', '0 0 1', 1), 'with a motion from vertex 0 to itself'),
-        *((PLANE.format(f'{text} 0 0 1 0'), f'line 1: .*{text[:3]}.*{words}')
-          for text, words in BAD_NUMBERS.items()),
-        *((edge(0, [1, 1, text]), words) for text, words in BAD_NUMBERS.items()),
-        *((edge(0, [1] * 5 + [text]), words) for text, words in BAD_NUMBERS.items()),
-        *((f'EDGE_SE2 {text} 1 1 0 0 1 0 0 1 0 1', 'line 1: ') for text in ('nan', '0.0', 'x0')),
+        (f'\n{SOUND} 1', 'line 2: EDGE_SE2 has 12 numbers'),
+        ('EDGE_XY 0 1 1 0', 'line 1: EDGE_XY is not read: expected VERTEX_SE2'),
+        (f'{SOUND}\n' + edge(2, 1, 1, 1), 'vertices 1 and'),
+        ('VERTEX_SE2 0 0 0 0', 'has no edge: expected lines of EDGE_SE2 or'),
+        ('EDGE_SE2 0 1 1e9 0 0 1 0 0 1 0 1', 'line 1: pose .* is not finite: expected meters up'),
+        (edge(0, 1, -1, 1), 'line 1: the information matrix has eigenvalues of -1 to 1: expected'),
+        ('EDGE_SE2 0 1 1 0 0 1 1 0 1 0 1', 'the information matrix .* such as 1e-3'),
+        (edge(0, 1e200, 1, 1), 'the information matrix'),
+        (edge(0, 4, 4, 0, 0, 0, 25), 'the information matrix'),
+        (edge(0, *[1] * 6, pose='1 0 0 0 0 0 0'), 'a quaternion of norm 0:'),
+        (SOUND.replace('0 1', '0 0', 1), 'with a motion from vertex 0 to itself'),
+        (SOUND.replace('0 1', 'nan 1', 1), 'line 1: nan is not finite'),
+        *((edge(0, 1, 1, text), f'line 1: {text} is not') for text in ('-nan', 'inf', '1e999')),
+        *((edge(0, *[1] * 5, text), f"'{text}'") for text in ('1.#INF', '1,5', '0x10')),
     ],
-)  # fmt: skip
+)
 def test_graph_that_cannot_be_solved_is_named(tmp_path, text, words):
     (tmp_path / 'a.g2o').write_text(text + '\n')
     with pytest.raises(InputError, match=words):
         graph_of(read_edges(str(tmp_path / 'a.g2o')))
 
 
-@pytest.mark.parametrize('content', [b'\x1f\x8b\x08\0', b'EDGE_SE2 \xfc'])
-def test_file_that_is_no_text_is_named(tmp_path, content):
-    (tmp_path / 'a.g2o').write_bytes(content)
+def test_file_that_is_no_text_is_named(tmp_path):
+    (tmp_path / 'a.g2o').write_bytes(b'\x1f\x8b\x08\0')
     with pytest.raises(InputError, match=r'a\.g2o is no text .*: decompress or convert it'):
         read_edges(str(tmp_path / 'a.g2o'))
 
 
-def test_encodings_line_ends_and_lines_that_state_nothing(tmp_path):
-    lines = [
-        '# comment',
-        'FIX 0',
-        'VERTEX_SE2 0 nan 0 0',
-        '',
-        edge(0, [1, 1, 1]),
-        edge(1, [2, 2, 2]),
-    ]
+def test_byte_order_mark_line_ends_and_lines_that_state_nothing(tmp_path):
+    lines = ['# comment', 'FIX 0', 'VERTEX_SE2 0 nan 0 0', '', SOUND, edge(1, 2, 2, 1e-3)]
     lines.append('EDGE_SE2 1 1 0 0 0 1 0 0 1 0 1')
-    for encoding in ('utf-8', 'utf-8-sig', 'utf-16'):
-        for end in ('\n', '\r\n', '\r'):
-            (tmp_path / 'a.g2o').write_bytes(end.join(lines).encode(encoding))
-            graph = graph_of(read_edges(str(tmp_path / 'a.g2o')))
-            assert (len(graph.chain), len(graph.edges)) == (3, 0)
-    semidefinite = edge(0, [4, 4, 1e-3, 1e-3, 1e-3, 25])  # as the message advises
-    (tmp_path / 'a.g2o').write_text(semidefinite)
-    assert len(graph_of(read_edges(str(tmp_path / 'a.g2o'))).chain) == 2
+    for end in ('\n', '\r\n', '\r'):
+        (tmp_path / 'a.g2o').write_bytes(end.join(lines).encode('utf-8-sig'))
+        graph = graph_of(read_edges(str(tmp_path / 'a.g2o')))
+        assert (len(graph.chain), len(graph.edges)) == (3, 0)
 
 
 def test_command_writes_the_solution(tmp_path, capsys):

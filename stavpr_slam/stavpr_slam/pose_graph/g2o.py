@@ -24,9 +24,6 @@ HALF = np.diag([1.0, 1, 1, 2, 2, 2])
 OUT_OF_PLANE = 1e4  # information of z, roll and pitch that a plane's edges are given
 ORDER = [3, 4, 5, 0, 1, 2]  # rotation first, or translation
 SIZES = {'EDGE_SE2': (3, 3), 'EDGE_SE3:QUAT': (7, 6)}  # numbers of a pose, of its information
-BOMS = b'\xff\xfe', b'\xfe\xff'  # of UTF-16
-MAX_ANGLE = 100.0  # rad, of many turns
-NO_MOTION = 1e-6  # m, or of a quaternion
 NORM_ERROR = 0.1  # of a quaternion in text, of a few digits
 ROUNDING = 1e-12  # of an eigenvalue, in parts of the greatest
 INFORMATION = 1e-11, 1e15  # least and greatest eigenvalue: of 3e5 and 3e-8 m
@@ -74,8 +71,7 @@ def read_edges(path: str) -> list[Edge]:
     """
     edges = []
     try:
-        content = Path(path).read_bytes()
-        lines = content.decode('utf-16' if content[:2] in BOMS else 'utf-8-sig').splitlines()
+        lines = Path(path).read_text(encoding='utf-8-sig').splitlines()
     except OSError as error:
         raise InputError(f'{path}: {error}') from error
     except UnicodeDecodeError as error:
@@ -87,20 +83,15 @@ def read_edges(path: str) -> list[Edge]:
         try:
             edges.append(_edge(tag, fields))
         except (ValueError, InputError) as error:
-            raise InputError(
-                f'{path}, line {number}: {error}, found {line.strip()[:60]!r}'
-            ) from error
+            text = line.strip()[:60]
+            raise InputError(f'{path}, line {number}: {error}, found {text!r}') from error
     if not edges:
         raise InputError(f'{path} has no edge: expected lines of {" or ".join(SIZES)}')
     return edges
 
 
 def _edge(tag: str, fields: list[str]) -> Edge:
-    """
-    Return the edge of a line.
-
-    :raises ValueError, InputError: it is none, or its numbers cannot be computed with.
-    """
+    """Return the edge of a line; ValueError, InputError: none that can be computed with."""
     if tag not in SIZES:
         raise ValueError(
             f'{tag} is not read: expected VERTEX_SE2, VERTEX_SE3:QUAT, {" or ".join(SIZES)}'
@@ -109,57 +100,33 @@ def _edge(tag: str, fields: list[str]) -> Edge:
     count = 2 + pose + freedom * (freedom + 1) // 2
     if len(fields) != count:
         raise ValueError(f'{tag} has {len(fields)} numbers: expected {count}')
-    numbers = np.array([*map(_number, fields)])
+    numbers = np.array(fields, np.float64)
+    if not (finite := np.isfinite(numbers)).all():
+        raise ValueError(f'{fields[finite.argmin()]} is not finite: correct or remove the line')
     start, end = int(fields[0]), int(fields[1])
     upper = np.zeros((freedom, freedom))
     upper[np.triu_indices(freedom)] = numbers[2 + pose :]
     own = upper + np.triu(upper, 1).T
-    _require_invertible(own)
+    least, *_, most = np.linalg.eigvalsh(own).tolist()
+    if least <= max(ROUNDING * most, INFORMATION[0]) or most > INFORMATION[1]:
+        raise ValueError(
+            f'the information matrix has eigenvalues of {least:.3g} to {most:.3g}: expected a '
+            'positive definite one, the inverse of a covariance, its upper triangle by rows; give '
+            'directions of which nothing is known (0) a small information, such as 1e-3'
+        )
     if freedom == 3:
         information, at = np.eye(6) * OUT_OF_PLANE, [0, 1, 5]
         information[np.ix_(at, at)] = own
-        if abs(numbers[4]) > MAX_ANGLE:
-            raise ValueError(f'an angle of {numbers[4]:g} rad: expected -pi to pi')
         motion = planar_poses(numbers[None, 2:5])[0]
     else:
         information, motion = np.linalg.inv(HALF) @ own @ np.linalg.inv(HALF), numbers[2:9]
         norm = float(np.linalg.norm(motion[3:]))
         if abs(norm - 1) > NORM_ERROR:
             raise ValueError(f'a quaternion of norm {norm:.3g}: expected qx qy qz qw of norm 1')
-    if start == end and abs(motion[:6]).max() > NO_MOTION:
+    transform = matrices(checked_pose(motion))
+    if start == end and not np.allclose(transform, np.eye(4), atol=1e-6):
         raise ValueError(f'an edge with a motion from vertex {start} to itself')
-    return start, end, matrices(checked_pose(motion)), information
-
-
-def _number(field: str) -> float:
-    """
-    Return the number of a field.
-
-    :raises ValueError: it is none, or not finite.
-    """
-    try:
-        value = float(field.replace('_', '?'))  # Python reads 1_0 as 10
-    except ValueError:
-        raise ValueError(f'{field!r} is no number: expected one such as 1.25e-3') from None
-    if not np.isfinite(value):
-        raise ValueError(f'the number {field} is not finite: correct it or remove the line')
-    return value
-
-
-def _require_invertible(information: np.ndarray) -> None:
-    """Raise ValueError where an information matrix states no errors of its edge."""
-    least, *_, most = np.linalg.eigvalsh(information).tolist()
-    if least < -ROUNDING * most or most <= 0:
-        raise ValueError(
-            f'the information matrix is indefinite, with an eigenvalue of {least:.3g}: expected '
-            'the inverse of a covariance, upper triangle by rows'
-        )
-    if least <= max(ROUNDING * most, INFORMATION[0]) or most > INFORMATION[1]:
-        raise ValueError(
-            f'the information matrix has eigenvalues of {least:.3g} to {most:.3g}, without an '
-            'inverse (semidefinite) or nearly so: expected a positive definite one; give '
-            'directions of which nothing is known (0) a small information, such as 1e-3'
-        )
+    return start, end, transform, information
 
 
 def _reversed(start: int, end: int, motion: np.ndarray, information: np.ndarray) -> Edge:
