@@ -56,8 +56,5 @@ if by_colcon and '--uninstall' not in sys.argv:
     # fill the cache of compiled kernels, as the first start would; never fail
     install = distribution.get_command_obj('install').install_lib
     call = 'import sys; from stavpr_ros.commands.warm import main; sys.exit(main([]))'
-    command = [sys.executable, '-c', call]
     folder = '.' if 'develop' in sys.argv else install  # in which Python finds the package
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    lines = (done.stdout if done.returncode == 0 else done.stderr).splitlines() or ['']
-    print(lines[-1] if done.returncode == 0 else f'kernels are not compiled: {lines[-1]}')
+    subprocess.run([sys.executable, '-c', call], cwd=folder, stderr=subprocess.STDOUT, check=False)
