@@ -67,14 +67,13 @@ def _temporary_folder(template: Path | None) -> Path | None:
     try:
         folder = Path(tempfile.gettempdir()) / f'stavpr_kernels_{os.getuid()}'
         if not folder.exists():
-            copy = Path(tempfile.mkdtemp())
-            try:
+            with tempfile.TemporaryDirectory() as scratch:  # removed on a full disk as well
+                copy = Path(scratch, folder.name)
+                copy.mkdir()
                 if template is not None:
                     shutil.copytree(template, copy, dirs_exist_ok=True)
                 copy.chmod(0o700)
                 copy.rename(folder)
-            finally:  # of a full disk
-                shutil.rmtree(copy, ignore_errors=True)
         status = folder.lstat()
     except (OSError, shutil.Error):
         return None

@@ -7,7 +7,6 @@ import logging
 import multiprocessing
 from pathlib import Path
 import pickle
-import shutil
 from typing import Any
 
 from numba.core.caching import (
@@ -48,12 +47,7 @@ class _Implementation(CompileResultCacheImpl):
 
 
 class _Files(IndexDataCacheFile):
-    """
-    One file for each signature of a kernel, without an index that processes would share.
-
-    Its name is a digest of numba's version, the kernel's source and the signature; its head is a
-    digest of the rest, without which nothing is unpickled.
-    """
+    """A file for each signature, after a digest of it; without an index that processes share."""
 
     def _path(self, key: object) -> Path:
         text = f'{self._version} {self._source_stamp} {key}'
@@ -61,11 +55,7 @@ class _Files(IndexDataCacheFile):
         return Path(self._index_path).with_suffix(f'.{name}.nbc')
 
     def load(self, key: object) -> Any:
-        """
-        Return what was saved, None = nothing.
-
-        :raises OSError, ValueError: the file cannot be read, or is damaged.
-        """
+        """Return what was saved, None = nothing; OSError, ValueError: it is damaged."""
         try:
             with open_regular(self._path(key)) as file:
                 content = file.readall()
@@ -78,10 +68,8 @@ class _Files(IndexDataCacheFile):
 
     def save(self, key: object, data: Any) -> None:
         """Write a file in one step."""
-        path, rest = self._path(key), self._dump(data)
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        with self._open_for_write(str(path)) as file:
+        rest = self._dump(data)
+        with self._open_for_write(str(self._path(key))) as file:
             file.write(hashlib.blake2b(rest, digest_size=DIGEST_SIZE).digest() + rest)
 
 

@@ -18,11 +18,6 @@ class _Lines:
         if sys.stderr is not None and (line := text.strip(': \r\n')):
             sys.stderr.write(f'{line}\n')
 
-    def flush(self) -> None:
-        """Write what is buffered."""
-        if sys.stderr is not None:
-            sys.stderr.flush()
-
 
 def shows_bars() -> bool:
     """Return whether standard error is a terminal on which a bar can move."""
