@@ -50,7 +50,6 @@ DAMAGE = {
     'cut_in_its_head': lambda content: content[:20],
     'zeros_at_its_end': lambda content: content[:-512] + bytes(512),
     'flipped': _flipped,
-    'longer': lambda content: content + b'\0',
     'attack': lambda content: pickle.dumps(_Attack()),
     'pipe': None,
 }
@@ -72,12 +71,6 @@ def test_damaged_kernel_is_compiled_anew_and_replaced(folder, damaged, caplog, m
     assert str(folder) in line
     assert 'some are damaged or cannot be read, and are compiled anew (' in line
     assert not Path('attacked').exists()  # nothing is unpickled that was not written here
-
-
-def test_file_in_place_of_the_folder_is_no_reason_to_stop(folder, caplog):
-    folder.write_text('')
-    assert [hits(), hits()] == [0, 0]
-    assert len(caplog.messages) == 2  # neither read nor written
 
 
 PROGRAM = """

@@ -28,10 +28,6 @@ class Listener(event.Listener):
 event.register('numba:compile', Listener())
 from stavpr_ros.commands.stavpr import main
 """
-WARM = f"""{LISTENER}
-assert main(['warm']) == 0
-print(len(names))
-"""
 COMMANDS = f"""{LISTENER}
 for line in '''
 build_map --input monday --output monday.stavpr
