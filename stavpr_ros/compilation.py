@@ -67,13 +67,11 @@ def _temporary_folder(template: Path | None) -> Path | None:
     try:
         folder = Path(tempfile.gettempdir()) / f'stavpr_kernels_{os.getuid()}'
         if not folder.exists():
-            with tempfile.TemporaryDirectory() as scratch:  # removed on a full disk as well
-                copy = Path(scratch, folder.name)
-                copy.mkdir()
+            with tempfile.TemporaryDirectory() as copy:  # removed where the disk is full
                 if template is not None:
                     shutil.copytree(template, copy, dirs_exist_ok=True)
-                copy.chmod(0o700)
-                copy.rename(folder)
+                os.chmod(copy, 0o700)
+                os.rename(copy, folder)
         status = folder.lstat()
     except (OSError, shutil.Error):
         return None
