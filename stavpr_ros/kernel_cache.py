@@ -17,7 +17,7 @@ from numba.core.caching import (
 )
 from stavpr_ros.regular_file import ElsewhereError, open_regular
 
-READ_FAILED = 'some are damaged or cannot be read, and are compiled anew'
+READ_FAILED = 'damaged or not readable, and compiled anew'
 WRITE_FAILED = 'they cannot be written, and are compiled again at the next start'
 DIGEST_SIZE = 32  # bytes at the head of a file: of its rest
 failures: dict[str, str] = {}

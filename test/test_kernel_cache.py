@@ -69,7 +69,7 @@ def test_damaged_kernel_is_compiled_anew_and_replaced(folder, damaged, caplog, m
     assert [hits(), hits()] == [0, 1]
     (line,) = caplog.messages
     assert str(folder) in line
-    assert 'some are damaged or cannot be read, and are compiled anew (' in line
+    assert 'damaged or not readable, and compiled anew (' in line
     assert not Path('attacked').exists()  # nothing is unpickled that was not written here
 
 

@@ -70,7 +70,7 @@ def read_weights(content: bytes) -> dict[str, np.ndarray]:
     Read tensors that ``torch.save`` wrote before version 1.6; nothing in them is executed.
 
     :returns: float64, by their names.
-    :raises UnavailableError: the content is damaged, or has other names than those of tensors.
+    :raises UnavailableError: the content is damaged, or has names that are not of tensors.
     """
     file = io.BytesIO(content)
     try:
@@ -107,7 +107,7 @@ class _Tensor:
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return what stands for a name; there are no others."""
+        """Return what replaces a name; there are no others."""
         if (module, name) == ('collections', 'OrderedDict'):
             return OrderedDict
         if (module, name) == ('torch._utils', '_rebuild_tensor_v2'):

@@ -169,10 +169,10 @@ class LocalFeatures:
 
     def require_fit(self, settings: FeatureSettings, where: str, dimension: int) -> None:
         """
-        Reject features that do not fit those of places: kernels trust their shapes.
+        Reject features that do not fit the places: kernels trust their shapes.
 
         :param settings, dimension: of the places; a dimension of 0 is unknown yet.
-        :raises FeatureMismatchError: other settings, or those of another network.
+        :raises FeatureMismatchError: other settings, or another network.
         :raises InputError: strips or weights of another shape or type.
         """
         self.require_same_settings(settings, where)

@@ -66,12 +66,12 @@ class Camera:
         size, text = (self.width, self.height), f'of {self.width}x{self.height} pixels'
         if not all(0.25 < c / n < 0.75 for c, n in zip(self.center, size, strict=True)):
             x, y = self.center
-            seen = f'the center ({x:.0f}, {y:.0f}), as of another resolution or a part'
+            fault = f'the center ({x:.0f}, {y:.0f}), as of another resolution or a part'
         elif not all(0.1 < f / n < 50 for f, n in zip(self.focal, size, strict=True)):
-            seen = f'the focal length {self.focal[0]:g}, as of another unit'
+            fault = f'the focal length {self.focal[0]:g}, as of another unit'
         else:
             return ''
-        return f'camera_info {text} has {seen}: calibrate the camera as it runs'
+        return f'camera_info {text} has {fault}: calibrate the camera as it runs'
 
     def require_fitting(self, width: int, height: int) -> None:
         """

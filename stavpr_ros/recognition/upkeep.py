@@ -96,7 +96,7 @@ def update_map(
     """
     Return a map after a drive, and its version, without id and parent.
 
-    A map that neither learns places nor loses some is returned as it is.
+    A map that neither learns nor loses places is returned as it is.
 
     :param drive: all its images, as a map with the features of this one.
     :param name: of the drive, for the sessions.

@@ -132,7 +132,7 @@ def unknown_arguments(words: Iterable[str], names: Iterable[str]) -> list[str]:
 
 
 def _values(texts: dict[str, str], types: dict[str, type], camera: str = '') -> dict[str, object]:
-    """Return the values of arguments that are parameters, but those of empty arguments."""
+    """Return the values of arguments that are parameters, if they are not empty."""
     values: dict[str, object] = {}
     for name, text in ((n, text.replace(CAMERA, camera)) for n, text in texts.items() if text):
         kind = types[name]
