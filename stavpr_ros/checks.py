@@ -121,26 +121,15 @@ def float_array(values: np.ndarray, name: str, axes: str) -> np.ndarray:
 
 
 def float32_vector(name: str, values: np.ndarray, shortest: int, longest: int) -> np.ndarray:
-    """
-    Return a contiguous float32 vector of finite values or +inf.
-
-    :raises InputError: another type or length, NaN or -inf.
-    """
-    array = np.asarray(values)
-    (n,) = require_shape(name, array, 'n', 'float32', 'float64')
-    if not shortest <= n <= longest:
-        raise InputError(f'{name} of {n} places: expected {shortest} to {longest}')
-    if n and not array.min() > -np.inf:
-        no_nan(array, name)
-    return np.ascontiguousarray(array, np.float32)
+    """Return a contiguous float32 vector of finite values or +inf; raise InputError for others."""
+    array = no_nan(float_array(values, name, 'n'), name)
+    if not shortest <= len(array) <= longest:
+        raise InputError(f'{name} of {len(array)} places: expected {shortest} to {longest}')
+    return array.astype(np.float32, copy=False)
 
 
 def relative_weights(count: int, *weights: np.ndarray) -> list[np.ndarray]:
-    """
-    Return relative probabilities, finite and at least 0, not all of them 0, float64, (count,).
-
-    :raises InputError: others.
-    """
+    """Return relative probabilities, float64, (count,); raise InputError for others."""
     arrays = [np.asarray(each) for each in weights]
     for array in arrays:
         numbers = array.tolist() if array.shape == (count,) and array.dtype.kind in 'fiu' else ()
@@ -151,22 +140,16 @@ def relative_weights(count: int, *weights: np.ndarray) -> list[np.ndarray]:
 
 def require_indices(name: str, values: Any, end: int) -> None:
     """Raise InputError if not all are whole numbers of at least 0 and below ``end``."""
-    low = high = values
-    if not isinstance(values, int):
-        array = np.asarray(values)
-        if not array.size:
-            return
-        low, high = (array.min(), array.max()) if array.dtype.kind in 'iu' else (-1, -1)
-    if not 0 <= low <= high < end:
+    array = np.asarray(values)
+    is_whole = not array.size or array.dtype.kind in 'iu'
+    if not is_whole or (array.size and not 0 <= array.min() <= array.max() < end):
         raise InputError(f'{name} = {values}: expected whole numbers of at least 0, below {end}')
 
 
 def require_ascending(name: str, values: np.ndarray, end: int) -> None:
     """Raise InputError if values are no ascending indices below ``end``, (m,), integers."""
     require_shape(name, values, 'm', 'int32', 'int64')
-    if not len(values):
-        return
-    if values[0] < 0 or values[-1] >= end or (values[1:] <= values[:-1]).any():
+    if (np.diff(values, prepend=-1, append=end) < 1).any():
         raise InputError(f'{name} = {values}: expected ascending indices below {end}, each once')
 
 
@@ -193,38 +176,32 @@ def rgb_image(image: Any, name: str = 'image', *dtypes: str) -> np.ndarray:
     :raises InputError: another type or shape, and how to convert it.
     """
     dtypes = dtypes or ('uint8',)
+    expected = f'expected RGB pixels of shape (height, width, 3), {" or ".join(dtypes)}'
+    kind = type(image).__name__
     try:
         array = np.asarray(image)
     except (TypeError, ValueError, RuntimeError) as error:  # a ragged list, a tensor of a GPU
-        raise InputError(
-            f'{name} is {type(image).__name__}, which is no array ({error}): expected RGB pixels '
-            'of shape (height, width, 3), uint8'
-        ) from error
+        raise InputError(f'{name} is {kind}, which is no array ({error}): {expected}') from error
     if array.ndim == 3 and array.shape[2] == 3 and array.size and array.dtype.name in dtypes:
         return np.ascontiguousarray(array)
-    raise InputError(
-        f'{name} is {type(image).__name__} of shape {array.shape} {array.dtype}: expected RGB '
-        f'pixels of shape (height, width, 3), {" or ".join(dtypes)}: {_conversion(image, array)}'
-    )
+    what = f'{name} is {kind} of shape {array.shape} {array.dtype}'
+    raise InputError(f'{what}: {expected}: {_conversion(image, array)}')
 
 
 def _conversion(image: Any, array: np.ndarray) -> str:
     """Return how to convert an image that is no RGB image of bytes."""
     shape, is_number = array.shape, array.dtype.kind in 'buif'
-    is_finite = is_number and bool(np.isfinite(array).all())
-    low, high = (array.min(), array.max()) if is_finite and array.size else (0, 0)
+    low, high = (array.min(), array.max()) if is_number and array.size else (0, 0)
     rows = (
         (hasattr(image, 'image'), 'give its field image'),
         (not is_number, 'give the pixels as numbers; open_source(path) reads files'),
         (not array.size, 'it has no pixels: check that it was read'),
         (hasattr(image, 'convert'), "take np.asarray(image.convert('RGB'))"),  # a PIL image
         (len(shape) == 4, 'give each image alone, as image[0]'),
-        (len(shape) == 2, 'gray becomes RGB by np.stack(3 * [image], axis=2)'),
-        (shape[2:] == (1,), 'gray becomes RGB by np.repeat(image, 3, axis=2)'),
+        (len(shape) == 2 or shape[2:] == (1,), 'gray becomes RGB by np.dstack(3 * [image])'),
         (shape[2:] == (4,), 'take image[..., :3], without the transparency'),
         (shape[:1] == (3,), 'the channels come first: take image.transpose(1, 2, 0)'),
         (shape[2:] != (3,), 'an axis is missing, or has another size'),
-        (not is_finite, 'values are NaN or infinite: replace them first'),
         (low >= 0 and high <= 1, 'values of 0 to 1 become bytes by np.uint8(255 * image)'),
         (low >= 0 and high <= 255, 'take np.uint8(image)'),
         (True, f'values are {low} to {high}: scale them to 0 to 255, then np.uint8(image)'),

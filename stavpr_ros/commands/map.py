@@ -357,7 +357,6 @@ def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.sources.folder import text_of
 
     maps = [_verified(path) for path in arguments.maps]
-    _name_twins(arguments.maps, maps)
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
@@ -366,17 +365,6 @@ def _merge(arguments: argparse.Namespace) -> None:
     if not arguments.different_routes:
         merged = with_same_places(merged)
     _write(merged, arguments)
-
-
-def _name_twins(paths: list[str], maps: list['PlaceMap']) -> None:
-    """Name maps whose images an earlier one has."""
-    from stavpr_ros.recognition.same_drive import has_drives_of
-
-    for i, place_map in enumerate(maps):
-        twin = next((j for j in range(i) if has_drives_of(maps[j], place_map)), None)
-        if twin is not None:
-            text = f'{paths[i]} has the images of {paths[twin]}, which teach nothing twice'
-            say(f'{text}: leave it out', sys.stderr)
 
 
 def _camera(text: str) -> tuple[str, float | None]:

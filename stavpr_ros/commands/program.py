@@ -23,21 +23,13 @@ from stavpr_ros.threads import wait_passively
 
 DONE, FAILED, BAD_USAGE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
 
-OPTIONAL = {
-    'av': 'av',
+_SAME = 'av', 'evo', 'h5py', 'jinja2', 'matplotlib', 'onnx', 'onnxruntime', 'ray', 'torch'
+OPTIONAL = {name: name for name in _SAME} | {
     'faiss': 'faiss-cpu',
-    'evo': 'evo',
-    'h5py': 'h5py',
-    'jinja2': 'jinja2',
-    'matplotlib': 'matplotlib',
-    'onnx': 'onnx',
-    'onnxruntime': 'onnxruntime',
     'pillow_heif': 'pillow-heif',
     'qdrant_client': 'qdrant-client',
     'qdrant_edge': 'qdrant-edge-py',
-    'ray': 'ray',
     'sklearn': 'scikit-learn',
-    'torch': 'torch',
 }
 """Modules that only a part of the commands needs, and the packages of pip that have them."""
 
@@ -149,11 +141,7 @@ def lacking(module: str) -> str:
 
 
 def require_modules(*modules: str) -> None:
-    """
-    Raise UnavailableError if a module is missing, before a command begins its work.
-
-    :param modules: of ``OPTIONAL``.
-    """
+    """Raise UnavailableError if one of OPTIONAL is missing, before a command begins its work."""
     for module in modules:
         if find_spec(module) is None:
             raise UnavailableError(lacking(module))
@@ -201,22 +189,16 @@ def run_program(
             raise
         say(f'{name}: {text}', sys.stderr)
         return FAILED
-    except OSError as error:
-        if interrupted():
-            say(f'{name}: {interruption()}', sys.stderr)
-            return INTERRUPTED
-        say(
-            f'{name}: {error}; expected folders that can be written and have room: name others, '
-            'TMPDIR for temporary files',
-            sys.stderr,
-        )
-        return FAILED
     except BaseException as error:
         # an interrupt within a foreign library comes out as another exception
-        if not (isinstance(error, KeyboardInterrupt) or interrupted()):
+        if isinstance(error, KeyboardInterrupt) or interrupted():
+            say(f'{name}: {interruption()}', sys.stderr)
+            return INTERRUPTED
+        if not isinstance(error, OSError):
             raise
-        say(f'{name}: {interruption()}', sys.stderr)
-        return INTERRUPTED
+        remedy = 'expected folders that can be written and have room: name others, TMPDIR for'
+        say(f'{name}: {error}; {remedy} temporary files', sys.stderr)
+        return FAILED
 
 
 def run_node_program(text: str, module: str, node: str, args: list[str] | None) -> int:

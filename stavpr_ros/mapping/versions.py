@@ -11,7 +11,6 @@ program, the map is the version before or the new one.
 from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
-import re
 import shutil
 import time
 from typing import Any
@@ -124,10 +123,10 @@ def save_version(
     folder, map_id = history_of(path), place_map.map_id
     try:
         folder.mkdir(exist_ok=True)
+        if map_id != before.map_id:
+            map_id = _write_version(path, place_map, before, statistics)
     except OSError as error:
         raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
-    if map_id != before.map_id:
-        map_id = _write_version(path, place_map, before, statistics)
     version = replace(
         version,
         map_id=map_id,
@@ -147,11 +146,10 @@ def save_version(
 
 def _clean(folder: Path, chain: list[str]) -> None:
     """Delete old versions, and all of a branch that was left by a return to an earlier one."""
-    for file in folder.glob('*.*'):
-        is_version = re.fullmatch('[0-9a-f]{16}', file.stem) is not None
-        remaining = {'.stavpr': chain[:KEPT], '.json': chain}.get(file.suffix, [file.stem])
-        if is_version and file.stem not in remaining:
-            file.unlink(missing_ok=True)
+    for suffix, kept in (('.stavpr', chain[:KEPT]), ('.json', chain)):
+        for file in folder.glob(f'{"[0-9a-f]" * 16}{suffix}'):
+            if file.stem not in kept:
+                file.unlink(missing_ok=True)
 
 
 def roll_back(path: str | Path, map_id: str = '') -> Version:
@@ -178,22 +176,15 @@ def _write_version(
     path: str | Path, place_map: PlaceMap, before: Version, statistics: MapStatistics | None
 ) -> str:
     """Write a version, beside the present one, into the history; return its id."""
-    folder = history_of(path)
-    old = folder / f'{before.map_id}.stavpr'
-    try:
-        if not _is_sound(old, before.map_id):
-            old.unlink(missing_ok=True)
-            _copy(Path(path), old, False)
-    except OSError as error:
-        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
+    folder, old = history_of(path), _file(path, before)
+    if not _is_sound(old, before.map_id):
+        old.unlink(missing_ok=True)
+        _copy(Path(path), old, False)
     features = open_map(path).features
     storage = features.storage if isinstance(features, StoredFeatures) else ''
     new = folder / 'new.stavpr'
     map_id = save_map(place_map, new, storage, force=True, statistics=statistics)
-    try:
-        new.replace(folder / f'{map_id}.stavpr')
-    except OSError as error:
-        raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
+    new.replace(folder / f'{map_id}.stavpr')
     return map_id
 
 

@@ -12,9 +12,10 @@ drive in the same light by 37 or more from the nearest one (least of 7 drives).
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import PlaceMap, select_session
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.units import DATED
 
 PROBES = 64  # images of a drive that are kept, from its first to its last one
@@ -42,8 +43,8 @@ def drive_hash(name: str, drive: PlaceMap, images: np.ndarray | None = None) -> 
     """Return the hash of a drive, or of these images of it, ascending."""
     images = np.arange(len(drive)) if images is None else images
     probes = images[np.linspace(0, len(images) - 1, min(PROBES, len(images))).astype(int)]
-    bits = np.packbits(_bits(drive.features[probes]), axis=1)
-    return DriveHash(name, int(drive.stamps[images[0]]), bits.tobytes().hex())
+    hashes = _hashes(drive.features[probes]).tobytes().hex()
+    return DriveHash(name, int(drive.stamps[images[0]]), hashes)
 
 
 def session_hashes(place_map: PlaceMap, name: str) -> list[DriveHash]:
@@ -64,37 +65,27 @@ def earlier_drive(drive: PlaceMap, earlier: Iterable[DriveHash]) -> DriveHash | 
     A drive of another time by the same clock is another one, however alike its images are.
     """
     n, start, end = len(drive), int(drive.stamps.min()), int(drive.stamps.max())
-    bits = np.concatenate([_bits(drive.features[i : i + 1024]) for i in range(0, n, 1024)])
-    signs, count = 2 * bits.astype(np.float32) - 1, bits.shape[1]
+    hashes = np.concatenate([_hashes(drive.features[i : i + 1024]) for i in range(0, n, 1024)])
     for one in earlier:
         has_one_clock = start and one.start and (start >= DATED) == (one.start >= DATED)
-        packed = np.frombuffer(bytes.fromhex(one.hashes), np.uint8)
-        if (has_one_clock and not start <= one.start <= end) or packed.size % -(-count // 8):
+        if has_one_clock and not start <= one.start <= end:
             continue
-        probes = np.unpackbits(packed.reshape(-1, -(-count // 8)), axis=1, count=count)
-        is_near = (count - (2 * probes.astype(np.float32) - 1) @ signs.T) / 2 <= NEAR
-        images = np.flatnonzero(is_near.any(axis=0))
-        if is_near.any(axis=1).mean() >= SHARE and np.ptp(images) + 1 >= SHARE * n:
+        probes = np.frombuffer(bytes.fromhex(one.hashes), np.uint8).reshape(-1, hashes.shape[1])
+        images = np.flatnonzero(_are_near(hashes, probes))
+        if _are_near(probes, hashes).mean() >= SHARE and np.ptp(images) + 1 >= SHARE * n:
             return one
     return None
 
 
-def has_drives_of(place_map: PlaceMap, other: PlaceMap) -> bool:
-    """Return whether each session of another map repeats one of a map."""
-    if other.settings != place_map.settings:
-        return False
-    ids = [session.id for session in place_map.sessions]
-    sessions = [select_session(place_map, one) for one in ids] or [place_map]
-    return all(
-        any(earlier_drive(session, [one]) for session in sessions)
-        for one in session_hashes(other, '')
-    )
+def _are_near(hashes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return whether each hash is near one of the others, bool."""
+    bits, _ = cv2.batchDistance(hashes, others, cv2.CV_32S, K=1, normType=cv2.NORM_HAMMING)
+    return bits[:, 0] <= NEAR
 
 
-def _bits(features: LocalFeatures) -> np.ndarray:
-    """Return the bits of each image, (n, BITS or a few less), bool."""
+def _hashes(features: LocalFeatures) -> np.ndarray:
+    """Return the bits of each image, BITS or a few less, packed, (n, bytes), uint8."""
     W, n, d = features.strips.shape
     planes = np.random.default_rng(0).standard_normal((d, max(BITS // W, 1)), np.float32)
     centered = features.strips - features.strips.mean(axis=2, keepdims=True)
-    bits: np.ndarray = centered @ planes > 0
-    return bits.transpose(1, 0, 2).reshape(n, -1)
+    return np.packbits((centered @ planes > 0).transpose(1, 0, 2).reshape(n, -1), axis=1)
