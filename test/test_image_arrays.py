@@ -21,8 +21,6 @@ from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-FLOAT = RGB / 255
-NAN = np.where(RGB < 9, np.nan, FLOAT)
 EXTRACTOR = FeatureExtractor()
 
 
@@ -32,32 +30,26 @@ class Tensor:
 
 
 IMAGES = {
-    'float': (FLOAT, 'np.uint8(255 * image)'),
-    'float32': (FLOAT.astype(np.float32), 'np.uint8(255 * image)'),
+    'float': (RGB / 255, 'np.uint8(255 * image)'),
     'float of bytes': (RGB.astype(float), 'np.uint8(image)'),
-    'NaN': (NAN, 'NaN'),
-    'infinite': (np.full((9, 9, 3), np.inf), 'infinite'),
+    'NaN': (np.where(RGB < 9, np.nan, RGB), 'nan to nan'),
     '16 bit': (RGB.astype(np.uint16) * 256, 'scale them to 0 to 255'),
     'signed': (RGB.astype(np.int8), 'scale them to 0 to 255'),
-    'int64': (RGB.astype(int), 'np.uint8(image)'),
     'bool': (RGB > 99, '255 * image'),
-    'gray': (RGB[..., 0], 'np.stack(3 * [image], axis=2)'),
-    'gray with an axis': (RGB[..., :1], 'np.repeat(image, 3, axis=2)'),
+    'gray': (RGB[..., 0], 'np.dstack(3 * [image])'),
+    'gray with an axis': (RGB[..., :1], 'np.dstack(3 * [image])'),
     'RGBA': (np.dstack([RGB, RGB[..., :1]]), 'image[..., :3]'),
     'two channels': (RGB[..., :2], 'another size'),
     'channels first': (RGB.transpose(2, 0, 1), 'image.transpose(1, 2, 0)'),
     'batch': (RGB[None], 'image[0]'),
     'no rows': (RGB[:0], 'no pixels'),
-    'nothing': (np.zeros(0, np.uint8), 'no pixels'),
     'a number': (np.uint8(3), 'axis'),
     'None': (None, 'open_source(path)'),
     'a name': ('image.png', 'open_source(path)'),
     'objects': (RGB.astype(object), 'as numbers'),
-    'complex': (RGB.astype(complex), 'as numbers'),
     'a list': (RGB.tolist(), 'np.uint8(image)'),
     'a ragged list': ([[1, 2], [3]], 'no array'),
     'a tensor with gradients': (Tensor(), 'requires grad'),
-    'PIL gray': (Image.fromarray(RGB[..., 0]), "image.convert('RGB')"),
     'PIL palette': (Image.fromarray(RGB).convert('P'), "image.convert('RGB')"),
     'a frame': (Frame(RGB, 0, ''), 'field image'),
 }
@@ -98,22 +90,15 @@ def test_an_image_of_another_kind_is_a_sentence_that_converts_it(kind, entry):
 
 
 @pytest.mark.parametrize('make', [
-    lambda: Image.fromarray(RGB), lambda: np.asfortranarray(RGB), lambda: RGB[::-1][::-1],
-    lambda: np.ma.masked_equal(RGB, 3), lambda: memoryview(RGB),
+    Image.fromarray, np.asfortranarray, lambda image: image[::-1][::-1], memoryview,
 ])  # fmt: skip
-@pytest.mark.parametrize('entry', ENTRIES)
-def test_what_is_an_rgb_image_is_taken_as_it_is(entry, make):
-    image, expected = make(), RGB.copy()
-    if isinstance(image, np.ndarray):
-        image.flags.writeable = False
-    ENTRIES[entry](image)
-    np.testing.assert_array_equal(Frame(image, 0, '').image, expected)
-    np.testing.assert_array_equal(
-        EXTRACTOR.extract([image]).strips, EXTRACTOR.extract([expected]).strips
-    )
+def test_what_is_an_rgb_image_is_taken_as_it_is(make):
+    for entry in ENTRIES.values():
+        entry(make(RGB))
+    np.testing.assert_array_equal(Frame(make(RGB), 0, '').image, RGB)
 
 
-@pytest.mark.parametrize('images', [RGB, RGB[..., 0], Image.fromarray(RGB), None, np.uint8(1)])
+@pytest.mark.parametrize('images', [RGB, Image.fromarray(RGB), None, np.uint8(1)])
 def test_one_image_instead_of_a_list_is_a_sentence(images):
     with pytest.raises(InputError, match=r'expected a list, extract\(\[image\]\)'):
         EXTRACTOR.extract(images)
@@ -121,15 +106,13 @@ def test_one_image_instead_of_a_list_is_a_sentence(images):
 
 @pytest.mark.parametrize(('work', 'text'), [
     (lambda: build_map([RGB], EXTRACTOR, progress=False), r'ndarray: expected Frame\('),
-    (lambda: build_map([RGB], EXTRACTOR, Trajectory(), progress=False), r'ndarray: .*Frame\('),
     (lambda: build_map([Frame(RGB, 0, '')], EXTRACTOR, [[0] * 7]), 'list: expected an array'),
     (lambda: Frame(RGB, time.time(), ''), r'stamp is of type float: .*time\.time_ns\(\)'),
     (lambda: Frame(RGB, 0, 3), 'identifier is of type int: expected a text'),
     (lambda: encode_thumbnail(RGB, 0), 'width of thumbnails = 0 must be at least 1'),
     (lambda: Trajectory().add(1, 'here'), r"pose 'here' is no array"),
-    (lambda: Trajectory().add(1, {}), r'pose \{\} is no array'),
     (lambda: Projection(np.eye(3), 'mine'), r'matrix of the projection: .*float64, .*float32'),
-    (lambda: LocalFeatures(FLOAT, FLOAT[0], EXTRACTOR.settings), 'strips: .*float64, .*float32'),
+    (lambda: LocalFeatures(RGB / 1, RGB[0] / 1, EXTRACTOR.settings), 'strips: .*64, .*float32'),
     (lambda: LocalFeatures(np.ones((7, 2, 9), 'f'), np.ones((7, 1), 'f'), EXTRACTOR.settings),
      r'weights: shape \(7, 1\) float32, expected \(7, 2\)'),
 ])  # fmt: skip
@@ -138,9 +121,7 @@ def test_other_arguments_are_named_with_what_is_expected(work, text):
         work()
 
 
-@pytest.mark.parametrize('bad', [
-    RGB, None, np.zeros((192, 80)), np.full((192, 80), np.nan, np.float32), np.zeros((9, 80), 'f')
-])  # fmt: skip
+@pytest.mark.parametrize('bad', [RGB, None, np.full((192, 80), np.nan, np.float32)])
 def test_columns_of_another_kind_leave_the_filter_as_it_was(bad):
     columns, offsets = describe_columns(RGB), OffsetFilter()
     expected = OffsetFilter().update(columns, columns)

@@ -330,16 +330,14 @@ def test_stavpr_without_a_package_names_it(monkeypatch, capsys):
 def test_a_command_without_an_optional_module_names_its_package(monkeypatch, capsys, module):
     """The module is missing while the command is imported, or while it runs, or a part of it."""
     monkeypatch.setitem(sys.modules, module, None)
-    sentence = f'{program.OPTIONAL[module]}, which is not installed: pip install '
-    sentence += program.OPTIONAL[module]
-    for name in (module, f'{module}.part'):
-        assert program.run_program('work', partial(import_module, name)) == 1
-        assert capsys.readouterr().err == f'work: this needs {sentence}\n'
+    package = program.OPTIONAL[module]
+    sentence = f'this needs {package}, which is not installed: pip install {package}'
+    assert program.run_program('work', partial(import_module, f'{module}.part')) == 1
     with pytest.raises(UnavailableError, match=re.escape(sentence)):
         program.require_modules('json', module)
     monkeypatch.setattr(stavpr.importlib, 'import_module', lambda _: import_module(module))
     assert stavpr.main(['map', 'info', 'x']) == 1
-    assert capsys.readouterr().err == f'stavpr: this needs {sentence}\n'
+    assert capsys.readouterr().err == f'work: {sentence}\nstavpr: {sentence}\n'
     with pytest.raises(ModuleNotFoundError):  # of an error of this package
         program.run_program('work', lambda: import_module('stavpr_ros.nothing'))
 
@@ -350,26 +348,20 @@ def test_packages_of_optional_modules_are_those_of_the_extras():
 
 
 @pytest.mark.parametrize(('module', 'words'), [
-    ('sklearn', ('evaluate', '--truth', 'identity', '--json', 'result.json')),
-    ('matplotlib', ('evaluate', '--output', 'report')),
-    ('jinja2', ('evaluate',)),
-    ('matplotlib', ('map', 'info', '--plot', 'map.png')),
+    ('sklearn', 'evaluate --truth identity --json x --map monday.stavpr --query nowhere'),
+    ('matplotlib', 'evaluate --output report --map monday.stavpr --query nowhere'),
+    ('jinja2', 'evaluate --map monday.stavpr --query nowhere'),
+    ('matplotlib', 'map info --plot map.png monday.stavpr'),
 ])  # fmt: skip
 def test_a_report_without_its_packages_is_refused_before_any_work(
     monkeypatch, capsys, tmp_path, small_map, module, words
 ):
     monkeypatch.chdir(tmp_path)
     save_map(small_map, 'monday.stavpr')
-    if words[0] == 'evaluate':
-        words += ('--map', 'monday.stavpr', '--query', 'tuesday')  # which is nowhere
-    else:
-        words += ('monday.stavpr',)
-    for name in [each for each in sys.modules if each.startswith('stavpr_lab.map_plot')]:
-        monkeypatch.delitem(sys.modules, name)
-    for name in [each for each in sys.modules if each.partition('.')[0] == module]:
+    for name in [each for each in sys.modules if re.match(rf'{module}\b|stavpr_lab.map_p', each)]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, module, None)
-    assert stavpr.main([*words]) == 1
+    assert stavpr.main(words.split()) == 1
     assert 'which is not installed: pip install ' in capsys.readouterr().err
 
 
@@ -408,11 +400,6 @@ def test_command_without_docstrings_and_letters_explains_itself(name):
     code = f'import sys; from stavpr_ros.commands import stavpr; sys.exit(stavpr.main(["{name}", '
     env = os.environ | {'LC_ALL': 'C', 'PYTHONUTF8': '0', 'PYTHONCOERCECLOCALE': '0'}
     for words, expected in (('"--help"', 0), ('"caf\\u00e9", "--none"', 2)):
-        done = subprocess.run(
-            [sys.executable, '-OO', '-c', f'{code}{words}]))'],
-            env=env,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        command = [sys.executable, '-OO', '-c', f'{code}{words}]))']
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
         assert (done.returncode, 'Traceback' in done.stderr) == (expected, False), done.stderr
