@@ -166,20 +166,19 @@ def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
     content = (files('stavpr_lab.monitor') / 'page.html').read_text()
     page = tmp_path / 'page.html'
     page.write_text(content.replace('<script>', f'{EVENTS.replace("NEWS", news)}<script>', 1))
-    browser = [CHROMIUM, '--headless=new', '--no-sandbox', '--disable-gpu']
-    browser += ['--window-size=900,900', '--virtual-time-budget=1500']
-    browser.append(f'--user-data-dir={tmp_path / "profile"}')
-    run = [*browser, '--dump-dom', page.as_uri()]
-    shown = subprocess.check_output(run, text=True, timeout=100, stderr=subprocess.DEVNULL)
+    options = ['--headless=new', '--no-sandbox', '--disable-gpu', '--window-size=900,900']
+    options += ['--virtual-time-budget=1500', f'--user-data-dir={tmp_path / "profile"}']
+    shot = tmp_path / f'{old}.png'
+    outputs = ['--dump-dom'], [f'--screenshot={shot}']
+    shown, _ = (
+        subprocess.check_output([CHROMIUM, *options, *each, page.as_uri()], text=True, timeout=100)
+        for each in outputs
+    )
     now = re.search(r'<div id="now"[^>]*>[^<]*', shown)[0]
     assert ('stale' in now, bool(re.search(r'\d+ s ago: place 40', now))) == (old > 0,) * 2, now
-    shot = tmp_path / f'{old}.png'
-    run = [*browser, f'--screenshot={shot}', page.as_uri()]
-    subprocess.run(run, check=True, capture_output=True, timeout=100)
     pixels = cv2.imread(str(shot)).astype(int)[:, 530:]  # position on the map, and the right half
     is_green = pixels[..., 1] - pixels[..., [0, 2]].max(axis=-1) > 40
     assert bool(is_green[:350].sum() > 50) is (old == 0)
-    print(f'screenshot: {shot}')
 
 
 def test_server_runs_commands_and_returns_their_errors(served):
