@@ -50,7 +50,7 @@ DAMAGE = {
     'cut_in_its_head': lambda content: content[:20],
     'zeros_at_its_end': lambda content: content[:-512] + bytes(512),
     'flipped': _flipped,
-    'attack': lambda content: pickle.dumps(_Attack()),
+    'attack': lambda content: bytes(32) + pickle.dumps(_Attack()),
     'pipe': None,
 }
 
