@@ -7,14 +7,8 @@ import enum
 import math
 
 from stavpr_nav.evidence import OdometryComparison
-from stavpr_nav.follower import (
-    Command,
-    FollowerSettings,
-    NO_EVIDENCE,
-    Observation,
-    RouteFollower,
-    TaughtRun,
-)
+from stavpr_nav.follower import Command, FollowerSettings, NO_EVIDENCE, RouteFollower, TaughtRun
+from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError
 
 DEADMAN_AGE = 0.5  # seconds that the dead-man switch counts after its last message

@@ -10,15 +10,13 @@ Meters of the path include turns: a radian counts as ``ARM`` meters, where this 
 
 from collections import deque
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import cv2
 import numpy as np
+from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
-
-if TYPE_CHECKING:
-    from stavpr_nav.follower import Observation
 
 MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places are dense
 ARM = 0.5  # meters
@@ -107,7 +105,7 @@ class MotionEvidence:
         """Count a standstill: what an image shows that was taken before is no evidence since."""
         self.is_fresh, self._rested = False, totals[0]
 
-    def take(self, image: 'Observation', totals: np.ndarray, speed: float) -> None:
+    def take(self, image: Observation, totals: np.ndarray, speed: float) -> None:
         """
         Take the result of an image of the route.
 

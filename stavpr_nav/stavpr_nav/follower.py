@@ -26,8 +26,8 @@ import math
 
 import numpy as np
 from stavpr_nav.evidence import BRIDGE_TIME, MotionEvidence, OdometryComparison, path_speed
+from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.relative_pose.offset import Offset
 
 UNCERTAIN, CERTAIN = 0.5, 0.9  # probabilities of the slowest and of the full speed
 SLOWEST = 0.3  # share of the taught speed
@@ -35,7 +35,6 @@ WITHOUT_OFFSET = 0.5  # share of the speed while the offset is not valid
 # Widths of the image: of the sum; of the parallax in it, for a small angle back to the path.
 MAX_STEER, MAX_APPROACH = 0.2, 0.1
 INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image, of summands too
-BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
 BRIDGE_SHARE = 0.5  # share of the speed without a match
 CREEP = 0.3  # m/s from a standstill to the first evidence of motion
 MAX_STEP = 0.5  # seconds between two commands; beyond it the program or the clock has jumped
@@ -127,41 +126,6 @@ class TaughtRun:
 
 
 @dataclass(frozen=True)
-class Observation:
-    """
-    What an image showed.
-
-    :param stamp: when it was taken, seconds.
-    :param place: that the image shows; -1 = unknown.
-    :param probability: of the place; NaN = without a match, it is the expected place.
-    :param offset: of the image against the place; None = unknown.
-    :param is_new: it differs from the images before.
-    :param is_compared: it was compared with the map; False = skipped, as no keyframe.
-    """
-
-    stamp: float
-    place: int
-    probability: float
-    offset: Offset | None
-    is_new: bool = True
-    is_compared: bool = True
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether the image is of the route: its sequence is matched, and it is similar."""
-        if self.place < 0 or self.offset is None:
-            return False
-        return self.offset.is_similar and (
-            self.is_matched or not self.is_compared or self.offset.similarity >= BRIDGE_SIMILARITY
-        )
-
-    @property
-    def is_matched(self) -> bool:
-        """Whether the place is of a match."""
-        return not math.isnan(self.probability)
-
-
-@dataclass(frozen=True)
 class Command:
     """
     Velocities of the robot.
@@ -213,7 +177,7 @@ class RouteFollower:
 
     @property
     def _now(self) -> np.ndarray:
-        """The totals at the latest command."""
+        """Return the totals until now."""
         return self._totals[-1][1]
 
     def start(self, place: int) -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 from stavpr_nav.driver import DEADMAN_AGE, Driver, Goal, Outcome, PAUSED
-from stavpr_nav.follower import Observation
+from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError
 from test_follower import COVERED, FAST, STEP, STRAIGHT, taught
 

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 from stavpr_nav import follower
-from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
+from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
+from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.relative_pose.offset import Offset
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from stavpr_nav.driver import DEADMAN_AGE, Driver, Goal, PAUSED
 from stavpr_nav.evidence import ImageComparison, MotionEvidence, OdometryComparison
-from stavpr_nav.follower import NO_EVIDENCE, Observation
+from stavpr_nav.follower import NO_EVIDENCE
+from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError
 from test_driver import Drive
 from test_follower import FAST, Run, STEP, STRAIGHT, taught

@@ -16,7 +16,8 @@ import math
 import numpy as np
 from stavpr_nav.driver import Driver, Goal
 from stavpr_nav.evidence import OdometryComparison
-from stavpr_nav.follower import FollowerSettings, Observation, TaughtRun
+from stavpr_nav.follower import FollowerSettings, TaughtRun
+from stavpr_nav.observation import Observation
 from stavpr_ros.relative_pose.offset import Offset
 
 SPEED, STEP, LATENCY, BRAKING = 1.0, 0.01, 0.05, 5.0  # m/s, seconds, seconds, m/s^2

@@ -34,7 +34,8 @@ from stavpr_lab.demonstration.street.traverses import (
     Traverse,
 )
 from stavpr_nav.evidence import ImageComparison
-from stavpr_nav.follower import FollowerSettings, Observation, RouteFollower, TaughtRun
+from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
+from stavpr_nav.observation import Observation
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.progress import Progress

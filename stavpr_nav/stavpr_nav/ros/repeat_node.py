@@ -28,7 +28,8 @@ from stavpr_msgs.msg import Offset as OffsetMessage
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_nav.driver import DEADMAN_AGE, Driver, Goal, Outcome
 from stavpr_nav.evidence import ImageComparison, OdometryComparison
-from stavpr_nav.follower import Command, FollowerSettings, Observation
+from stavpr_nav.follower import Command, FollowerSettings
+from stavpr_nav.observation import Observation
 from stavpr_nav.parameters import REPEAT
 from stavpr_nav.taught_run import positions, read_velocities, taught_places, taught_run
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
