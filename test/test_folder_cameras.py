@@ -28,7 +28,7 @@ CAMERAS = {
     'euroc': files('mav0/{}/data/{}.png', 'cam0', 'cam1', step=50_000_000, first=1403636 * 10**12),
     'kitti': files('04/{}/{:06d}.png', 'image_0', 'image_1', 'image_2', 'image_3'),
     'prefix': files('{}{:04d}.png', 'left', 'right'),
-    'lost images': files('{}{:04d}.png', 'left', 'right')[:40],
+    'lost images': files('{}{:04d}.png', 'left', 'right')[:-1],
     'dashcam': files('20300506_{1:06d}_{0}.jpg', 'F', 'R'),
     'scan': files('frame-{1:06d}.{0}.png', 'color', 'depth'),
     'tum': files('{}/1305031102.{:06d}.png', 'depth', 'rgb', step=33_000, lag=10_000),
@@ -59,12 +59,20 @@ def test_cameras_of_one_drive_are_listed_and_chosen(name):
     (files('cam_{:.0s}{}.jpg', ''), 0),
     (files('front_{:.0s}{:04d}.jpg', '') + files('rear_{:.0s}{:04d}.jpg', '', first=24), 0),
     (files('{}/{:04d}.jpg', 'monday', 'tuesday'), 1),
+    (files('hall_{}_{:04d}.jpg', 'left', 'right')[:-3], 1),
+    (files('{}_{:04d}.jpg', 'hall_left', 'hall_right', 'stairs', 'lift'), 1),
+    (files('{}_{:04d}.jpg', 'stairs_back', 'lift'), 1),
 ])  # fmt: skip
 def test_parts_of_one_drive_are_no_cameras(drive, warnings, caplog):
     """Two kinds of names with the same numbers may be two drives: a line states it."""
     assert of_one_camera(drive, TOP) == drive
     assert len(caplog.records) == warnings
     assert all('of the same numbers' in record.getMessage() for record in caplog.records)
+
+
+def test_data_sets_of_one_camera_are_read(data_folder):
+    for folder in {file.parent for file in data_folder.rglob('*.jpg')}:
+        assert len(open_source(folder).files) == len(list(folder.glob('*.jpg')))
 
 
 def test_commands_choose_a_camera(tmp_path, capsys, route):

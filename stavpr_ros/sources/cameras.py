@@ -28,6 +28,8 @@ TOKEN = re.compile(r'[A-Z]?[a-z]+|[A-Z]+')
 WORD = re.compile(r'(?<![^\W_])[a-f]+(?![^\W_])|[^\W\d_]*[^\W\d_a-f][^\W\d_]*')
 """Letters that are no hexadecimal digits."""
 MIN_SHARE = 0.05  # of all images, of a camera
+MOST = 0.75  # of all images are of the cameras: hall_left, hall_right and stairs are parts
+MIN_COMMON = 0.95  # of the counters of two cameras that take images together
 STAMPS = 10**7  # stamps and dates are not below
 
 Numbers = tuple[int, ...]
@@ -51,9 +53,16 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
         names = roles if len(roles) > 1 else streams
         choice = f'expected one of {_listed(names)}' if len(names) > 1 else 'leave it out'
         raise SourceError(f'{top} has no camera {camera!r}: {choice}')
-    for groups in (roles, streams):
-        several = _parallel(groups, len(files))
-        if several and (groups is roles or _is_stamped(several)):
+    alike: dict[str, list[Path]] = {}  # by their names without the camera's and without numbers
+    for file in files:
+        rest = Path(_role(file.relative_to(top))[1]).name.casefold()
+        alike.setdefault(re.sub(r'[\W\d_]', '', rest), []).append(file)
+    roles_of_alike = (
+        _groups(same, top, _role) for same in alike.values() if len(same) >= MOST * len(files)
+    )
+    for groups in (*roles_of_alike, streams):
+        several = _parallel(groups, len(files), is_sure=groups is not streams)
+        if several and (groups is not streams or _is_stamped(several)):
             raise SourceError(
                 f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
                 'choose it, --camera NAME; parts of one drive need other names'
@@ -81,10 +90,10 @@ def _role(path: Path) -> tuple[str, str]:
     """Return the camera that a path names, and the path without it."""
     folders = [part for part in path.parts[:-1] if _words(part)]
     known = {word for part in folders for word in _words(part)}
-    words = [word for word in _words(path.stem, is_file=True) if word not in known]
-    rest = path.stem
+    words, rest = _words(path.stem, is_file=True), path.stem
     for word in words:
         rest = rest.replace(word, ' ')
+    words = [word for word in words if word not in known]
     others = [part for part in path.parts[:-1] if part not in folders]
     return '/'.join([*folders, *(['_'.join(words)] if words else [])]), '/'.join([*others, rest])
 
@@ -109,14 +118,17 @@ def _is_stamped(groups: Groups) -> bool:
     return all(own >= (STAMPS,) for group in groups.values() for own in group.values())
 
 
-def _parallel(groups: Groups, count: int) -> Groups:
-    """Return the groups whose numbers, or times, are among another group's."""
+def _parallel(groups: Groups, count: int, is_sure: bool) -> Groups:
+    """Return the groups whose times are among another group's, or whose counters are equal."""
     large = {name: own for name, own in groups.items() if len(own) >= max(2, MIN_SHARE * count)}
     several: Groups = {}
     for a, b in combinations(large, 2):
         small, other = sorted((large[a], large[b]), key=len)
         first, last = min(other.values()), max(other.values())
-        if sum(first <= own <= last for own in small.values()) >= len(small) / 2:
+        least = len(small) / 2
+        if is_sure and not _is_stamped({a: large[a], b: large[b]}):
+            least = max(least, MIN_COMMON * len(other))
+        if sum(first <= own <= last for own in small.values()) >= least:
             several |= {a: large[a], b: large[b]}
     return several
 
