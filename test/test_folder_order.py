@@ -21,15 +21,11 @@ SURE = {
     'longer than a float': ['1700000000.63555584', '1700000000.113555584'],
     'negative': ['x-10', 'x-2', 'x-1.5', 'x0', 'x3', 'x12'],
     'dash': ['IMG-1', 'IMG-2', 'IMG-10'],
-    'hexadecimal': [f'frame_{i:x}' for i in range(300)],
-    'days first': ['31-12-2029', '01-01-2030', '02-01-2030', '15-02-2030'],
-    'months first': ['12-31-2029', '01-01-2030', '01-20-2030'],
+    'dates': ['2030.1.5', '2030.1.10', '2030.2.1'],
     'copies': ['IMG_9', 'IMG_9 (2)', 'IMG_10'],
 }
 GUESSED = {
     'decimal': ['1.25', '1.5'],
-    'days or months': ['05-01-2030', '03-02-2030'],
-    'hashes': ['1d41d8cd98f00b20', 'd41d8cd98f00b204'],
     'gopro': [f'G001{i}' for i in counter(9989, 10000, width=4, zero=1)],
     'steps': counter(9900, 10000, 240, width=4)[::10],
     '16 bits': counter(65530, 2**16),

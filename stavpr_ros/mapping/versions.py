@@ -42,8 +42,7 @@ class Version:
     :param changes: what the update added and removed, and why: sentences.
     :param use: of each place, the decayed number of drives that were recognized there; empty = 1.
     :param missed: of each place, the drives in a row that passed it unrecognized; empty = 0.
-    :param drives: the last ones, name, first stamp and hashes
-        (:class:`stavpr_ros.recognition.same_drive.DriveHash`).
+    :param drives: the last ones, see :data:`stavpr_ros.recognition.same_drive.Row`.
     """
 
     map_id: str
@@ -60,7 +59,7 @@ class Version:
 
 def _drive(value: Any, where: str) -> None:
     if not (isinstance(value, list) and [type(each) for each in value] == [str, int, str]):
-        raise ValueError(f'{where} is {value!r:.80}: expected name, stamp and hashes of a drive')
+        raise ValueError(f'{where} is {value!r:.80}: expected name, stamp and bits of a drive')
     bytes.fromhex(value[2])
 
 

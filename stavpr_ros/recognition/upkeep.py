@@ -18,7 +18,7 @@ map, so that no path leads from one into the other.
 The root of a place is the place of an earlier session that shows the same, or itself.
 """
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -37,7 +37,7 @@ from stavpr_ros.output_file import FileVersion
 from stavpr_ros.prepare.prepared_map import statistics_of_map
 from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.recognition.recognizer import PlaceRecognizer
-from stavpr_ros.recognition.same_drive import drive_hash, DriveHash, earlier_drive, session_hashes
+from stavpr_ros.recognition.same_drive import earlier_drive, rows_of
 from stavpr_ros.recognition.same_places import recognized, SamePlaces
 from stavpr_ros.recognition.settings import RecognizerSettings
 from stavpr_ros.recognition.verification import GeometricSettings, PlaceVerifier
@@ -172,13 +172,12 @@ def update_file(
     """
     drive.features.require_same_settings(place_map.settings, 'the map')
     before = current_version(path)
-    earlier = [DriveHash(*each) for each in before.drives]
-    if one := earlier_drive(drive, [*earlier, *session_hashes(place_map, 'the map')]):
-        text = f'{name} has the images of {one.name}, taken already: the map stays as it is'
+    row = (name, *rows_of(drive, name)[0][1:])
+    if one := earlier_drive(row, [*before.drives, *rows_of(place_map, 'the map')]):
+        text = f'{name} has the images of {one}, taken already: the map stays as it is'
         return replace(before, changes=(text,))
     updated, version = update_map(place_map, drive, name, before, settings)
-    drives = *before.drives[1 - KEPT :], astuple(drive_hash(name, drive))
-    version = replace(version, drives=drives)
+    version = replace(version, drives=(*before.drives[1 - KEPT :], row))
     return save_version(path, opened, updated, before, version, statistics_of_map(updated))
 
 
