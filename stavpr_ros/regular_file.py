@@ -21,7 +21,6 @@ POINTERS = {
 }
 """The first bytes of files that replace others, and what to do."""
 MAX_POINTER, LONGEST_TARGET = 1024, 60  # bytes, characters
-TOOLS = {'/annex/': 'run `git annex get`', 'dvc': 'run `dvc pull`', 'files/md5': 'run `dvc pull`'}
 
 
 class ElsewhereError(OSError):
@@ -31,28 +30,14 @@ class ElsewhereError(OSError):
 def elsewhere(path: str | Path) -> str:
     """Return what replaces the content of a file, and what to do; '' = it is here or unknown."""
     path = Path(path)
-    if not path.exists():
-        if path.is_symlink() and not _is_loop(path):
-            target = os.readlink(path)
-            tool = next((tool for part, tool in TOOLS.items() if part in target), 'copy the file')
-            return f'a link into nothing, {target[-LONGEST_TARGET:]}: {tool}'
-        if path.with_name(f'{path.name}.dvc').exists():
-            return 'of DVC, and its content not here: run `dvc pull`'
-        if path.with_name(f'.{path.name}.icloud').exists():
-            return 'in iCloud only: download it in the Finder'
-        return ''
+    if path.is_symlink() and not path.exists():
+        target = os.readlink(path)
+        remedy = 'run `git annex get`' if '/annex/' in target else 'copy the file'
+        return f'a link into nothing, {target[-LONGEST_TARGET:]}: {remedy}'
     if path.is_file() and path.stat().st_size <= MAX_POINTER:
         content = path.read_bytes()
         return next((text for first, text in POINTERS.items() if content.startswith(first)), '')
     return ''
-
-
-def _is_loop(link: Path) -> bool:
-    try:
-        link.stat()
-    except OSError as error:
-        return error.errno == errno.ELOOP
-    return False
 
 
 def home_folder() -> Path:

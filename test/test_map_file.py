@@ -281,7 +281,7 @@ def test_load_map_takes_regular_files_only(tmp_path, saved):
         server.bind(str(tmp_path / 'socket'))
         for name, kind in (
             ('pipe', 'a pipe'), ('zero', 'a device'), ('socket', 'a socket'), ('.', 'a folder'),
-            ('loop', 'symbolic links'), ('x' * 5000, 'too long'), ('a\0b', 'null'),
+            ('loop', 'a link into nothing'), ('x' * 5000, 'too long'), ('a\0b', 'null'),
         ):  # fmt: skip
             with pytest.raises(MapFileError, match=rf'{kind}.*name a map file'):
                 load_map(tmp_path / name)

@@ -281,13 +281,6 @@ def test_video_with_sound_that_is_cut_is_reported(tmp_path, suffix):
         list(open_source(path))
 
 
-def test_second_track_of_video_is_named(tmp_path, caplog):
-    path = write_video(tmp_path / 'dash.mkv', colored_images(30), tracks=2)
-    Output(path).check(np.arange(30) / RATE, colored_images(30))
-    assert len(open_source(path, fps=RATE)) == 30
-    assert 'dash.mkv has 2 tracks of video, as of two cameras: the first' in caplog.text
-
-
 def test_size_in_the_header_is_limited(tmp_path):
     path = write_video(tmp_path / 'phone.avi', colored_images(3), 'ffv1')
     size, huge = (np.array(sides, '<u4').tobytes() for sides in ((WIDTH, HEIGHT), (9_000, 8_000)))

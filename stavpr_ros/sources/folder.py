@@ -34,10 +34,6 @@ FOREIGN = re.compile(
     re.IGNORECASE,
 )
 """Names of sub-folders that a NAS, an archive program or a viewer adds."""
-STUB = re.compile(
-    r'.*\.(dvc|icloud|lnk|url|webloc|part|partial|crdownload|download|opdownload)', re.IGNORECASE
-)
-"""Names of files that replace others, or are not complete."""
 FEW = 5  # times as many images in sub-folders: images beside these are not the drive
 
 
@@ -184,7 +180,6 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         names |= {path.stem for path in images}
         others = (path for path in paths if path.suffix.lower() in OTHER_IMAGES)
         unread['format'] += sum(path.stem not in names for path in others)
-        unread['elsewhere'] += sum(map(bool, map(STUB.fullmatch, files)))
         unread['bag'] += sum(path.suffix.lower() in STORAGE_SUFFIXES for path in paths)
         unread['video'] += sum(path.suffix.lower() in VIDEOS for path in paths)
         (own if Path(name) == top else below).extend(images)

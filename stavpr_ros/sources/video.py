@@ -107,22 +107,17 @@ class VideoSource:
                     facts.append(FACTS.unpack(next(messages)))
                 except _DecoderError as error:
                     raise SourceError(f'{file} {error}') from error
-        self._durations, rates, created, tracks, *sizes = np.array(facts).T
+        self._durations, rates, created, *sizes = np.array(facts).T
         self._rate = rates[0]
         disorder = created.all() and (np.diff(created) < 0).any()
         if disorder or np.ptp(sizes, 1).any() or np.ptp(rates) > SAME_RATE * self._rate:
             rows = zip(self._files, facts, strict=True)
             listed = ', '.join(
-                f'{one.name} ({w}x{h}, {r:.4g} Hz)' for one, (_, r, _, _, h, w) in rows
+                f'{one.name} ({w}x{h}, {r:.4g} Hz)' for one, (_, r, _, h, w) in rows
             )
             raise SourceError(
                 f'{path} has videos of several sizes or rates, or not in the order of creation: '
                 f'expected the files of one drive; name one of {listed}'
-            )
-        if (count := int(tracks.max())) > 1:
-            note_once(
-                f'{path} has {count} tracks of video, as of two cameras: the first one is read; '
-                '`ffmpeg -i FILE -map 0:v:1 -c copy second.mkv` makes a file of the second'
             )
         self._start = round(created[0] * SECOND) or SECOND
 

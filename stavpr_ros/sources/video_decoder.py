@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.sources.frame import MAX_PIXELS
 
-# duration, s; rate, Hz; creation, s since 1970; tracks of video; height, width
-FACTS = struct.Struct('<dddIII')
+FACTS = struct.Struct('<dddII')  # duration, s; rate, Hz; creation, s since 1970; height, width
 FRAME = struct.Struct('<dIII')  # seconds after the start of the first file, file, height, width
 CUT_OFF, JUMP = 1, 2  # width of a header without height
 MEMORY = 4 << 30  # bytes of address space
@@ -76,19 +75,13 @@ def _open(path: str) -> Any:
     return av.open(path, options=options, metadata_errors='replace')
 
 
-def _tracks(container: Any) -> list[Any]:
-    """Return the tracks of video, without covers and thumbnails if there are others."""
+def _video(container: Any) -> Any:
+    """Return the first track of video that is no cover or thumbnail, if there is one."""
     from av.stream import Disposition
 
     stills = Disposition.attached_pic | Disposition.timed_thumbnails
     tracks = [each for each in container.streams.video if each.codec_context is not None]
-    return [
-        each for each in tracks if not each.disposition & stills and each.frames != 1
-    ] or tracks
-
-
-def _video(container: Any) -> Any:
-    tracks = _tracks(container)
+    tracks.sort(key=lambda each: bool(each.disposition & stills) or each.frames == 1)
     if not tracks:
         sys.exit(NOT_OPENED)
     if tracks[0].width * tracks[0].height > MAX_PIXELS:
@@ -96,7 +89,7 @@ def _video(container: Any) -> Any:
     return tracks[0]
 
 
-def _facts(container: Any) -> tuple[float, float, float, int, int, int]:
+def _facts(container: Any) -> tuple[float, float, float, int, int]:
     stream, duration, created = _video(container), (container.duration or 0) / 1e6, 0.0
     bare = container.format.flags & NO_TIMES
     rate = (not bare and stream.average_rate) or stream.guessed_rate or RATE
@@ -110,8 +103,7 @@ def _facts(container: Any) -> tuple[float, float, float, int, int, int]:
         duration = float(stream.duration * stream.time_base)
     elif container.format.name.startswith('matroska'):  # it states the last time
         duration -= max(container.start_time or 0, 0) / 1e6
-    duration, tracks = (0.0 if bare else duration), len(_tracks(container))
-    return duration, float(rate), created, tracks, stream.height, stream.width
+    return (0.0 if bare else duration), float(rate), created, stream.height, stream.width
 
 
 def _packets(container: Any, span: list[float]) -> Iterator[Any]:

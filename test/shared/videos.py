@@ -31,7 +31,6 @@ def write_video(
     high_dynamic_range: bool = False,
     sounds=(),
     voice: str = 'aac',
-    tracks: int = 1,
 ) -> Path:
     """
     Write a video.
@@ -39,28 +38,22 @@ def write_video(
     :param images: RGB, uint8; of ``colored_images`` if not given.
     :param times: of the frames, in frames; 0, 1, 2, ... if not given.
     :param sounds: begin and end of each track of sound, seconds, encoded by ``voice``.
-    :param tracks: of video, of equal images.
     :param high_dynamic_range: state BT.2020 and SMPTE ST 2084; the images are not changed.
     """
     images = colored_images() if images is None else images
     with av.open(str(path), 'w', options={'movflags': 'faststart'}) as container:
         container.metadata.update(metadata or {})
-        streams = [
-            container.add_stream(codec, rate=rate, options=options or {}) for _ in range(tracks)
-        ]
-        for stream in streams:
-            stream.height, stream.width = images[0].shape[:2]
-            stream.pix_fmt, stream.bit_rate = pixels, 1_000_000
-            if high_dynamic_range:
-                stream.color_primaries, stream.color_trc, stream.colorspace = 9, 16, 9  # H.273
+        stream = container.add_stream(codec, rate=rate, options=options or {})
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate = pixels, 1_000_000
+        if high_dynamic_range:
+            stream.color_primaries, stream.color_trc, stream.colorspace = 9, 16, 9  # ITU-T H.273
         voices = [container.add_stream(voice, rate=48000, layout='mono') for _ in sounds]
         for i, image in enumerate(images):
-            for stream in streams:
-                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
-                frame.pts = int(i if times is None else times[i])
-                container.mux(stream.encode(frame))
-        for stream in streams:
-            container.mux(stream.encode(None))
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format='rgb24')
+            frame.pts = int(i if times is None else times[i])
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
         for stream, (begin, end) in zip(voices, sounds, strict=True):
             for at in range(int(begin * 48000), int(end * 48000), 960):
                 frame = av.AudioFrame.from_ndarray(np.zeros((1, 960), np.float32), 'fltp', 'mono')
