@@ -192,6 +192,7 @@ def _conversion(image: Any, array: np.ndarray) -> str:
     """Return how to convert an image that is no RGB image of bytes."""
     shape, is_number = array.shape, array.dtype.kind in 'buif'
     low, high = (array.min(), array.max()) if is_number and array.size else (0, 0)
+    nan, inf = (int(is_bad(array).sum()) if is_number else 0 for is_bad in (np.isnan, np.isinf))
     rows = (
         (hasattr(image, 'image'), 'give its field image'),
         (not is_number, 'give the pixels as numbers; open_source(path) reads files'),
@@ -202,6 +203,7 @@ def _conversion(image: Any, array: np.ndarray) -> str:
         (shape[2:] == (4,), 'take image[..., :3], without the transparency'),
         (shape[:1] == (3,), 'the channels come first: take image.transpose(1, 2, 0)'),
         (shape[2:] != (3,), 'an axis is missing, or has another size'),
+        (nan or inf, f'it contains {nan} NaN and {inf} infinite values: replace them'),
         (low >= 0 and high <= 1, 'values of 0 to 1 become bytes by np.uint8(255 * image)'),
         (low >= 0 and high <= 255, 'take np.uint8(image)'),
         (True, f'values are {low} to {high}: scale them to 0 to 255, then np.uint8(image)'),
