@@ -62,7 +62,7 @@ def pipeline(path, recorded):
 
 
 def waiting(path):
-    return sorted(file.stem for file in Path(f'{path}.history/drives').glob('*'))
+    return sorted(file.stem for file in Path(f'{path}.history/drives').glob('[!.]*'))
 
 
 def at_once(function):

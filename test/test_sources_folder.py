@@ -189,7 +189,7 @@ def test_images_whose_content_is_elsewhere_are_named(tmp_path, content, reason):
 @pytest.mark.parametrize('name', ['drive.mp4', 'drive.mcap', 'drive.bag', 'drive'])
 def test_sources_whose_content_is_elsewhere_are_named(tmp_path, name):
     (tmp_path / name).write_bytes(LFS)
-    with pytest.raises(SourceError, match='is a pointer of Git LFS .*: run `git lfs pull`'):
+    with pytest.raises(SourceError, match=r'is a pointer of Git LFS .*: run `git lfs pull`'):
         open_source(tmp_path / name)
 
 

@@ -8,11 +8,10 @@ It is written at once, before the map is updated, which takes long; whatever end
 next one finds the drive there, or in a version of the map.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 import fcntl
 from logging import Logger
-import os
 from pathlib import Path
 import time
 from typing import Any
@@ -26,6 +25,7 @@ from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
 from stavpr_ros.units import DATED, SECOND
 
+LOCK = '.lock'
 OnWorker = Callable[[Callable[[], Any]], Any]
 
 
@@ -60,7 +60,8 @@ def take_up_drives(
     places, folder = 0, _folder(path)
     if not folder.is_dir():
         return places
-    with explained(folder), _locked(folder):
+    with explained(folder), (folder / LOCK).open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # until no other program, or thread, updates the map
         files = sorted(folder.glob('*.stavpr'), key=lambda file: file.stem)
         if files:
             log.info(f'updating {path} with {len(files)} drives, which are in {folder} until then')
@@ -104,14 +105,3 @@ def _write(path: str, drive: PlaceMap) -> None:
             with suppress(OutputTakenError):
                 save_map(drive, file)
                 return
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Wait until no other program, or thread, updates the map."""
-    file = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(file)

@@ -25,15 +25,13 @@ NUMBERED = re.compile(
 )
 SINGLE = re.compile(r'(?<![^\W_])[a-fA-F](?![^\W_])')  # else they are hexadecimal digits
 TOKEN = re.compile(r'[A-Z]?[a-z]+|[A-Z]+')
-WORD = re.compile(r'(?<![^\W_])[a-f]+(?![^\W_])|[^\W\d_]*[^\W\d_a-f][^\W\d_]*')
-"""Letters that are no hexadecimal digits."""
+WORD = re.compile(r'[^\W\d_]*[^\W\d_a-f][^\W\d_]*')  # no hexadecimal digits
 MIN_SHARE = 0.05  # of all images, of a camera
 MOST = 0.75  # of all images are of the cameras: hall_left, hall_right and stairs are parts
 MIN_COMMON = 0.95  # of the counters of two cameras that take images together
 STAMPS = 10**7  # stamps and dates are not below
 
-Numbers = tuple[int, ...]
-Groups = dict[str, dict[Path, Numbers]]
+Groups = dict[str, dict[Path, tuple[int, ...]]]
 """The files of each camera with the numbers in their names."""
 
 
@@ -46,27 +44,28 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
     :raises SourceError: several cameras passed the same places, or none has the name.
     """
     roles, streams = (_groups(files, top, split) for split in (_role, _stream))
+    groups = roles if len(roles) > 1 else streams
     if camera is not None:
-        by_name = {name.casefold(): group for name, group in (streams | roles).items()}
+        by_name = {name.casefold(): group for name, group in groups.items()}
         if group := by_name.get(camera.strip('/').casefold()):
             return list(group)
-        names = roles if len(roles) > 1 else streams
-        choice = f'expected one of {_listed(names)}' if len(names) > 1 else 'leave it out'
+        choice = f'expected one of {_listed(groups)}' if len(groups) > 1 else 'leave it out'
         raise SourceError(f'{top} has no camera {camera!r}: {choice}')
     alike: dict[str, list[Path]] = {}  # by their names without the camera's and without numbers
     for file in files:
         rest = Path(_role(file.relative_to(top))[1]).name.casefold()
         alike.setdefault(re.sub(r'[\W\d_]', '', rest), []).append(file)
-    roles_of_alike = (
-        _groups(same, top, _role) for same in alike.values() if len(same) >= MOST * len(files)
-    )
-    for groups in (*roles_of_alike, streams):
-        several = _parallel(groups, len(files), is_sure=groups is not streams)
-        if several and (groups is not streams or _is_stamped(several)):
-            raise SourceError(
-                f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
-                'choose it, --camera NAME; parts of one drive need other names'
-            )
+    most = max(alike.values(), key=len, default=[])
+    of_roles = _groups(most if len(most) >= MOST * len(files) else [], top, _role)
+    several, is_sure = _parallel(of_roles, len(files), MIN_COMMON), True
+    if not several:
+        several = _parallel(streams, len(files), 0.5)
+        is_sure = bool(several) and all(map(_is_stamped, several.values()))
+    if several and is_sure:
+        raise SourceError(
+            f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
+            'choose it, --camera NAME; parts of one drive need other names'
+        )
     if several:
         note_once(
             f'{top} has images of the same numbers, {_listed(several)}: they are taken for parts '
@@ -88,46 +87,49 @@ def _groups(files: Sequence[Path], top: Path, split: Callable[[Path], tuple[str,
 
 def _role(path: Path) -> tuple[str, str]:
     """Return the camera that a path names, and the path without it."""
-    folders = [part for part in path.parts[:-1] if _words(part)]
-    known = {word for part in folders for word in _words(part)}
-    words, rest = _words(path.stem, is_file=True), path.stem
-    for word in words:
-        rest = rest.replace(word, ' ')
-    words = [word for word in words if word not in known]
+    folders = [part for part in path.parts[:-1] if _words(part, 0)]
     others = [part for part in path.parts[:-1] if part not in folders]
-    return '/'.join([*folders, *(['_'.join(words)] if words else [])]), '/'.join([*others, rest])
+    rest, words = path.stem, {word for part in folders for word in _words(part, 0)}
+    own = [word for word in _words(rest, 1) if word not in words]
+    for word in [*own, *words]:
+        rest = rest.replace(word, ' ')
+    return '/'.join(filter(None, [*folders, '_'.join(own)])), '/'.join([*others, rest])
 
 
-def _words(name: str, is_file: bool = False) -> list[str]:
-    """Return the words for cameras in a name; the only number of a file is a counter."""
+def _words(name: str, counters: int) -> list[str]:
+    """Return the words for cameras in a name; so many of its numbers are counters."""
     words = [word for word in TOKEN.findall(name) if WORDS.fullmatch(word)]
     numbers, numbered = len(re.findall(r'\d+', name)), NUMBERED.search(name)
-    words += SINGLE.findall(name) if is_file and numbers else []
-    return words + ([numbered[0]] if numbered and numbers > is_file else [])
+    words += SINGLE.findall(name) if counters and numbers else []
+    return words + ([numbered[0]] if numbered and numbers > counters else [])
 
 
 def _stream(path: Path) -> tuple[str, str]:
     """Return the folder and the words of a name, and its numbers."""
-    stem, words = path.stem, WORD.findall(path.stem.casefold())
-    is_stamp = int('0' + ''.join(re.findall(r'\d+', stem)[:1])) >= STAMPS
-    name = '/'.join(filter(None, [*path.parts[:-1], '_'.join(words)]))
-    return name, stem if is_stamp else str(path.with_suffix(''))
+    name, number = '_'.join(WORD.findall(path.stem.casefold())), re.search(r'\d+', path.stem)
+    is_stamp = number and int(number[0]) >= STAMPS
+    return '/'.join([*path.parts[:-1], name]).strip('/'), path.stem if is_stamp else str(path)
 
 
-def _is_stamped(groups: Groups) -> bool:
-    return all(own >= (STAMPS,) for group in groups.values() for own in group.values())
+def _is_stamped(group: dict[Path, tuple[int, ...]]) -> bool:
+    return all(own >= (STAMPS,) for own in group.values())
 
 
-def _parallel(groups: Groups, count: int, is_sure: bool) -> Groups:
-    """Return the groups whose times are among another group's, or whose counters are equal."""
+def _parallel(groups: Groups, count: int, common: float) -> Groups:
+    """
+    Return the groups whose times are among another group's, or whose counters are equal.
+
+    :param count: images of the folder.
+    :param common: least share of the counters of the larger group.
+    """
     large = {name: own for name, own in groups.items() if len(own) >= max(2, MIN_SHARE * count)}
     several: Groups = {}
     for a, b in combinations(large, 2):
         small, other = sorted((large[a], large[b]), key=len)
         first, last = min(other.values()), max(other.values())
         least = len(small) / 2
-        if is_sure and not _is_stamped({a: large[a], b: large[b]}):
-            least = max(least, MIN_COMMON * len(other))
+        if not (_is_stamped(small) and _is_stamped(other)):
+            least = max(least, common * len(other))
         if sum(first <= own <= last for own in small.values()) >= least:
             several |= {a: large[a], b: large[b]}
     return several

@@ -62,8 +62,7 @@ def _clock_oddities(stamps: Sequence[int], times: Sequence[int], has_epoch: bool
     # of all, since images come in bursts, and of two, since cameras pause
     stamped, passed = stamps[-1] - stamps[0], times[-1] - times[0]
     step, pause = median(steps), median(b - a for a, b in pairwise(times))
-    slow = stamped * MAX_RATIO < passed and step * MAX_RATIO < pause
-    fast = stamped > passed * MAX_RATIO and step > pause * MAX_RATIO
+    differ = all(min(pair) * MAX_RATIO < max(pair) for pair in ((stamped, passed), (step, pause)))
     apart = median(stamp - time for stamp, time in zip(stamps, times, strict=True))
     remedy = 'correct the clock of the driver'
     if len(set(stamps)) == 1:
@@ -71,7 +70,7 @@ def _clock_oddities(stamps: Sequence[int], times: Sequence[int], has_epoch: bool
     elif jumps:
         largest = max(jumps, key=abs) / SECOND
         yield f'stamps jump {len(jumps)} times, by up to {largest:.1f} s: {remedy}'
-    elif passed > SECOND // 2 and (slow or fast):
+    elif passed > SECOND // 2 and differ:
         took = f'{stamped / SECOND:.4g} s in {passed / SECOND:.4g} s'
         yield f'stamps advance by {took}, as of another unit: {remedy}'
     elif has_epoch and abs(apart) > DAY and all(times):
