@@ -9,7 +9,6 @@ from stavpr_ros.alignment import best_match, SequenceDistances, SpatialSettings
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.filter import FilterSettings, PlaceFilter
 from stavpr_ros.prepare import make_matcher, prepare_map, z_normalized
-from stavpr_ros.relative_pose.offset import OffsetFilter, WIDTH
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 N, LAG, V = 100, 4, len(FilterSettings().speeds)
@@ -61,19 +60,9 @@ def test_arguments_that_do_not_fit_are_an_error_and_change_nothing(call):
 def test_error_names_what_came_and_what_was_expected():
     with pytest.raises(InputError, match='z of 4 places: expected 11 to 100'):
         driven(9, 10).update(np.zeros(4, np.float32), 0.3, SAME)
-    with pytest.raises(InputError, match='images_ago = 0'):
-        PlaceFilter(N, LAG).belief(N, 0)
     for arguments in (-1, LAG), (2.5, LAG), (N, 0), (N, LAG, S, np.array([5, 4])):
         with pytest.raises(StavprError):
             PlaceFilter(*arguments)
-
-
-def test_eviction_of_nothing_changes_nothing_and_of_all_leaves_nothing():
-    one, expected = driven(), driven()
-    one.evict(0)
-    np.testing.assert_array_equal(one.belief(N, LAG).weights, expected.belief(N, LAG).weights)
-    one.evict(N)
-    assert not one.places_of_states().any()
 
 
 WRONG_VALUES = {
@@ -121,16 +110,12 @@ def test_other_kernels_reject_arrays_of_other_shapes(precision, strategy):
     prepared = prepare_map(features, precision)
     matcher = make_matcher(prepared.features, SpatialSettings(strategy), 'cpu', precision)
     image, weights = features.strips[:, 0], features.weights[:, 0]
-    columns = np.zeros((WIDTH, 80), np.float32)
     for function, arguments, words in [
         (matcher.distances, (image[:, :-1], weights), r'strips: shape .*, expected \(7, n, 24\)'),
-        (matcher.distances, (image.astype(float), weights), r'strips: .* float32'),
         (matcher.distances, (image, weights[:3]), r'weights: shape \(3, 1\)'),
         (prepared.centering.next_query, (image[:-1],), r'strips: shape .*, expected \(7, 24\)'),
         (z_normalized, (np.ones(9, np.float32), None, np.ones(3, bool)), 'counted: shape'),
         (best_match, (SequenceDistances(np.ones(9), np.ones(3, int)), 2), 'lengths: shape'),
-        (OffsetFilter().update, (columns[:9], columns), 'query.*: shape'),
-        (OffsetFilter().update, (columns, columns[:, :3]), 'place.*: shape'),
     ]:
         with pytest.raises(InputError, match=words):
             function(*arguments)

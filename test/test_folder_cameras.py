@@ -36,7 +36,6 @@ CAMERAS = {
     'nuscenes': files('CAM_{0}/n015__CAM_{0}__{1}.jpg', 'BACK', 'FRONT', first=1532 * 10**12),
     'masks': files('{}/{:04d}.png', 'frames', 'masks'),
     'number': files('cam{}_{:04d}.jpg', '0', '1'),
-    'camel case': files('{}Camera/{:04d}.jpg', 'Left', 'Right'),
     'no word, but the same time': files('{}/{}.png', 'A', 'B', first=1305031102),
 }
 

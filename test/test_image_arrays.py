@@ -71,15 +71,6 @@ def test_an_image_of_another_kind_is_a_sentence_that_converts_it(kind, entry):
     assert len(text) < 400
 
 
-@pytest.mark.parametrize('make', [
-    Image.fromarray, np.asfortranarray, lambda image: image[::-1][::-1], memoryview,
-])  # fmt: skip
-def test_what_is_an_rgb_image_is_taken_as_it_is(make):
-    for entry in ENTRIES.values():
-        entry(make(RGB))
-    np.testing.assert_array_equal(Frame(make(RGB), 0, '').image, RGB)
-
-
 @pytest.mark.parametrize('images', [RGB, Image.fromarray(RGB), None, np.uint8(1)])
 def test_one_image_instead_of_a_list_is_a_sentence(images):
     with pytest.raises(InputError, match=r'expected a list, extract\(\[image\]\)'):
@@ -88,15 +79,10 @@ def test_one_image_instead_of_a_list_is_a_sentence(images):
 
 @pytest.mark.parametrize(('work', 'text'), [
     (lambda: build_map([RGB], EXTRACTOR, progress=False), r'ndarray: expected Frame\('),
-    (lambda: build_map([Frame(RGB, 0, '')], EXTRACTOR, [[0] * 7]), 'list: expected an array'),
     (lambda: Frame(RGB, time.time(), ''), r'stamp is of type float: .*time\.time_ns\(\)'),
-    (lambda: Frame(RGB, 0, 3), 'identifier is of type int: expected a text'),
-    (lambda: encode_thumbnail(RGB, 0), 'width of thumbnails = 0 must be at least 1'),
     (lambda: Trajectory().add(1, 'here'), r"pose 'here' is no array"),
     (lambda: Projection(np.eye(3), 'mine'), r'matrix of the projection: .*float64, .*float32'),
     (lambda: LocalFeatures(RGB / 1, RGB[0] / 1, EXTRACTOR.settings), 'strips: .*64, .*float32'),
-    (lambda: LocalFeatures(np.ones((7, 2, 9), 'f'), np.ones((7, 1), 'f'), EXTRACTOR.settings),
-     r'weights: shape \(7, 1\) float32, expected \(7, 2\)'),
 ])  # fmt: skip
 def test_other_arguments_are_named_with_what_is_expected(work, text):
     with pytest.raises(ValueError, match=text):

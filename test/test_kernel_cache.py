@@ -39,17 +39,10 @@ class _Attack:
         return (os.mkdir, ('attacked',))
 
 
-def _flipped(content):
-    middle = len(content) // 2
-    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-
-
 DAMAGE = {
     'empty': lambda content: b'',
     'cut': lambda content: content[:-1],
-    'cut_in_its_head': lambda content: content[:20],
-    'zeros_at_its_end': lambda content: content[:-512] + bytes(512),
-    'flipped': _flipped,
+    'flipped': lambda content: content[:999] + bytes([content[999] ^ 1]) + content[1000:],
     'attack': lambda content: bytes(32) + pickle.dumps(_Attack()),
     'pipe': None,
 }

@@ -90,21 +90,15 @@ def test_odometry_in_millimeters_is_named():
     poses[:, 0] = np.arange(COUNT) / 10  # 1 m/s
     stamps = np.array(STEADY)
     assert speed_oddity(stamps, poses) == speed_oddity(stamps, 0 * poses) == ''
-    assert 'odometry moves at 1000 m/s' in speed_oddity(stamps, 1000 * poses)
     poses[5] = np.nan
     assert 'perhaps it has millimeters' in speed_oddity(stamps, 1000 * poses)
-    assert speed_oddity(stamps[:2], 1000 * poses[:2]) == ''
 
 
-@pytest.mark.parametrize(
-    ('focal', 'center', 'text'),
-    [
-        (500, (320, 240), ''),
-        (1000, (640, 360), 'the center (640, 360), as of another resolution'),
-        (250, (160, 120), 'the center (160, 120), as of another resolution'),
-        (4.2, (320, 240), 'the focal length 4.2, as of another unit'),
-    ],
-)
+@pytest.mark.parametrize(('focal', 'center', 'text'), [
+    (500, (320, 240), ''),
+    (1000, (640, 360), 'the center (640, 360), as of another resolution'),
+    (4.2, (320, 240), 'the focal length 4.2, as of another unit'),
+])  # fmt: skip
 def test_intrinsics_of_another_image_are_named(focal, center, text):
     oddity = Camera(640, 480, (focal, focal), center).oddity
     assert text in oddity

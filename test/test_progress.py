@@ -34,10 +34,6 @@ def test_log_file_has_plain_lines():
     assert all(re.fullmatch(r'(extracting: )?\d of \d', line) for line in lines[:-1])
 
 
-def test_closed_standard_error_is_no_error():
-    _run(preexec_fn=lambda: os.close(2))
-
-
 @pytest.mark.parametrize(('terminal', 'has_bar'), [('xterm', True), ('dumb', False)])
 def test_terminal_that_can_move_a_bar_shows_one(terminal, has_bar):
     first, second = pty.openpty()
@@ -57,17 +53,3 @@ def test_help_has_columns_for_names_of_any_length(monkeypatch, capsys):
         (line,) = (line for line in lines if line.split(maxsplit=1)[:1] == [name])
         assert re.search(rf'^  {name} {{2,}}{re.escape(command.summary)}', line)
         assert line.index(command.summary) == len('  a_command_of_another_package  ')
-
-
-@pytest.mark.parametrize('columns', ['40', '200'])
-@pytest.mark.parametrize('name', [n for n, c in stavpr.all_commands().items() if not c.needs_ros])
-def test_help_of_commands_keeps_options_and_texts_apart(name, columns, monkeypatch, capsys):
-    monkeypatch.setenv('COLUMNS', columns)
-    with pytest.raises(SystemExit, match='0'):
-        stavpr.main([name, '--help'])
-    value = r'(-\w|--[\w-]+|[A-Z\d{\[.]\S*|\w+\|\S+|\w+(?=  |$))'
-    option = re.compile(rf' {{2,4}}(-\w|--[\w-]+)(,? {value})*( {{2,}}\S.*)?')
-    lines = [line for line in capsys.readouterr().out.splitlines() if re.match(' {2,4}-', line)]
-    assert lines
-    for line in lines:
-        assert option.fullmatch(line), line

@@ -21,9 +21,8 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_shape, require_type, rgb_image
+from stavpr_ros.checks import float_array, no_nan, rgb_image
 from stavpr_ros.compilation import kernel, reassociating_kernel
-from stavpr_ros.errors import InputError
 
 WIDTH = 192  # pixels of the compared images
 GROUND = 0.62  # the rows below this part of the height are not compared
@@ -182,12 +181,9 @@ class OffsetFilter:
 
 def _columns(columns: np.ndarray, name: str) -> np.ndarray:
     """Return columns as the kernels read them."""
-    remedy = 'columns as of describe_columns(image)'
-    require_type(name, columns, np.ndarray, remedy)
-    require_shape(f'{name}, {remedy}', columns, f'{WIDTH} {ROWS * ORIENTATIONS}', 'float32')
-    if not np.isfinite(columns).all():
-        raise InputError(f'{name} has values that are not finite: expected {remedy}')
-    return np.ascontiguousarray(columns)
+    name = f'{name}, columns as of describe_columns(image)'
+    columns = no_nan(float_array(columns, name, f'{WIDTH} {ROWS * ORIENTATIONS}'), name)
+    return columns.astype(np.float32, copy=False)
 
 
 # ------------------------------------------------ kernels

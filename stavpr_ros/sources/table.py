@@ -17,7 +17,6 @@ COMMENTS = ('#', '%', 'sep=')  # a spreadsheet writes the last one
 MIN_STAMP = 1e8  # seconds of 1973; no meters on Earth, and no number of an image
 LONGEST_REASON = 120  # characters
 FILE = re.compile(r'.*\.[a-z]\w{2,4}', re.IGNORECASE)  # the name of one
-DECIMAL_COMMAS = re.compile(r'\s*-?\d+,\d+(\s+-?\d+,\d+)+')
 
 
 class Table:
@@ -52,10 +51,7 @@ class Table:
             raise self.error('it is empty')
         self._separator = next((mark for mark in SEPARATORS if mark in first), None)
         in_spreadsheet = self._separator in (';', '\t') and '.' not in (second or first)
-        if has_commas := bool(DECIMAL_COMMAS.fullmatch(second or first)):
-            self._separator = None
-        # as German programs write numbers
-        self._point = ',' if in_spreadsheet or has_commas else '.'
+        self._point = ',' if in_spreadsheet else '.'  # as German programs write numbers
         names, cells = self._cells(first), self._cells(second or first)
         self._ended = len(cells) > 1 and not cells[-1]  # a separator ends each line
         width = len(cells) - self._ended
