@@ -3,7 +3,6 @@
 """Checks of arguments and settings at the border of the public functions."""
 
 from collections.abc import Iterable
-from functools import lru_cache
 import math
 import numbers
 import re
@@ -93,20 +92,14 @@ def require_shape(name: str, array: Any, axes: str, *dtypes: str) -> tuple[int, 
     :param dtypes: allowed types; none = any.
     :raises InputError: another shape or type.
     """
-    if not _fits(array.shape, array.dtype, axes, dtypes):
-        expected = f'({", ".join(axes.split())}) {" or ".join(dtypes)}'.rstrip()
+    words = axes.split()
+    sizes = dict(zip(words, array.shape, strict=False))
+    shape = tuple(int(word) if word.isdecimal() else sizes.get(word) for word in words)
+    is_empty = any(not size for word, size in sizes.items() if word[0].isupper())
+    if array.shape != shape or is_empty or (dtypes and array.dtype not in dtypes):
+        expected = f'({", ".join(words)}) {" or ".join(dtypes)}'.rstrip()
         raise InputError(f'{name}: shape {array.shape} {array.dtype}, expected {expected}')
     return tuple(array.shape)
-
-
-@lru_cache(1024)
-def _fits(shape: tuple[int, ...], dtype: Any, axes: str, dtypes: tuple[str, ...]) -> bool:
-    """Return whether an array has the axes and one of the types: :func:`require_shape`."""
-    words = axes.split()
-    sizes = dict(zip(words, shape, strict=False))
-    expected = tuple(int(word) if word.isdecimal() else sizes.get(word) for word in words)
-    is_empty = any(not size for word, size in sizes.items() if word[0].isupper())
-    return shape == expected and not is_empty and (not dtypes or dtype in dtypes)
 
 
 def float_array(values: np.ndarray, name: str, axes: str) -> np.ndarray:

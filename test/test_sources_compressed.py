@@ -299,13 +299,6 @@ def test_compressed_message_of_depth_is_rejected(transport):
     assert caught.value.kind == 'depth'
 
 
-def test_compressed_message_of_another_format_has_a_remedy():
-    message = SimpleNamespace(format='bgr8; JXL compressed bgr8', data=bytes(99))
-    with pytest.raises(ImageError, match='set the format of the publisher to jpeg') as caught:
-        decode_message(message)
-    assert caught.value.kind == 'format'
-
-
 @pytest.mark.parametrize('encoding', BAYER)
 @pytest.mark.parametrize('suffix', ['.png', '.tiff'])
 def test_compressed_message_of_bayer_is_demosaiced(encoding, suffix):

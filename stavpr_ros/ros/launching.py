@@ -169,31 +169,21 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
     sentences = {row.name: row.sentence for row in PARAMETERS}
     sentences |= {old: f'Earlier name of {new}.' for old, new in RENAMED.items()}
     sentences['use_sim_time'] = 'Take the time from the topic /clock.'
+    params_file = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'stavpr.yaml'])
+    rows: dict[str, tuple[Any, str]] = {
+        'image': (image, 'topic of the images'),
+        'odom': (odom, 'topic of the odometry'),
+        'camera_info': (
+            'camera_info', 'topic of the intrinsics; camera_info: the one beside the images'
+        ),
+        'namespace': ('', 'namespace of node and topics'),
+        'params_file': (params_file, 'file of the parameters of all nodes'),
+    }  # fmt: skip
+    own = (name for name in sentences if name not in fixed)
+    rows |= {name: ('', f'{sentences[name]} Empty: as set in params_file.') for name in own}
     return [
-        DeclareLaunchArgument('image', default_value=image, description='topic of the images'),
-        DeclareLaunchArgument('odom', default_value=odom, description='topic of the odometry'),
-        DeclareLaunchArgument(
-            'camera_info',
-            default_value='camera_info',
-            description='topic of the intrinsics; camera_info: the one beside the images',
-        ),
-        DeclareLaunchArgument(
-            'namespace', default_value='', description='namespace of node and topics'
-        ),
-        DeclareLaunchArgument(
-            'params_file',
-            default_value=PathJoinSubstitution(
-                [FindPackageShare(PACKAGE), 'config', 'stavpr.yaml']
-            ),
-            description='file of the parameters of all nodes',
-        ),
-        *(
-            DeclareLaunchArgument(
-                name, default_value='', description=f'{sentence} Empty: as set in params_file.'
-            )
-            for name, sentence in sentences.items()
-            if name not in fixed
-        ),
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in rows.items()
     ]
 
 

@@ -19,8 +19,6 @@ from stavpr_ros.sources import files
 
 _FILES = {'jpeg', 'jpg', 'mjpeg', 'png'}
 """Encodings of raw messages that have the bytes of a file, of cameras on USB."""
-_OTHER_FORMATS = re.compile('avif|jxl|jp2|j2k|jpeg ?2000|jpegxl|gif|heic|qoi|svg|exr|raw')
-"""Formats of compressed messages that are not read."""
 _MEASUREMENTS = re.compile(r'(8S|16S|32[SUF]|64[SUF])C\d*')
 """Encodings of depth images, vectors and other measurements, without brightness."""
 # Rows: R, G, B of Y, U, V and 1: BT.601 in the range of video (Y 16..235), as in OpenCV.
@@ -273,11 +271,7 @@ def decode_compressed_message(
     try:
         return files.decode_file(message.data, _demosaic_of(message.format), least, to_bytes)
     except ImageError as error:
-        remedy = ''
-        if _OTHER_FORMATS.search(message.format.lower()):
-            remedy = '; set the format of the publisher to jpeg or png (image_transport)'
-        text = f'format {message.format!r}: {error}{remedy}'
-        raise ImageError(text, kind='format' if remedy else error.kind) from error
+        raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
 
 
 def _demosaic_of(transport: str) -> Callable[[np.ndarray], np.ndarray] | None:
