@@ -54,6 +54,8 @@ class KernelCache(Cache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled form, in one step, if the disk lets."""
+        if data.library.has_dynamic_globals:  # addresses of this process
+            return
         try:
             rest, folder = dumps(data._reduce()), Path(self._cache_path)
             folder.mkdir(parents=True, exist_ok=True)
