@@ -315,24 +315,15 @@ def split_bag(tmp_path, request):
 NO_METADATA = r'metadata\.yaml is damaged or of another program .*: read without it'
 
 
-@pytest.mark.parametrize(
-    ('change', 'count', 'note'),
-    [
-        (lambda *files, at: None, 9, ''),
-        (lambda *files, at: at.unlink(), 9, ''),
-        (lambda *files, at: at.write_text(at.read_text()[:150]), 9, NO_METADATA),
-        (lambda *files, at: at.write_text('rosbag2_bagfile_information: {}'), 9, NO_METADATA),
-        (lambda *files, at: files[2].unlink(), 6, r'2\.\w+ is missing, /raw has 6 of 9 messages'),
-        (
-            lambda *files, at: files[1].write_bytes(b'?' * 300),
-            6,
-            r'left out: .*_1\.\w+ is damaged',
-        ),
-        (lambda *files, at: files[0].rename(files[0].with_stem('a')), 9, r'_0\.\w+ is missing'),
-        (lambda *files, at: [f.rename(f.with_name(f.name.upper())) for f in files], 9, ''),
-    ],
-    ids=['whole', 'no metadata', 'cut', 'foreign', 'no part 2', 'damaged', 'renamed', 'upper'],
-)
+@pytest.mark.parametrize(('change', 'count', 'note'), [
+    (lambda *files, at: at.unlink(), 9, ''),
+    (lambda *files, at: at.write_text(at.read_text()[:150]), 9, NO_METADATA),
+    (lambda *files, at: at.write_text('rosbag2_bagfile_information: {}'), 9, NO_METADATA),
+    (lambda *files, at: files[2].unlink(), 6, r'2\.\w+ is missing, /raw has 6 of 9 messages'),
+    (lambda *files, at: files[1].write_bytes(b'?' * 300), 6, r'left out: .*_1\.\w+ is damaged'),
+    (lambda *files, at: files[0].rename(files[0].with_stem('a')), 9, r'_0\.\w+ is missing'),
+    (lambda *files, at: [f.rename(f.with_name(f.name.upper())) for f in files], 9, ''),
+])  # fmt: skip
 def test_what_is_there_of_a_split_bag_is_read(split_bag, caplog, change, count, note):
     change(*sorted(split_bag.glob('drive_*')), at=split_bag / 'metadata.yaml')
     source = open_source(split_bag)

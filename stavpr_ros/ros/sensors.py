@@ -61,9 +61,8 @@ class OdometryInput:
 
     def oddities(self) -> list[str]:
         """Return what is odd about the last poses, for the diagnostics."""
-        if not (rows := list(self._last)):
-            return []
-        text = speed_oddity(np.array([stamp for stamp, _ in rows]), np.array([p for _, p in rows]))
+        rows = list(self._last)
+        text = speed_oddity(*map(np.array, zip(*rows, strict=True))) if rows else ''
         return [text] if text else []
 
     def close(self) -> None:

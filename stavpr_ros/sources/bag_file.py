@@ -27,14 +27,8 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 from stavpr_ros.errors import SourceError
-from stavpr_ros.sources.bag_path import (
-    MAGIC,
-    METADATA,
-    reading,
-    storage_files,
-    storage_kind,
-    ZSTD,
-)
+from stavpr_ros.sources import bag_path
+from stavpr_ros.sources.bag_path import METADATA, reading, storage_kind, ZSTD
 from stavpr_ros.sources.mcap import with_end
 from stavpr_ros.sources.notes import note_once
 from stavpr_ros.sources.video_topic import DEFINITIONS, FFMPEG, FOXGLOVE, ROS1_FFMPEG
@@ -75,11 +69,9 @@ class OpenBag:
         Only types of ``sensor_msgs`` and ``nav_msgs`` are read, equal in every distribution, and
         the ones of video topics, of which fields may follow: no definition in the bag is needed.
         """
-        return (
-            _ros1_store().deserialize_ros1(raw, kind)
-            if self.is_ros1
-            else _deserialize_cdr(raw, kind)
-        )
+        if self.is_ros1:
+            return _ros1_store().deserialize_ros1(raw, kind)
+        return _deserialize_cdr(raw, kind)
 
     def messages(
         self, topics: Collection[str], start: float = 0.0, duration: float = math.inf
@@ -102,7 +94,8 @@ class OpenBag:
                 if wanted:  # none would be all
                     parts.append(read(wanted, first if start else None, last))
             for connection, time_ns, raw in merge(*parts, key=lambda each: each[1]):
-                is_packed = not self.is_ros1 and bytes(raw[:4]) in MAGIC  # ZSTD; no start of CDR
+                # of ZSTD; no CDR starts so
+                is_packed = not self.is_ros1 and bytes(raw[:4]) in bag_path.MAGIC
                 yield connection, time_ns, zstd.decompress(raw) if is_packed else raw
 
 
@@ -167,7 +160,7 @@ def _files(folder: Path, names: list[str]) -> list[Path]:
     stated = {name.lower() for name in names}
     files = {file for file in folder.iterdir() if file.name.lower() in stated}
     if len(files) < len(names) or not names:  # perhaps renamed
-        files.update(storage_files(folder))
+        files.update(bag_path.storage_files(folder))
     others = {file.name.lower() for file in files if file.suffix.lower() != '.bag'}
     if not files or (not names and len({re.sub(r'_\d+\.', '.', each) for each in others}) > 1):
         raise SourceError(
@@ -184,10 +177,9 @@ def _note_missing(
     """Log in one line what the metadata state and the files do not have."""
     topics, present = bag.topics, {file.name.lower() for file in files}
     notes = [f'{name} is missing' for name in names if name.lower() not in present]
-    for topic, count in counts.items():
-        total = sum(each.msgcount for each in topics.get(topic, []))
-        if total < count:
-            notes.append(f'{topic} has {total} of {count} messages')
+    totals = {topic: sum(each.msgcount for each in topics.get(topic, [])) for topic in counts}
+    rows = ((topic, totals[topic], count) for topic, count in counts.items())
+    notes += [f'{topic} has {n} of {count} messages' for topic, n, count in rows if n < count]
     if notes:
         note_once(f'{bag.path} has less than its {METADATA} states: {", ".join(notes)}')
 
