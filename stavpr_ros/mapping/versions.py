@@ -8,6 +8,7 @@ Both are complete before the version replaces the map, which is one step: whatev
 program, the map is the version before or the new one.
 """
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
@@ -176,7 +177,10 @@ def _write_version(
 ) -> str:
     """Write a version, beside the present one, into the history; return its id."""
     folder, old = history_of(path), _file(path, before)
-    if not _is_sound(old, before.map_id):
+    is_sound = False
+    with suppress(MapFileError):
+        is_sound = load_map(old).map_id == before.map_id
+    if not is_sound:
         old.unlink(missing_ok=True)
         _copy(Path(path), old, False)
     features = open_map(path).features
@@ -185,14 +189,6 @@ def _write_version(
     map_id = save_map(place_map, new, storage, force=True, statistics=statistics)
     new.replace(folder / f'{map_id}.stavpr')
     return map_id
-
-
-def _is_sound(file: Path, map_id: str) -> bool:
-    """Return whether a file is a version, undamaged."""
-    try:
-        return load_map(file).map_id == map_id
-    except MapFileError:
-        return False
 
 
 def _file(path: str | Path, version: Version) -> Path:
