@@ -49,6 +49,7 @@ def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(taught, tmp_pa
     assert driven[-1] > 25
     assert drive.within(0.5) >= 0.95
     assert drive.within(1.0, after=15.0) == 1.0
+    assert drive.presses == 0
     covered = drive.times >= COVERED
     assert drive.speeds[covered][0] > 1
     assert drive.speeds[covered & (drive.times > COVERED + 1)].max() < 0.05
@@ -71,6 +72,7 @@ def test_robot_stops_within_a_second_where_the_camera_shows_another_route(taught
 
     drive = repeat(taught, CONDITIONS['day'], 14.0, begin=10, change=change)
     assert drive.speeds[drive.times < 12][-1] > 2
+    assert drive.presses == 0
     assert drive.speeds[drive.times >= 13].max() < 0.05
 
 

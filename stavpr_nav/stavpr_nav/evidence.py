@@ -23,8 +23,8 @@ ARM = 0.5  # meters
 SAME_PLACE = 0.05  # meters between two places that show the same
 BRIDGE_TIME = 6.0  # seconds of the taught run without a match, of images that change
 SLIP = 1.2  # meters that are commanded per meter to the next place, of wheels that slip
-MIN_LEAD, MAX_LEAD = 0.5, 1.5  # meters that a match is ahead of the commanded ones, and counts
-LEAD_GAIN = 0.1  # share by which the commanded meters are corrected at a new place
+MIN_JITTER, MAX_JITTER = 0.5, 1.5  # meters, of matches against the commanded ones, that count
+MEMORY = 10  # latest new places whose jitter counts
 PERIODS = 1.25  # of images, after this distance or the next place
 INTERVALS = 3  # of the latest images, whose median is the period
 CELLS = (16, 12)  # columns and rows of the gray levels that are compared
@@ -82,8 +82,6 @@ class MotionEvidence:
         self._lap = math.inf if seam is None else float(meters[-1] - meters[seam])
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._stamp = -math.inf
-        # position by the commanded meters, less these; by how much the last match is ahead of it
-        self._start, self._lead = math.nan, 0.0
         self.restart(np.zeros(3))
 
     def restart(self, totals: np.ndarray, place: int = -1) -> None:
@@ -98,6 +96,8 @@ class MotionEvidence:
         self._matched, self._place = np.zeros(len(self._meters), bool), -1
         self._totals, self._changed = totals, totals[0]
         self.bridge, self.is_changed = 0.0, True
+        # by how much the latest new places are ahead of the commanded meters, but for a constant
+        self._ahead: deque[float] = deque([0.0], MEMORY)
         if place >= 0:
             self._mark(place, totals)
 
@@ -138,18 +138,17 @@ class MotionEvidence:
         driven = totals - self._totals
         period = float(np.median(self._intervals)) if self._intervals else self._max_period
         seconds = PERIODS * period + delay
-        demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + self._lead
+        # matches that were ahead stay at a place until the robot is there
+        jitter = min(max(max(self._ahead) - min(self._ahead) - MIN_JITTER, 0.0), MAX_JITTER)
+        demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + jitter
         return bool(driven[:2].max() > demanded and driven[2] > self.bridge)
 
     def _mark(self, place: int, totals: np.ndarray) -> None:
         """Mark a place as matched, and those of the far half of a lap no longer."""
+        if self._place >= 0:
+            step = math.remainder(self._meters[place] - self._meters[self._place], self._lap)
+            self._ahead.append(self._ahead[-1] + step - (totals[0] - self._totals[0]))
         self._place = place
-        if math.isnan(self._start):
-            self._start = self._meters[place] - totals[0]
-        # after a standstill matches may run ahead; they stay at a place until the robot is there
-        lead = math.remainder(self._meters[place] - self._start - totals[0], self._lap)
-        self._lead = min(max(lead - MIN_LEAD, 0.0), MAX_LEAD)
-        self._start += LEAD_GAIN * lead
         away = abs(self._meters - self._meters[place])
         around = away % self._lap
         self._matched &= np.minimum(around, self._lap - around) < self._lap / 4

@@ -194,12 +194,26 @@ def test_odometry_that_disagrees_or_ends_stops_the_robot(x, reason, options):
     assert last.reason == reason
 
 
-@pytest.mark.parametrize(('place', 'added'), [(5, 0.0), (9, 0.5), (19, 1.5)])
-def test_match_ahead_of_the_commanded_meters_allows_for_the_distance(place, added):
-    """Up to a limit: after 1.25 m, the match of a place at 1.25, 2.25 or 4.75 m."""
+@pytest.mark.parametrize(
+    ('places', 'added'),
+    [
+        ([1, 2, 3], 0.0),
+        ([5, 7, 6, 4, 8], 0.75),  # by 0 to 1.25 m
+        ([13, 14, 15], 1.5),  # up to a limit
+        ([13, *range(2, 13), *range(14, 20)], 0.0),  # of the latest ones
+    ],
+)
+def test_matches_ahead_of_or_behind_the_commanded_meters_allow_for_the_distance(places, added):
+    """A place each 0.25 m."""
     evidence = MotionEvidence(0.25 * np.arange(25), None, 0.1)
     evidence.restart(np.zeros(3), 0)
-    evidence.take(Observation(1.0, place, 0.9, None), np.array([1.25, 0, 1.25]), 0.0)
+    for k, place in enumerate(places):
+        meters = 0.25 * (k + 1)
+        evidence.is_changed = True
+        evidence.take(Observation(meters, place, 0.9, None), np.array([meters, 0, meters]), 0.0)
     for margin in (-0.01, 0.01):
-        meters = 1.25 + 0.3 + added + margin
-        assert evidence.is_due(np.array([meters, 0, meters]), 0.0) == (margin > 0)
+        late = meters + 0.3 + added + margin
+        assert evidence.is_due(np.array([late, 0, late]), 0.0) == (margin > 0)
+    evidence.restart(np.array([late, 0, late]))
+    for meters in (late + 0.29, late + 0.31):
+        assert evidence.is_due(np.array([meters, 0, meters]), 0.0) == (meters > late + 0.3)
