@@ -158,11 +158,9 @@ class MotionEvidence:
         """Return the meters to the next place that was not matched; 0 at the end of the route."""
         if self._place < 0:
             return 0.0
-        away = self._meters - self._meters[self._place]
-        if math.isfinite(self._lap):
-            away = away % self._lap
-        ahead = away[~self._matched & (away > 0)]
-        return float(ahead.min()) if len(ahead) else 0.0
+        away = (self._meters - self._meters[self._place]) % self._lap  # of an open route, or inf
+        ahead = float(away[~self._matched & (away > 0)].min(initial=math.inf))
+        return ahead if math.isfinite(ahead) else 0.0
 
 
 class OdometryComparison:

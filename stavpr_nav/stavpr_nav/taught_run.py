@@ -81,24 +81,18 @@ def taught_places(
     if index is None or len(sessions) == 1:
         return np.arange(len(place_map))
 
-    def is_part(number: int, name: str) -> bool:
-        return re.fullmatch(rf'{re.escape(name)}(-\d+)*', sessions[number].id) is not None
-
-    possible = np.unique(index[_is_covered(place_map.stamps / SECOND, velocities)]).tolist()
-    possible = [number for number in possible if not session or is_part(number, session)]
-    if not possible:
+    covered = np.unique(index[_is_covered(place_map.stamps / SECOND, velocities)]).tolist()
+    name = session or next((sessions[number].id for number in covered), '')
+    of_name = re.compile(rf'{re.escape(name)}(-\d+)*')
+    parts = [number for number in covered if of_name.fullmatch(sessions[number].id)]
+    if not parts:
         raise InputError(
             f'no session {session!r} of the map was recorded with the velocities: it has '
             f'{[each.id for each in sessions]}; correct the line {SESSION!r} of the run, or take '
             'map and run of one drive'
         )
-    first = sessions[possible[0]]
-    parts = [
-        number
-        for number in possible
-        if is_part(number, session or first.id) and replace(sessions[number], id=first.id) == first
-    ]
-    return np.flatnonzero(np.isin(index, parts))
+    is_same = [replace(each, id='') == replace(sessions[parts[0]], id='') for each in sessions]
+    return np.flatnonzero(np.isin(index, [number for number in parts if is_same[number]]))
 
 
 def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
@@ -110,12 +104,11 @@ def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
 
     :param taught: places of the taught session, ascending, shape (n,).
     """
-    n, numbers = len(place_map), np.arange(len(place_map))
-    roots = numbers if place_map.same_as is None else place_map.same_as
-    of_root = np.full(n, -1)
-    of_root[roots[taught][::-1]] = np.arange(len(taught))[::-1]  # the first one of several
+    roots = np.arange(len(place_map)) if place_map.same_as is None else place_map.same_as
+    numbers, of_root = np.arange(len(taught)), np.full(len(place_map), -1)
+    of_root[roots[taught][::-1]] = numbers[::-1]  # the first one of several
     result = of_root[roots]
-    result[taught] = np.arange(len(taught))
+    result[taught] = numbers
     index = place_map.session_index
     for session in range(len(place_map.sessions)) if index is not None else ():
         related = np.flatnonzero((index == session) & (result >= 0))
@@ -170,9 +163,7 @@ def taught_run(
 
 def _stamps(stamps: np.ndarray, velocities: np.ndarray | None) -> np.ndarray:
     """Return the stamps of places, between those beside where an update renewed the images."""
-    is_own = _is_covered(stamps, velocities)
-    if velocities is None:
-        is_own = (stamps >= stamps[0]) & (stamps <= stamps[-1])
+    is_own = _is_covered(stamps, stamps[[0, -1], None] if velocities is None else velocities)
     is_own[[0, -1]] = True
     return np.interp(np.arange(len(stamps)), np.flatnonzero(is_own), stamps[is_own])
 
