@@ -17,13 +17,12 @@ from test_driver import Drive
 from test_follower import FAST, Run, STEP, STRAIGHT, taught
 
 rng = np.random.default_rng(0)
+TEXTURE = cv2.resize(rng.integers(0, 256, (30, 60, 3), np.uint8), (960, 480))
 
 
-def scene(shift=0):
+def scene(shift=0.0):
     """Return an image of a texture that moves by pixels."""
-    texture = np.random.default_rng(1).integers(0, 256, (30, 60, 3), np.uint8)
-    large = cv2.resize(texture, (960, 480), interpolation=cv2.INTER_CUBIC)
-    return np.ascontiguousarray(large[:, shift : shift + 640])
+    return cv2.warpAffine(TEXTURE, np.float32([[1, 0, -shift], [0, 1, 0]]), (640, 480))
 
 
 def noisy(image):
@@ -31,8 +30,7 @@ def noisy(image):
 
 
 def recompressed(image):
-    packed = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
-    return cv2.imdecode(packed, cv2.IMREAD_COLOR)
+    return cv2.imdecode(cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], 1)
 
 
 def with_clock(image):
@@ -41,23 +39,18 @@ def with_clock(image):
 
 
 @pytest.mark.parametrize(
-    ('change', 'ring'), [(np.copy, 4), (noisy, 1), (recompressed, 1), (with_clock, 1)]
+    ('change', 'images'),
+    [
+        (np.copy, [scene(8 * k) for k in range(4)]),  # of a ring of buffers
+        (np.copy, [np.zeros((480, 640, 3), np.uint8)]),
+        *((change, [scene()]) for change in (noisy, recompressed, with_clock)),
+    ],
 )
-def test_repeated_images_are_not_new(change, ring):
-    """Also those of a ring of buffers."""
-    comparison, images = ImageComparison(), [scene(8 * k) for k in range(ring)]
+def test_repeated_images_are_not_new(change, images):
+    comparison = ImageComparison()
     assert all(map(comparison.is_new, images))
     assert not any(comparison.is_new(change(image)) for image in images * 8)
-    assert comparison.is_new(scene(8 * ring - 4))
-
-
-def test_slow_motion_adds_up_to_a_new_image_and_a_dark_one_has_none():
-    comparison = ImageComparison()
-    slow = [cv2.warpAffine(scene(), np.float32([[1, 0, -k / 10], [0, 1, 0]]), (600, 480))
-            for k in range(40)]  # fmt: skip
-    assert 2 <= sum(map(comparison.is_new, slow)) < 40
-    dark = np.zeros((480, 640, 3), np.uint8)
-    assert [comparison.is_new(dark) for _ in range(3)] == [True, False, False]
+    assert 2 <= sum(comparison.is_new(scene(k / 10 - 20)) for k in range(40)) < 40  # slow motion
 
 
 @pytest.mark.parametrize(
@@ -84,12 +77,12 @@ def test_only_places_that_were_not_matched_are_evidence(places, count, meters, s
 
 def blocked(drive, is_new=True):
     """Drive with blocked wheels: images of one place; return the meters that are commanded."""
-    meters = 0.0
+    meters, driver = 0.0, drive.driver
     for _ in range(round(8 / STEP)):
+        driver.press(drive.time)
         shown = Observation(drive.time, int(drive.place), 1.0, STRAIGHT, is_new)
-        drive.driver.press(drive.time)
-        drive.driver.observe(shown, drive.time)
-        meters += drive.driver.step(drive.time).speed * STEP
+        driver.observe(shown, drive.time)
+        meters += driver.step(drive.time).speed * STEP
         drive.time += STEP
     return meters
 
@@ -102,8 +95,7 @@ def test_emergency_stop_needs_a_new_press(is_new, start):
         assert drive.go(1, pressed=False)[-1].reason == PAUSED  # before the stop: no press for it
         drive.go(start)
     assert blocked(drive, is_new) < 0.8
-    assert drive.driver.command.reason == NO_EVIDENCE
-    assert {command.speed for command in drive.go(3)} == {0}  # its release
+    assert {command.reason for command in drive.go(3)} == {NO_EVIDENCE}  # after its release, too
     assert drive.go(1, pressed=False)[-1].reason == NO_EVIDENCE
     commands = drive.go(4)
     assert 0 < max(c.speed for c in commands[:10]) <= 0.3
@@ -112,52 +104,53 @@ def test_emergency_stop_needs_a_new_press(is_new, start):
 
 def test_release_or_restart_go_on_and_gaps_of_the_program_do_not():
     drive = Drive(Goal(start=0), n=90, needs_deadman=False, give_up_after=0.0)
-    assert not drive.driver.restart()
+    driver = drive.driver
+    assert not driver.restart()
     drive.go(4)
     drive.time += 3.0  # the program was suspended, or the clock was set forward
     assert max(command.speed for command in drive.go(0.5)) <= 0.3
     drive.go(4)
     blocked(drive)
     drive.time += 3.0
-    drive.driver.press(drive.time)
     assert drive.go(2)[-1].reason == NO_EVIDENCE
-    drive.driver.release()
-    drive.driver.press(drive.time)
-    assert not drive.driver.is_blocked
+    driver.release()
+    driver.press(drive.time)
+    assert not driver.is_blocked
     blocked(drive)
-    assert drive.driver.restart()
+    assert driver.restart()
     assert drive.go(5)[-1].speed == pytest.approx(0.8)
     again = Driver(drive.run, Goal(start=0), 0.0, FAST, is_blocked=True)  # the next goal
-    again.press(0.1)
-    assert again.step(0.1).reason == NO_EVIDENCE
-    again.press(0.2 + 2 * DEADMAN_AGE)
-    assert again.is_blocked  # no step between: suspended
+    for now in (0.1, 0.2 + 2 * DEADMAN_AGE):  # the second one suspended: no step between
+        again.press(now)
+        assert again.is_blocked
 
 
-def look(run, place=None, **shown):
-    """Observe an image without a match, or of a place, and take one step; return the command."""
-    at, probability = (run.follower.expected_place(), math.nan) if place is None else (place, 0.99)
-    run.follower.observe(Observation(run.time, at, probability, STRAIGHT, **shown), run.time)
-    return run.drive(STEP, images=False)[0]
+def look(run, count, has_match=False, is_new=1, is_compared=1):
+    """Take steps with an image each; each n-th is new or compared, 0 = none; return the speeds."""
+    speeds = []
+    for k in range(count):
+        new, compared = (n > 0 and k % n == 0 for n in (is_new, is_compared))
+        shown = run.follower.expected_place(), math.nan
+        if has_match and compared:
+            shown = int(run.place), 0.99
+        run.follower.observe(Observation(run.time, *shown, STRAIGHT, new, compared), run.time)
+        speeds.append(run.drive(STEP, images=False)[0].speed)
+    return speeds
 
 
 def test_skipped_images_keep_the_speed_and_are_no_evidence():
     run = Run(run=taught(400))
-    commands = [
-        look(run, None if k % 2 else int(run.place), is_compared=k % 2 == 0) for k in range(300)
-    ]
-    assert {command.speed for command in commands[100:]} == {0.8}
-    assert [look(run, is_compared=False) for _ in range(100)][-1].speed == 0
+    assert set(look(run, 300, True, is_compared=2)[100:]) == {0.8}
+    assert look(run, 100, is_compared=0)[-1] == 0
 
 
 def test_bridge_of_slow_motion_includes_skipped_and_equal_images_and_no_frozen_ones():
     run = Run(run=taught(400))
     run.follower.start(5)
-    speeds = [look(run, is_new=k % 6 == 0, is_compared=k % 3 == 0).speed for k in range(200)]
-    assert sum(speeds) * STEP == pytest.approx(0.3 * 200 * STEP, abs=0.1)  # beyond the next place
-    frozen = [look(run, is_new=False, is_compared=k % 3 == 0) for k in range(200)]
-    assert 0.1 < sum(command.speed for command in frozen) * STEP < 0.4
-    assert frozen[-1].reason == NO_EVIDENCE
+    meters = sum(look(run, 200, is_new=6, is_compared=3)) * STEP
+    assert meters == pytest.approx(0.3 * 200 * STEP, abs=0.1)  # beyond the next place
+    assert 0.1 < sum(look(run, 200, is_new=0, is_compared=3)) * STEP < 0.4
+    assert run.follower.command(run.time).reason == NO_EVIDENCE
 
 
 def test_images_out_of_order_or_of_the_future_are_not_used():
@@ -171,25 +164,24 @@ def test_images_out_of_order_or_of_the_future_are_not_used():
 
 
 @pytest.mark.parametrize(
-    ('x', 'reason', 'options'),
+    ('pose', 'reason'),  # x, stamp and frame by the meters that are driven, and the time
     [
-        (lambda x, t: x, '', {}),
-        (lambda x, t: min(x, 2.0), NO_EVIDENCE, {}),  # frozen, or blocked wheels
-        (lambda x, t: 3 * x, NO_EVIDENCE, {}),  # moves, and the places do not
-        (lambda x, t: x + 50 * (t > 4), '', {}),  # one jump
-        (lambda x, t: x + 50 * (round(t / STEP) % 2), 'no odometry', {}),
-        (lambda x, t: x if t < 4 else math.nan, 'no odometry', {}),
-        (lambda x, t: x, 'no odometry', {'stamp': lambda t: min(t, 4.0)}),
-        (lambda x, t: x, 'no odometry', {'frame': lambda t: 'ab'[round(t / STEP) % 2]}),
+        (lambda x, t: (x, t, 'odom'), ''),
+        (lambda x, t: (min(x, 2.0), t, 'odom'), NO_EVIDENCE),  # frozen, or blocked wheels
+        (lambda x, t: (3 * x, t, 'odom'), NO_EVIDENCE),  # moves, and the places do not
+        (lambda x, t: (x + 50 * (t > 4), t, 'odom'), ''),  # one jump
+        (lambda x, t: (x + 50 * (round(t / STEP) % 2), t, 'odom'), 'no odometry'),
+        (lambda x, t: (x if t < 4 else math.nan, t, 'odom'), 'no odometry'),
+        (lambda x, t: (x, min(t, 4.0), 'odom'), 'no odometry'),
+        (lambda x, t: (x, t, 'ab'[round(t / STEP) % 2]), 'no odometry'),
     ],
 )
-def test_odometry_that_disagrees_or_ends_stops_the_robot(x, reason, options):
-    stamp, frame = options.get('stamp', float), options.get('frame', lambda t: 'odom')
+def test_odometry_that_disagrees_or_ends_stops_the_robot(pose, reason):
     drive = Drive(Goal(start=0), n=90, odometry=(odometry := OdometryComparison(1.0)))
     for _ in range(round(8 / STEP)):
-        now, pose = drive.time, np.array([x(drive.place * 0.4, drive.time), 1, 3, 0, 0, 0, 1.0])
+        x, stamp, frame = pose(drive.place * 0.4, drive.time)
         with contextlib.suppress(InputError):
-            odometry.take(frame(now), stamp(now), pose, now)
+            odometry.take(frame, stamp, np.array([x, 1, 3, 0, 0, 0, 1.0]), drive.time)
         last = drive.go(STEP)[-1]
     assert last.reason == reason
 
