@@ -127,8 +127,8 @@ class Rover:
         self.send(start_index=3)
         self.until(lambda: self.place > 5)
 
-    def reason(self):
-        return self.feedback[-1].reason if self.feedback else ''
+    def until_reason(self, reason):
+        self.until(lambda: self.feedback and self.feedback[-1].reason == reason)
 
     def drives(self):
         return bool(self.commands) and self.commands[-1].linear.x > 0
@@ -165,10 +165,12 @@ def repeat(context, rover, map_file):
 
 def test_goal_is_reached_with_feedback_and_velocities_stop(rover, repeat):
     repeat()
-    handle = rover.send(place_index=9, start_index=3)
-    assert handle.accepted
-    answer = rover.result_of(handle.get_result_async())
-    result = answer.result
+    rover.status = PlaceMatch.NO_MATCH
+    handle = rover.send(place_index=9)
+    rover.until(lambda: len(rover.feedback) > 5)
+    assert not rover.commands  # an operator drives until the first match
+    rover.status = PlaceMatch.MATCH
+    result = rover.result_of(handle.get_result_async()).result
     assert (result.code, result.place_index, result.message) == (Repeat.Result.REACHED, 9, '')
     assert result.distance == pytest.approx(6, abs=1.5)
     assert rover.rests()
@@ -219,8 +221,7 @@ def test_robot_stands_without_switch_matches_or_images_and_goal_is_canceled(rove
     assert node.counts['failed images'] > 0
     canceled = rover.result_of(handle.cancel_goal_async())
     assert len(canceled.goals_canceling) == 1
-    answer = rover.result_of(handle.get_result_async())
-    assert answer.result.code == Repeat.Result.CANCELED
+    assert rover.result_of(handle.get_result_async()).result.code == Repeat.Result.CANCELED
     assert rover.rests()
 
 
@@ -230,13 +231,13 @@ def test_robot_without_evidence_of_motion_waits_for_a_press_or_start(rover, repe
     repeat(give_up_after=0.0, require_deadman=needs_deadman)
     rover.begin()
     rover.is_blocked = True
-    rover.until(lambda: rover.reason() == NO_EVIDENCE)
+    rover.until_reason(NO_EVIDENCE)
     rover.is_blocked = False
     for rover.pressed in (True, not needs_deadman):
         rover.commands.clear()
         rover.until(lambda: len(rover.commands) > 20)
         assert not any(command.linear.x for command in rover.commands)
-        assert rover.reason() == NO_EVIDENCE
+        assert rover.feedback[-1].reason == NO_EVIDENCE
     rover.pressed = True
     if not needs_deadman:
         for success in (True, False):
@@ -285,7 +286,7 @@ def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, rep
     repeat(give_up_after=0.0, use_sim_time=True)
     rover.begin()
     rover.is_paused = True
-    rover.until(lambda: rover.reason() == 'the clock does not advance')
+    rover.until_reason('the clock does not advance')
     assert rover.rests()
     rover.is_paused = False
     rover.until(rover.drives)
@@ -296,33 +297,11 @@ def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, rep
         assert abs(rover.feedback[-1].place_index - rover.place) <= 2
 
 
-def test_nothing_is_published_before_the_first_match(rover, repeat):
-    repeat()
-    rover.status = PlaceMatch.NO_MATCH
-    rover.send()
-    rover.until(lambda: len(rover.feedback) > 5)
-    assert not rover.commands
-    rover.status = PlaceMatch.MATCH
-    rover.until(rover.drives)
-
-
-def test_other_type_of_velocity_rejects_the_goal(rover, repeat, capfd):
-    node, other = repeat(), rclpy.Context()
-    rclpy.init(context=other, domain_id=DOMAIN)
-    base = rclpy.create_node('base', context=other)
-    base.create_subscription(TwistStamped, 'cmd_vel', print, 10)
-    rover.until(lambda: len(node.get_subscriptions_info_by_topic('cmd_vel')) == 2)
-    assert not rover.send(start_index=3).accepted
-    assert 'msg/Twist: set the parameter stamped to True' in capfd.readouterr().err
-    base.destroy_node()
-    rclpy.shutdown(context=other)
-
-
 def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
     repeat(use_odometry=True, give_up_after=0.0)
     odometry = rover.node.create_publisher(Odometry, 'odom', 10)
     rover.send(start_index=3)
-    rover.until(lambda: rover.reason() == 'no odometry')
+    rover.until_reason('no odometry')
 
     def wheels():
         message = Odometry(header=Header(stamp=rover.node.get_clock().now().to_msg()))
@@ -330,7 +309,7 @@ def test_odometry_that_does_not_come_or_stands_stops_the_robot(rover, repeat):
         odometry.publish(message)
 
     rover.node.create_timer(0.05, wheels)
-    rover.until(lambda: rover.reason() == NO_EVIDENCE)
+    rover.until_reason(NO_EVIDENCE)
 
 
 def test_two_laps_of_a_closed_map(rover, repeat, map_file, tmp_path):
@@ -368,8 +347,7 @@ def test_map_of_several_sessions_is_repeated_by_matches_of_any(rover, repeat, ma
     assert 3 <= rover.offsets[-1].place_index <= 9
     assert not rover.send(place_index=n + 45).accepted
     rover.place = n + 45.0  # beside the taught run
-    handle = rover.send(start_index=3)
-    result = rover.result_of(handle.get_result_async()).result
+    result = rover.result_of(rover.send(start_index=3).get_result_async()).result
     assert (result.code, result.distance) == (Repeat.Result.LOST, 0)
 
 
@@ -394,10 +372,18 @@ def test_node_that_ends_stops_the_robot(rover, repeat):
     rover.until(rover.rests)
 
 
-def test_goals_that_are_not_on_the_route_are_rejected(rover, repeat):
-    repeat()
+def test_goals_off_the_route_or_for_another_type_of_velocity_are_rejected(rover, repeat, capfd):
+    node, other = repeat(), rclpy.Context()
     for goal in ({'place_index': 60}, {'place_id': 'nowhere'}, {'laps': 2}):
         assert not rover.send(**goal).accepted
+    rclpy.init(context=other, domain_id=DOMAIN)
+    base = rclpy.create_node('base', context=other)
+    base.create_subscription(TwistStamped, 'cmd_vel', print, 10)
+    rover.until(lambda: len(node.get_subscriptions_info_by_topic('cmd_vel')) == 2)
+    assert not rover.send(start_index=3).accepted
+    assert 'msg/Twist: set the parameter stamped to True' in capfd.readouterr().err
+    base.destroy_node()
+    rclpy.shutdown(context=other)
 
 
 @pytest.mark.parametrize('rover', [TwistStamped], indirect=True)
@@ -405,9 +391,8 @@ def test_lost_robot_gives_up_and_velocities_may_be_stamped(rover, repeat):
     repeat(give_up_after=0.5, stamped=True, base_frame='base')
     rover.status = PlaceMatch.NO_MATCH
     handle = rover.send()
-    answer = rover.result_of(handle.get_result_async())
-    assert answer.result.code == Repeat.Result.LOST
-    assert answer.result.place_index == -1
+    result = rover.result_of(handle.get_result_async()).result
+    assert (result.code, result.place_index) == (Repeat.Result.LOST, -1)
     rover.until(lambda: rover.commands)
     assert rover.commands[-1].header.frame_id == 'base'
 
