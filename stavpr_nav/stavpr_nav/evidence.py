@@ -20,13 +20,11 @@ from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
 
 MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places are dense
 ARM = 0.5  # meters
-SAME_PLACE = 0.05  # meters between two places that show the same
 BRIDGE_TIME = 6.0  # seconds of the taught run without a match, of images that change
 SLIP = 1.2  # meters that are commanded per meter to the next place, of wheels that slip
 MIN_JITTER, MAX_JITTER = 0.5, 1.5  # meters, of matches against the commanded ones, that count
 MEMORY = 10  # latest new places whose jitter counts
 PERIODS = 1.25  # of images, after this distance or the next place
-INTERVALS = 3  # of the latest images, whose median is the period
 CELLS = (16, 12)  # columns and rows of the gray levels that are compared
 EQUAL_QUANTILE, EQUAL = 0.75, 0.012  # of the changes of the cells, over the contrast
 IMAGES = 5  # latest different images: a driver may repeat a ring of its buffers
@@ -78,10 +76,9 @@ class MotionEvidence:
     """
 
     def __init__(self, meters: np.ndarray, seam: int | None, max_period: float) -> None:
-        self._meters, self._seam, self._max_period = meters, seam, max_period
+        self._meters, self._max_period = meters, max_period
         self._lap = math.inf if seam is None else float(meters[-1] - meters[seam])
-        self._intervals: deque[float] = deque(maxlen=INTERVALS)
-        self._stamp = -math.inf
+        self._stamp, self._period = -math.inf, max_period  # of compared images
         self.restart(np.zeros(3))
 
     def restart(self, totals: np.ndarray, place: int = -1) -> None:
@@ -114,8 +111,8 @@ class MotionEvidence:
         :param speed: m/s that is commanded.
         """
         if image.is_compared:
-            self._intervals.append(min(image.stamp - self._stamp, self._max_period))
-            self._stamp = image.stamp
+            interval = max(image.stamp - self._stamp, self._period / 2)  # some come in bursts
+            self._stamp, self._period = image.stamp, min(interval, self._max_period)
         if image.is_new:
             self._changed = totals[0]
         if image.is_matched or totals[0] - self._changed > MIN_DISTANCE:
@@ -136,8 +133,7 @@ class MotionEvidence:
         :param delay: seconds until an image is processed.
         """
         driven = totals - self._totals
-        period = float(np.median(self._intervals)) if self._intervals else self._max_period
-        seconds = PERIODS * period + delay
+        seconds = PERIODS * self._period + delay
         # matches that were ahead stay at a place until the robot is there
         jitter = min(max(max(self._ahead) - min(self._ahead) - MIN_JITTER, 0.0), MAX_JITTER)
         demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + jitter
@@ -152,7 +148,7 @@ class MotionEvidence:
         away = abs(self._meters - self._meters[place])
         around = away % self._lap
         self._matched &= np.minimum(around, self._lap - around) < self._lap / 4
-        self._matched |= away < SAME_PLACE
+        self._matched |= away < MIN_MOTION
 
     def _next(self) -> float:
         """Return the meters to the next place that was not matched; 0 at the end of the route."""
