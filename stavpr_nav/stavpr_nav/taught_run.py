@@ -109,14 +109,14 @@ def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
     of_root[roots[taught][::-1]] = numbers[::-1]  # the first one of several
     result = of_root[roots]
     result[taught] = numbers
-    index = place_map.session_index
-    for session in range(len(place_map.sessions)) if index is not None else ():
-        related = np.flatnonzero((index == session) & (result >= 0))
-        for before, after in pairwise(related.tolist()):
-            gap, ahead = after - before, result[after] - result[before]
-            if 1 < gap <= MAX_UNRELATED and 0 <= ahead <= 2 * gap:
-                steps = np.arange(1, gap) / gap
-                result[before + 1 : after] = np.rint(result[before] + steps * ahead)
+    if (index := place_map.session_index) is None:
+        return result
+    for before, after in pairwise(np.flatnonzero(result >= 0).tolist()):
+        gap, ahead = after - before, result[after] - result[before]
+        is_short = 1 < gap <= MAX_UNRELATED and index[before] == index[after]
+        if is_short and 0 <= ahead <= 2 * gap:
+            steps = np.arange(1, gap) / gap
+            result[before + 1 : after] = np.rint(result[before] + steps * ahead)
     return result
 
 

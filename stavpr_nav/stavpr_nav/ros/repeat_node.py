@@ -143,9 +143,7 @@ class RepeatNode(Node):
         best_effort = qos_profile_sensor_data  # receives from reliable publishers as well
         self.create_subscription(*images, self._on_image, best_effort)
         self.create_subscription(PlaceMatch, values['match_topic'], self._on_match, 10)
-        self.create_subscription(
-            CameraInfo, camera_info_topic(self), self._on_camera, qos_profile_sensor_data
-        )
+        self.create_subscription(CameraInfo, camera_info_topic(self), self._on_camera, best_effort)
         self.create_subscription(Bool, 'deadman', self._on_deadman, best_effort)
         if values['use_odometry']:
             self._odometry = OdometryComparison(self._settings.max_speed)
