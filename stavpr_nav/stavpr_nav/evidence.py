@@ -30,8 +30,7 @@ EQUAL_QUANTILE, EQUAL = 0.75, 0.012  # of the changes of the cells, over the con
 IMAGES = 5  # latest different images: a driver may repeat a ring of its buffers
 STILL_DISTANCE = 0.2  # meters that are commanded while odometry stays within MIN_MOTION
 MIN_MOTION = 0.02  # meters
-JUMP = 0.5  # meters between two odometry messages beyond twice the largest speed
-MAX_SECONDS = 1.0  # between them
+MAX_STEP = 0.5  # seconds between two messages or commands; beyond it program or clock has jumped
 
 
 def path_speed(speed: Any, turn: Any) -> Any:
@@ -163,7 +162,7 @@ class OdometryComparison:
     """
     The motion of the wheels, by the poses of odometry.
 
-    :param max_speed: m/s; faster poses are jumps.
+    :param max_speed: m/s; steps of twice as much in ``MAX_STEP`` are jumps.
 
     ``received``: when the latest valid pose came; ``meters`` since :meth:`take_meters`;
     ``commanded``: meters that were commanded until the robot moved last.
@@ -188,12 +187,12 @@ class OdometryComparison:
             self._from = pose
             return
         seconds, step = stamp - last[1], _length(last[2], pose)
-        is_motion = step <= 2 * self._max_speed * seconds + JUMP
-        if last[0] != frame or not 0 < seconds <= MAX_SECONDS or not is_motion:
+        is_motion = step <= 2 * self._max_speed * MAX_STEP
+        if last[0] != frame or not 0 < seconds <= MAX_STEP or not is_motion:
             self._from = pose
             raise InputError(
                 f'{step:.2f} m and {seconds:.3f} s from frame {last[0]!r} to {frame!r}: expected '
-                f'one frame, up to {MAX_SECONDS:g} s, and {self._max_speed:g} m/s'
+                f'one frame, up to {MAX_STEP:g} s, and {self._max_speed:g} m/s'
             )
         self.meters, self.received = self.meters + step, now
 

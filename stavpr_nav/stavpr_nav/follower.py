@@ -25,7 +25,13 @@ from functools import cached_property
 import math
 
 import numpy as np
-from stavpr_nav.evidence import BRIDGE_TIME, MotionEvidence, OdometryComparison, path_speed
+from stavpr_nav.evidence import (
+    BRIDGE_TIME,
+    MAX_STEP,
+    MotionEvidence,
+    OdometryComparison,
+    path_speed,
+)
 from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError, SettingsError
 
@@ -37,7 +43,6 @@ MAX_STEER, MAX_APPROACH = 0.2, 0.1
 INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image, of summands too
 BRIDGE_SHARE = 0.5  # share of the speed without a match
 CREEP = 0.3  # m/s from a standstill to the first evidence of motion
-MAX_STEP = 0.5  # seconds between two commands; beyond it the program or the clock has jumped
 NO_EVIDENCE = 'no evidence of motion: press the dead-man switch again, or call ~/start'
 FALL, MEMORY = 0.3, 10  # share of the recent similarity that is dissimilar; images of its mean
 FIRST = 3  # successive confirmed images, from which on the robot moves
