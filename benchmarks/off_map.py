@@ -446,7 +446,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = options_parser(__doc__, 'gradient features, coarser steps; to off_map-quick')
     parser.add_argument('--features', nargs='+', choices=tuple(KINDS), help='default: all')
-    parser.add_argument('--strategy', choices=STRATEGIES, default='adaptive', help='%(default)s')
+    parser.add_argument('--strategy', choices=STRATEGIES, default='rigid', help='%(default)s')
     options = parser.parse_args(arguments)
     global SETTINGS  # noqa: PLW0603  (one for all functions of this command)
     SETTINGS = replace(SETTINGS, spatial=SpatialSettings(options.strategy))

@@ -9,6 +9,7 @@ from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.filter.evidence import (
     changed_images,
+    lead_of,
     own_evidence,
     path_probability,
     RecentWindows,
@@ -21,16 +22,16 @@ import torch
 
 
 def plain_elsewhere(z, steps, excluded):
-    """Return the largest mean of -z of straight paths, by plain loops."""
-    n, means = z.shape[1], []
+    """Return the largest mean of -z of straight paths, and its path, by plain loops."""
+    n, means = z.shape[1], [(-np.inf, [])]
     counted = [place for place in range(n) if not any(a <= place < b for a, b in excluded)]
     for place in counted:
         for path in place + steps:
             near = [
                 z[i, y] if 0 <= y < n and np.isfinite(z[i, y]) else 1 for i, y in enumerate(path)
             ]
-            means.append(-np.mean(near))
-    return max(means, default=-np.inf)
+            means.append((-np.mean(near), np.clip(path, 0, n - 1).tolist()))
+    return max(means)
 
 
 @pytest.mark.parametrize('n', [30, 60, 1100])
@@ -49,21 +50,30 @@ def test_best_path_elsewhere_equals_plain_loops_on_all_devices(device, n):
         assert counted.tolist() == [True, True, False, True, True, True][:count]
         expected = plain_elsewhere(rows[-count:][counted], steps[:, counted], excluded)
         for buffer in buffers:
-            found = buffer.best_elsewhere(numbers, position, np.array(excluded))
-            assert found == pytest.approx(expected, abs=1e-5)
+            score, path = buffer.best_elsewhere(numbers, position, np.array(excluded))
+            assert score == pytest.approx(expected[0], abs=1e-5)
+            assert path.tolist() == expected[1]
+        everything = np.array([[0, n]])
+        assert all(len(each.best_elsewhere(numbers, position, everything)[1]) == 0
+                   for each in buffers)  # fmt: skip
 
 
 def test_path_probability_by_hand():
     """Of odds 3, a lead of 1, and half a window; of a drive that rarely matched."""
-    own = own_evidence(0.75, 2.0, 1.0, 10)
-    assert own == pytest.approx(-7.01 + 0.62 * np.log(3) + 2.56 * np.log(11))
-    expected = 1 / (1 + np.exp(((own - 3.65 * np.log(3)) / 5) ** 2))
+    own = own_evidence(-7.0, 0.75, 1.0, 10, 4.0)
+    expected = -7.0 + 0.5 * np.log(3) + 2.4 * np.log(11) + 2.06 * np.log(5)
+    assert own == pytest.approx(expected)
+    assert own_evidence(-7.0, 0.75, 1.0, 10, -2.0) == own_evidence(-7.0, 0.75, 1.0, 10)
+    own = own_evidence(-7.0, 0.75, 0.6, 10)
+    expected = 1 / (1 + np.exp(((own - 5 * np.log(3)) / 5) ** 2))
     assert path_probability(own, 0.25) == pytest.approx(expected)
     assert path_probability(own, 0.5) == path_probability(own, 0.9) > expected
-    sure = own_evidence(1.0, 4.0, 0.0, 20)
-    assert sure == own_evidence(1 - 1e-9, 4.0, -8.0, 20) > 4
-    assert own_evidence(0.5, -1.0, 0.0, 20) == own_evidence(0.5, 1.0, 2.0, 20)
-    assert path_probability(own_evidence(0.0, 4.0, 0.0, 20), 0.9) == 0
+    assert own_evidence(-7.0, 1.0, 4.0, 20) == own_evidence(-7.0, 1 - 1e-9, 4.0, 20) > 4
+    assert lead_of(4.0, -8.0) == lead_of(4.0, 0.0) == 4
+    assert lead_of(1.0, 2.0) == 0
+    least = np.log(0.02 / 0.98) + 4  # a path that has left the map stays improbable
+    assert own_evidence(-7.0, 0.02, 4.0, 20, 20.0) == pytest.approx(least)
+    assert path_probability(own_evidence(-7.0, 0.0, 4.0, 20), 0.9) == 0
 
 
 def test_log_odds_below_one_half_are_squared_and_keep_their_order():
@@ -77,17 +87,15 @@ def test_log_odds_below_one_half_are_squared_and_keep_their_order():
 
 
 def test_recent_windows_start_even_forget_and_trust_sure_ones_soon():
-    recent, learned = RecentWindows(-0.6), RecentWindows(1.5)
+    recent = RecentWindows()
     for _ in range(4):
         recent.add(1.0)
-        learned.add(1.0)
-    assert learned.share < 0.5 < recent.share  # with learned features, 1.0 is not likely
     assert recent.share == pytest.approx((8 * 0.5 + 4) / 12)
     for _ in range(600):
         recent.add(-np.inf)
     assert recent.share < 0.01
     for _ in range(15):
-        recent.add(4.0)
+        recent.add(6.0)
     assert recent.share > 0.5
     for _ in range(30):
         recent.add(1.0)  # likely, not sure

@@ -274,7 +274,7 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
     """Without evidence, at the speed before: the camera may move there."""
     dark = features_of(route).strips.copy()
     dark[:, 20:50] = 0
-    window = FilterWindow(SequenceSettings(4), PLACES, likely=-0.6)
+    window = FilterWindow(SequenceSettings(4), PLACES, constant=-7.0)
     seen = PlaceChanges(PLACES, MAX_LAG)
     seen.add(dark)
     window.change.learn(seen.changes)

@@ -90,7 +90,7 @@ class PlainCloser:
         row = np.full(len(self.all), np.inf, np.float32)
         if last - first >= MIN_PLACES:
             strips, weights = self.all.strips[:, image], self.all.weights[:, image]
-            matcher = CpuMatcher(self.all[:last], self.settings.spatial)
+            matcher = CpuMatcher(self.all[:last], self.settings.applied_spatial)
             row[first:last] = matcher.distances(strips, weights)[first:]
             if self.settings.applied_options.query_znorm:
                 row[first:last] = z_normalized(row[first:last], AROUND)

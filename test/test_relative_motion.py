@@ -177,7 +177,7 @@ def test_early_matches_are_compared_since_the_first_of_them():
         driven_map(features_of(route, 0.2, 1), track(count=200)), RecognizerSettings()
     )
     matches = drive(one, features_of(strips, 0.2, 2), way)
-    assert len(matches[100].path) < len(matches[-1].path)  # an early one
+    assert min(len(match.path) for match in matches[95:105]) < len(matches[-1].path)  # early ones
     assert all(match.accepted for match in matches[95:])
 
 

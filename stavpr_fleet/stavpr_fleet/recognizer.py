@@ -14,7 +14,7 @@ from stavpr_fleet.store import place_vectors, sample_places
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.features.registry import likely_evidence
+from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.motion import ImageChange, MAX_LAG
@@ -24,6 +24,7 @@ from stavpr_ros.prepare.blocks import PlaceChanges
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.recognition import Match, RecognizerSettings, Status
+from stavpr_ros.recognition.cells import CellAgreement
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
 from stavpr_ros.recognition.sessions import session_gap
@@ -116,14 +117,16 @@ class FleetRecognizer(SequenceRecognizer):
     def __init__(
         self, city: CityMap, settings: RecognizerSettings, timeout: float = TIMEOUT
     ) -> None:
-        if settings.applied_options != ROBUST or settings.spatial.vertical:
+        is_vertical = settings.applied_spatial.vertical
+        if settings.applied_options != ROBUST or is_vertical:
             raise SettingsError(
-                f'mode {settings.mode}, vertical {settings.spatial.vertical}: the map of a fleet '
+                f'mode {settings.mode}, vertical {is_vertical}: the map of a fleet '
                 'is matched in mode robust, without vertical alignment'
             )
         positions = () if city.poses is None else city.poses[:, :2]
-        self._evidence = likely_evidence(city.settings.kind)
-        self._filter_window = FilterWindow(settings.sequence, 0, likely=self._evidence)
+        kind, strips = city.settings.kind, city.settings.strips
+        self._constant, self._cells = evidence_of(kind, strips, city.dimension)
+        self._filter_window = FilterWindow(settings.sequence, 0, constant=self._constant)
         super().__init__(settings, city.settings, self._filter_window, positions)
         self._city, self._timeout = city, timeout
         index = city.store.index
@@ -138,7 +141,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._strips[:, : self._sampled] = centered.strips
         self._weights[:, : self._sampled] = centered.weights
         self._matcher = CpuMatcher(
-            LocalFeatures(self._strips, self._weights, city.settings), settings.spatial
+            LocalFeatures(self._strips, self._weights, city.settings), settings.applied_spatial
         )
         self._learned = ImageChange(self._sampled, MODEL, settings.sequence.length)
         self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
@@ -293,7 +296,7 @@ class FleetRecognizer(SequenceRecognizer):
         from_before = changes.changes[0]
         from_before[:1] = 1  # of the first place it is unknown
         images = list(self._images)
-        distances = CpuMatcher(centered, self._settings.spatial).distance_matrix(
+        distances = CpuMatcher(centered, self._settings.applied_spatial).distance_matrix(
             np.stack([image.strips for image in images], axis=1),
             np.stack([image.weights for image in images], axis=1),
         )
@@ -333,7 +336,14 @@ class FleetRecognizer(SequenceRecognizer):
         share = len(places) / len(self._city)
         model = replace(MODEL, start=MODEL.start * share, enter=MODEL.enter * share)
         sequence = self._settings.sequence
-        window = FilterWindow(sequence, len(places), model, layout, likely=self._evidence)
+        window = FilterWindow(sequence, len(places), model, layout, constant=self._constant)
+        if self._cells is not None:
+            rows = self._sampled + self._order
+            window.cells = CellAgreement(
+                self._cells,
+                lambda columns: self._strips[:, rows[layout.pass_before(columns)]],
+                sequence.length,
+            )
         window.recent = self._filter_window.recent  # the drive goes on
         window.choice.learn_times(self._city.stamps[places])
         window.change.copy_statistics(self._learned, self._from_before[self._order])
@@ -343,6 +353,8 @@ class FleetRecognizer(SequenceRecognizer):
 
     def _push(self, image: _Image) -> None:
         self._filter_window.change.next_query(image.strips)
+        if self._filter_window.cells is not None:
+            self._filter_window.cells.push(image.strips)
         self._filter_window.add(image.z[self._order], image.stamp, image.change)
 
 

@@ -19,6 +19,7 @@ from stavpr_fleet.qdrant_store import EdgePoints
 from stavpr_fleet.store import map_vectors, MapIndex, place_vectors
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap
+from stavpr_ros.alignment import SpatialSettings
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import FleetError, InputError, OutputTakenError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -260,7 +261,7 @@ def test_recognizer_rejects_mode_paper_and_vertical(city):
     made = CityMap.of(MemoryStore(city))
     with pytest.raises(SettingsError, match='mode paper'):
         FleetRecognizer(made, RecognizerSettings(mode='paper'))
-    spatial = replace(SETTINGS.spatial, vertical=True)
+    spatial = SpatialSettings(vertical=True)
     with pytest.raises(SettingsError, match='vertical True'):
         FleetRecognizer(made, replace(SETTINGS, spatial=spatial))
 

@@ -165,6 +165,21 @@ class DescriptorSettings:
 
 
 @dataclass(frozen=True)
+class Cells:
+    """
+    Where the cells of an image are in its strips, (channels, rows, columns) from ``first`` on.
+
+    :param dimension: of a strip, without a projection.
+    """
+
+    first: int
+    channels: int
+    rows: int
+    columns: int
+    dimension: int
+
+
+@dataclass(frozen=True)
 class Kind:
     """
     A kind of features.
@@ -172,13 +187,16 @@ class Kind:
     :param settings: the frozen dataclass of its settings.
     :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use;
         '' for features that are not computed from images.
-    :param likely: evidence by itself of a window that is a likely match
-        (:mod:`stavpr_ros.filter.evidence`), which shows that a drive is on the map.
+    :param constant: of the evidence of a window (:mod:`stavpr_ros.filter.evidence`).
+    :param cells: of its strips, with its default settings.
+    :param with_cells: the constant where they are compared.
     """
 
     settings: Any
     backbone: str = ''
-    likely: float = -0.6
+    constant: float = -7.2
+    cells: Cells | None = None
+    with_cells: float = 0.0
 
 
 LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
@@ -186,11 +204,26 @@ LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
 
 _FEATURES = 'stavpr_ros.features'
 KINDS = {
-    'gradient': Kind(GradientSettings, f'{_FEATURES}.gradient:Gradient'),
-    'efficientnet_lite1': Kind(
-        EfficientNetSettings, f'{_FEATURES}.efficientnet_lite:EfficientNetLite1', likely=1.5
+    'gradient': Kind(
+        GradientSettings,
+        f'{_FEATURES}.gradient:Gradient',
+        cells=Cells(0, 8, 14, 2, dimension=224),
+        with_cells=-9.1,
     ),
-    'hybrid': Kind(HybridSettings, f'{_FEATURES}.hybrid:Hybrid', likely=1.5),
+    'efficientnet_lite1': Kind(
+        EfficientNetSettings,
+        f'{_FEATURES}.efficientnet_lite:EfficientNetLite1',
+        constant=-8.6,
+        cells=Cells(0, 112, 7, 1, dimension=784),
+        with_cells=-11.7,
+    ),
+    'hybrid': Kind(
+        HybridSettings,
+        f'{_FEATURES}.hybrid:Hybrid',
+        constant=-8.6,
+        cells=Cells(224, 112, 7, 1, dimension=1008),
+        with_cells=-11.7,
+    ),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
     'descriptors': Kind(DescriptorSettings),
 }
@@ -236,13 +269,16 @@ def settings_class(kind: str) -> Any:
     return _kind(kind).settings
 
 
-def likely_evidence(kind: str) -> float:
+def evidence_of(kind: str, strips: int, dimension: int) -> tuple[float, Cells | None]:
     """
-    Return the own evidence of a likely window with a kind of features, or one without an entry.
+    Return the constant of the evidence and the cells of a kind of features.
 
-    Features of a map in memory can have any name.
+    Features of a map in memory can have any name; reduced ones have no cells.
     """
-    return (KINDS.get(kind) or _all().get(kind) or Kind(None)).likely
+    entry = KINDS.get(kind) or _all().get(kind) or Kind(None)
+    if entry.cells is None or (strips, dimension) != (7, entry.cells.dimension):
+        return entry.constant, None
+    return entry.with_cells, entry.cells
 
 
 def _kind(name: str) -> Kind:

@@ -45,9 +45,10 @@ from stavpr_ros.compilation import kernel
 from stavpr_ros.filter.paths import is_excluded
 from stavpr_ros.simd import LANES, load, select, splat, store
 
-CONSTANT, POSTERIOR, LEAD, RECENT = -7.01, 0.62, 2.56, 3.65
+POSTERIOR, LEAD, CELLS, RECENT = 0.5, 2.4, 2.06, 5.0
+GAIN = 4.0  # by which the evidence raises the log odds of p, at most
 UNLIKELY = 5.0  # the log odds x below 0 are -(x / UNLIKELY)^2
-SURE = 3.4  # own evidence of sure windows
+LIKELY, SURE = -0.6, 5.2  # own evidence of likely and of sure windows
 APART = 20  # places: paths nearer than that to the path are not elsewhere
 SPEEDS = np.array([1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0])  # of straight paths
 CERTAIN = 1e-4  # probability p beyond which, and beyond 1 less it, the odds do not grow
@@ -61,14 +62,9 @@ CHUNK = 128  # places whose sums are computed together
 
 
 class RecentWindows:
-    """
-    The share r of a drive's windows that are matches by themselves: .5 at first.
+    """The share r of a drive's windows that are matches by themselves: .5 at first."""
 
-    :param likely: own evidence of a likely window.
-    """
-
-    def __init__(self, likely: float) -> None:
-        self._least = likely
+    def __init__(self) -> None:
         self._likely = self._sure = 0.5
         self._count = FIRST
 
@@ -80,23 +76,37 @@ class RecentWindows:
     def add(self, own: float) -> None:
         """Count another window by its own evidence."""
         self._count = min(self._count + 1, LAST)
-        self._likely += ((own > self._least) - self._likely) / self._count
+        self._likely += ((own > LIKELY) - self._likely) / self._count
         self._sure += ((own > SURE) - self._sure) / min(self._count, LATEST)
 
 
-def own_evidence(posterior: float, score: float, elsewhere: float, images: int) -> float:
+def own_evidence(
+    constant: float,
+    posterior: float,
+    lead: float,
+    images: int,
+    cells: float = 0.0,
+) -> float:
     """
     Return the evidence of a path by its window alone; -inf if it is impossible.
 
+    :param constant: of the kind of features, K.
     :param posterior: p, by the filter and the checks.
-    :param score: m, mean of -z along the path.
-    :param elsewhere: m', of :func:`best_elsewhere`.
+    :param lead: d, of :func:`lead_of`.
     :param images: l.
+    :param cells: e, by how many cells it agrees better than its rival; 0 = not compared.
     """
     if posterior <= 0:
         return -math.inf
-    lead = max(score - max(elsewhere, 0.0), 0.0)
-    return CONSTANT + POSTERIOR * _log_odds(posterior, CERTAIN) + LEAD * math.log1p(images * lead)
+    odds = _log_odds(posterior, CERTAIN)
+    own = constant + POSTERIOR * odds + LEAD * math.log1p(images * lead)
+    own += CELLS * math.log1p(max(cells, 0.0))
+    return min(own, odds + GAIN) if odds < 0 else own
+
+
+def lead_of(score: float, elsewhere: float) -> float:
+    """Return the lead d by m, the mean of -z along the path, and m' of :func:`best_elsewhere`."""
+    return max(score - max(elsewhere, 0.0), 0.0)
 
 
 def path_probability(own: float, recent: float) -> float:
@@ -154,22 +164,24 @@ def _counted(rows, numbers, steps):  # type: ignore[no-untyped-def]
 def best_elsewhere(
     memory: np.ndarray, rows: np.ndarray, n: int, numbers: np.ndarray, position: int,
     excluded: np.ndarray,
-) -> float:  # fmt: skip
+) -> tuple[float, np.ndarray]:  # fmt: skip
     """
-    Return the largest mean of -z of straight paths, -inf where there is none.
+    Return the largest mean of -z of straight paths, -inf where there is none, and its path.
 
     :param memory: distances z, (L, n or more), float32.
     :param rows: of the images in memory, (l,).
     :param numbers, position: of :func:`straight_steps`; images that do not differ from the one
         before do not count.
     :param excluded: first ones and ends of the places whose paths do not count, (m, 2).
+    :returns: also the place of each image that counts, within the map, (m,), int64; or empty.
     """
     rows, steps = _counted(rows, numbers, straight_steps(numbers, position))
     images = len(rows)
     before, behind = max(-steps[-1, 0], 0), max(steps[-1, images - 1], 0)  # of the largest speed
     width = before + CHUNK + behind
     near = np.empty((images, width), np.float32)  # z of the images around a chunk, finite
-    flat, sums, least = near.reshape(-1), np.empty(CHUNK, np.float32), splat(INF)
+    flat, sums, lanes = near.reshape(-1), np.empty(CHUNK, np.float32), np.empty(LANES, np.float32)
+    best, place, speed = INF, -1, 0
     for start in range(0, n, CHUNK):
         if is_excluded(memory[rows[-1]], start, min(start + CHUNK, n)):
             continue
@@ -194,12 +206,17 @@ def best_elsewhere(
             sums[n - start :] = INF
             for first, end in excluded:
                 sums[max(first - start, 0) : max(end - start, 0)] = INF
+            least = splat(INF)
             for x in range(0, CHUNK, LANES):
                 least = select(load(sums, x) < least, load(sums, x), least)
-    store(sums, 0, least)
-    for lane in range(1, LANES):
-        sums[0] = min(sums[0], sums[lane])
-    return -float(sums[0]) / images
+            store(lanes, 0, least)
+            if lanes.min() < best:
+                place, speed = start + int(sums.argmin()), v
+                best = sums[place - start]
+    path = np.empty(images if place >= 0 else 0, np.int64)
+    for i in range(len(path)):
+        path[i] = min(max(place + steps[speed, i], 0), n - 1)
+    return -float(best) / images, path
 
 
 def _log_odds(probability: float, least: float) -> float:

@@ -53,7 +53,7 @@ class CpuMatcher:
         self._prepare(W, spatial)
         self._cells = features.cells if spatial.vertical else None
         self._axes = f'{W} n {d}'
-        self._weights = features.weights
+        self._weights, self._strips = features.weights, features.strips
         self.places = self._weights.shape[1]
         if isinstance(features, Int8Features):
             self._map = features.strips.kernel_arguments()
@@ -77,6 +77,10 @@ class CpuMatcher:
         self._spatial = spatial
         self._band, self._is_rigid = spatial.band(W), spatial.strategy == 'rigid'
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
+
+    def strips_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the strips of places, (W, m, d), float32; in int8, rounded ones."""
+        return np.ascontiguousarray(self._strips[:, places])
 
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,)."""

@@ -56,6 +56,15 @@ class DeviceMatcher:
         for _ in range(2 if n else 0):  # the second one captures the graph
             self.distances(np.zeros((W, d), np.float32), np.zeros(W, np.float32))
 
+    def strips_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the strips of places, (W, m, d), float32; in int8, rounded ones."""
+        size = self._pieces[0].shape[1]
+        strips = [self._pieces[place // size][:, place % size] for place in places.tolist()]
+        rows = torch.stack(strips, 1).float()
+        if self._lengths is not None:
+            rows *= self._lengths[:, torch.from_numpy(places).to(rows.device), None]
+        return rows.cpu().numpy()
+
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> torch.Tensor:
         """Return the distances of one image to every place, (n,), on the device."""
         if self.places:

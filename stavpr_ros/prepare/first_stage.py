@@ -61,6 +61,10 @@ class FirstStage:
         self._chunks = -(-n // CHUNK)
         self._sample = evenly(self._chunks, SAMPLED)
 
+    def strips_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the strips of places, (W, m, d)."""
+        return self._matcher.strips_of(places)
+
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,); exact ones where they count."""
         rows = np.full((self._chunks, CHUNK), np.inf, np.float32)

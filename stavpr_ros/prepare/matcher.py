@@ -30,6 +30,9 @@ class Matcher(Protocol):
     def places(self) -> int:
         """Return the number of places n."""
 
+    def strips_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the strips of places, (W, m, d), float32; in int8, rounded ones."""
+
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> Any:
         """
         Return the distances of one image to every place.

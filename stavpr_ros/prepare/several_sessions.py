@@ -60,6 +60,10 @@ class SeveralSessions:
         """Return the number of places n."""
         return self._matcher.places
 
+    def strips_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the strips of places, (W, m, d)."""
+        return self._matcher.strips_of(places)
+
     def distances(self, strips: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the distances of one image to every place, (n,); +inf where it is left out."""
         arguments = self._chunks, self._ends, self._farther

@@ -56,7 +56,9 @@ class DeviceBuffer(SequenceBuffer):
         flat = torch.from_numpy(self._ring(images)[:, None] * self.memory.shape[1] + columns)
         return self.memory.take(flat.to(self._device)).cpu().numpy()
 
-    def best_elsewhere(self, numbers: np.ndarray, position: int, excluded: np.ndarray) -> float:
+    def best_elsewhere(
+        self, numbers: np.ndarray, position: int, excluded: np.ndarray
+    ) -> tuple[float, np.ndarray]:
         """See :meth:`SequenceBuffer.best_elsewhere`; waits for the device."""
         counted = changed_images(numbers)
         rows = torch.from_numpy(self._ring(len(numbers))[counted]).to(self._device)
@@ -66,15 +68,27 @@ class DeviceBuffer(SequenceBuffer):
         z = pad(torch.where(z.isfinite(), z, float(FAR)), (reach, reach), value=float(FAR))
         shifts = torch.from_numpy(steps + reach).to(self._device)[:, :, None]
         columns = torch.arange(self.known, device=self._device)
-        smallest = torch.cat(
+        sums = torch.cat(
             [
-                z.expand(len(steps), -1, -1).gather(2, shifts + part).sum(dim=1).amin(dim=0)
+                z.expand(len(steps), -1, -1).gather(2, shifts + part).sum(dim=1)
                 for part in columns.split(PLACES_AT_ONCE)
-            ]
+            ],
+            dim=1,
         )
         for first, end in np.maximum(excluded, 0).tolist():
-            smallest[first:end] = torch.inf
-        return -float(smallest.min()) / images
+            sums[:, first:end] = torch.inf
+        least, speed, place = torch.stack(_smallest(sums)).tolist()
+        if not np.isfinite(least):
+            return -np.inf, np.empty(0, np.int64)
+        path = np.clip(int(place) + steps[int(speed)], 0, self.known - 1)
+        return -least / images, path
+
+
+def _smallest(sums: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Return the smallest number of a matrix, its row and its column, (), float64 each."""
+    at = sums.argmin()
+    row, column = at // sums.shape[1], at % sums.shape[1]
+    return sums.flatten()[at].double(), row.double(), column.double()
 
 
 class RowColumns:

@@ -19,7 +19,7 @@ from stavpr_ros.mapping.place_map import ErrorRisks
 
 # error rates, descending, and the least probability of matches that keep them
 ERRORS = np.array([0.1, 0.05, 0.03, 0.02, 0.01, 0.005])
-PROBABILITIES = np.array([0.246, 0.301, 0.48, 0.5, 0.969, 0.9985])
+PROBABILITIES = np.array([0.1, 0.3, 0.45, 0.5, 0.95, 0.999])
 
 
 def least_probability(max_error: float, risks: ErrorRisks | None = None) -> float:

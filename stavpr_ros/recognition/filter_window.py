@@ -15,6 +15,8 @@ from stavpr_ros.filter.choice import ChosenPath, PathChoice, WindowImages
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.evidence import (
     APART,
+    changed_images,
+    lead_of,
     own_evidence,
     path_probability,
     RecentWindows,
@@ -25,6 +27,7 @@ from stavpr_ros.filter.paths import NEGLIGIBLE, NO_PLACES
 from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.filter.place_means import PlaceMeans
 from stavpr_ros.filter.protocol import Filter
+from stavpr_ros.recognition.cells import CellAgreement
 from stavpr_ros.recognition.match import WindowMatch, WindowSequences
 from stavpr_ros.recognition.sessions import in_places
 from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
@@ -46,7 +49,8 @@ class FilterWindow(QueryWindow):
     :param to_oldest: for loop closure: states are followed back to the oldest image of the
         window, which :meth:`match_oldest` requires, instead of the middle one, and the mean z of
         each place is subtracted (:mod:`stavpr_ros.filter.place_means`).
-    :param likely: of :class:`RecentWindows`.
+    :param constant: of the evidence (:class:`stavpr_ros.features.registry.Kind`).
+    :param cells: of the images; None = they are not compared.
 
     ``change`` compares images, ``filter`` contains the states, ``recent`` is of the drive.
     """
@@ -64,7 +68,8 @@ class FilterWindow(QueryWindow):
         around: int = 0,
         to_oldest: bool = False,
         *,
-        likely: float,
+        constant: float,
+        cells: CellAgreement | None = None,
     ) -> None:
         layout = layout or ColumnLayout()
         length, width = sequence.length, layout.width(places)
@@ -75,7 +80,7 @@ class FilterWindow(QueryWindow):
         self.filter: Filter = self.filter_class(width, lag, settings, layout.gaps)
         self.change = ImageChange(layout.passes(places), settings, length)
         self.choice = PathChoice(self.filter, self.change, layout, width)
-        self._likely, self.recent = likely, RecentWindows(likely)
+        self._constant, self.cells, self.recent = constant, cells, RecentWindows()
         self._own = -math.inf  # evidence of the latest match
         self._at_rest: WindowMatch | None = None  # match of a camera at rest
         self._means = PlaceMeans()
@@ -97,8 +102,10 @@ class FilterWindow(QueryWindow):
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._at_rest, self._entered, self.recent = None, 0, RecentWindows(self._likely)
+        self._at_rest, self._entered, self.recent = None, 0, RecentWindows()
         self._repeated, self._means = slice(0, 0), PlaceMeans()
+        if self.cells is not None:
+            self.cells.reset()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -115,6 +122,8 @@ class FilterWindow(QueryWindow):
         row, change = self._as_columns(row), self.change.next_query(strips)
         if self._to_oldest:
             row = self._means.subtracted(row, self.change.is_standstill(change))
+        if self.cells is not None:
+            self.cells.push(strips)
         self._add(row, stamp, change)
 
     def add(self, row: np.ndarray, stamp: int, change: float) -> None:
@@ -285,11 +294,16 @@ class FilterWindow(QueryWindow):
         if self._to_oldest:
             return posterior, least
         near = self.layout.around(int(chosen.path[position]), APART)
-        elsewhere = self.buffer.best_elsewhere(numbers, position, near)
-        lead = chosen.score, elsewhere, len(numbers)
-        self._own, recent = own_evidence(posterior, *lead), self.recent.share
+        elsewhere, rival = self.buffer.best_elsewhere(numbers, position, near)
+        cells = 0.0
+        if self.cells is not None:
+            counted = changed_images(numbers)
+            cells = self.cells.lead(counted, chosen.path[counted], rival)
+        window = lead_of(chosen.score, elsewhere), len(numbers), cells
+        recent = self.recent.share
+        self._own = own_evidence(self._constant, posterior, *window)
         return path_probability(self._own, recent), path_probability(
-            own_evidence(least, *lead), recent
+            own_evidence(self._constant, least, *window), recent
         )
 
     def _sequences(

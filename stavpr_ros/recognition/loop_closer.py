@@ -7,6 +7,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -48,7 +49,7 @@ class LoopCloser(SequenceRecognizer):
     are numbered from the start of the route all the same: a number never comes to mean another
     image.
 
-    :param settings: strategies ``adaptive`` and ``vanilla``.
+    :param settings: strategies that align strips; ``adaptive`` if none is set.
     :param exclude: the latest images that are not part of the map, at least 1.
     :param feature_settings: how the features are made.
     :param limit: most places that are kept; None for all. It must leave room for more than the
@@ -70,13 +71,14 @@ class LoopCloser(SequenceRecognizer):
         exclude_seconds: float = 0.0,
         precision: str = 'float32',
     ) -> None:
+        settings = replace(settings, spatial=settings.spatial or SpatialSettings())
         _require_fitting(settings, exclude, limit, exclude_seconds)
         require_choice('precision', precision, PRECISIONS)
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
         super().__init__(settings, feature_settings, _route_window(settings), self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
-        self._matcher = CpuRouteMatcher(W, settings.spatial)
+        self._matcher = CpuRouteMatcher(W, settings.applied_spatial)
         options = settings.applied_options
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit, precision
@@ -258,7 +260,7 @@ def _route_window(settings: RecognizerSettings) -> QueryWindow:
     if not options.place_filter:
         return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
     arguments = sequence, 0, ROUTE_MODEL, None, options.query_znorm, AROUND, True
-    return FilterWindow(*arguments, likely=math.inf)  # its probabilities are without evidence
+    return FilterWindow(*arguments, constant=-math.inf)  # its probabilities are without evidence
 
 
 def least_limit(exclude: int, length: int) -> int:
@@ -279,8 +281,9 @@ def _require_fitting(
                 f'limit = {limit} places leaves too few beyond exclude = {exclude} and windows of '
                 f'{settings.sequence.length} images: take at least {least}'
             )
-    if not settings.spatial.aligns_strips:
+    spatial = settings.applied_spatial
+    if not spatial.aligns_strips:
         raise SettingsError(
-            f'strategy {settings.spatial.strategy!r}, vertical {settings.spatial.vertical}: '
+            f'strategy {spatial.strategy!r}, vertical {spatial.vertical}: '
             'take adaptive, vanilla or rigid, without vertical alignment'
         )

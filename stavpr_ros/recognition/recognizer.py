@@ -13,7 +13,7 @@ from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.features.registry import likely_evidence
+from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.paths import BLOCK
 from stavpr_ros.filter.place_filter import PlaceFilter
@@ -25,6 +25,7 @@ from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.prepare.several_sessions import SeveralSessions
+from stavpr_ros.recognition.cells import CellAgreement
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
 from stavpr_ros.recognition.match import (
@@ -356,17 +357,28 @@ class PlaceRecognizer(SequenceRecognizer):
                 require_finite(block, 'the map')
         self._dimension = features.dimension
         # cells are made of float32 strips
-        precision = 'float32' if settings.spatial.vertical else precision
+        precision = 'float32' if settings.applied_spatial.vertical else precision
         prepared = prepare_map(
             features, precision, options.mean_centering, options.whitening, options.place_filter
         )
         self._centering = prepared.centering
-        self._matcher = make_matcher(prepared.features, settings.spatial, backend, precision)
+        self._matcher = make_matcher(
+            prepared.features, settings.applied_spatial, backend, precision
+        )
         numbers = place_map.settings.strips * len(features) * self._dimension
         self._is_small = numbers * (1 if precision == 'int8' else 4) < SMALL_MAP
         if isinstance(self._window, FilterWindow):
             layout = self._window.layout
             self._window.change.learn(layout.changes_of_passes(prepared.changes), layout.firsts)
+            _, cells = evidence_of(
+                place_map.settings.kind, place_map.settings.strips, self._dimension
+            )
+            if cells is not None:
+                self._window.cells = CellAgreement(
+                    cells,
+                    lambda columns: self._matcher.strips_of(layout.names_of(columns)),
+                    settings.sequence.length,
+                )
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time budget
         self.start_notes = '; '.join(filter(None, [prepared.note, settings.error_note]))
@@ -379,7 +391,9 @@ class PlaceRecognizer(SequenceRecognizer):
             self._keep_time_budget(prepared.features, features[:1])
         same_as, matcher = place_map.same_as, self._matcher
         is_many = same_as is not None and len(same_as) > MANY * len(np.unique(same_as))
-        is_filtered = isinstance(self._window, FilterWindow) and settings.spatial.aligns_strips
+        is_filtered = (
+            isinstance(self._window, FilterWindow) and settings.applied_spatial.aligns_strips
+        )
         if same_as is not None and is_many and is_filtered and isinstance(matcher, CpuMatcher):
             arguments = self._window.layout.runs, same_as, self.place_probabilities
             self._matcher = SeveralSessions(matcher, *arguments)
@@ -490,13 +504,14 @@ def _window_of(
     if options.place_filter:
         window: FilterWindow
         arguments = sequence, n, MODEL, layout, options.query_znorm
-        likely = likely_evidence(place_map.settings.kind)
+        W = place_map.settings.strips
+        constant, _ = evidence_of(place_map.settings.kind, W, place_map.features.dimension)
         if isinstance(backend, str):
-            window = FilterWindow(*arguments, likely=likely)
+            window = FilterWindow(*arguments, constant=constant)
         else:
             from stavpr_ros.recognition.device_windows import DeviceFilterWindow
 
-            window = DeviceFilterWindow(*arguments, likely=likely, device=backend)
+            window = DeviceFilterWindow(*arguments, constant=constant, device=backend)
         window.choice.learn_times(place_map.stamps)
         return window
     if isinstance(backend, str):

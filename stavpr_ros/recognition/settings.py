@@ -70,7 +70,8 @@ class RecognizerSettings:
 
     :param threshold: mode paper: a window is matched when its distance is below it; > 0. None =
         not set: the map's, else nothing is matched. Mode robust has ``min_probability`` instead.
-    :param spatial: how two images are compared.
+    :param spatial: how two images are compared; None = ``rigid`` with the place filter on
+        a map, else ``adaptive``, as published.
     :param sequence: how a window is matched.
     :param nms_radius: the second best's midpoint is more than this many places from the nearest
         one's.
@@ -95,7 +96,7 @@ class RecognizerSettings:
     """
 
     threshold: float | None = None
-    spatial: SpatialSettings = field(default_factory=SpatialSettings)
+    spatial: SpatialSettings | None = None
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = default('nms_radius')
     mode: str = default('mode')
@@ -132,7 +133,9 @@ class RecognizerSettings:
                 f'direction = both is of mode robust: in mode {self.mode}, sequences of the map '
                 'are along it; take forward'
             )
-        if self.time_budget_ms and not (self.has_probability and self.spatial.aligns_strips):
+        if self.time_budget_ms and not (
+            self.has_probability and self.applied_spatial.aligns_strips
+        ):
             raise SettingsError(
                 f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
                 'strategy adaptive, vanilla or rigid, without vertical alignment; take 0'
@@ -142,6 +145,11 @@ class RecognizerSettings:
     def applied_options(self) -> RobustOptions:
         """Return the options that are applied."""
         return options_of(self.mode) if self.robust_options is None else self.robust_options
+
+    @property
+    def applied_spatial(self) -> SpatialSettings:
+        """Return how two images are compared."""
+        return self.spatial or SpatialSettings('rigid' if self.has_probability else 'adaptive')
 
     @property
     def has_probability(self) -> bool:
@@ -170,10 +178,10 @@ class RecognizerSettings:
     @property
     def method(self) -> str:
         """Return what error risks depend on, as text."""
-        spatial, sequence = self.spatial, self.sequence
+        spatial, sequence = self.applied_spatial, self.sequence
         mode = self.mode if self.robust_options is None else 'own options'
         return (
-            f'{mode} by evidence, version 2, length {sequence.length}, beta {sequence.beta:g}, '
+            f'{mode} by evidence, version 3, length {sequence.length}, beta {sequence.beta:g}, '
             f'{spatial.strategy}, sigma {spatial.sigma:g}, xi {spatial.xi}, '
             f'vertical {spatial.vertical}' + ', both directions' * self.moves_against
         )

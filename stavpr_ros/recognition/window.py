@@ -126,15 +126,17 @@ class SequenceBuffer:
         """
         return self.memory[self._ring(images)[:, None], columns]
 
-    def best_elsewhere(self, numbers: np.ndarray, position: int, excluded: np.ndarray) -> float:
+    def best_elsewhere(
+        self, numbers: np.ndarray, position: int, excluded: np.ndarray
+    ) -> tuple[float, np.ndarray]:
         """
-        Return the largest mean of -z of straight paths of the newest images.
+        Return the largest mean of -z of straight paths of the newest images, and its path.
 
         :param numbers, excluded, position: of
             :func:`stavpr_ros.filter.evidence.best_elsewhere`.
         """
         rows = self._ring(len(numbers))
-        return float(best_elsewhere(self.memory, rows, self.known, numbers, position, excluded))
+        return best_elsewhere(self.memory, rows, self.known, numbers, position, excluded)
 
     def _ring(self, images: int | None = None) -> np.ndarray:
         """Return the rows of one copy of the newest images, oldest first, (images,)."""

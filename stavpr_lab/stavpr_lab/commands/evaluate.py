@@ -194,8 +194,8 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add, spatial = group.add_argument, SpatialSettings
     beta = 'mode paper: places per image of a window (%(default)g)'
     add('--beta', type=float, default=SequenceSettings.beta, help=beta)
-    strategy = 'spatial alignment (%(default)s)'
-    add('--strategy', choices=STRATEGIES, default=spatial.strategy, help=strategy)
+    strategy = 'spatial alignment (on a map in mode robust: rigid, else adaptive)'
+    add('--strategy', choices=STRATEGIES, help=strategy)
     sigma = 'of the adaptive weight (%(default)g)'
     add('--sigma', type=float, default=spatial.sigma, help=sigma)
     add('--xi', type=int, help='strips this far apart are not aligned (none)')
@@ -209,8 +209,11 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Reject options that contradict each other."""
+    """Choose the alignment, and reject options that contradict each other."""
     loop, dataset = arguments.loop_closure, arguments.dataset is not None
+    if arguments.strategy is None:
+        is_published = arguments.mode == 'paper' or loop or arguments.vertical
+        arguments.strategy = 'adaptive' if is_published else 'rigid'
     if dataset and (arguments.map or arguments.query or arguments.truth or loop):
         parser.error(
             '--dataset has map, query and ground truth: leave --map, --query, --truth and '
