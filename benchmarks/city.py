@@ -129,7 +129,7 @@ def drive(
 def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dict[str, Any]:
     """Return the numbers of one case."""
     folder, (reference, query_folder, tolerance, speed) = data_folder(), CASES[name]
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor('gradient')
     real = extract_features(open_source(folder / reference), extractor, progress=False)
     query = extract_features(open_source(folder / query_folder), extractor, progress=False)
     indices = DriveChanges.named(speed, len(query)).images(len(query))

@@ -178,7 +178,9 @@ def measure_sessions(counts: list[int]) -> list[str]:
 
     limit_threads(1)
     seasons = [
-        build_map(open_source(data_folder() / 'nordland_64x32' / season), FeatureExtractor())
+        build_map(
+            open_source(data_folder() / 'nordland_64x32' / season), FeatureExtractor('gradient')
+        )
         for season in ('summer', 'winter')
     ]
     places = len(seasons[0])

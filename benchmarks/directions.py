@@ -88,7 +88,7 @@ class Cameras:
         """Return the features of the images in the order of the drive."""
         step = -1 if is_mirrored else 1
         each = [np.ascontiguousarray(image[:, ::step]) for image in self.of[camera]]
-        return FeatureExtractor().extract(each[::-1] if is_back else each)
+        return FeatureExtractor('gradient').extract(each[::-1] if is_back else each)
 
     def map_of(self, *cameras: str) -> PlaceMap:
         """Return the map of one camera, or of two that look ahead and back."""
@@ -179,7 +179,9 @@ def cost() -> list[list[str]]:
     for n in SIZES:
         strips = rng.standard_normal((7, n, 224), np.float32)
         strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-        features = LocalFeatures(strips, np.ones((7, n), np.float32), FeatureExtractor().settings)
+        features = LocalFeatures(
+            strips, np.ones((7, n), np.float32), FeatureExtractor('gradient').settings
+        )
         one_camera = descriptor_map(features)
         two = merge_maps([one_camera] * 2, ['front', 'rear'], [('front', 0.0), ('rear', pi)])
         images = [features[i : i + 1] for i in range(100)]

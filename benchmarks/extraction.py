@@ -79,7 +79,7 @@ def raw_message(image: np.ndarray) -> Any:
 
 def extraction_stages(run: Run, seed: int) -> None:
     """Measure decoding, extraction of one image and of a batch, and both of images of 1080p."""
-    images, extractor = make_images(seed), FeatureExtractor()
+    images, extractor = make_images(seed), FeatureExtractor('gradient')
     size, messages = images[0].nbytes, cycle([raw_message(image) for image in images])
     run.measure('decoding', (1, 0), lambda: decode_message(next(messages)), [Work(size, 0)])
     for n in (1, BATCH):

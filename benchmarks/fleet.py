@@ -106,7 +106,7 @@ def main() -> None:
     parser.add_argument('--places', type=int, nargs='+', default=[20_000])
     parser.add_argument('--homes', nargs='+', default=['faiss', 'qdrant'])
     arguments = parser.parse_args()
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor('gradient')
     opened = {
         name: build_map(open_source(data_folder() / name), extractor, progress=False)
         for name in (*ROUTES, *ROUTES.values(), OFF_THE_MAP, *DISTRACTORS)

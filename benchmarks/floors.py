@@ -61,7 +61,7 @@ def main() -> None:
         queries = []
         for floor in floors:
             frames = list(open_source(floor))
-            place_map = build_map(frames[1::2], FeatureExtractor(), progress=False)
+            place_map = build_map(frames[1::2], FeatureExtractor('gradient'), progress=False)
             save_map(merge_maps([place_map], [floor.name]), Path(folder) / f'{floor.name}.stavpr')
             queries.append([frame.image for frame in frames[::2]])
         of_all = drive(folder, queries), drive(folder, queries, resets=True)

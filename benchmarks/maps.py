@@ -56,7 +56,9 @@ def write_files(folder: Path, places: int) -> None:
     from stavpr_ros.sources import open_source
 
     source = open_source(data_folder() / 'gardens_point/day_left')
-    features, _ = city(extract_features(source, FeatureExtractor(), progress=False), places, 0)
+    features, _ = city(
+        extract_features(source, FeatureExtractor('gradient'), progress=False), places, 0
+    )
     save_map(descriptor_map(features), folder / 'plain', 'float16')
     for name, options in (('statistics', []), ('codes', ['--codes'])):
         assert map_main(['compact', str(folder / 'plain'), str(folder / name), *options]) == 0

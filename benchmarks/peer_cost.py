@@ -53,7 +53,7 @@ class Drive(NamedTuple):
         images, orb = [frame.image for frame in source], cv2.ORB_create(ORB_FEATURES)
         descriptors = [orb.detectAndCompute(image, None)[1] for image in images]
         assert all(each is not None for each in descriptors)
-        features = FeatureExtractor().extract(images)
+        features = FeatureExtractor('gradient').extract(images)
         return cls(features, preprocess(images, SeqSlamSettings()), descriptors)
 
     def repeated(self, n: int, rng: np.random.Generator) -> 'Drive':

@@ -100,7 +100,7 @@ def routes(folder: Path) -> Iterator[Route]:
         drive, mirrored = (
             replace(each, stamps=(1 + np.arange(len(each))) * 10**9, same_as=None)
             for each in (
-                build_map(images, FeatureExtractor(), progress=False)
+                build_map(images, FeatureExtractor('gradient'), progress=False)
                 for images in (source, flipped)
             )
         )

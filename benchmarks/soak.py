@@ -45,7 +45,7 @@ def make_map(path: Path) -> None:
     from stavpr_ros.sources.frame import Frame
 
     frames = (Frame(image, 0, '') for image in texture_route(PLACES))
-    save_map(build_map(frames, FeatureExtractor(), thumbnails=False), path)
+    save_map(build_map(frames, FeatureExtractor('gradient'), thumbnails=False), path)
 
 
 def memory(pid: int) -> float:

@@ -251,7 +251,7 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
     """
     if n < 2 * DRIVEN:
         return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVEN:,} places')
-    extractor, d = FeatureExtractor(projection=PROJECTED), PROJECTED
+    extractor, d = FeatureExtractor('gradient', projection=PROJECTED), PROJECTED
     images = np.random.default_rng(seed).integers(0, 256, (DRIVEN, 48, 64, 3), np.uint8)
     driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, seed)
     strips = strips.strips

@@ -68,7 +68,7 @@ def main() -> None:
     print('|---|---|---|---|---|---|')
     for name, folders in CASES.items():
         paths: list[Path] = [data_folder() / folder for folder in folders]
-        place_map = build_map(open_source(paths[0]), FeatureExtractor(), progress=False)
+        place_map = build_map(open_source(paths[0]), FeatureExtractor('gradient'), progress=False)
         queries = extract_features(open_source(paths[1]), place_map.extractor())
         vectors = [
             np.concatenate(each.strips.astype(np.float64), axis=1)

@@ -106,10 +106,11 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         ),
         NodeParameter(
             'features',
-            'gradient',
-            'Kind of the features of a map that is recorded without map_path: gradient; hybrid '
-            'or efficientnet_lite1, of the extra learned; onnx, or one that another package adds, '
-            'such as densenet161_places365 of stavpr_lab.',
+            'auto',
+            'Kind of the features of a map that is recorded without map_path: hybrid; gradient, '
+            'for a small board; auto, the former where onnxruntime and its network are, else the '
+            'latter; efficientnet_lite1, onnx, or one that another package adds, such as '
+            'densenet161_places365 of stavpr_lab.',
         ),
         NodeParameter(
             'exclude_places',

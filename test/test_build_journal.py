@@ -17,7 +17,7 @@ from stavpr_ros.mapping.journal import JournalReader
 from stavpr_ros.mapping.journal_map import journal_map
 from stavpr_ros.sources.frame import Frame
 
-EXTRACTOR = FeatureExtractor()
+EXTRACTOR = FeatureExtractor('gradient')
 
 
 class StopError(Exception):
@@ -75,7 +75,10 @@ def test_build_journal_of_another_work_is_refused(frames, tmp_path):
     target = tmp_path / 'route.stavpr'
     with pytest.raises(StopError):
         build_journal(until(frames, 40), EXTRACTOR, target, 'drive', progress=False)
-    for extractor, source in ((EXTRACTOR, 'other'), (FeatureExtractor(projection=8), 'drive')):
+    for extractor, source in (
+        (EXTRACTOR, 'other'),
+        (FeatureExtractor('gradient', projection=8), 'drive'),
+    ):
         with pytest.raises(JournalError, match='is of other images or options'):
             build_journal(frames, extractor, target, source, progress=False)
 

@@ -72,15 +72,6 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
     assert node.runtime.pipeline.operation.window_fill == 0
 
 
-def test_log_recommends_hybrid_where_its_network_is(make_node, map_file, tmp_path, monkeypatch):
-    (tmp_path / 'efficientnet_lite1.onnx').touch()
-    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path))
-    logged, node = [], make_node(map_path=map_file)
-    monkeypatch.setattr(node.get_logger(), 'info', lambda text, **_: logged.append(text))
-    assert node.trigger_configure() == SUCCESS
-    assert 'a map with features hybrid, with min_probability 0.9' in ' '.join(logged)
-
-
 def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
     make_node, map_file, route, monkeypatch
 ):

@@ -112,7 +112,7 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
     for i, image in enumerate(panoramas):
         cv2.imwrite(str(tmp_path / f'{i:03}.png'), image[:, :, ::-1])
     out, back, both = (str(tmp_path / f'{name}.stavpr') for name in ('out', 'back', 'both'))
-    build = ['--input', str(tmp_path), '--output']
+    build = ['--features', 'gradient', '--input', str(tmp_path), '--output']
     assert build_map.main([*build, out]) == 0
     assert build_map.main([*build, back, '--panorama-yaw', '180', '--force']) == 0
     assert build_map.main([*build, back, '--panorama-yaw', '181', '--force']) == 2
@@ -120,7 +120,7 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
     assert map_command.main(merge) == 0
     place_map = load_map(both)
     turned = [np.roll(image, 96, axis=1) for image in panoramas]  # of the robot
-    features = FeatureExtractor().extract(turned[::-1])
+    features = FeatureExtractor('gradient').extract(turned[::-1])
     for i, match in list(enumerate(recognize(place_map, features)))[LENGTH:]:
         assert match.accepted
         assert place_map.session(match.place_index).yaw == pytest.approx(np.pi)
@@ -128,7 +128,9 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
         assert abs(match.newest_index - (2 * n - 1 - i)) <= 2
     # to the left by a quarter: what was at the left is ahead
     assert build_map.main([*build, back, '--panorama-yaw', '90', '--force']) == 0
-    expected = FeatureExtractor().extract([np.roll(panoramas[0], 48, axis=1)]).strips[:, 0]
+    expected = (
+        FeatureExtractor('gradient').extract([np.roll(panoramas[0], 48, axis=1)]).strips[:, 0]
+    )
     np.testing.assert_allclose(load_map(back).features.strips[:, 0], expected, atol=1e-3)
 
 

@@ -23,7 +23,7 @@ def test_gradient_settings_out_of_range_are_rejected(bad):
 def test_images_that_are_views_have_the_same_features():
     """BGR reversed to RGB, as OpenCV's images are, and crops."""
     image = np.random.default_rng(0).integers(0, 256, (300, 400, 3), dtype=np.uint8)
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor('gradient')
     for view in (image[..., ::-1], image[10:, 20:], image[::-1]):
         expected = extractor.extract([view.copy()])
         np.testing.assert_array_equal(extractor.extract([view]).strips, expected.strips)

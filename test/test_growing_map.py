@@ -157,7 +157,7 @@ def test_growing_map_equals_plain_list(steps):
     ('arguments', 'error', 'words'),
     [
         (
-            (features(1, settings=FeatureExtractor(strips=6).settings),),
+            (features(1, settings=FeatureExtractor('gradient', strips=6).settings),),
             FeatureMismatchError,
             'strips',
         ),

@@ -21,7 +21,7 @@ from stavpr_ros.sources.frame import Frame, ImageRecord
 
 RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 SAME = np.count_nonzero(RGB[0, 0, 0] == RGB)
-EXTRACTOR = FeatureExtractor()
+EXTRACTOR = FeatureExtractor('gradient')
 
 
 class Tensor:

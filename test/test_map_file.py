@@ -268,7 +268,7 @@ def test_names_of_images_that_are_no_text_are_replaced(tmp_path):
     from stavpr_ros.sources.frame import Frame
 
     frame = Frame(np.zeros((64, 64, 3), np.uint8), 0, os.fsdecode(b'a\xff\x00.png'))
-    place_map = build_map([frame], FeatureExtractor(), progress=False)
+    place_map = build_map([frame], FeatureExtractor('gradient'), progress=False)
     save_map(place_map, tmp_path / 'map')
     assert load_map(tmp_path / 'map').ids == ('a??.png',)
 

@@ -13,6 +13,7 @@ from stavpr_ros.mapping import build_map, encode_thumbnail, KeyframeSettings, Tr
 from stavpr_ros.sources.frame import Frame
 
 SECOND = 10**9
+GRADIENT = FeatureExtractor('gradient')
 
 
 def traverse(images, seconds=1):
@@ -37,18 +38,18 @@ def test_build_map_with_distance_selects_keyframes(route, known):
                 trajectory.add(frame.stamp, pose)
         poses = trajectory
     built = build_map(
-        frames, FeatureExtractor(), poses, progress=False, keyframes=KeyframeSettings(distance=2)
+        frames, GRADIENT, poses, progress=False, keyframes=KeyframeSettings(distance=2)
     )
     assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
     assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
-    every = build_map(frames, FeatureExtractor(), poses, progress=False)
+    every = build_map(frames, GRADIENT, poses, progress=False)
     assert len(every) == 20
     assert every.pose(4) is None
     assert every.pose(5)[0] == 5
 
 
 def test_build_map_with_wrong_poses_fails(route):
-    frames, extractor = traverse(route[:20]), FeatureExtractor()
+    frames, extractor = traverse(route[:20]), GRADIENT
     for count in (19, 21):
         with pytest.raises(InputError, match=f'{count} poses for 20 images'):
             build_map(frames, extractor, straight(count), progress=False)
@@ -73,13 +74,13 @@ def test_build_map_with_wrong_poses_fails(route):
 
 def test_build_map_scales_thumbnails(route):
     image = cv2.resize(route[0], (640, 480))
-    built = build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=320)
+    built = build_map(traverse([image]), GRADIENT, progress=False, thumbnail_width=320)
     assert built.thumbnail(0).shape == (240, 320, 3)
     assert built.thumbnails[0] == encode_thumbnail(image, 320)
-    narrow = build_map(traverse([image]), FeatureExtractor(), progress=False)
+    narrow = build_map(traverse([image]), GRADIENT, progress=False)
     assert narrow.thumbnail(0).shape == (144, 192, 3)
     with pytest.raises(SettingsError, match='width = 0'):
-        build_map(traverse([image]), FeatureExtractor(), progress=False, thumbnail_width=0)
+        build_map(traverse([image]), GRADIENT, progress=False, thumbnail_width=0)
 
 
 class Watched:
@@ -103,12 +104,12 @@ class Watched:
 def test_build_map_reads_and_closes_source_on_one_thread(route):
     """Required by bags; also if the images, or their features, fail."""
     whole = Watched(traverse(route))
-    assert len(build_map(whole, FeatureExtractor(), progress=False)) == 60
+    assert len(build_map(whole, GRADIENT, progress=False)) == 60
     damaged = Watched(traverse(route), fails_at=40)
     with pytest.raises(ImageError, match='40'):
-        build_map(damaged, FeatureExtractor(), progress=False)
+        build_map(damaged, GRADIENT, progress=False)
     abandoned = Watched(traverse(route))
-    broken = FeatureExtractor()
+    broken = FeatureExtractor('gradient')
     broken.extract = lambda images: 1 / 0
     with pytest.raises(ZeroDivisionError):
         build_map(abandoned, broken, progress=False)

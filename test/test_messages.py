@@ -55,7 +55,7 @@ def rejected(**fields):
 
 @pytest.fixture(scope='module')
 def extractor():
-    return FeatureExtractor(projection=8)
+    return FeatureExtractor('gradient', projection=8)
 
 
 @pytest.fixture(scope='module')

@@ -50,7 +50,7 @@ def laps(robot, start):
 def test_loop_closures_of_the_node_are_those_of_the_library(robot, laps, tmp_path):
     """Match for match, with both poses or none; the recorded route is saved."""
     matches, closures, stamps = laps
-    extractor, sequence = FeatureExtractor(), SequenceSettings(LENGTH)
+    extractor, sequence = FeatureExtractor('gradient'), SequenceSettings(LENGTH)
     settings = RecognizerSettings(
         sequence=sequence, nms_radius=5, mode='robust', min_probability=0.05
     )

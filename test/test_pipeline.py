@@ -110,7 +110,7 @@ def test_mapping_records_places(route):
     assert stamps_of(places) == list(range(1, 9))
     np.testing.assert_array_equal(places.poses[:4], [at(i) for i in range(4)])
     assert np.isnan(places.poses[4:]).all()
-    features = FeatureExtractor().extract(route[:8])
+    features = FeatureExtractor('gradient').extract(route[:8])
     np.testing.assert_allclose(places.features.strips, features.strips, atol=1e-6, rtol=0)
     thumbnail = places.thumbnail(3)
     assert thumbnail.shape == (48, 64, 3)

@@ -59,7 +59,9 @@ def test_recognizer_by_image_equals_whole_matrix_at_once(small_map, strategy):
 
 
 def test_recognizer_at_threshold_does_not_match(small_map, route):
-    query = FeatureExtractor(projection=64).extract([255 - image for image in route[3:8]])
+    query = FeatureExtractor('gradient', projection=64).extract(
+        [255 - image for image in route[3:8]]
+    )
     distance = recognize_all(recognizer(small_map), query)[-1].sequence.distance
     assert distance > 0.01
     for threshold, status in (
@@ -126,7 +128,11 @@ def test_arguments_of_wrong_types_are_rejected_with_the_expected_one(small_map):
             r'float: expected RecognizerSettings',
         ),
         (lambda: one.update(image), InputError, 'expected the LocalFeatures of one image'),
-        (lambda: build_map('monday/', FeatureExtractor()), InputError, 'expected open_source'),
+        (
+            lambda: build_map('monday/', FeatureExtractor('gradient')),
+            InputError,
+            'expected open_source',
+        ),
         (lambda: build_map([], 'gradient'), InputError, 'str: expected a FeatureExtractor'),
         (lambda: open_source(None), InputError, 'NoneType: expected the path of a folder'),
         (lambda: load_map(3), InputError, 'int: expected the path of a map file'),

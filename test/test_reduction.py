@@ -26,14 +26,14 @@ def images(count):
 @pytest.fixture(scope='module')
 def whole():
     frames = [Frame(image, 0, str(i)) for i, image in enumerate(images(30))]
-    return map_of(frames, FeatureExtractor(), thumbnails=False, progress=False)
+    return map_of(frames, FeatureExtractor('gradient'), thumbnails=False, progress=False)
 
 
 @pytest.mark.parametrize('count', [30, 40])
 def test_directions_are_those_of_largest_variance(count):
     """Of 7 strips each, fewer and more than their 224 dimensions."""
     frames = [Frame(image, 0, str(i)) for i, image in enumerate(images(count))]
-    whole = map_of(frames, FeatureExtractor(), thumbnails=False, progress=False)
+    whole = map_of(frames, FeatureExtractor('gradient'), thumbnails=False, progress=False)
     assert (7 * count < whole.dimension) == (count == 30)
     reduced = with_principal_components(whole, D)
     x = whole.features.strips.astype(np.float64)

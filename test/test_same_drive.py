@@ -36,7 +36,9 @@ def coarse(image):
 @pytest.fixture
 def path(tmp_path):
     frames = open_source(write_images(tmp_path / 'monday', ROUTE))
-    save_map(build_map(frames, FeatureExtractor(), progress=False), tmp_path / 'route.stavpr')
+    save_map(
+        build_map(frames, FeatureExtractor('gradient'), progress=False), tmp_path / 'route.stavpr'
+    )
     return str(tmp_path / 'route.stavpr')
 
 

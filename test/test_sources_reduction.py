@@ -138,7 +138,7 @@ def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes,
 @pytest.mark.parametrize('images', [lambda source: source, lambda source: _Images(source, 1)])
 def test_map_of_large_files_has_the_features_that_a_node_computes(image, images, tmp_path):
     cv2.imwrite(str(tmp_path / 'large.jpg'), image[..., ::-1])
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor('gradient')
     place_map = build_map(images(open_source(tmp_path)), extractor, progress=False)
     reduced = decode_file(
         (tmp_path / 'large.jpg').read_bytes(), None, extractor.needed_size(THUMBNAIL_WIDTH)

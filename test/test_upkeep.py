@@ -50,7 +50,7 @@ def built(images, day=0, poses=None, thumbnails=False):
         )
         for i, image in enumerate(images)
     ]
-    return build_map(frames, FeatureExtractor(), poses, thumbnails, progress=False)
+    return build_map(frames, FeatureExtractor('gradient'), poses, thumbnails, progress=False)
 
 
 @pytest.fixture(scope='module')

@@ -49,7 +49,7 @@ def folders(drives, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def thermal_map(folders):
-    return build_map(open_source(folders[0]), FeatureExtractor(), progress=False)
+    return build_map(open_source(folders[0]), FeatureExtractor('gradient'), progress=False)
 
 
 def matches(place_map, query):
@@ -89,7 +89,7 @@ def test_thermal_images_match_by_the_range_of_the_map(thermal_map, folders, capl
     query = extract_features(open_source(folders[1]), loaded.extractor(), progress=False)
     found = matches(loaded, query)
     assert len(found) > IMAGES / 2
-    again = build_map(open_source(folders[0]), FeatureExtractor(), progress=False)
+    again = build_map(open_source(folders[0]), FeatureExtractor('gradient'), progress=False)
     assert again.settings == thermal_map.settings
     assert caplog.text.count(f'images of 16 bits: their values {low} to {high}') == 1
 
@@ -97,7 +97,7 @@ def test_thermal_images_match_by_the_range_of_the_map(thermal_map, folders, capl
 def test_a_map_without_a_range_keeps_the_upper_byte(folders, drives, thermal_map, tmp_path):
     """A map of today: its file has no such section, and its queries are decoded as before."""
     images = [np.repeat((image >> 8).astype(np.uint8)[..., None], 3, 2) for image in drives[0]]
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor('gradient')
     extractor.set_value_range(None)
     old = build_map(open_source(folders[0]), extractor, progress=False)
     np.testing.assert_array_equal(old.features.strips, extractor.extract(images).strips)
@@ -137,7 +137,7 @@ def test_replayed_images_keep_their_16_bits(folders, drives, tmp_path):
 
 @pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
 def test_pipeline_finds_the_range_before_its_first_place(drives, thermal_map, operation):
-    pipeline = Pipeline(PipelineSettings(), operation)
+    pipeline = Pipeline(PipelineSettings(features='gradient'), operation)
     results = [
         pipeline.operation.process(raw(image), (i + 1) * 10**9)
         for i, image in enumerate(drives[0])
@@ -152,7 +152,7 @@ def test_pipeline_finds_the_range_before_its_first_place(drives, thermal_map, op
 
 
 def test_pipeline_of_images_of_8_bits_begins_at_once(drives):
-    pipeline = Pipeline(PipelineSettings(), 'mapping')
+    pipeline = Pipeline(PipelineSettings(features='gradient'), 'mapping')
     image = np.repeat(scale((LOW, HIGH))(drives[0][0])[..., None], 3, 2)
     assert pipeline.operation.process(image_message(image), 1).status is Status.MAPPED
     assert pipeline.places.settings.value_range is None

@@ -193,7 +193,7 @@ def test_visualization_of_distances_is_the_newest_row(localized):
 
 
 def test_visualization_of_distances_states_the_places_after_an_eviction():
-    extractor = FeatureExtractor(projection=8)
+    extractor = FeatureExtractor('gradient', projection=8)
     features = extractor.extract(route_images(1))
     route = GrowingMap(extractor.settings, extractor.projection, 1200)
     for _ in range(1200):

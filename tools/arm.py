@@ -67,7 +67,7 @@ def results(folder: Path, foreign: Path) -> Iterator[tuple[str, np.ndarray]]:
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
     from stavpr_ros.sources.frame import Frame
 
-    extractor, rng = FeatureExtractor(), np.random.default_rng(0)
+    extractor, rng = FeatureExtractor('gradient'), np.random.default_rng(0)
     frames = [Frame(image, i, f'place {i}') for i, image in enumerate(images_of_camera(60))]
     place_map = build_map(frames, extractor, progress=False)
     yield 'features of the map', place_map.features.strips

@@ -58,7 +58,16 @@ def numbers(run, tmp_path):
 
 
 def pair(folders):
-    return ['--map', folders / 'map', '--query', folders / 'query', '--truth', 'identity']
+    features = '--features', 'gradient'
+    return [
+        '--map',
+        folders / 'map',
+        '--query',
+        folders / 'query',
+        '--truth',
+        'identity',
+        *features,
+    ]
 
 
 def page_data(page):
@@ -84,7 +93,7 @@ def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_pat
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
-    found = numbers(*pair(folders), '--features', 'gradient', '--mode', 'paper', '--tolerance', 1)
+    found = numbers(*pair(folders), '--mode', 'paper', '--tolerance', 1)
     assert all(found[kind]['average_precision'] > 0.9 for kind in KINDS)
     assert found['sequence']['queries'] == PLACES
     assert found['sequence_without_ends']['queries'] == PLACES - 19
@@ -105,7 +114,7 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     options = [*options, '--mode', 'paper', '--warp', '2x', '--tolerance', 2]
     options += ['--sequence-length', 8, '--beta', 1.5]
     found = numbers(*pair(folders), '--query', folders / 'shifted', *options)
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor('gradient')
     place_map = build_map(open_source(folders / 'map'), extractor, progress=False)
     query = build_map(open_source(folders / 'shifted'), extractor, progress=False).features[::2]
     sequence = SequenceSettings(8, 1.5)
@@ -150,7 +159,7 @@ def test_evaluate_with_crop_equals_images_cropped_before(folders, numbers, tmp_p
 
 
 def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run):
-    extractor = FeatureExtractor(projection=32)
+    extractor = FeatureExtractor('gradient', projection=32)
     for name in ('map', 'query'):
         place_map = build_map(open_source(folders / name), extractor, progress=False)
         save_map(place_map, tmp_path / f'{name}.stavpr')
@@ -177,7 +186,7 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     found = numbers('--dataset', f'nordland={tmp_path}')
     assert (found['settings']['tolerance'], found['sequence']['f1']) == (3, 1)
     source, saved = open_source(tmp_path / 'nordland' / 'winter'), tmp_path / 'unknown.stavpr'
-    save_map(build_map(source, FeatureExtractor(projection=32), progress=False), saved)
+    save_map(build_map(source, FeatureExtractor('gradient', projection=32), progress=False), saved)
     options = ['--dataset', f'nordland={tmp_path}', '--projection', 32, '--unknown', saved]
     assert numbers(*options)['unknown_images'] == 24
     code, _, errors = run(*options, '--seed', 1)

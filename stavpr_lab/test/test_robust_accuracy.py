@@ -20,7 +20,7 @@ SETTINGS = RecognizerSettings(mode='robust')
 @pytest.fixture(scope='module')
 def traverses(data_folder):
     """Return a function from a folder to the gradient features of its images."""
-    extractor, known = FeatureExtractor(), {}
+    extractor, known = FeatureExtractor('gradient'), {}
 
     def features(name):
         if name not in known:

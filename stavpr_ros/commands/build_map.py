@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from stavpr_ros.commands.jobs import add_job_options, Job, job_names, other_arguments, run_jobs
 from stavpr_ros.commands.program import add_camera, add_fps, make_parser, run_program, say
 from stavpr_ros.errors import ImageError, left_out, SettingsError, SourceError
+from stavpr_ros.features.registry import AUTO
 from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
@@ -302,11 +303,17 @@ def _report(place_map: 'PlaceMap', output: str) -> None:
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
     """Build a map of each input; return the exit code."""
+    from stavpr_ros.features.efficientnet_lite import choose_kind
+
     folder = Path(arguments.output)
     if folder.is_file():
         raise SettingsError(f'--output {folder} is a file: give a folder for several maps')
     folder.mkdir(parents=True, exist_ok=True)
     others = other_arguments(args, '--input')
+    if arguments.features == AUTO:  # one kind, also on the machines of a cluster
+        kind, choice = choose_kind()
+        others += ['--features', kind]
+        say(choice, sys.stderr)
     jobs = []
     for name, one in zip(job_names(arguments.input), arguments.input, strict=True):
         output = Path(f'{folder / name}.stavpr')

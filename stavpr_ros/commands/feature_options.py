@@ -4,11 +4,13 @@
 
 import argparse
 import dataclasses
+import sys
 from typing import Any, TYPE_CHECKING
 
+from stavpr_ros.commands.program import say
 from stavpr_ros.devices import DEVICES
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import kinds, settings_class
+from stavpr_ros.features.registry import AUTO, kinds, settings_class
 from stavpr_ros.parameters import default
 
 if TYPE_CHECKING:
@@ -37,7 +39,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     """
     add = parser.add_argument_group('features').add_argument
     kind_help = 'kind of features (%(default)s)'
-    add('--features', choices=kinds(), default=default('features'), help=kind_help)
+    add('--features', choices=(AUTO, *kinds()), default=default('features'), help=kind_help)
     strips = 'vertical strips of an image (7; 1 if the features are one vector)'
     add('--strips', type=int, metavar='W', help=strips)
     projection = 'each strip to D dimensions by a random projection (none)'
@@ -65,13 +67,13 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
 
 def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
     """
-    Return the extractor of the parsed options.
+    Return the extractor of the parsed options, where ``auto`` becomes a kind, which is printed.
 
     :raises SettingsError: an option is missing, out of range or of another kind.
     """
     from stavpr_ros.features import FeatureExtractor
 
-    return FeatureExtractor(
+    extractor = FeatureExtractor(
         arguments.features,
         _backbone_settings(arguments),
         arguments.strips,
@@ -79,6 +81,10 @@ def make_extractor(arguments: argparse.Namespace) -> 'FeatureExtractor':
         arguments.seed,
         arguments.device,
     )
+    if extractor.choice:
+        say(extractor.choice, sys.stderr)
+    arguments.features = extractor.settings.kind
+    return extractor
 
 
 def kind_options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -96,7 +102,7 @@ def _option(kind: str, name: str) -> str:
 
 def _backbone_settings(arguments: argparse.Namespace) -> Any:
     """
-    Return the settings of the chosen kind from the parsed options.
+    Return the settings of the chosen kind from the parsed options, None for ``auto``.
 
     :raises SettingsError: an option of this kind is missing, or one of another kind was given.
     """
@@ -111,6 +117,8 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
                 )
             if value is not None:
                 values[row.name] = value
+    if kind == AUTO:
+        return None
     missing = [
         _option(kind, row.name)
         for row in dataclasses.fields(settings_class(kind))

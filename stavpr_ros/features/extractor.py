@@ -16,6 +16,7 @@ import numpy as np
 from stavpr_ros.checks import require_at_least, require_shape, rgb_image
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features.registry import (
+    AUTO,
     Backbone,
     backbone_class,
     NetworkSettings,
@@ -201,8 +202,9 @@ class FeatureExtractor:
 
     A network is tried on one image first, so that unusable ones fail before any work.
 
-    :param kind: one of :func:`stavpr_ros.features.registry.kinds`.
-    :param backbone: settings of that kind; None for its defaults.
+    :param kind: one of :func:`stavpr_ros.features.registry.kinds`; or ``auto``: ``hybrid`` where
+        onnxruntime and the network's file are there or can be made, else ``gradient``.
+    :param backbone: settings of that kind; None for its defaults, and with ``auto``.
     :param strips: number of vertical strips W; None = 7, or 1 if an image has one vector.
     :param projection: number of dimensions of a new Gaussian projection, a :class:`Projection`,
         or None.
@@ -211,20 +213,28 @@ class FeatureExtractor:
     :raises SettingsError: the network's output cannot be used.
     :raises UnavailableError: the device or the network's file is not there.
 
-    ``is_new`` until its first images have decided the range of values of 16 bits.
+    ``is_new`` until its first images have decided the range of values of 16 bits; ``choice`` is
+    the line in the log that names what ``auto`` became, and why, '' = a kind was named.
     """
 
     is_new = True
+    choice = ''
 
     def __init__(
         self,
-        kind: str = 'gradient',
+        kind: str = AUTO,
         backbone: Any = None,
         strips: int | None = None,
         projection: int | Projection | None = None,
         seed: int = 0,
         device: str = 'cpu',
     ) -> None:
+        if kind == AUTO and backbone is None:
+            from stavpr_ros.features.efficientnet_lite import choose_kind  # imports this module
+
+            kind, self.choice = choose_kind()
+            device = 'auto' if device == 'cuda' else device  # gradient computes on the CPU as well
+            logging.getLogger(__name__).info('%s', self.choice)
         if backbone is None:
             backbone = settings_class(kind)()
         self._backbone: Backbone = backbone_class(kind)(backbone, device)

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Oriented-gradient features: no weights, no training, the default.
+Oriented-gradient features: no weights, no training, the default without a network.
 
 Histograms of gradient orientation on a regular grid of overlapping cells, each normalized by the
 four 2 x 2 blocks around it (after Dalal and Triggs, "Histograms of Oriented Gradients for Human

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_SIDE = 4096  # pixels of a side of the resized image
 RESIZE_METHODS = ('bilinear', 'area')
+AUTO = 'auto'  # instead of a kind: hybrid where it can be computed, else gradient
 CACHED = 'cached'  # the file that `stavpr weights` puts in its place, instead of a path
 POOLINGS = ('flatten', 'mean', 'gem')
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
@@ -283,6 +284,11 @@ def evidence_of(kind: str, strips: int, dimension: int) -> tuple[float, Cells | 
 
 def _kind(name: str) -> Kind:
     kind = KINDS.get(name) or _all().get(name)
+    if name == AUTO:
+        raise SettingsError(
+            f'features {AUTO} have no settings: name the kind, such as features hybrid for the '
+            'network, or leave the settings out'
+        )
     if kind is None:
         remedy = f'take one of {", ".join(kinds())}'
         if name in LAB:

@@ -14,7 +14,7 @@ from stavpr_ros.checks import require_choice
 from stavpr_ros.devices import choose_backend, why_no_cuda
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.features.registry import kinds, settings_class, settings_from_json
+from stavpr_ros.features.registry import AUTO, kinds, settings_class, settings_from_json
 from stavpr_ros.mapping.camera import mount_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.mapping.stores import is_address
@@ -38,7 +38,7 @@ class PipelineSettings:
         set.
     :param min_probability, max_error: mode robust, see
         :class:`stavpr_ros.recognition.RecognizerSettings`.
-    :param features: kind of the features of a route that starts without a map.
+    :param features: kind of the features of a route that starts without a map, or ``auto``.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
     :param candidates: nearest places that every match lists.
     :param geometric: the geometric check of matches, None = off.
@@ -69,9 +69,10 @@ class PipelineSettings:
     update_map: bool = default('update_map')
 
     def __post_init__(self) -> None:
-        settings_class(self.features)  # rejects an unknown kind
         if self.feature_settings:
             settings_from_json(self.features, self.feature_settings, self.model_path)
+        elif self.features != AUTO:
+            settings_class(self.features)  # rejects an unknown kind
         self.recognition()
 
     @cached_property
@@ -140,9 +141,16 @@ class PipelineSettings:
 
         :raises StavprError: invalid settings of the features, or a missing model file.
         """
-        backbone = settings_from_json(
-            self.features, self.feature_settings or '{}', self.model_path
-        )
+        backbone = None
+        if self.features != AUTO:
+            backbone = settings_from_json(
+                self.features, self.feature_settings or '{}', self.model_path
+            )
+        elif self.model_path:
+            raise SettingsError(
+                f'model_path {self.model_path!r} with features {AUTO}: name the kind of that '
+                'network, such as features hybrid, or leave it out'
+            )
         return FeatureExtractor(self.features, backbone, device=self.extraction_device)
 
     @property
@@ -212,7 +220,7 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
     :raises UnavailableError: the backend is not available.
     """
     for name, value in values.items():
-        choices = kinds() if name == 'features' else BY_NAME[name].choices
+        choices = (AUTO, *kinds()) if name == 'features' else BY_NAME[name].choices
         if choices:
             require_choice(name, value, choices)
     values = {**values, 'threshold': None if values['threshold'] < 0 else values['threshold']}

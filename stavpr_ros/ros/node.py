@@ -20,7 +20,6 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import MapInfo
 from stavpr_ros.compilation import progress
 from stavpr_ros.errors import left_out, SettingsError, StavprError
-from stavpr_ros.features.efficientnet_lite import recommendation
 from stavpr_ros.parameters import BY_NAME, RENAMED
 from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
@@ -181,8 +180,8 @@ class PlaceRecognitionNode(ManagedNode):
             self._publish_map_info('loading', settings.map_path)
         self._runtime = Runtime(self, settings, self.statistics, self._publish_map_info)
         extractor = self._runtime.pipeline.operation.extractor
-        if extractor is not None and (better := recommendation(extractor.settings.kind)):
-            self.get_logger().info(better)
+        if extractor is not None and extractor.choice:
+            self.get_logger().info(extractor.choice)
         if missing := self._runtime.pipeline.operation.missing:
             self.get_logger().warning(f'waiting, no image can be matched: {missing}')
         self._publish_map_info()

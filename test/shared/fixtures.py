@@ -84,7 +84,7 @@ def small_map(route):
     frames = [Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route)]
     poses = np.zeros((len(route), 7))
     poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
-    return build_map(frames, FeatureExtractor(projection=64), poses, progress=False)
+    return build_map(frames, FeatureExtractor('gradient', projection=64), poses, progress=False)
 
 
 @pytest.fixture(scope='module')

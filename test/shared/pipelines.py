@@ -16,7 +16,7 @@ SECOND = 10**9
 def settings_of(**changes):
     short = {'sequence': SequenceSettings(LENGTH), 'nms_radius': 5, 'exclude_places': EXCLUDED}
     short['min_probability'] = MIN_PROBABILITY
-    return PipelineSettings(**{'backend': 'cpu'} | short | changes)
+    return PipelineSettings(**{'backend': 'cpu', 'features': 'gradient'} | short | changes)
 
 
 def message(image):

@@ -73,5 +73,6 @@ def command(name: str) -> list[str]:
 
 def node_process(log: Path, *options: str, slow: bool = False, **parameters: object) -> Process:
     """Start the node, or the slow one, with options of ROS and parameters."""
+    parameters = {'features': 'gradient'} | parameters
     values = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
     return Process(log, 'slow_node' if slow else 'node', '--ros-args', *options, *values)

@@ -40,6 +40,7 @@ PARAMETERS = {
     'min_probability': 0.05,  # windows as short as these are certain of nothing
     'threads': 1,
     'keyframe_change': 0.0,
+    'features': 'gradient',
     'diagnostics_period': 0.1,
     'qos_overrides./image.subscription.depth': 1000,
 }

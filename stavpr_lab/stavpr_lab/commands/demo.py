@@ -58,6 +58,7 @@ exit codes: 0 done, 1 something failed (the reason is printed), 2 usage, 130 int
 
 
 def _parser() -> argparse.ArgumentParser:
+    from stavpr_lab.demonstration import FEATURES
     from stavpr_ros.commands.feature_options import add_feature_options
 
     parser = make_parser('demo', DESCRIPTION, EPILOG)
@@ -103,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     sessions = '2: lap 3 is on the next day, its odometry starts anew'
     add('--sessions', type=int, default=1, choices=(1, 2), help=sessions)
     add_feature_options(parser)
+    parser.set_defaults(features=FEATURES)
     return parser
 
 

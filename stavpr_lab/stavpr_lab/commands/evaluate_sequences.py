@@ -19,8 +19,10 @@ from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.errors import left_out, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.features.registry import AUTO
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.mapping.builder import fit_value_range
+from stavpr_ros.parameters import default
 from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import is_folder, open_source
 from stavpr_ros.sources.bag_path import is_bag
@@ -29,7 +31,7 @@ from stavpr_ros.sources.pose_file import read_poses
 from stavpr_ros.sources.video import require_video
 
 IDENTITY_TOLERANCE = 3  # places; a file of accepted pairs includes its tolerance
-DEFAULTS = {'features': 'gradient', 'seed': 0}
+DEFAULTS = {'features': default('features'), 'seed': 0}
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,7 @@ class _Loader:
         own = {'features': place_map.settings.kind, 'strips': place_map.settings.strips}
         for name, present in own.items():
             requested = getattr(args, name)
-            if requested is not None and requested != present:
+            if requested not in (None, AUTO, present):
                 raise SettingsError(
                     f'--{name} {requested}: the map {path} was made with {present}; leave it out'
                 )

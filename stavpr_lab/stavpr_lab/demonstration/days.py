@@ -15,6 +15,7 @@ import sys
 
 import matplotlib as mpl
 import numpy as np
+from stavpr_lab.demonstration import FEATURES
 from stavpr_lab.demonstration.street.days import DAY, Days
 from stavpr_lab.demonstration.street.traverses import EPOCH
 from stavpr_ros.errors import InputError
@@ -60,7 +61,7 @@ def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
     traverse = days.drive(day)
     meters = np.where(traverse.detour, DETOUR - traverse.along, traverse.along)
     positions |= dict(zip(traverse.stamps.tolist(), meters.tolist(), strict=True))
-    return build_map(traverse, FeatureExtractor(), progress=False)
+    return build_map(traverse, FeatureExtractor(FEATURES), progress=False)
 
 
 def measure(

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from stavpr_lab.demonstration import FEATURES
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import render
 from stavpr_lab.demonstration.street.street import CELL
@@ -148,7 +149,7 @@ def teach(world: RingWorld, begin: float = 0.0, length: float = LENGTH) -> Taugh
     )
     speeds = np.hypot(np.gradient(x), np.gradient(y)) * RATE
     run = TaughtRun(times, speeds, np.gradient(heading) * RATE)
-    place_map = build_map(frames, FeatureExtractor(), progress=False)
+    place_map = build_map(frames, FeatureExtractor(FEATURES), progress=False)
     return Taught(world, place_map, run, poses)
 
 
