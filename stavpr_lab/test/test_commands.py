@@ -222,6 +222,7 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
     ],
 )
 def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, code, word):
+    options = ['--features', 'gradient', *options]
     result = run(build_map, '--input', traverse, '--output', tmp_path / 'map.stavpr', *options)
     assert result.code == code
     assert word in result.err

@@ -58,16 +58,8 @@ def numbers(run, tmp_path):
 
 
 def pair(folders):
-    features = '--features', 'gradient'
-    return [
-        '--map',
-        folders / 'map',
-        '--query',
-        folders / 'query',
-        '--truth',
-        'identity',
-        *features,
-    ]
+    options = ['--truth', 'identity', '--features', 'gradient']
+    return ['--map', folders / 'map', '--query', folders / 'query', *options]
 
 
 def page_data(page):
@@ -155,7 +147,7 @@ def test_evaluate_with_crop_equals_images_cropped_before(folders, numbers, tmp_p
 
     first, second = crop('map', slice(128 - 38)), crop('query', slice(13, None))
     found = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
-    assert found == numbers('--map', first, '--query', second, '--truth', 'identity')['sequence']
+    assert found == numbers(*pair(folders), '--map', first, '--query', second)['sequence']
 
 
 def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run):
@@ -187,7 +179,8 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     assert (found['settings']['tolerance'], found['sequence']['f1']) == (3, 1)
     source, saved = open_source(tmp_path / 'nordland' / 'winter'), tmp_path / 'unknown.stavpr'
     save_map(build_map(source, FeatureExtractor('gradient', projection=32), progress=False), saved)
-    options = ['--dataset', f'nordland={tmp_path}', '--projection', 32, '--unknown', saved]
+    options = ['--dataset', f'nordland={tmp_path}', '--features', 'gradient']
+    options += ['--projection', 32, '--unknown', saved]
     assert numbers(*options)['unknown_images'] == 24
     code, _, errors = run(*options, '--seed', 1)
     assert (code, 'those of the first sequence' in errors) == (1, True)

@@ -29,7 +29,8 @@ def run(monkeypatch, capsys, tmp_path, route):
 
 
 def test_export_vpr_methods_evaluation_has_positions_in_the_names(run, tmp_path):
-    assert run('vpr_methods_evaluation', '--truth', 'identity', '--tolerance', 2)[0] == 0
+    options = ['--truth', 'identity', '--tolerance', 2, '--features', 'gradient']
+    assert run('vpr_methods_evaluation', *options)[0] == 0
     out, positions, rows = tmp_path / 'out', [], []
     for side in ('database', 'queries'):
         paths = (out / f'{side}_images_paths.txt').read_text().splitlines()

@@ -60,11 +60,10 @@ def test_evaluate_names_a_result_that_cannot_be_wrong(run, pair, tmp_path):
 def test_evaluate_exports_strips_of_images(run, route, tmp_path):
     folder = write_images(tmp_path / 'images', route[:24])
     both = ['--map', folder, '--query', folder, '--sequence-length', 5]
+    both += ['--features', 'gradient']
     assert run(*both, '--json', tmp_path / 'a.json', '--export', tmp_path)[0] == 0
-    array, features = (
-        np.load(tmp_path / 'map.npy'),
-        FeatureExtractor('gradient').extract(route[:24]),
-    )
+    array = np.load(tmp_path / 'map.npy')
+    features = FeatureExtractor('gradient').extract(route[:24])
     assert array.shape == (24, 7, 224)
     again = read_descriptors(str(tmp_path / 'map.npy'))
     np.testing.assert_allclose(again.strips, features.strips, rtol=1e-5, atol=1e-5)

