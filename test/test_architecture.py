@@ -153,7 +153,8 @@ from stavpr_ros.mapping import open_map
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
-assert main(['--input', {str(tmp_path)!r}, '--output', {str(tmp_path / 'map')!r}]) == 0
+output = ['--output', {str(tmp_path / 'map')!r}, '--features', 'gradient']
+assert main(['--input', {str(tmp_path)!r}, *output]) == 0
 place_map = open_map({str(tmp_path / 'map')!r})
 extractor, recognizer = place_map.extractor(), PlaceRecognizer(place_map, RecognizerSettings())
 images = [frame.image for frame in open_source({str(tmp_path)!r})]

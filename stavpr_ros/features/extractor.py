@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_shape, rgb_image
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
+from stavpr_ros.features.choice import choose_kind
 from stavpr_ros.features.registry import (
     AUTO,
     Backbone,
@@ -230,8 +231,6 @@ class FeatureExtractor:
         device: str = 'cpu',
     ) -> None:
         if kind == AUTO and backbone is None:
-            from stavpr_ros.features.efficientnet_lite import choose_kind  # imports this module
-
             kind, self.choice = choose_kind()
             device = 'auto' if device == 'cuda' else device  # gradient computes on the CPU as well
             logging.getLogger(__name__).info('%s', self.choice)

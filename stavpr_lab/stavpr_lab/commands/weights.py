@@ -41,7 +41,7 @@ def main(args: list[str] | None = None) -> int:
         if arguments.features == CONVERTED:
             if arguments.sha256:
                 parser.error(f'--sha256 is for downloads: {CONVERTED} is converted')
-            from stavpr_ros.features.efficientnet_lite import make_file
+            from stavpr_ros.features.efficientnet_lite_file import make_file
 
             path = make_file()
             sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
