@@ -5,7 +5,7 @@ Gradient and learned features together, strip by strip: they fail at different p
 
 With the unit-norm strips g_i, e_i of both kinds, and their shares a_i, b_i of the image's norm,
 strip i is w_i (g_i, e_i) / sqrt(2), w_i^2 = (a_i^2 + b_i^2) / 2: the cosine of two strips is the
-mean of both cosines. The default where its network is, see ``auto`` of the extractor.
+mean of both cosines. ``auto`` takes it where its network is.
 """
 
 from collections.abc import Sequence
