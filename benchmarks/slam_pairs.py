@@ -76,7 +76,8 @@ def recognize(
     """Recognize a drive and return its pairs."""
     own = [drive.images[:, 0] == lap for lap in range(drive.images[-1, 0] + 1)]
     laps = np.array([0, *np.cumsum([drive.images[lap, 1].max() + 1 for lap in own])])
-    pipeline = Pipeline(PipelineSettings(backend='cpu', exclude_places=exclude), 'loop_closure')
+    settings = PipelineSettings(backend='cpu', exclude_places=exclude, features='gradient')
+    pipeline = Pipeline(settings, 'loop_closure')
     odometry, pairs = planar_poses(drive.odometry), []
     image_of = {int(stamp): i for i, stamp in enumerate(drive.stamps)}
     route: Any = None  # pairs without their map can be kept in a file

@@ -75,10 +75,8 @@ def test_build_journal_of_another_work_is_refused(frames, tmp_path):
     target = tmp_path / 'route.stavpr'
     with pytest.raises(StopError):
         build_journal(until(frames, 40), EXTRACTOR, target, 'drive', progress=False)
-    for extractor, source in (
-        (EXTRACTOR, 'other'),
-        (FeatureExtractor('gradient', projection=8), 'drive'),
-    ):
+    projected = FeatureExtractor('gradient', projection=8)
+    for extractor, source in ((EXTRACTOR, 'other'), (projected, 'drive')):
         with pytest.raises(JournalError, match='is of other images or options'):
             build_journal(frames, extractor, target, source, progress=False)
 

@@ -128,9 +128,8 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
         assert abs(match.newest_index - (2 * n - 1 - i)) <= 2
     # to the left by a quarter: what was at the left is ahead
     assert build_map.main([*build, back, '--panorama-yaw', '90', '--force']) == 0
-    expected = (
-        FeatureExtractor('gradient').extract([np.roll(panoramas[0], 48, axis=1)]).strips[:, 0]
-    )
+    turned = np.roll(panoramas[0], 48, axis=1)
+    expected = FeatureExtractor('gradient').extract([turned]).strips[:, 0]
     np.testing.assert_allclose(load_map(back).features.strips[:, 0], expected, atol=1e-3)
 
 

@@ -10,7 +10,7 @@ import pytest
 from stavpr_ros.alignment import best_match, match_sequence, SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import build_map, load_map, PlaceMap
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.sources import open_source
@@ -59,9 +59,7 @@ def test_recognizer_by_image_equals_whole_matrix_at_once(small_map, strategy):
 
 
 def test_recognizer_at_threshold_does_not_match(small_map, route):
-    query = FeatureExtractor('gradient', projection=64).extract(
-        [255 - image for image in route[3:8]]
-    )
+    query = small_map.extractor().extract([255 - image for image in route[3:8]])
     distance = recognize_all(recognizer(small_map), query)[-1].sequence.distance
     assert distance > 0.01
     for threshold, status in (
@@ -128,11 +126,7 @@ def test_arguments_of_wrong_types_are_rejected_with_the_expected_one(small_map):
             r'float: expected RecognizerSettings',
         ),
         (lambda: one.update(image), InputError, 'expected the LocalFeatures of one image'),
-        (
-            lambda: build_map('monday/', FeatureExtractor('gradient')),
-            InputError,
-            'expected open_source',
-        ),
+        (lambda: build_map('monday/', small_map.extractor()), InputError, 'expected open_source'),
         (lambda: build_map([], 'gradient'), InputError, 'str: expected a FeatureExtractor'),
         (lambda: open_source(None), InputError, 'NoneType: expected the path of a folder'),
         (lambda: load_map(3), InputError, 'int: expected the path of a map file'),

@@ -36,9 +36,8 @@ def coarse(image):
 @pytest.fixture
 def path(tmp_path):
     frames = open_source(write_images(tmp_path / 'monday', ROUTE))
-    save_map(
-        build_map(frames, FeatureExtractor('gradient'), progress=False), tmp_path / 'route.stavpr'
-    )
+    extractor = FeatureExtractor('gradient')
+    save_map(build_map(frames, extractor, progress=False), tmp_path / 'route.stavpr')
     return str(tmp_path / 'route.stavpr')
 
 

@@ -118,9 +118,8 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     sources = [FolderSource(write_images(tmp_path / name, each)) for name, each in shifted.items()]
     truth = GroundTruth.identity(40, 40, 1)
     experiment = DatasetExperiment(Dataset(*sources, truth, 1), 'gradient', None)
-    place_map, query = (
-        build_map(each, FeatureExtractor('gradient'), progress=False) for each in sources
-    )
+    extractor = FeatureExtractor('gradient')
+    place_map, query = (build_map(each, extractor, progress=False) for each in sources)
     settings = RecognizerSettings(1.0, mode='paper')
     plain = evaluate_on_map(place_map, query.features, truth, settings)
     columns = {column.name: column for preset in PRESETS.values() for column in preset}

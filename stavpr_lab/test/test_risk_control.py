@@ -119,9 +119,8 @@ def traverses(tmp_path_factory):
     second = [np.clip(0.5 * image + rng.normal(0, 40, image.shape), 0, 255) for image in first]
     write_images(folder / 'map', first)
     write_images(folder / 'query', [image.astype(np.uint8) for image in second])
-    place_map = build_map(
-        open_source(folder / 'map'), FeatureExtractor('gradient'), progress=False
-    )
+    extractor = FeatureExtractor('gradient')
+    place_map = build_map(open_source(folder / 'map'), extractor, progress=False)
     with patch.object(prepared_map, 'MIN_PLACES', 1):
         learned = prepared_map.statistics_of_map(place_map, 'float16')
         learned = prepared_map.with_codes(learned, place_map, 'float16')
