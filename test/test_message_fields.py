@@ -178,7 +178,7 @@ PLACE_MATCH: Checks = {
         math.isnan(m.distance) == (m.sequence_first < 0) and (not matched(m) or
         is_close(m.distance, 0, 0.001))),
     'threshold': ('as applied: MATCH means distance < threshold; mode robust: 1 - the '
-        'probability that applies: of min_probability or max_error; at least 0.97 of fewer images '
+        'probability that applies: of min_probability or max_error; at least 0.95 of fewer images '
         'than a full window, up to 0.9 of a camera at rest, 1 of a path that is not confirmed '
         'yet (operation loop_closure)',
         lambda m, d: (is_close(m.threshold, d.limit(m)) or m.status == Status.INVALID_IMAGE or

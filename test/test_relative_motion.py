@@ -170,13 +170,13 @@ def test_session_of_a_match_ends_its_track():
 
 def test_early_matches_are_compared_since_the_first_of_them():
     """The robot was carried 30 m before it came back: what no match is of does not count."""
-    route, elsewhere = route_strips(3, 200, 32), route_strips(7, 24, 32)
+    route, elsewhere = route_strips(3, 200, 32), route_strips(11, 24, 32)
     strips = np.concatenate([route[:, :70], elsewhere, route[:, 110:190]], axis=1)
     way = track(count=174) + (np.arange(174) >= 94)[:, None] * (0, 30)
     one = PlaceRecognizer(
-        driven_map(features_of(route, 0.2, 1), track(count=200)), RecognizerSettings()
+        driven_map(features_of(route, 0.1, 1), track(count=200)), RecognizerSettings()
     )
-    matches = drive(one, features_of(strips, 0.2, 2), way)
+    matches = drive(one, features_of(strips, 0.1, 2), way)
     assert min(len(match.path) for match in matches[95:105]) < len(matches[-1].path)  # early ones
     assert all(match.accepted for match in matches[95:])
 

@@ -195,7 +195,7 @@ class Kind:
 
     settings: Any
     backbone: str = ''
-    constant: float = -7.2
+    constant: float = -6.8
     cells: Cells | None = None
     with_cells: float = 0.0
 
@@ -214,14 +214,14 @@ KINDS = {
     'efficientnet_lite1': Kind(
         EfficientNetSettings,
         f'{_FEATURES}.efficientnet_lite:EfficientNetLite1',
-        constant=-8.6,
+        constant=-8.2,
         cells=Cells(0, 112, 7, 1, dimension=784),
         with_cells=-11.7,
     ),
     'hybrid': Kind(
         HybridSettings,
         f'{_FEATURES}.hybrid:Hybrid',
-        constant=-8.6,
+        constant=-8.2,
         cells=Cells(224, 112, 7, 1, dimension=1008),
         with_cells=-11.7,
     ),

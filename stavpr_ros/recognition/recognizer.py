@@ -51,7 +51,7 @@ from stavpr_ros.threads import one_thread
 if TYPE_CHECKING:
     import torch
 
-EARLY = 0.97  # minimum probability of a match by the newest images alone
+EARLY = 0.95  # minimum probability of a match by the newest images alone
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
 MANY = 2  # places of a position, in the mean: more are not all compared
 TIMED = 3  # images, to compare the time of one with the time budget
