@@ -46,7 +46,7 @@ def test_cells_are_the_parts_of_an_image_row_by_row():
 
 
 @pytest.mark.parametrize('count', [4, 20])
-def test_lead_is_the_mean_over_images_of_path_less_rival(count):
+def test_lead_is_the_mean_over_images_of_path_less_competitor(count):
     """Also of images that went before in the window, whose cells are compared once."""
     rng = np.random.default_rng(2)
     strips = rng.standard_normal((7, 40, 112)).astype(np.float32)

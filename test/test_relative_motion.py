@@ -59,20 +59,20 @@ def drive(recognizer, features, positions=None):
 
 def test_agreement_of_another_length_is_the_tail_of_chi_squared():
     """Five images after the middle one drive 8 m, where the path is 5 places of 1 m long."""
-    way = track(count=LENGTH, step=1.6)
-    found = agreement(track(), (40, 45), way, MIDDLE, 0.1)
+    driven = track(count=LENGTH, step=1.6)
+    found = agreement(track(), (40, 45), driven, MIDDLE, 0.1)
     assert found == pytest.approx(chi2.sf(3**2 / (1 + 0.8**2), 3))
     assert agreement(track(), (40, 45), track(count=LENGTH), MIDDLE, 0.1) == 1
 
 
 def test_agreement_of_another_shape_is_the_tail_of_chi_squared():
     """Five images: 1 m ahead, then 1 m to the side, on a straight track."""
-    way = np.array([[-1.0, 0], [0, 0], [0, 1]])
+    driven = np.array([[-1.0, 0], [0, 0], [0, 1]])
     # less mean and rotation: a triangle on a line of three points
-    mine, line = way @ (1, 1j), np.array([-1, 0, 1])
+    mine, line = driven @ (1, 1j), np.array([-1, 0, 1])
     mine = (mine - mine.mean()) * np.exp(-1j * np.pi / 4)
     rest = np.abs(line - mine) ** 2 / (0.25 + np.array([0.1, 0, 0.1]) ** 2)
-    found = agreement(track(), (40, 41), way, 1, 0.1)
+    found = agreement(track(), (40, 41), driven, 1, 0.1)
     assert found == pytest.approx(chi2.sf(2 * rest.mean(), 3))
 
 
@@ -87,17 +87,17 @@ def test_agreement_of_turns_is_independent_of_frames(turn):
 
 
 def test_agreement_without_poses_is_unknown():
-    way, unknown = track(count=LENGTH), np.full(2, np.nan)
-    for hole, rows in (('way', (MIDDLE, LENGTH - 1)), ('track', (40, 45))):
+    driven, unknown = track(count=LENGTH), np.full(2, np.nan)
+    for hole, rows in (('driven', (MIDDLE, LENGTH - 1)), ('track', (40, 45))):
         for row in rows:
-            arrays = {'track': track(), 'way': way.copy()}
+            arrays = {'track': track(), 'driven': driven.copy()}
             arrays[hole][row] = unknown
-            found = agreement(arrays['track'], (40, 45), arrays['way'], MIDDLE, 0.1)
+            found = agreement(arrays['track'], (40, 45), arrays['driven'], MIDDLE, 0.1)
             assert np.isnan(found), (hole, row)
-    others = way.copy()
+    others = driven.copy()
     others[[0, 7]] = unknown  # of other images: the rest is compared
     assert agreement(track(), (40, 45), others, MIDDLE, 0.1) == 1
-    assert np.isnan(agreement(np.zeros((N, 2)), (40, 45), way, MIDDLE, 0.1))  # it stood
+    assert np.isnan(agreement(np.zeros((N, 2)), (40, 45), driven, MIDDLE, 0.1))  # it stood
     assert np.isnan(agreement(track(), (40, 45), np.full((LENGTH, 2), np.nan), MIDDLE, 0.1))
 
 
@@ -125,18 +125,18 @@ def test_the_same_corridor_is_matched_in_spite_of_drift():
     rng = np.random.default_rng(1)
     steps = np.diff(track(90), axis=0) @ (1, 1j) * (1.03 + 0.02 * rng.standard_normal(N - 1))
     steps *= np.exp(1j * np.cumsum(np.radians(0.3) * rng.standard_normal(N - 1)))
-    way = np.concatenate([[0], np.cumsum(steps)])
-    way = np.column_stack([way.real, way.imag])
+    driven = np.concatenate([[0], np.cumsum(steps)])
+    driven = np.column_stack([driven.real, driven.imag])
     place_map = driven_map(places, track(90))
     plain = drive(PlaceRecognizer(place_map, settings_of()), query)
-    matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
+    matches = drive(PlaceRecognizer(place_map, settings_of()), query, driven)
     assert [match.probability for match in matches[LENGTH:]] == [
         match.probability for match in plain[LENGTH:]
     ]
 
 
 @pytest.mark.parametrize(
-    ('positions', 'way', 'changes'),
+    ('positions', 'driven', 'changes'),
     [
         (track(90), None, {}),
         (None, track(-90), {}),
@@ -145,25 +145,25 @@ def test_the_same_corridor_is_matched_in_spite_of_drift():
     ],
     ids=['no odometry', 'no poses of places', 'switched off', 'mode paper'],
 )
-def test_absence_of_odometry_or_poses_changes_nothing(positions, way, changes):
+def test_absence_of_odometry_or_poses_changes_nothing(positions, driven, changes):
     places, query = corridor()
     settings = replace(settings_of(), **changes)
     expected = drive(PlaceRecognizer(driven_map(places, None), settings), query)
-    found = drive(PlaceRecognizer(driven_map(places, positions), settings), query, way)
+    found = drive(PlaceRecognizer(driven_map(places, positions), settings), query, driven)
     assert [repr(one.sequence) for one in found] == [repr(one.sequence) for one in expected]
     assert [one.reason for one in found] == [one.reason for one in expected]
 
 
 def test_session_of_a_match_ends_its_track():
-    """The second session begins elsewhere: what lies between is no way."""
+    """The second session begins elsewhere: what lies between is no driven."""
     places, query = corridor()
     positions = track(90)
     positions[CORNER:] += (1000.0, 0)
     sessions = Session('a'), Session('b')
     index = (np.arange(N) >= CORNER).astype(np.int32)
     place_map = driven_map(places, positions, sessions=sessions, session_index=index)
-    way = np.vstack([track(90)[:CORNER], track(90)[CORNER:]])
-    matches = drive(PlaceRecognizer(place_map, settings_of()), query, way)
+    driven = np.vstack([track(90)[:CORNER], track(90)[CORNER:]])
+    matches = drive(PlaceRecognizer(place_map, settings_of()), query, driven)
     assert all(match.accepted for match in matches[LENGTH : CORNER - 6])
     assert all(match.accepted for match in matches[CORNER + LENGTH :])
 
@@ -172,11 +172,11 @@ def test_early_matches_are_compared_since_the_first_of_them():
     """The robot was carried 30 m before it came back: what no match is of does not count."""
     route, elsewhere = route_strips(3, 200, 32), route_strips(11, 24, 32)
     strips = np.concatenate([route[:, :70], elsewhere, route[:, 110:190]], axis=1)
-    way = track(count=174) + (np.arange(174) >= 94)[:, None] * (0, 30)
+    driven = track(count=174) + (np.arange(174) >= 94)[:, None] * (0, 30)
     one = PlaceRecognizer(
         driven_map(features_of(route, 0.1, 1), track(count=200)), RecognizerSettings()
     )
-    matches = drive(one, features_of(strips, 0.1, 2), way)
+    matches = drive(one, features_of(strips, 0.1, 2), driven)
     assert min(len(match.path) for match in matches[95:105]) < len(matches[-1].path)  # early ones
     assert all(match.accepted for match in matches[95:])
 

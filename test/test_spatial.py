@@ -129,11 +129,11 @@ def test_sliding_window_by_hand():
 def test_rigid_shift_by_hand():
     d = np.ones((3, 3))
     d[0, 1], d[1, 2] = 0.25, 0.5  # the place is one strip to the right
-    assert one(d, SpatialSettings('rigid')) == 0.375
+    assert one(d, SpatialSettings('rigid')) == 0.375 + 1 / 32
     assert one(d, SpatialSettings('rigid', xi=1)) == 1
     d[2, 0] = 0.125  # two strips to the left
-    assert one(d, SpatialSettings('rigid')) == 0.125
-    assert one(d, SpatialSettings('rigid', xi=2)) == 0.375
+    assert one(d, SpatialSettings('rigid')) == 0.125 + 2 / 32
+    assert one(d, SpatialSettings('rigid', xi=2)) == 0.375 + 1 / 32
 
 
 def check(d, strategy, sigma=1.0, xi=None):

@@ -110,7 +110,7 @@ class MotionEvidence:
         :param speed: m/s that is commanded.
         """
         if image.is_compared:
-            interval = max(image.stamp - self._stamp, self._period / 2)  # some come in bursts
+            interval = max(image.stamp - self._stamp, self._period / 2)  # images come in bursts
             self._stamp, self._period = image.stamp, min(interval, self._max_period)
         if image.is_new:
             self._changed = totals[0]

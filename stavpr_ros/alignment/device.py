@@ -18,6 +18,7 @@ is F = D - t // 2, which a diagonal step, from t - 2 to t, does not change.
 from collections.abc import Callable, Iterable
 
 import numpy as np
+from stavpr_ros.alignment.cpu.dtw import SHIFT_COST
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.alignment.spatial import adaptive_weights, WINDOW
 import torch
@@ -105,7 +106,7 @@ def spatial_alignment(
             total = pairs[:, 0]
             for i in range(1, W - abs(s)):
                 total = total + pairs[:, i]
-            best = torch.minimum(best, total / (W - abs(s)))
+            best = torch.minimum(best, total / (W - abs(s)) + SHIFT_COST * abs(s))
         return best
 
     def warped(d: torch.Tensor) -> torch.Tensor:

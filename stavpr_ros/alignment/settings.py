@@ -18,7 +18,8 @@ class SpatialSettings:
     How the distance of two images is made from the distances of their strips.
 
     :param strategy: ``adaptive`` (weight a on diagonal steps), ``vanilla`` DTW (a = 1),
-        ``rigid`` (the best shift of the whole image, by whole strips), ``sliding_window`` (the
+        ``rigid`` (the best shift of the whole image, by whole strips,
+        each of which costs 1 / 32), ``sliding_window`` (the
         best four strips in a row), ``none`` (whole images, no alignment).
     :param sigma: how strongly the viewpoint change raises ``a = sqrt(1 + sigma |I_c - c|)``; >= 0.
     :param xi: restricted alignment: strips i and j with ``|i - j| >= xi`` are never aligned;

@@ -94,7 +94,7 @@ def own_evidence(
     :param posterior: p, by the filter and the checks.
     :param lead: d, of :func:`lead_of`.
     :param images: l.
-    :param cells: e, by how many cells it agrees better than its rival; 0 = not compared.
+    :param cells: e, by how many cells it agrees better than its competitor; 0 = not compared.
     """
     if posterior <= 0:
         return -math.inf

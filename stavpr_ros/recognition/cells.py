@@ -3,11 +3,11 @@
 """
 Cells that agree: whether the same parts of two images are at the same places.
 
-The strips of some kinds of features are 7 x 7 cells of an image. A cell of the image and one of
+The strips of several kinds of features are 7 x 7 cells of an image. A cell of the image and one of
 the place **agree** if each is the nearest one of the other, at most one row apart; c is the number
 of those that agree at one sideways shift, within one column. Unlike a distance, c is not changed
 by what all cells share, such as light. The quantity of :mod:`stavpr_ros.filter.evidence` is the
-mean c along a path, less the same along its rival, the nearest straight path elsewhere.
+mean c along a path, less the same along its competitor, the nearest straight path elsewhere.
 """
 
 from collections import deque
@@ -24,7 +24,7 @@ MAX_SHIFT = 3  # columns
 
 class CellAgreement:
     """
-    The cells of the images of a window, and how well they agree with those of places.
+    The cells of the images of a window, and how well they agree with cells of places.
 
     :param cells: where they are in a strip.
     :param strips_of: returns the strips of columns, (m,) to (7, m, d), float32.
@@ -47,19 +47,21 @@ class CellAgreement:
         number = self._images[-1][0] + 1 if self._images else 0
         self._images.append((number, cells_of(strips[:, None], self._cells)[0], {}))
 
-    def lead(self, counted: np.ndarray, path: np.ndarray, rival: np.ndarray) -> float:
+    def lead(self, counted: np.ndarray, path: np.ndarray, competitor: np.ndarray) -> float:
         """
-        Return by how many cells a path agrees better than its rival.
+        Return by how many cells a path agrees better than its competitor.
 
         :param counted: which of the newest images count, (l,), bool.
-        :param path: column of each of these, (m,); rival: likewise, or empty.
+        :param path: column of each of these, (m,); competitor: likewise, or empty.
         """
         images = np.array(self._images, object)[-len(counted) :][counted]
         if len(images) > FEW:
             is_even = np.array([image[0] % 2 == 0 for image in images])
-            images, path, rival = (part[is_even] if len(part) else part
-                                   for part in (images, path, rival))  # fmt: skip
-        return self._mean(images, path) - (self._mean(images, rival) if len(rival) else 0.0)
+            images, path, competitor = (part[is_even] if len(part) else part
+                                   for part in (images, path, competitor))  # fmt: skip
+        return self._mean(images, path) - (
+            self._mean(images, competitor) if len(competitor) else 0.0
+        )
 
     def _mean(self, images: Sequence, path: np.ndarray) -> float:
         pairs = [(image, column) for image, column in zip(images, path.tolist(), strict=True)]

@@ -294,11 +294,11 @@ class FilterWindow(QueryWindow):
         if self._to_oldest:
             return posterior, least
         near = self.layout.around(int(chosen.path[position]), APART)
-        elsewhere, rival = self.buffer.best_elsewhere(numbers, position, near)
+        elsewhere, competitor = self.buffer.best_elsewhere(numbers, position, near)
         cells = 0.0
         if self.cells is not None:
             counted = changed_images(numbers)
-            cells = self.cells.lead(counted, chosen.path[counted], rival)
+            cells = self.cells.lead(counted, chosen.path[counted], competitor)
         window = lead_of(chosen.score, elsewhere), len(numbers), cells
         recent = self.recent.share
         self._own = own_evidence(self._constant, posterior, *window)

@@ -402,7 +402,7 @@ class Runtime:
             reason = 'newer images arrived before it was processed'
             self._drop(dropped.message, Status.DROPPED, reason, 'queue full')
             self._node.get_logger().warning(
-                'images arrive faster than they are processed, some are dropped: see /diagnostics',
+                'images arrive faster than they are processed, and are dropped: see /diagnostics',
                 throttle_duration_sec=REPORT_PERIOD,
             )
 

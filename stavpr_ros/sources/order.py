@@ -39,13 +39,13 @@ def in_order(files: Sequence[Path], top: Path) -> list[Path]:
     Names are in natural order, or by decimal or negative numbers, and counters that began again.
     Times in EXIF count more, unless a clock was set.
     """
-    ways = {file: [*reversed((path := file.relative_to(top)).parents), path] for file in files}
+    levels = {file: [*reversed((path := file.relative_to(top)).parents), path] for file in files}
     names: dict[Path, set[str]] = {}
-    for folder, below in (pair for way in ways.values() for pair in pairwise(way)):
+    for folder, below in (pair for level in levels.values() for pair in pairwise(level)):
         names.setdefault(folder, set()).add(below.name)
     keys: dict[Path, Any] = {}
     notes = [_add_keys(keys, folder, sorted(own)) for folder, own in names.items()]
-    result = sorted(files, key=lambda file: [keys[path] for path in ways[file][1:]])
+    result = sorted(files, key=lambda file: [keys[path] for path in levels[file][1:]])
     result, note = _by_times(result, '; '.join(filter(None, dict.fromkeys(notes))))
     if note:
         note_once(f'{top}: {note}')

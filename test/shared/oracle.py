@@ -224,7 +224,7 @@ def sliding_window(d: Array, xi: int | None = None, dtype: type = np.float64) ->
 
 
 def rigid(d: Array, xi: int | None = None, dtype: type = np.float64) -> Any:
-    """Min over |s| < xi of the mean of d[i, i+s]; without xi, over |s| <= 2."""
+    """Min over |s| < xi of the mean of d[i, i+s] + |s| / 32; without xi, over |s| <= 2."""
     d, W = d.astype(dtype), len(d)
     best = dtype(np.inf)
     for s in range(1 - W, W):
@@ -233,7 +233,7 @@ def rigid(d: Array, xi: int | None = None, dtype: type = np.float64) -> Any:
             for i in range(W):
                 if 0 <= i + s < W:
                     total, count = total + d[i, i + s], count + 1
-            best = min(best, total / dtype(count))
+            best = min(best, total / dtype(count) + dtype(abs(s) / 32))
     return best
 
 

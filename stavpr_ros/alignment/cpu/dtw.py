@@ -18,6 +18,7 @@ from stavpr_ros.simd import LANES, load, select, splat, store
 
 SLOT = 2 * LANES  # S, then C
 VERTICAL, HORIZONTAL, DIAGONAL = 0, 1, 2
+SHIFT_COST = 1 / 32  # of a strip: a camera that looks to the side shifts from place to place
 BLOCKS = 16  # vectors of map images that a thread takes at a time
 
 
@@ -130,7 +131,7 @@ def align_lanes(d, at, row, column, weights, xi, edge):
 @kernel
 def shift_lanes(d, at, row, column, W, xi):
     """
-    Smallest mean distance of strips i and i + s, |s| < xi, of LANES map images, as a vector.
+    Smallest mean distance of strips i and i + s, |s| < xi, and its cost, of LANES map images.
 
     :param d, at, row, column: as in :func:`align_lanes`.
     """
@@ -139,7 +140,8 @@ def shift_lanes(d, at, row, column, W, xi):
         total = splat(d.dtype.type(0))
         for i in range(max(0, -s), W - max(0, s)):
             total = total + load(d, at + i * row + (i + s) * column)
-        mean = total / splat(d.dtype.type(W - abs(s)))
+        cost = splat(d.dtype.type(SHIFT_COST * abs(s)))
+        mean = total / splat(d.dtype.type(W - abs(s))) + cost
         best = select(mean < best, mean, best)
     return best
 
