@@ -12,6 +12,7 @@ mean c along a path, less the same along its competitor, the nearest straight pa
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from stavpr_ros.compilation import kernel, reassociating_kernel
@@ -63,7 +64,7 @@ class CellAgreement:
             self._mean(images, competitor) if len(competitor) else 0.0
         )
 
-    def _mean(self, images: Sequence, path: np.ndarray) -> float:
+    def _mean(self, images: Sequence[Any], path: np.ndarray) -> float:
         pairs = [(image, column) for image, column in zip(images, path.tolist(), strict=True)]
         new = [(image, column) for image, column in pairs if column not in image[2]]
         if new:
