@@ -11,31 +11,29 @@ depend on it:
   straight paths of the same images elsewhere, more than ``APART`` places from its position
   (:func:`best_elsewhere`): how much nearer it is than its look-alikes, in this window and light.
   Of a camera at rest, one image counts;
+- by how many **cells** e the path agrees better than that path elsewhere, its competitor
+  (:mod:`stavpr_ros.recognition.cells`);
 - the number l of images that are matched: a window, or the newest images alone;
 - r, the **recent** windows of the drive: whether this drive is on the map at all.
 
 The probability is 1 / (1 + exp(-x)), below one half 1 / (1 + exp((x / 5)^2)), with::
 
-    x = own + 3.65 min(0, ln(r / (1 - r)))
-    own = -7.01 + 0.62 ln(p / (1 - p)) + 2.56 ln(1 + l d)
+    x = own + 5 min(0, ln(r / (1 - r)))
+    own = K + 0.5 ln(p / (1 - p)) + 2.4 ln(1 + l d) + 2.06 ln(1 + max(e, 0))
 
-By x alone, 0.8 of the windows of a route were right where 0.01 to 0.5 is declared, since x also
-serves drives off the map. The square has the least logarithmic loss on sets left out, and moves
-nothing over one half.
+K is of the kind of features, with its cells or without
+(:class:`stavpr_ros.features.registry.Kind`). Where p is below one half, own is at most
+ln(p / (1 - p)) + 4: a path that has left the map has been right. The square below one half serves
+drives off the map and on it, and moves nothing over it.
 
 r is the share of the windows before that are likely matches by themselves, own > -0.6, or, if that
-is larger, the share of the latest ones that are sure by themselves, own > 3.4: of a drive that
-comes to the map late. Of right windows with ``efficientnet_lite1`` or ``hybrid``, own is larger:
-own > 1.5 is likely (:class:`stavpr_ros.features.registry.Kind`), which by logarithmic loss suits
-both on sets left out. The mean of p separates less: by night p is low on right paths, too.
+is larger, the share of the latest ones that are sure by themselves, own > 5.2: of a drive that
+comes to the map late.
 
-By logistic regression on features ``gradient`` and ``efficientnet_lite1`` together: on full
-windows of drives, half of them with detours, and on the first images of drives. Each of six
-routes, floors that look alike, and unrelated routes have the same weight. The log odds y of this
-regression are recalibrated on routes left out, x = 2 (y - 0.8), with 1.25 times the factor of r:
-of what it declared 0.9 with ``gradient``, 0.97 was right, and detours are matched at 0.7 and
-below. benchmarks/results/evidence.md names the data, and has the results on data sets left out,
-other quantities, and what half and double of each factor does.
+By logistic regression y on windows of drives with ``gradient`` and ``hybrid``, and on their first
+images: each route, floors that look alike, reverse drives and unrelated routes have the same
+weight; x = 2 (y - 0.8), with less of r and more of p. benchmarks/results/evidence.md names the
+data, and has the results on sets left out, other quantities, and what other factors do.
 """
 
 import math
