@@ -70,7 +70,7 @@ def test_default_values_give_default_settings():
     [
         ({'sequence_length': 7}, 'sequence.length', 7),
         ({'min_probability': 0.25}, 'applied_threshold', 0.75),
-        ({'max_error': 0.05}, 'applied_threshold', pytest.approx(0.699)),
+        ({'max_error': 0.05}, 'applied_threshold', pytest.approx(0.7)),
         ({'max_error': 0.05, 'min_probability': 0.4}, 'applied_threshold', pytest.approx(0.6)),
         ({'max_error': 0.05, 'min_probability': 0.75}, 'applied_threshold', 0.25),
         (PAPER | {'threshold': 0.25}, 'applied_threshold', 0.25),

@@ -78,7 +78,7 @@ def test_camera_that_stops_beyond_the_map_is_not_matched_for_as_long_as_it_stand
     wrong = 0
     for seed in range(12):
         known, unknown = route_strips(seed, PLACES), route_strips(90 + seed, 8)
-        beyond = 0.2 * known[:, 100:108] + 0.8 * unknown
+        beyond = 0.15 * known[:, 100:108] + 0.85 * unknown
         query = standing(np.concatenate([known[:, 40:100], beyond], axis=1), seed=seed)
         matches = recognize_all(PlaceRecognizer(map_of(features_of(known)), robust()), query)
         wrong += any(match.accepted for match in matches[-50:])
