@@ -3,8 +3,10 @@
 """Cells of two images that are each other's nearest, and the lead of a path in them."""
 
 import numpy as np
+from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.features.registry import Cells, evidence_of, KINDS
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.recognition.cells import agreeing, CellAgreement, cells_of
 
 CELLS = Cells(0, 4, 14, 2, dimension=112)
@@ -87,3 +89,22 @@ def test_kinds_have_cells_where_strips_are_as_they_were_extracted():
             for strips, dimension in ((7, 64), (1, entry.cells.dimension)):
                 assert evidence_of(kind, strips, dimension) == (entry.constant, None)
     assert evidence_of('of another program', 7, 224) == (-6.8, None)
+
+
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
+def test_cells_are_compared_on_all_backends(device, precision):
+    """Features as long as gradients have cells; in int8 and on a device, c is nearly the same."""
+    places = features_of(route_strips(0, 90, 224), 0.2, 1)
+    query = features_of(route_strips(0, 90, 224)[:, 20:70], 0.6, 2)
+    settings = RecognizerSettings()
+    one = PlaceRecognizer(map_of(places), settings)
+    matches = recognize_all(one, query)
+    others = recognize_all(PlaceRecognizer(map_of(places), settings, device, precision), query)
+    plain = PlaceRecognizer(map_of(places), settings)
+    plain._window.cells = None
+    without = recognize_all(plain, query)
+    probabilities, same, lower = (
+        np.array([match.probability for match in each[20:]]) for each in (matches, others, without)
+    )
+    np.testing.assert_allclose(same, probabilities, atol=0.02)
+    assert (lower < probabilities).all()
