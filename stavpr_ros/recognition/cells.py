@@ -58,11 +58,10 @@ class CellAgreement:
         images = np.array(self._images, object)[-len(counted) :][counted]
         if len(images) > FEW:
             is_even = np.array([image[0] % 2 == 0 for image in images])
-            images, path, competitor = (part[is_even] if len(part) else part
-                                   for part in (images, path, competitor))  # fmt: skip
-        return self._mean(images, path) - (
-            self._mean(images, competitor) if len(competitor) else 0.0
-        )
+            images, path = images[is_even], path[is_even]
+            competitor = competitor[is_even] if len(competitor) else competitor
+        elsewhere = self._mean(images, competitor) if len(competitor) else 0.0
+        return self._mean(images, path) - elsewhere
 
     def _mean(self, images: Sequence[Any], path: np.ndarray) -> float:
         pairs = [(image, column) for image, column in zip(images, path.tolist(), strict=True)]
