@@ -35,7 +35,7 @@ class FirstStage:
     """
     A matcher that compares images with few places exactly, see the module.
 
-    :param matcher: compares with the places exactly, strategy ``adaptive`` or ``vanilla``.
+    :param matcher: compares with the places exactly, strategies that align strips.
     :param features: of the places, as the matcher has them.
     :param probable: returns the first places of the blocks of ``BLOCK`` places that the filter
         finds probable.

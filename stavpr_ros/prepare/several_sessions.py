@@ -28,7 +28,7 @@ class SeveralSessions:
     """
     A matcher that leaves places out.
 
-    :param matcher: of all places, strategy ``adaptive`` or ``vanilla``.
+    :param matcher: of all places, strategies that align strips.
     :param runs: places of each session.
     :param same_as: for each place, itself, or the place of an earlier session that shows the same.
     :param probabilities: returns the probability of each place now, (n,).
