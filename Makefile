@@ -27,13 +27,14 @@ OPTIONS = --torch-index '$(TORCH_INDEX)' --with
 LEARNED = $(filter learned hybrid efficientnet_lite1,$(FEATURES))
 TESTS := test stavpr_fleet/test stavpr_slam/test stavpr_nav/test stavpr_lab/test
 PYTEST = pytest -n 2 --dist loadfile $(TESTS)
+SOURCES := $(subst $() $(),:,$(CURDIR) $(addprefix $(CURDIR)/stavpr_,fleet slam nav lab))
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN)
 # Package and least percentage of its lines and branches that the tests reach.
 COVERAGE := stavpr_ros:95 stavpr_fleet:93 stavpr_slam:88 stavpr_nav:88 stavpr_lab:91
 EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
-.PHONY: help setup build demo animation days repeat evaluate test test-long test-arm coverage crash-test lint docs bench bench-quick \
+.PHONY: help setup build demo animation days repeat evaluate test test-long test-arm coverage crash-test check lint ceilings docs bench bench-quick \
 	accuracy protocol off-map pose-graphs shell clean distclean development
 
 help: ## list the targets (the default)
@@ -91,6 +92,12 @@ evaluate: build ## report the matches of QUERY= on MAP=; metrics with TRUTH= (AR
 test: lint docs ## lint, build the documentation, and run the tests but the long ones (ARGS=)
 	@$(TEST) $(PYTEST) -m 'not long' $(ARGS)
 
+check: ceilings ## ruff, mypy, and the tests without ROS and processes, on the sources (ARGS=)
+	@test -d .venv || $(MAKE) development
+	@$(RUN) ruff check .
+	@$(RUN) mypy
+	@$(RUN) bash -c 'PYTHONPATH="$(SOURCES):$$PYTHONPATH" $(PYTEST) -m "quick and not long" $(ARGS)'
+
 test-long: development ## run the tests that take minutes each (ARGS=)
 	@$(TEST) $(PYTEST) -m long $(ARGS)
 
@@ -110,9 +117,12 @@ coverage: development ## run the tests, and require the lines and branches that 
 crash-test: development ## kill, stop and disturb a recording node for HOURS=; nothing may be lost
 	@$(RUN) bash -c 'PYTHONPATH="test/shared:$$PYTHONPATH" python test/crash_run.py $(HOURS)'
 
-lint: development ## check style and types with ruff and mypy
+lint: development ceilings ## check style and types with ruff and mypy, and sizes
 	@$(RUN) ruff check .
 	@$(RUN) mypy
+
+ceilings:
+	@$(PYTHON) -E tools/ceilings.py
 
 docs: development ## build the documentation into docs/_build; warnings are errors
 	@$(RUN) sphinx-build -E -W --keep-going -q -b html docs docs/_build

@@ -8,6 +8,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from ceilings import CEILINGS, excess, sizes
 import cv2
 import numpy as np
 import pytest
@@ -186,3 +187,10 @@ def test_modules_import_each_other_without_cycles():
         for module, path in MODULES.items()
     }
     TopologicalSorter(arrows).prepare()  # raises CycleError
+
+
+def test_size_above_its_ceiling_is_named():
+    assert not list(excess({'lines': 10}, {'lines': 10}))
+    (sentence,) = excess({'lines': 10, 'numbers': 3}, {'lines': 7, 'numbers': 3})
+    assert sentence.startswith('10 lines, 3 above the ceiling 7')
+    assert sizes().keys() == CEILINGS.keys()

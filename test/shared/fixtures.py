@@ -3,8 +3,10 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 from collections import OrderedDict
+from functools import cache
 import os
 from pathlib import Path
+import re
 from types import SimpleNamespace
 
 from domain import DOMAIN
@@ -27,13 +29,31 @@ settings.register_profile('stavpr', deadline=None, derandomize='CI' in os.enviro
 settings.load_profile('stavpr')
 
 
+ROS_FIXTURES = {'robot', 'context', 'kernels'}
+NEEDS_ROS = re.compile(
+    r'^ *(import|from) (rclpy|\w+_msgs|robot|processes|subprocess|multiprocessing|launch\w*|'
+    r'stavpr_\w+\.(ros|commands)|stavpr_nav|stavpr_lab\.(monitor|demonstration))\b|'
+    r'sys\.executable',
+    re.MULTILINE,
+)
+
+
+@cache
+def needs_ros_or_processes(path: Path) -> bool:
+    """Whether a file of tests imports ROS, or what starts a process."""
+    return NEEDS_ROS.search(path.read_text()) is not None
+
+
 def pytest_collection_modifyitems(config, items):
     """
-    Run a test of several ROS participants once more where it fails; the summary names it.
+    Mark the tests of ``make check``; run one of several ROS participants again where it fails.
 
-    This is ``colcon test --retest-until-pass 1``: discovery and clocks of a busy machine, not
-    arithmetic, and nothing else. ``ARGS='--force-reruns 0'`` shows what it covers.
+    The latter is ``colcon test --retest-until-pass 1``: discovery and clocks of a busy machine,
+    not arithmetic, and nothing else. ``ARGS='--force-reruns 0'`` shows what it covers.
     """
+    for item in items:
+        if not (needs_ros_or_processes(item.path) or ROS_FIXTURES & {*item.fixturenames}):
+            item.add_marker('quick')
     if not config.pluginmanager.hasplugin('rerunfailures'):
         return
     for item in items:
