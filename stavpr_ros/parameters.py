@@ -404,11 +404,12 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
     'Computation and life cycle': (
         NodeParameter(
             'precision',
-            'float32',
+            'auto',
             'Precision of the features of the map; int8 quarters their memory '
-            'and, on large maps on a CPU, takes less than half the time. In loop closure, of a '
-            'route of 2,000 places and more.',
-            choices=('float32', 'int8'),
+            'and, on large maps on a CPU, takes less than half the time. auto: int8 in mode robust '
+            'on the CPU for 2,000 places and more, else float32. In loop closure, int8 is that of '
+            'a route of 2,000 places and more, and auto is float32.',
+            choices=('auto', 'float32', 'int8'),
         ),
         NodeParameter(
             'time_budget_ms',

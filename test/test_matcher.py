@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numba
 import numpy as np
-from places import features_of
+from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import (
     image_distances,
@@ -20,6 +20,7 @@ from stavpr_ros.alignment import (
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.threads import limit_threads
 
 ADAPTIVE = SpatialSettings()
@@ -114,3 +115,22 @@ def test_kernels_of_one_and_two_threads_return_same_bits():
 def test_make_matcher_of_unknown_precision_is_rejected():
     with pytest.raises(SettingsError, match="'float16' is unknown: take one of float32, int8"):
         make_matcher(random_features(7, 4, 8), SpatialSettings(), 'cpu', 'float16')
+
+
+@pytest.mark.parametrize(('places', 'changes', 'precision'), [
+    (2_000, {}, 'int8'),
+    (1_999, {}, 'float32'),
+    (2_000, {'mode': 'paper', 'threshold': 1.0}, 'float32'),
+    (2_000, {'spatial': SpatialSettings(vertical=True)}, 'float32'),
+])  # fmt: skip
+def test_precision_auto_is_int8_on_large_maps_in_mode_robust(places, changes, precision):
+    features = replace(features_of(route_strips(0, places, 32)), cells=(4, 2))
+    settings, query = RecognizerSettings(**changes), features[50:51]
+    auto, as_set = (
+        PlaceRecognizer(map_of(features), settings, precision=each).distances(query)
+        for each in ('auto', precision)
+    )
+    np.testing.assert_array_equal(auto, as_set)
+    other = 'int8' if precision == 'float32' and 'spatial' not in changes else 'float32'
+    as_other = PlaceRecognizer(map_of(features), settings, precision=other).distances(query)
+    assert np.array_equal(auto, as_other) == ('spatial' in changes)

@@ -48,7 +48,7 @@ def test_choices_are_those_of_library():
         'geometric_check': ('none', *METHODS),
         'relative_pose': EDGE_METHODS,
         'backend': BACKENDS,
-        'precision': PRECISIONS,
+        'precision': ('auto', *PRECISIONS),
     }
     assert {name: BY_NAME[name].choices for name in library} == library
 
@@ -91,7 +91,7 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
 @pytest.mark.parametrize(
     ('values', 'words'),
     [
-        ({'precision': 'int4'}, "precision = 'int4' is unknown: take one of float32"),
+        ({'precision': 'int4'}, "precision = 'int4' is unknown: take one of auto"),
         ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0.0 must be above 0'),
         (
             {'threshold': 0.8},
@@ -171,6 +171,8 @@ def test_backend_summary_names_device_of_each_stage(
     assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
     extracting = f'backend {backend}{why}: networks on {extraction}'
     assert settings.backend_summary('mapping') == extracting
+    rounds = matching == 'cpu' and operation == 'localization'
+    precision = 'int8 from 2,000 places on' if rounds else 'float32'
     assert settings.backend_summary(operation) == (
-        f'{extracting}, image distances on {matching} (float32), sequences on {matching}'
+        f'{extracting}, image distances on {matching} ({precision}), sequences on {matching}'
     )

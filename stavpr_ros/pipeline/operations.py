@@ -523,11 +523,11 @@ def _map_recognizer(
 
 def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
     others = settings.precision, settings.direction
-    if settings.backend == 'cuda' or others != ('float32', 'forward'):
+    if settings.backend == 'cuda' or others[0] == 'int8' or others[1] != 'forward':
         raise SettingsError(
             f'backend {settings.backend}, precision {settings.precision}, direction '
             f'{settings.direction}: the map of a fleet is matched on the CPU in float32; take '
-            'backend auto or cpu, precision float32, and direction forward'
+            'backend auto or cpu, precision auto or float32, and direction forward'
         )
     assert isinstance(place_map, PartialMap)
     return place_map.recognizer(settings.recognition())

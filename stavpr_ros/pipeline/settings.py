@@ -129,7 +129,10 @@ class PipelineSettings:
             return summary
         matching = self.matching_backend(operation)
         precision = self.precision
-        if precision == 'int8' and matching == 'cpu':
+        if precision == 'auto':
+            rounds = matching == 'cpu' and operation == 'localization' and self.mode == 'robust'
+            precision = 'int8 from 2,000 places on' if rounds else 'float32'
+        if self.precision == 'int8' and matching == 'cpu':
             from stavpr_ros.alignment.cpu.int8 import INSTRUCTION
 
             precision = f'int8, {INSTRUCTION} kernel'

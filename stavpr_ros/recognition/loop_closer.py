@@ -14,7 +14,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.refine import BAND
 from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
-from stavpr_ros.prepare.matcher import PRECISIONS
+from stavpr_ros.prepare.matcher import precision_of, PRECISIONS
 from stavpr_ros.prepare.route_features import RouteFeatures
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
@@ -55,7 +55,8 @@ class LoopCloser(SequenceRecognizer):
     :param limit: most places that are kept; None for all. It must leave room for more than the
         excluded images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
-    :param precision: of the route's features once it is settled, ``float32`` or ``int8``; see
+    :param precision: of the route's features once it is settled, ``float32``, also by ``auto``, or
+        ``int8``; see
         :mod:`stavpr_ros.prepare.route_features`.
     :raises SettingsError: invalid settings.
     """
@@ -73,6 +74,7 @@ class LoopCloser(SequenceRecognizer):
     ) -> None:
         settings = replace(settings, spatial=settings.spatial or SpatialSettings())
         _require_fitting(settings, exclude, limit, exclude_seconds)
+        precision = precision_of(precision, 0, False)
         require_choice('precision', precision, PRECISIONS)
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
         super().__init__(settings, feature_settings, _route_window(settings), self._track)

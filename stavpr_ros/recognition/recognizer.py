@@ -22,7 +22,7 @@ from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.prepare.blocks import blocks, Int8Features
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
-from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.matcher import make_matcher, precision_of
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.prepare.several_sessions import SeveralSessions
 from stavpr_ros.recognition.cells import CellAgreement
@@ -323,8 +323,9 @@ class PlaceRecognizer(SequenceRecognizer):
     :param settings: see :class:`RecognizerSettings`.
     :param backend: ``cpu``, ``cuda``, ``auto``, or any device of torch, for mode paper and the
         place filter: :func:`stavpr_ros.devices.choose_backend`.
-    :param precision: of the map's features in the matcher, ``float32`` or ``int8``; see
-        :func:`stavpr_ros.prepare.matcher.make_matcher`.
+    :param precision: of the map's features in the matcher, ``float32`` or ``int8``
+        (:func:`stavpr_ros.prepare.matcher.make_matcher`); ``auto`` = ``int8`` on the CPU in mode
+        robust for 2,000 places and more.
     :raises UnavailableError: no such backend here.
     :raises SettingsError: settings that do not fit the map (xi > W).
     :raises InputError: features of the map are not finite, or an argument of another type.
@@ -335,7 +336,7 @@ class PlaceRecognizer(SequenceRecognizer):
         place_map: PlaceMap,
         settings: RecognizerSettings,
         backend: 'str | torch.device' = 'cpu',
-        precision: str = 'float32',
+        precision: str = 'auto',
     ) -> None:
         maps, expected = 'a PlaceMap, as of load_map() or build_map()', 'RecognizerSettings(...)'
         require_type('place_map', place_map, PlaceMap, maps)
@@ -356,8 +357,10 @@ class PlaceRecognizer(SequenceRecognizer):
             for _, block in blocks(features):
                 require_finite(block, 'the map')
         self._dimension = features.dimension
-        # cells are made of float32 strips
-        precision = 'float32' if settings.applied_spatial.vertical else precision
+        is_vertical = settings.applied_spatial.vertical  # cells are made of float32 strips
+        rounds = settings.has_probability and backend == 'cpu' and not is_vertical
+        precision = precision_of(precision, len(features), rounds)
+        precision = 'float32' if is_vertical else precision
         prepared = prepare_map(
             features, precision, options.mean_centering, options.whitening, options.place_filter
         )

@@ -260,7 +260,7 @@ def _processing_finding(health: Health) -> Finding:
     elif rate * mean < BUSY * 1e3:
         why = f'{takes}, which is fast enough: they arrive in bursts; raise queue_size'
     else:
-        int8 = '' if health.settings.pipeline.precision == 'int8' else 'precision int8, '
+        int8 = 'precision int8, ' if health.settings.pipeline.precision == 'float32' else ''
         remedy = f'set max_rate or keyframe_*, {int8}a smaller map'
         why = f'{takes}, so {1e3 / mean:.1f} per second are possible: {remedy}'
     losses = f'{_plural(drops["queue full"], "image")} dropped {RECENTLY}, the queue was full'

@@ -271,7 +271,7 @@ def evaluate_on_map(
     unknown: LocalFeatures | None = None,
     shown: Collection[int] = (),
     backend: str = 'cpu',
-    precision: str = 'float32',
+    precision: str = 'auto',
     progress: bool = False,
     odometry: np.ndarray | None = None,
     stamps: np.ndarray | None = None,
@@ -318,7 +318,7 @@ def evaluate_loop_closures(
     progress: bool = False,
     odometry: np.ndarray | None = None,
     late: bool = False,
-    precision: str = 'float32',
+    precision: str = 'auto',
     stamps: np.ndarray | None = None,
 ) -> Evaluation:
     """
