@@ -192,7 +192,6 @@ class NodeSettings:
     subgoal_distance: float
     subgoal_width: int
     relative_pose: str
-    verifier: str
     camera_transform: str
     pipeline: PipelineSettings
 

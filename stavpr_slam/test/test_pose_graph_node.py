@@ -293,7 +293,7 @@ def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
     peer.until_diagnosed(DiagnosticStatus.WARN, '100 of 100 closures are of stamps without')
     assert peer.call(peer.reset, Trigger.Request()).success
     for source, remedy in (
-        (RelativePose.REFUTED, 'are refuted by PnP or the verifier'),
+        (RelativePose.REFUTED, 'are refuted by PnP'),
         (RelativePose.DROPPED, 'are dropped, as PnP is slower'),
     ):
         publish(source=source)
