@@ -15,7 +15,6 @@ import pytest
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
 from stavpr_ros.recognition.recognizer import EARLY
-from stavpr_slam.ros.bridges.bridge import EdgeBridge
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / 'benchmarks' / 'results'
@@ -125,7 +124,7 @@ def test_documented_parameters_exist():
     text = '\n'.join(page.read_text() for page in PAGES)
     given = set(re.findall(r'(?:-p (?=\w+:=)|param set /stavpr )(\w+)', text))
     assert given
-    assert given <= NAMES | EdgeBridge.ROBOTS.keys()
+    assert given <= NAMES
     table = (ROOT / 'README.md').read_text().partition('| parameter |')[2].partition('\n\n')[0]
     assert set(re.findall(r'^\| `(\w+)`', table, re.M)) <= NAMES
 
