@@ -220,7 +220,7 @@ def test_pose_graph_in_a_long_solution_delays_no_odometry_and_ends_at_once(peer,
     os.kill(solver, signal.SIGSTOP)
     saving = peer.save.call_async(SaveMap.Request(path='drive.tum'))
     delays = [peer.delay((i + 1) * SECOND, poses[i]) for i in range(1, 100)]
-    assert max(delays) < 10  # on a busy machine; benchmarks/live_graph.py measures it
+    assert max(delays) < 10  # on a busy machine
     assert peer.call(peer.reset, Trigger.Request()).success
     peer.wait_until(saving.done)
     assert 'reset' in saving.result().message
