@@ -169,9 +169,10 @@ def measure_sessions(counts: list[int]) -> list[str]:
     from data import data_folder
     from lower_bounds import ITEM_BYTES
     import numpy as np
-    from projection import projected
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, merge_maps
+    from stavpr_ros.mapping.reduction import with_principal_components
+    from stavpr_ros.prepare.centering import normalize
     from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
     from stavpr_ros.sources import open_source
     from stavpr_ros.threads import limit_threads
@@ -200,7 +201,12 @@ def measure_sessions(counts: list[int]) -> list[str]:
             one = merge_maps([drive(seed) for seed in range(count)], list(map(str, range(count))))
             same_as = np.tile(np.arange(places, dtype=np.int32), count)
             one = replace(one, same_as=same_as) if count > 1 else one
-            one, query = projected(one, raw, 'pca' if dimension else '', dimension)
+            query = raw
+            if dimension:
+                one = with_principal_components(one, dimension)
+                query = replace(raw, strips=raw.strips @ one.projection.matrix, cells=None)
+                normalize(query.strips)
+                query = replace(query, settings=one.features.settings)
             recognizers.append(PlaceRecognizer(one, RecognizerSettings(), precision=precision))
             queries.append(query)
             sizes.append(len(one) * one.settings.strips * one.dimension * ITEM_BYTES[precision])

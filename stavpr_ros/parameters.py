@@ -318,13 +318,6 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
             choices=('auto', 'none', 'aligned', 'pnp'),
         ),
         NodeParameter(
-            'verifier',
-            '',
-            'Function package.module:name that accepts or refutes each match before it gets a '
-            'relative pose, see stavpr_ros.relative_pose.verification; empty = none.',
-            when='start',
-        ),
-        NodeParameter(
             'camera_transform',
             '',
             'Pose of the optical frame of the camera (z ahead, x right) in the base of the robot, '
@@ -405,10 +398,10 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'precision',
             'auto',
-            'Precision of the features of the map; int8 quarters their memory '
-            'and, on large maps on a CPU, takes less than half the time. auto: int8 in mode robust '
-            'on the CPU for 2,000 places and more, else float32. In loop closure, int8 is that of '
-            'a route of 2,000 places and more, and auto is float32.',
+            'Precision of the features of the map; int8 quarters their memory and, on large maps '
+            'on a CPU, takes less than half the time. auto: int8 in mode robust on the CPU for '
+            '2,000 places and more, else float32. In loop closure, auto is float32, and int8 '
+            'applies to a route of 2,000 places and more.',
             choices=('auto', 'float32', 'int8'),
         ),
         NodeParameter(
@@ -444,6 +437,10 @@ PARAMETERS = tuple(row for rows in GROUPS.values() for row in rows)
 BY_NAME = {row.name: row for row in PARAMETERS}
 # earlier names, accepted with a warning until version 1.1
 RENAMED = {'keyframe_angle': 'keyframe_angle_deg'}
+# parameters without effect, named in a warning until version 1.1: what to do instead
+REMOVED = {
+    'verifier': 'verify closures in a node of your own, which subscribes to ~/loop_closure',
+}
 
 
 def default(name: str) -> Any:

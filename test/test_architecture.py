@@ -114,18 +114,6 @@ def test_package_and_parameters_import_lightly():
     assert not {'torch', 'numba', 'numpy', 'cv2', 'rclpy', 'rosbags'} & set(loaded.split())
 
 
-def test_node_loads_neither_linear_algebra_nor_pillow():
-    code = """
-import sys
-from stavpr_ros.commands import node
-node._import_numba()
-import numba.np.arraymath, stavpr_ros.ros.node, stavpr_ros.recognition.recognizer
-assert not {'scipy.linalg', 'PIL'} & sys.modules.keys()
-import scipy.linalg.cython_blas
-"""
-    subprocess.run([sys.executable, '-c', code], check=True)
-
-
 @pytest.mark.usefixtures('kernels')
 def test_mapping_and_localization_with_gradient_load_no_torch(tmp_path):
     """

@@ -10,7 +10,7 @@ import sys
 from processes import environment, TIMEOUT
 import pytest
 from stavpr_ros import compilation
-from stavpr_ros.compilation import cache_folder, COMPILING
+from stavpr_ros.compilation import cache_folder
 
 
 @pytest.fixture
@@ -64,15 +64,6 @@ def test_kernels_of_another_version_are_not_read(tmp_path):
     assert folders[0] == folders[2] != folders[1]
     assert not folders[1].exists()  # of the version in between
     assert folders[0].parent == package / '__pycache__' / 'kernels'
-
-
-def test_compilation_is_announced_once():
-    progress, texts = compilation._Progress(), []
-    progress.announce = texts.append
-    for _ in range(2):
-        progress.on_start(None)
-        progress.on_end(None)
-    assert texts == [COMPILING]
 
 
 DRIVE = """

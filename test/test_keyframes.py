@@ -18,7 +18,6 @@ from stavpr_ros.sources import open_source
 SECOND = 10**9
 CHANGE = 0.004  # between a standing camera and the slowest of these drives
 BLACK = np.zeros((24, 32, 3), np.uint8)
-NO_LIMITS = -1e-9, math.nan, math.inf
 
 
 def pose(x=0.0, degrees=0.0):
@@ -48,31 +47,6 @@ def test_keyframe_settings_out_of_range_are_rejected(name, values):
     for value in values:
         with pytest.raises(SettingsError, match=name):
             KeyframeSettings(**{name: value})
-
-
-def test_selector_interval_by_hand():
-    made = selector(interval=0.1)
-    reason = made.too_soon(10 * SECOND + 99_999_999, None)
-    assert '0.100 s after the last keyframe: less than 0.1 s' in reason
-    assert made.too_soon(10 * SECOND, None)
-    assert made.too_soon(10 * SECOND - 99_999_999, None)  # overtaken on the way
-    for fine in (
-        10 * SECOND + 100_000_000,
-        10 * SECOND - 100_000_000,
-        0,
-    ):  # late, jumped back, unknown
-        assert made.too_soon(fine, None) == ''
-    assert selector(stamp=0, interval=0.1).too_soon(5, None) == ''
-
-
-def test_selector_distance_or_angle_suffices():
-    made = selector(where=pose(), distance=1, angle=10)
-    reason = made.too_soon(0, pose(0.999, -9.99))
-    assert reason == 'moved 0.999 m of 1 m and turned 9.99 of 10 degrees since the last keyframe'
-    assert made.too_soon(0, pose(1)) == ''
-    assert made.too_soon(0, pose(0, -10.001)) == ''
-    assert 'degrees' not in selector(where=pose(), distance=1).too_soon(0, pose(0, 90))
-    assert 'm of' not in selector(where=pose(), angle=10).too_soon(0, pose(5, 9))
 
 
 def test_selector_with_new_settings_keeps_keyframe(route):

@@ -142,17 +142,6 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
     assert closer.first > 0
 
 
-def test_loop_closer_at_limit_evicts_an_eighth(laps):
-    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80)
-    for i in range(len(laps)):
-        closer.update(laps[i : i + 1])
-        evicted = max(0, -(-(i + 1 - 80) // (80 // EVICTED))) * (80 // EVICTED)
-        assert (closer.first, len(closer)) == (evicted, i + 1 - evicted)
-        assert len(closer) <= 80
-        assert len(closer.newest_row()) == max(0, len(closer) - 12)
-    assert closer.features().strips.shape == (7, len(closer), 16)
-
-
 @pytest.mark.parametrize(('centering', 'limit'), [(True, None), (True, 90), (False, 83)])
 def test_route_features_are_original_less_mean(laps, centering, limit):
     """At the limit, an eighth is evicted."""
@@ -359,18 +348,6 @@ def test_reset_after_clock_jump_keeps_route(laps):
             assert not answer.accepted or (i - answer.newest_index) % 60 == 0
 
 
-def test_reset_forgets_place_and_means_of_places(laps):
-    one, other = (LoopCloser(settings_of(ROBUST), 12, laps.settings) for _ in range(2))
-    drive(one, laps[:100])
-    drive(other, laps[:100])
-    one.reset()
-    for i in range(100, 105):
-        fresh, tracked = (closer.update(laps[i : i + 1]) for closer in (one, other))
-        assert np.corrcoef(one.newest_row(), other.newest_row())[0, 1] < 0.999
-    assert fresh.sequence.middle == tracked.sequence.middle == 42
-    assert fresh.probability < tracked.probability
-
-
 # ------------------------------------------------ candidates, errors
 
 
@@ -454,11 +431,6 @@ def test_loop_closer_with_invalid_input_is_rejected(laps, small_map):
 
 
 # ------------------------------------------------ backend and precision
-
-
-def test_loop_closer_of_unknown_precision_is_rejected(laps):
-    with pytest.raises(SettingsError, match='float64'):
-        LoopCloser(settings_of(ROBUST), 12, laps.settings, precision='float64')
 
 
 @pytest.mark.parametrize('limit', [None, 90])

@@ -4,12 +4,11 @@
 
 import threading
 
-import cv2
 import numpy as np
 import pytest
 from stavpr_ros.errors import ImageError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, encode_thumbnail, KeyframeSettings, Trajectory
+from stavpr_ros.mapping import build_map, KeyframeSettings, Trajectory
 from stavpr_ros.sources.frame import Frame
 
 SECOND = 10**9
@@ -25,27 +24,6 @@ def straight(count):
     poses = np.zeros((count, 7))
     poses[:, 0], poses[:, 6] = np.arange(count), 1
     return poses
-
-
-@pytest.mark.parametrize('known', ['array', 'trajectory'])
-def test_build_map_with_distance_selects_keyframes(route, known):
-    frames, poses = traverse(route[:20], 3), straight(20)
-    poses[4] = np.nan
-    if known == 'trajectory':
-        trajectory = Trajectory()  # does not interpolate over 6 s
-        for frame, pose in zip(frames, poses, strict=True):
-            if not np.isnan(pose[0]):
-                trajectory.add(frame.stamp, pose)
-        poses = trajectory
-    built = build_map(
-        frames, GRADIENT, poses, progress=False, keyframes=KeyframeSettings(distance=2)
-    )
-    assert built.ids == ('0', '2', *map(str, range(5, 20, 2)))  # of 4 nothing is known
-    assert built.poses[:, 0].tolist() == [0, 2, *range(5, 20, 2)]
-    every = build_map(frames, GRADIENT, poses, progress=False)
-    assert len(every) == 20
-    assert every.pose(4) is None
-    assert every.pose(5)[0] == 5
 
 
 def test_build_map_with_wrong_poses_fails(route):
@@ -70,17 +48,6 @@ def test_build_map_with_wrong_poses_fails(route):
             frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(distance=1)
         )
     assert build_map(frames, extractor, nowhere, progress=False).poses is None
-
-
-def test_build_map_scales_thumbnails(route):
-    image = cv2.resize(route[0], (640, 480))
-    built = build_map(traverse([image]), GRADIENT, progress=False, thumbnail_width=320)
-    assert built.thumbnail(0).shape == (240, 320, 3)
-    assert built.thumbnails[0] == encode_thumbnail(image, 320)
-    narrow = build_map(traverse([image]), GRADIENT, progress=False)
-    assert narrow.thumbnail(0).shape == (144, 192, 3)
-    with pytest.raises(SettingsError, match='width = 0'):
-        build_map(traverse([image]), GRADIENT, progress=False, thumbnail_width=0)
 
 
 class Watched:

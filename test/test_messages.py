@@ -7,7 +7,6 @@ import math
 
 from builtin_interfaces.msg import Time
 from fixtures import route_images
-from nav_msgs.msg import Odometry
 import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
@@ -16,7 +15,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
-from stavpr_ros.pipeline import ImageResult, overlay
+from stavpr_ros.pipeline import ImageResult
 from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.pair import matched_pair
 from stavpr_ros.ros.messages import (
@@ -25,7 +24,6 @@ from stavpr_ros.ros.messages import (
     loop_closure_message,
     matched_pose_message,
     nanoseconds,
-    odometry_pose,
     pose_message,
     time_message,
 )
@@ -178,18 +176,6 @@ def test_matched_pose_message_rotates_about_the_axes_of_the_map(extractor, featu
 # ------------------------------------------------ times, poses, images, the map
 
 
-@pytest.mark.parametrize('stamp', [0, SECOND - 1, 1_700_000_000 * SECOND + 123_456_789])
-def test_time_message_round_trip(stamp):
-    assert nanoseconds(time_message(np.int64(stamp))) == stamp
-
-
-def test_pose_message_round_trip():
-    pose = np.array([1.5, -2, 3, 0.1, 0.2, 0.3, 0.9])
-    odometry = Odometry()
-    odometry.pose.pose = pose_message(pose)
-    np.testing.assert_array_equal(odometry_pose(odometry), pose)
-
-
 def test_image_message_of_a_strided_image():
     image = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)[:, ::2]
     message = image_message(HEADER, image)
@@ -198,21 +184,3 @@ def test_image_message_of_a_strided_image():
 
 
 # ------------------------------------------------ drawn images
-
-
-def test_draw_match_has_the_text_and_the_thumbnail_of_the_place(monkeypatch, extractor, features):
-    query, image = route_images(2)
-    route = GrowingMap(extractor.settings, extractor.projection, 40)
-    for i in range(40):
-        route.add(features, thumbnail=encode_thumbnail(image) if i != 35 else b'')
-    monkeypatch.setattr(overlay, 'match_image', lambda query, place, *text: (place, text))
-    for match, has_place, words, place in (
-        (accepted(image=query, inliers=20), False, 'distance 0.250 (threshold 0.300), 20', 35),
-        (rejected(image=query), True, 'distance 0.250 (threshold 0.300)', 32),
-        (rejected(image=query, probability=0.934), True, 'p 0.93', 32),
-    ):
-        thumbnail, (text, is_match, label) = overlay.draw_match(match, route)
-        assert (thumbnail is not None, label) == (has_place, f'map place {place}')
-        assert (words in text, is_match) == (True, match.accepted)
-    skipped = ImageResult(Status.SKIPPED, 'because', image=query)
-    assert overlay.draw_match(skipped, None) == (None, ('skipped because', False))

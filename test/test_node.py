@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node over ROS: images in, matches out; parameters that change meanwhile."""
 
-from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rcl_interfaces.srv import SetParameters
@@ -86,21 +85,6 @@ def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):
     assert int(robot.counts('processing').get(key, 0)) - counted == len(dropped)
     match = robot.drive(route[40:46])[-1]
     assert (match.status, match.newest_index) == (PlaceMatch.MATCH, 45)
-
-
-def test_node_after_a_failed_start_starts_with_a_changed_parameter(
-    robot, start, map_file, route, tmp_path
-):
-    bad = tmp_path / 'bad.stavpr'
-    bad.write_bytes(b'no map')
-    start(wait=False, map_path=str(bad), **PAPER)
-    robot.until_diagnosed('map', DiagnosticStatus.ERROR, 'bad.stavpr')
-    robot.until_logged('cannot configure')
-    robot.until_state('unconfigured')
-    robot.set(map_path=map_file)
-    robot.wait_for_node()
-    match = robot.drive(route[:LENGTH])[-1]
-    assert (match.status, match.newest_index) == (PlaceMatch.MATCH, LENGTH - 1)
 
 
 def test_node_with_changing_parameters_publishes_one_match_per_image(robot, start, route):

@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Edges over ROS: loop closures with camera_info and odometry, and their source and frames."""
 
-from dataclasses import replace
-import sys
 import threading
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,29 +90,6 @@ def closing(robot, start, route):
         return [match for match in matches if match.status == PlaceMatch.MATCH], on_time()
 
     return drive
-
-
-def test_verifier_replaces_and_refutes_edges(closing, monkeypatch):
-    """It refutes each second one, closures of late matches included."""
-    module, seen = ModuleType('own_verification'), []
-
-    def verify(query, place, query_camera, place_camera, edge):
-        seen.append((query.shape[2], place.shape[2], query_camera, edge.source))
-        return len(seen) % 2 == 1 and replace(edge, source=Source.PNP, inliers=len(seen))
-
-    module.verify = verify
-    monkeypatch.setitem(sys.modules, 'own_verification', module)
-    matches, closures = closing(verifier='own_verification:verify')
-    found = [c.relative_pose for c in closures]
-    accepted = [edge.inliers for edge in found if edge.source == RelativePose.PNP]
-    refuted = [edge.reason for edge in found if edge.source == RelativePose.REFUTED]
-    assert len(accepted) + len(refuted) == len(found)
-    assert accepted
-    assert all(number % 2 for number in accepted)
-    assert set(refuted) == {'the verifier did not confirm it'}
-    assert [c.has_relative_pose for c in closures] == [e.inliers > 0 for e in found]
-    assert {m.relative_pose.source for m in matches} == {RelativePose.NONE}
-    assert set(seen) == {(3, 3, None, Source.ALIGNED)}
 
 
 def test_edges_that_are_off_leave_closures_as_they_were(closing, monkeypatch):

@@ -16,7 +16,6 @@ import zipfile
 
 from catkin_pkg.changelog import get_changelog_from_path
 from interface_packages import INTERFACES
-from processes import executable
 import pytest
 import setuptools
 import stavpr_ros
@@ -43,28 +42,12 @@ DISTRIBUTIONS = {
     'sklearn': 'scikit-learn',
     'yaml': 'PyYAML',
 }
-# Import name: rosdep key, of those that rosdep can install on Ubuntu 24.04.
-ROSDEP_KEYS = {
-    'PIL': 'python3-pil',
-    'cv2': 'python3-opencv',
-    'jinja2': 'python3-jinja2',
-    'matplotlib': 'python3-matplotlib',
-    'numba': 'python3-numba',
-    'numpy': 'python3-numpy',
-    'scipy': 'python3-scipy',
-    'sklearn': 'python3-sklearn',
-    'tqdm': 'python3-tqdm',
-    'yaml': 'python3-yaml',
-}
 ROS = re.compile(
     r'\w+_(msgs|srvs|interfaces)|bond|rclpy|launch|launch_ros|ament_index_python|tf2_ros'
 )
 ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 
 each_package = pytest.mark.parametrize('package', PACKAGES)
-each_with_commands = pytest.mark.parametrize(
-    'package', ['stavpr_ros', *sorted({*stavpr.PACKAGES.values()})]
-)
 
 
 def setup_arguments(package: str, monkeypatch) -> dict:
@@ -126,20 +109,6 @@ def test_every_imported_ros_package_is_dependency(package):
     assert tests - declared(package, 'exec_depend', 'depend', 'test_depend') == set()
 
 
-@each_package
-def test_every_import_with_a_rosdep_key_is_dependency(package):
-    keys = {ROSDEP_KEYS[name] for name in imports_of(package) & set(ROSDEP_KEYS)}
-    assert keys - declared(package, 'exec_depend') == set()
-
-
-def test_dependencies_between_packages_are_declared():
-    found = {name: declared(name, 'exec_depend', 'depend', 'test_depend') for name in PACKAGES}
-    lower = set().union(*(found[name] for name in PACKAGES if name != 'stavpr_lab'))
-    assert {*SIBLINGS} & lower == set()
-    assert 'stavpr_lab' not in found['stavpr_lab']
-    assert all('stavpr_ros' in found[name] for name in SIBLINGS)
-
-
 def test_versions_agree(monkeypatch):
     versions = [manifest(folder).findtext('version') for folder in FOLDERS]
     citation = (ROOT / 'CITATION.cff').read_text(encoding='utf-8')
@@ -188,32 +157,11 @@ def colcon_arguments(folder: Path) -> list[str]:
     return [*build, '--record', str(folder / 'log'), '--single-version-externally-managed']
 
 
-def test_build_by_colcon_without_messages_names_the_links(sources, tmp_path):
-    links = r'ln -s stavpr_ros/stavpr_{msgs,fleet,slam,nav,lab} src/'
-    with pytest.raises(AssertionError, match=links):
-        run_setup(sources, *colcon_arguments(tmp_path), prefix='/opt/ros/jazzy')
-    assert not list(tmp_path.iterdir())
-
-
-def test_setup_runs_where_links_to_it_are(sources, tmp_path):
-    """``colcon build --symlink-install`` makes such a folder."""
-    for name in ('setup.py', 'package.xml'):
-        (tmp_path / name).symlink_to(sources / name)
-    assert run_setup(tmp_path, '--version').strip() == stavpr_ros.__version__
-
-
 def test_build_by_colcon_fills_the_cache_of_kernels(sources, tmp_path):
     assert CACHE is not None
     cache = CACHE.parent  # a filled one; by default, it would be in the installed package
     printed = run_setup(sources, *colcon_arguments(tmp_path), NUMBA_CACHE_DIR=str(cache))
     assert printed.splitlines()[-1] == f'the kernels are in {CACHE}'
-
-
-def test_build_by_colcon_goes_on_where_kernels_cannot_be_compiled(sources, tmp_path):
-    (tmp_path / 'llvmlite.py').write_text('raise ImportError("no compiler here")')
-    path = f'{tmp_path}:{os.environ.get("PYTHONPATH", "")}'
-    printed = run_setup(sources, *colcon_arguments(tmp_path / 'built'), PYTHONPATH=path)
-    assert printed.endswith('kernels are not compiled: ImportError: no compiler here\n')
 
 
 @pytest.fixture(scope='module')
@@ -233,54 +181,6 @@ def modules_in(prefix: Path) -> set[str]:
     """Return the files of Python packages below a prefix, relative to site-packages."""
     site = next(prefix.glob('**/*-packages'))
     return {str(path.relative_to(site)) for path in site.rglob('*.py')}
-
-
-def test_install_puts_one_command_on_path(installed):
-    found = [path.name for prefix in installed.values() for path in prefix.glob('**/bin/*')]
-    assert found == ['stavpr']
-
-
-@each_with_commands
-def test_install_keeps_names_of_ros2_run(installed, package):
-    scripts = next(installed[package].glob(f'**/lib/{package}'))
-    own = {name for name, owner in stavpr.PACKAGES.items() if owner == package}
-    if package == 'stavpr_ros':
-        own = {*COMMANDS, *stavpr.PACKAGES}
-    assert {path.name for path in scripts.iterdir()} == own
-    for name in own:
-        assert os.access(scripts / name, os.X_OK)
-        assert (scripts / name).read_text(encoding='utf-8').startswith('#!/usr/bin/env python3\n')
-        owner = stavpr.PACKAGES.get(name, 'stavpr_ros')
-        assert (PACKAGES[owner] / owner / 'commands' / f'{name}.py').is_file()
-
-
-@each_with_commands
-def test_executable_without_environment_names_remedy(installed, package):
-    scripts = next(installed[package].glob(f'**/lib/{package}'))
-    for script in scripts.iterdir():
-        command = [sys.executable, '-I', '-S', script]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 1
-        assert done.stderr.startswith(f"{script.name}: No module named 'stavpr_ros'. Source the")
-        assert 'Traceback' not in done.stderr
-
-
-def test_executables_run_commands_of_other_packages():
-    scripts = Path(executable('node')).parent
-    done = subprocess.run(
-        [scripts / 'evaluate', '--help'], capture_output=True, text=True, check=False
-    )
-    assert done.stdout.startswith('usage: ')
-    assert '--query' in done.stdout
-
-
-@each_package
-def test_install_registers_package(installed, package):
-    share = next(installed[package].glob('**/share'))
-    assert (share / 'ament_index/resource_index/packages' / package).is_file()
-    assert (share / package / 'package.xml').is_file()
-    for path in (PACKAGES[package] / 'launch').glob('*.launch.py'):
-        assert (share / package / 'launch' / path.name).is_file()
 
 
 @each_package
@@ -342,11 +242,6 @@ def test_a_command_without_an_optional_module_names_its_package(monkeypatch, cap
         program.run_program('work', lambda: import_module('stavpr_ros.nothing'))
 
 
-def test_packages_of_optional_modules_are_those_of_the_extras():
-    listed = re.findall(r"'([\w-]+)>=", (ROOT / 'setup.py').read_text())
-    assert {*program.OPTIONAL.values()} <= {*listed, 'evo'}
-
-
 @pytest.mark.parametrize(('module', 'words'), [
     ('sklearn', 'evaluate --truth identity --json x --map monday.stavpr --query nowhere'),
     ('matplotlib', 'evaluate --output report --map monday.stavpr --query nowhere'),
@@ -376,15 +271,6 @@ def test_script_of_setuptools_lets_pkg_resources_be_imported():
     command = [sys.executable, '-W', 'ignore', '-c', script]
     result = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
     assert result.returncode == 0, result.stderr
-
-
-def test_stavpr_passes_arguments_and_exit_code(monkeypatch):
-    received = []
-    module = type(sys)('stavpr_ros.commands.build_map')
-    module.main = lambda args: received.append(args) or 7
-    monkeypatch.setitem(sys.modules, 'stavpr_ros.commands.build_map', module)
-    assert stavpr.main(['build_map', '--input', 'a b']) == 7
-    assert received == [['--input', 'a b']]
 
 
 def test_stavpr_without_ros_names_missing_modules(monkeypatch, capsys):

@@ -11,7 +11,7 @@ from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 import rclpy
 from robot import parameters_of
-from stavpr_ros.parameters import BY_NAME, PARAMETERS
+from stavpr_ros.parameters import BY_NAME, PARAMETERS, REMOVED
 
 NESTED = '[' * 2000
 TEXTS = strategies.text(strategies.characters(exclude_characters='\0', codec='utf-8'), max_size=40)
@@ -102,3 +102,13 @@ def test_parameter_by_its_earlier_name_is_set_with_a_warning(make_node, capfd):
     assert node.settings.pipeline.keyframes.angle == 7
     assert "parameter 'keyframe_angle' is keyframe_angle_deg now" in capfd.readouterr().err
     assert not node.has_parameter('keyframe_angle')
+
+
+def test_removed_parameter_is_named_with_a_remedy(make_node, capfd):
+    for name, remedy in REMOVED.items():
+        sentence = f'parameter {name!r} was removed in 1.0: {remedy}'
+        node = make_node(**{name: 'package.module:name'})
+        assert sentence in capfd.readouterr().err
+        result = node.set_parameters(parameters_of({name: 1.0}))[0]
+        assert (result.successful, result.reason) == (False, sentence)
+        assert not node.has_parameter(name)

@@ -70,8 +70,6 @@ def test_default_values_give_default_settings():
     [
         ({'sequence_length': 7}, 'sequence.length', 7),
         ({'min_probability': 0.25}, 'applied_threshold', 0.75),
-        ({'max_error': 0.05}, 'applied_threshold', pytest.approx(0.7)),
-        ({'max_error': 0.05, 'min_probability': 0.4}, 'applied_threshold', pytest.approx(0.6)),
         ({'max_error': 0.05, 'min_probability': 0.75}, 'applied_threshold', 0.25),
         (PAPER | {'threshold': 0.25}, 'applied_threshold', 0.25),
         (PAPER | {'threshold': -1.0}, 'applied_threshold', None),
@@ -150,29 +148,3 @@ def test_network_without_its_settings_is_rejected_by_name(values, missing):
 def test_network_of_feature_settings_and_model_path_is_accepted():
     layer = '{"layer": "relu"}'
     PipelineSettings(features='onnx', feature_settings=layer, model_path='/nowhere/net.onnx')
-
-
-@pytest.mark.parametrize(
-    ('operation', 'backend', 'has_cuda', 'why', 'extraction', 'matching'),
-    [
-        ('localization', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cuda'),
-        ('loop_closure', 'auto', True, ' (torch has a CUDA device)', 'cuda', 'cpu'),
-        ('localization', 'cpu', True, '', 'cpu', 'cpu'),
-        ('localization', 'auto', False, ' (no torch)', 'cpu', 'cpu'),
-    ],
-)
-def test_backend_summary_names_device_of_each_stage(
-    monkeypatch, operation, backend, has_cuda, why, extraction, matching
-):
-    module, available = 'stavpr_ros.pipeline.settings', 'cuda' if has_cuda else 'cpu'
-    monkeypatch.setattr(f'{module}.choose_backend', {'auto': available, 'cpu': 'cpu'}.get)
-    monkeypatch.setattr(f'{module}.why_no_cuda', lambda: '' if has_cuda else 'no torch')
-    settings = PipelineSettings(backend=backend)
-    assert settings.extraction_device == ('cpu' if extraction == 'cpu' else backend)
-    extracting = f'backend {backend}{why}: networks on {extraction}'
-    assert settings.backend_summary('mapping') == extracting
-    rounds = matching == 'cpu' and operation == 'localization'
-    precision = 'int8 from 2,000 places on' if rounds else 'float32'
-    assert settings.backend_summary(operation) == (
-        f'{extracting}, image distances on {matching} ({precision}), sequences on {matching}'
-    )

@@ -8,14 +8,8 @@ import pytest
 from stavpr_ros.filter import checks as path_checks
 from stavpr_ros.filter import choice
 from stavpr_ros.filter.checks import (
-    EVEN,
-    EVEN_SHARE,
-    EXCESS,
-    EXCESS_WEIGHT,
     least_at_rest,
-    odds_factor,
     SURE_AT_REST,
-    UNEVEN_WEIGHT,
     unevenness,
 )
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
@@ -23,33 +17,9 @@ from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 PLACES = 240
 
 
-def test_unevenness_is_deviation_beyond_the_limit():
-    path = np.arange(4)
-    assert unevenness(path, np.array([-2.0, -3.0, -2.0, -3.0])) == 0
-    assert unevenness(path, np.array([-4.0, 0.0, -4.0, 0.0])) == pytest.approx(2 - EVEN)
-
-
-def test_unevenness_allows_a_share_of_the_mean():
-    z = np.array([-8.0, -4.0, -8.0, -4.0])
-    assert EVEN_SHARE * 6 > 2
-    assert unevenness(np.arange(4), z) == 0
-
-
 def test_unevenness_counts_each_place_once_with_its_nearest_image():
     path = np.array([3, 3, 4, 4, 5, 5])
     assert unevenness(path, np.array([-4.0, 1.0, 1.0, -4.0, -4.0, 1.0])) == 0
-
-
-def test_unevenness_of_few_or_unknown_places_is_zero():
-    assert unevenness(np.array([3, 4]), np.array([-6.0, 0.0])) == 0
-    assert unevenness(np.arange(3), np.array([-6.0, np.inf, 0.0])) == 0
-
-
-def test_odds_factor_is_of_both_checks():
-    assert odds_factor(0.0, EXCESS) == 1
-    assert odds_factor(0.0, -1.0) == 1
-    expected = np.exp(-0.1 * UNEVEN_WEIGHT - 0.02 * EXCESS_WEIGHT)
-    assert odds_factor(0.1, EXCESS + 0.02) == pytest.approx(expected)
 
 
 def test_camera_at_rest_needs_less_where_its_images_are_near():

@@ -208,19 +208,6 @@ def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkey
     assert len(set(np.abs(matches))) < 4
 
 
-@pytest.mark.parametrize(
-    ('relative_pose', 'has_odometry'), [('pnp', True), ('auto', False), ('aligned', False)]
-)
-def test_matched_pair_without_alignment_copies_nothing_of_the_window(
-    relative_pose, has_odometry, map_file, route, monkeypatch
-):
-    pipeline = localizing(map_file)
-    match = process(pipeline, route[:LENGTH], poses=has_odometry)[-1]
-    monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
-    pair = pipeline.operation.matched_pair(match, relative_pose)
-    assert (pair.place, pair.distances.size, len(pair.thumbnails)) == (match.place_index, 0, 8)
-
-
 def test_matched_pair_of_the_newest_images_alone_is_of_these(route):
     """After a jump, while images from before it are in the window."""
     pipeline = recorded(route, 'localization', 60, sequence=SequenceSettings(12))

@@ -137,16 +137,6 @@ def test_arguments_of_wrong_types_are_rejected_with_the_expected_one(small_map):
             call()
 
 
-def test_match_and_map_are_shown_on_one_line(small_map):
-    text = repr(recognize_all(recognizer(small_map), small_map.features[:5])[-1])
-    assert text.startswith('Match(MATCH, place_index=2, newest_index=4, distance=')
-    assert repr(recognizer(small_map).update(small_map.features[:1])) == (
-        "Match(WARMING_UP, reason='1 of 5 images in the window')"
-    )
-    assert repr(small_map).startswith(f'PlaceMap({len(small_map)} places, LocalFeatures(gradient')
-    assert max(len(text), len(repr(small_map))) < 160
-
-
 def test_recognizer_settings_out_of_range_are_rejected(small_map):
     for threshold in (0.0, -1.0, float('nan')):
         with pytest.raises(SettingsError, match='threshold'):

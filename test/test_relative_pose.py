@@ -14,7 +14,6 @@ from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map,
 from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.recognition.same_places import with_same_places
-from stavpr_ros.relative_pose import landmarks
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair, Source, TRIANGULATION_RADIUS
@@ -151,18 +150,6 @@ def test_edge_with_an_obstacle_is_dropped_only_where_pnp_is_possible():
     assert (edge.independent, edge.reason) == (False, 'PnP: a reason')
     assert estimator.estimate(pair, CAMERA, CAMERA).independent
     assert estimator.estimate(pair, None, CAMERA, 'a reason').source is Source.ALIGNED
-
-
-def test_estimator_keeps_landmarks_of_places_until_the_map_changes(monkeypatch):
-    pair = scene(CAMERA, pose(0.3))
-    detected, view_of = [], landmarks.view_of
-    module = 'stavpr_ros.relative_pose.estimator'
-    monkeypatch.setattr(f'{module}.view_of', lambda *of: detected.append(of) or view_of(*of))
-    estimator, views = EdgeEstimator(), 2 * TRIANGULATION_RADIUS + 2
-    for source, count in ((pair.source, views), (pair.source, 1), (object(), views)):
-        detected.clear()
-        estimator.estimate(replace(pair, source=source), CAMERA, CAMERA)
-        assert len(detected) == count
 
 
 NO_POSES = {'poses': np.full((PLACES, 7), np.nan)}

@@ -138,13 +138,6 @@ def test_z_normalized_around_subtracts_mean_of_neighbors():
 # ------------------------------------------------ the recognizer
 
 
-def test_robust_recognizer_after_reset_is_as_new(small_map):
-    one = robust(small_map, sequence=SHORT, nms_radius=5)
-    first = repr(recognize_all(one, small_map.features[20:30]))
-    recognize_all(one, small_map.features[:15])
-    assert repr(recognize_all(one, small_map.features[20:30])) == first
-
-
 @pytest.mark.parametrize(
     ('without', 'strategy'),
     [

@@ -360,12 +360,6 @@ def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route
     robot.until(reported, 'the finding on the map')
 
 
-def test_former_name_warns_and_is_the_same():
-    with pytest.warns(DeprecationWarning, match=r'stavpr_ros\.fleet\.upload is now stavpr_fleet'):
-        from stavpr_ros.fleet import upload as former
-    assert former is upload
-
-
 def test_load_map_service_rejects_addresses(robot, start, server):
     start()
     robot.until_map(state='loaded')

@@ -113,15 +113,6 @@ def small_vgg(vgg_file):
     return backbone_class('vgg16')(settings)
 
 
-def test_network_with_many_images_runs_in_passes(small_vgg, monkeypatch):
-    monkeypatch.setattr('stavpr_lab.features.paper_networks.PER_PASS', 2)
-    images = smooth_images((32, 32), (40, 40), (50, 32), (32, 50), (64, 64))
-    together = small_vgg.feature_maps(images)
-    assert together.shape == (5, 512, 2, 2)
-    for image, maps in zip(images, together, strict=True):
-        np.testing.assert_allclose(small_vgg.feature_maps([image])[0], maps, rtol=1e-4, atol=1e-4)
-
-
 def test_network_half_on_cpu_changes_nothing(small_vgg):
     """A robot's CPU may query a map that a GPU made in half precision."""
     assert small_vgg.feature_maps(smooth_images((32, 32))).dtype == np.float32

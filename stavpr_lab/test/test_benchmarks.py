@@ -22,7 +22,6 @@ import constants
 from lower_bounds import Peaks
 import matching
 import off_map
-import off_map_page
 import peaks
 import report
 from stavpr_ros.errors import InputError
@@ -98,16 +97,6 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     assert [(row['images'], row['right']) for row in bins] == [(1, 1), (1, 0), (1, 1), (1, 1)]
 
 
-def test_summary_of_off_map_has_the_calibration_of_each_data_set():
-    rows = {
-        f'set_calibration/{feature}/{name}': {'expected_calibration_error': error}
-        for feature, name, error in (('g', 'b', 0.1), ('g', 'a', 0.02), ('h', 'a', 0.5))
-    }
-    label = 'calibration: expected error, drives of a data set'
-    assert off_map_page.summary(rows, 'g') == {label: ('b 0.100, a 0.020', '<= 0.05')}
-    assert off_map_page.summary(rows, 'l') == {}
-
-
 def test_constants_are_set_everywhere_and_restored():
     """Also where a module has imported the value by its name."""
     before = MODEL.start, filter_window.APART
@@ -118,22 +107,6 @@ def test_constants_are_set_everywhere_and_restored():
     assert (MODEL.start, evidence.APART) == before
     with pytest.raises(InputError, match='no constant'):
         constants.value_of('NEVEST')
-
-
-@pytest.mark.parametrize(
-    ('name', 'value', 'half', 'double'),
-    [
-        ('weight', 0.3, 0.15, 0.6),
-        ('levels', (-1.0, -3.0), (-0.5, -1.5), (-2.0, -6.0)),
-        ('keep_speed', 0.75, 0.875, 0.5),  # of changing it
-        ('APART', 21, 10, 42),
-        ('speeds', (0.0, 1.0, 4.0, 16.0), (0.0, 1.0, 16.0), (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)),
-    ],
-)
-def test_half_and_double_of_constants(name, value, half, double):
-    with constants.constant(name, value):
-        found = constants.half_and_double(name)
-    assert found == (pytest.approx(half), pytest.approx(double))
 
 
 def test_constants_are_measured_beside_the_present_ones(tmp_path, monkeypatch):
@@ -162,38 +135,6 @@ def test_every_constant_is_named_where_it_is():
     for name in constants.CONSTANTS:
         half, double = constants.half_and_double(name)
         assert constants.value_of(name) not in (half, double)
-
-
-def test_public_graphs_go_on_where_they_were_ended(tmp_path, monkeypatch, capsys):
-    """Cells of the present code are kept; what is measured is written at once."""
-    graph_files = pytest.importorskip('graph_files', reason='needs gtsam', exc_type=ImportError)
-    measured: list[tuple[str, float]] = []
-
-    def measure(edges, expected, method, kind, share, seeds):
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        measured.append((kind, share))
-        return {'success': 1.0, 'precision': 1.0, 'recall': 1.0, 'seconds': 0.5}
-
-    for name, value in (('measure', measure), ('read_edges', list), ('ours', lambda _: [None])):
-        monkeypatch.setattr(graph_files, name, value)
-    path = tmp_path / 'a.json'
-    words = ['a', '--files', 'MIT', '--methods', 'this graph', '--kinds', 'random']
-    monkeypatch.setattr(sys, 'argv', [*words, '--output', str(path)])
-    monkeypatch.setenv('STAVPR_DATA', str(tmp_path))
-    with pytest.raises(KeyboardInterrupt):
-        graph_files.main()
-    document = json.loads(path.read_text())
-    document['rows'][0]['version'] = 'other'
-    path.write_text(json.dumps(document))
-    measured.pop(0)
-    with pytest.raises(KeyboardInterrupt):
-        graph_files.main()
-    assert measured == [('random', 0.3), ('random', 0.1)]
-    measured.clear()
-    graph_files.main()
-    assert measured == [('random', 0.5)]
-    assert '3 of 9' in capsys.readouterr().out
 
 
 def test_public_graph_one_closure_at_a_time_ends_like_all_at_once():

@@ -31,11 +31,3 @@ def test_slow_camera_is_driven_with_stop_and_go():
     stopped, reason, _, meters = blind.drive(half, 0.25, 10.0, 0.3)
     assert (stopped, reason) == (math.inf, '')
     assert meters == pytest.approx(blind.AFTER, abs=1.0)
-
-
-def test_table_has_a_line_per_failure(monkeypatch):
-    monkeypatch.setattr(blind, 'PHASES', 1)
-    monkeypatch.setattr(blind, 'AFTER', 3.0)
-    lines = blind.table()
-    assert len(lines) == 2 + len(blind.FAILURES)
-    assert len({line.count('|') for line in lines}) == 1

@@ -14,8 +14,6 @@ from fixtures import route_images
 import pytest
 from stavpr_ros.commands import stavpr
 from stavpr_ros.parameters import PARAMETERS
-from stavpr_ros.recognition.recognizer import EARLY
-from stavpr_slam.ros.bridges.bridge import EdgeBridge
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / 'benchmarks' / 'results'
@@ -125,7 +123,7 @@ def test_documented_parameters_exist():
     text = '\n'.join(page.read_text() for page in PAGES)
     given = set(re.findall(r'(?:-p (?=\w+:=)|param set /stavpr )(\w+)', text))
     assert given
-    assert given <= NAMES | EdgeBridge.ROBOTS.keys()
+    assert given <= NAMES
     table = (ROOT / 'README.md').read_text().partition('| parameter |')[2].partition('\n\n')[0]
     assert set(re.findall(r'^\| `(\w+)`', table, re.M)) <= NAMES
 
@@ -134,26 +132,6 @@ def test_documented_parameters_exist():
 def test_links_between_pages_resolve(page):
     for target in re.findall(r'\]\((?!https?://)([^)#\s]+)', page.read_text()):
         assert (page.parent / target).exists(), f'{page.name} links to {target}'
-
-
-EARLY_MATCHES = (
-    r'above a probability of N, by its newest images',
-    r'(?:no|until a) place has a probability above N',
-    r'while the window is not full, > N',
-    r'probability above N is (?:matched|a MATCH) from the second image on',
-    r'at least N of fewer images than a full window',
-    r'images since then are matched.{0,90} needs a probability of N',
-    r'early matches need a probability of N',
-)
-
-
-def test_limit_of_early_matches_is_one_number_on_all_pages():
-    pages = *PAGES, ROOT / 'stavpr_msgs/msg/PlaceMatch.msg', ROOT / 'CHANGELOG.rst'
-    texts = [re.sub(r'[\s#]+', ' ', page.read_text()) for page in pages]
-    patterns = [sentence.replace('N', r'(\d?\.\d+)') for sentence in EARLY_MATCHES]
-    stated = [[float(n) for text in texts for n in re.findall(one, text)] for one in patterns]
-    assert all(stated), 'a sentence has changed: state the limit here as well'
-    assert {number for numbers in stated for number in numbers} == {EARLY}
 
 
 def marked_tables() -> list:

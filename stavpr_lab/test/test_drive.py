@@ -49,22 +49,6 @@ def test_images_at_varying_speed_are_between_half_and_double():
     assert images[-1] <= 1999 < images[-1] + 3
 
 
-@pytest.mark.parametrize(
-    ('name', 'changes'),
-    [
-        ('same', DriveChanges()),
-        ('0.7x', DriveChanges(speed=0.7)),
-        ('vary', DriveChanges(speed='varying')),
-        ('varying', DriveChanges(speed='varying')),
-        ('stop', DriveChanges(stops=((50, 30),))),
-        ('stop 100', DriveChanges(stops=((50, 100),))),
-        ('drop 0.3', DriveChanges(drop=0.3)),
-    ],
-)
-def test_named_changes_are_those_of_the_name(name, changes):
-    assert DriveChanges.named(name, 100) == changes
-
-
 def test_images_are_dropped_with_the_probability_and_by_the_seed():
     images = DriveChanges(drop=0.3, seed=5).images(4000)
     assert images.tolist() == DriveChanges(drop=0.3, seed=5).images(4000).tolist()

@@ -14,9 +14,7 @@ from stavpr_lab.evaluation.paper.experiments import (
     BaselineInputs,
     DatasetExperiment,
     PRESETS,
-    sweep_configurations,
 )
-from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map
 from stavpr_ros.recognition import RecognizerSettings
@@ -34,18 +32,6 @@ def nordland(tmp_path):
     for name in ('summer', 'winter'):
         write_images(tmp_path / 'nordland' / name, route_images(24))
     return ['--data', tmp_path, '--features', 'gradient', '--datasets', 'nordland']
-
-
-def test_sweep_configurations_vary_one_parameter():
-    assert [column.sequence.length for column in sweep_configurations('l', [5, 10])] == [5, 10]
-    assert sweep_configurations('beta')[0].sequence.beta == 1.25
-    assert sweep_configurations('xi', [2])[0].spatial.xi == 2
-    assert sweep_configurations('sigma', [0.5])[0].spatial.sigma == 0.5
-    assert sweep_configurations('W', [5])[0].strips == 5
-    with pytest.raises(SettingsError, match='whole number'):
-        sweep_configurations('W', [5.5])
-    with pytest.raises(SettingsError, match='unknown'):
-        sweep_configurations('gamma')
 
 
 def test_experiments_field_prints_recall_at_the_tolerance_of_each_data_set(
@@ -138,13 +124,10 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     ('options', 'code', 'word'),
     [
         ('paper', 2, '--data'),
-        ('paper --datasets nordland', 2, 'NAME=FOLDER'),
         ('paper --data /missing', 1, '/missing'),
         ('paper --values 3 --data x', 2, 'sweep'),
-        ('paper --parameter W --data x', 2, 'sweep'),
         ('paper --seed 5 --data x', 2, 'the experiment sets'),
         ('paper --descriptors x=y --data x', 2, 'netvlad or saes or vgg_fc6'),
-        ('paper --ssm-layers x y --data x', 2, '--features onnx'),
         ('fast --ssm-layers x y --data x', 2, 'experiment paper'),
         ('paper --data x --json /missing/x.json', 1, 'make it first'),
     ],

@@ -228,17 +228,14 @@ TOKENS = ['--vector', 'token', '--map-module']
         ('transformer', [*TOKENS, 'norm'], 2, '20 without the first 1.*prefix_tokens = 5'),
         ('transformer', [*TOKENS, 'neck'], 2, "no module 'neck': its modules are backbone"),
         ('salad', ['--vector', ''], 2, 'neither a vector nor a map'),
-        ('salad', ['--vector', '2'], 2, "no output '2'"),
         ('salad', ['--vector', '', '--map', '0'], 2, r'returns vectors \(1, 30\)'),
         ('transformer', [], 2, 'its outputs are token, patches'),
         ('salad', ['--vector', '1'], 2, 'is list: expected a vector'),
         ('pooled', [], 1, 'AssertionError'),
         ('pooled', ['--argument', 'backbone=x'], 2, "'x' is no JSON"),
-        ('pooled', ['--argument', '1'], 2, 'expected NAME=JSON'),
         ('missing', [], 1, 'entry missing of .* fails'),
         ('no_model', [], 1, 'returns a str: expected a torch.nn.Module'),
         ('not_finite', [], 1, 'NaN or infinite'),
-        ('loop', ['--size', 7000], 2, 'must be 8 to 4096'),
         ('loop', ['--commit', 'main', '--repository', 'owner/name'], 2, 'expected 40 digits'),
     ],
 )
@@ -274,17 +271,6 @@ def quantized(repository, tmp_path_factory):
     for name in ('QDQ', 'QOperator'):
         quantize_static(folder / 'net.onnx', folder / f'{name}.onnx', Reader(), QuantFormat[name])
     return folder
-
-
-@pytest.mark.parametrize('kind', ['QDQ', 'QOperator'])
-def test_int8_onnx_features_are_near_those_of_float32(quantized, kind):
-    def vectors(name):
-        output = onnx.load(quantized / name).graph.output[0].name
-        settings = settings_class('onnx')(model=str(quantized / name), layer=output, size=SIZE)
-        return FeatureExtractor('onnx', settings).extract(images()).strips[0]
-
-    cosines = (vectors('net.onnx') * vectors(f'{kind}.onnx')).sum(1)
-    assert float(cosines.min()) > 0.98
 
 
 def test_int8_layer_of_quantized_numbers_is_rejected(quantized):

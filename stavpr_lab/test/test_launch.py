@@ -11,7 +11,7 @@ from launch_files import load_launch, PACKAGES, use_stand_ins, words
 from processes import executable
 import pytest
 from stavpr_nav.parameters import REPEAT, TEACH
-from stavpr_ros.parameters import BY_NAME, RENAMED
+from stavpr_ros.parameters import BY_NAME, REMOVED, RENAMED
 from stavpr_slam.ros.graph_node import PARAMETERS as GRAPH
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -92,7 +92,7 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
         types = {**table, **types, 'use_sim_time': False}
     given = {n: TEXTS[type(types[n])][0] for n in launch.arguments if n in types}
     own = {'replay': REPLAY, 'multi_camera': {'cameras'}}.get(name, set())
-    expected = (set(types) | set(RENAMED) | COMMON | own) - set(FIXED[name]) - NO_ARGUMENTS
+    expected = {*types, *RENAMED, *REMOVED, *COMMON, *own} - set(FIXED[name]) - NO_ARGUMENTS
     assert set(launch.arguments) == expected
     for argument in launch.arguments.values():
         assert len(argument.description) > 10
@@ -117,6 +117,13 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
         }
         assert words(node.namespace) == '${namespace}' + '/front' * (name == 'multi_camera')
     assert reached == set(given) - set(RENAMED)
+
+
+def test_removed_parameters_reach_the_node_which_names_them(load):
+    (node,) = load('stavpr').start(**dict.fromkeys(REMOVED, 'x:y'))
+    assert {name: value.first for name, value in node.parameters[1].items()} == dict.fromkeys(
+        REMOVED, 'x:y'
+    )
 
 
 @pytest.mark.parametrize('name', NAMES)

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The license header of every Python file."""
 
+from collections.abc import Iterator
+import os
 from pathlib import Path
 import subprocess
 import sys
 
 import pytest
-from test_language import repository_files
 
 ROOT = Path(__file__).resolve().parents[2]
 HEADER = '# Copyright 2026 The stavpr_ros authors\n# SPDX-License-Identifier: Apache-2.0\n'
@@ -16,7 +17,16 @@ PEP257_IGNORES = {
     *('D100', 'D101', 'D102', 'D103', 'D104', 'D105', 'D106', 'D107'),
     *('D203', 'D212', 'D404'),
 }
+NOT_OURS = {'build', 'install', 'log'}
 PLUGINS = ('flake8_builtins', 'flake8_comprehensions', 'flake8_import_order', 'flake8_quotes')
+
+
+def repository_files(suffix: str) -> Iterator[Path]:
+    for folder, subfolders, files in os.walk(ROOT):
+        subfolders[:] = sorted(
+            name for name in subfolders if not name.startswith('.') and name not in NOT_OURS
+        )
+        yield from (Path(folder, name) for name in sorted(files) if name.endswith(suffix))
 
 
 def test_python_files_have_license_header():

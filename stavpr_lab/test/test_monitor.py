@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The monitor: its history, its web server, and the node that it shows."""
 
-import base64
 from http.client import HTTPConnection
 from importlib.resources import files
 from itertools import cycle
@@ -16,14 +15,13 @@ import threading
 import time
 
 import cv2
-import numpy as np
 from processes import Process, TIMEOUT
 import pytest
 import rclpy
 from robot import LENGTH
 from sensor_msgs.msg import Image
 from stavpr_lab.commands import monitor
-from stavpr_lab.monitor.node import encode_row, History, KEPT, Monitor, span_of
+from stavpr_lab.monitor.node import History, Monitor
 from stavpr_lab.monitor.server import MonitorServer
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError, UnavailableError
@@ -48,30 +46,11 @@ def test_history_since_a_version_returns_what_has_changed(history):
     assert history.since(version, 0) == (version, {'samples': []})
 
 
-def test_history_keeps_the_last_samples_with_a_time_between_them(history):
-    for i in range(KEPT + 5):
-        history.add({'place': i})
-    samples = history.since(0, TIMEOUT)[1]['samples']
-    assert (len(samples), samples[0]['place']) == (KEPT, 5)
-    history = History(sample_seconds=1000)
-    for i in range(2):
-        history.add({'place': i})
-    assert history.since(0, TIMEOUT)[1]['samples'] == [{'place': 0}]
-
-
 def test_history_has_no_number_that_json_lacks(history):
     history.set('pose', [1.0, math.nan])
     history.add({'probability': math.inf})
     changes = history.since(0, TIMEOUT)[1]
     assert changes == {'pose': [1.0, None], 'samples': [{'probability': None}]}
-
-
-@pytest.mark.parametrize(
-    ('places', 'span'),
-    [([0], (0, 1)), (range(7), (0, 7)), (range(40, 70), (40, 70)), ([100, 104, 108], (100, 112))],
-)
-def test_row_spans_the_places_of_its_columns(places, span):
-    assert span_of(np.array(places, float)) == span
 
 
 def test_history_keeps_a_match_just_after_a_dropped_image():
@@ -80,12 +59,6 @@ def test_history_keeps_a_match_just_after_a_dropped_image():
         history.add({'status': status})
     samples = history.since(0, 0)[1]['samples']
     assert [sample['status'] for sample in samples] == ['dropped', 'match']
-
-
-def test_encode_row_by_hand():
-    row = np.array([1, 3, 2, np.inf, 9], np.float32)  # least 1, median 2.5
-    assert list(base64.b64decode(encode_row(row))) == [0, 255, 170, 255, 255]
-    assert list(base64.b64decode(encode_row(np.full(3, np.inf, np.float32)))) == [255] * 3
 
 
 # the server

@@ -14,7 +14,6 @@ from stavpr_lab.evaluation.protocol import (
     image_vectors,
     LENGTHS,
     match_sequences,
-    recalls,
 )
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 
@@ -29,17 +28,6 @@ def command(monkeypatch, capsys, tmp_path):
     arrays = '--map', tmp_path / 'map.npy', '--query', tmp_path / 'query.npy'
     run = runner(evaluate, monkeypatch, capsys)
     return lambda *options: run(*arrays, '--protocol', *options)
-
-
-def test_recalls_by_hand():
-    """Of six queries five are in the map; 0 and 1 precede the best wrong match, 4 ties with it."""
-    correct = np.array([1, 1, 0, 0, 1, 0], bool)
-    has_match = np.array([1, 1, 1, 0, 1, 1], bool)
-    scores = np.array([0.1, 0.2, 0.3, 0.4, 0.3, np.inf])
-    assert recalls(correct, scores, has_match) == (3 / 5, 2 / 5)
-    stacked = [np.stack([column, column[::-1]]) for column in (correct, scores, has_match)]
-    assert [values.tolist() for values in recalls(*stacked)] == [[0.6, 0.6], [0.4, 0.4]]
-    assert np.isnan(recalls(correct & False, scores, has_match & False)).all()
 
 
 def test_recalls_equal_metrics_of_random_rankings():

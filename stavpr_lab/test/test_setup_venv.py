@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of the set-up behind the Makefile; none of them needs a network."""
 
-import ast
 from importlib import metadata
 import os
 from pathlib import Path
-import platform
 import re
 import sys
 
@@ -16,7 +14,6 @@ import setup_venv
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = ('torch', *(f'locked/{name}' for name in ('base', *setup_venv.LOCKED_EXTRAS)))
-LOCKED = setup_venv.LOCKED_EXTRAS
 EXACT = re.compile(r'^([\w.-]+)(?:\[\w+\])?==([\w.]+)', re.MULTILINE)
 
 
@@ -34,17 +31,14 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class Recorder:
-    """Replaces ``run_logged``: records the commands; that of the name ``fails`` is interrupted."""
+    """Replaces ``run_logged``: records the commands."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.commands: dict[str, str] = {}
-        self.fails = ''
 
     def __call__(self, name: str, title: str, command: list) -> None:
         self.commands[name] = ' '.join(map(str, command))
-        if name == self.fails:
-            raise KeyboardInterrupt
         if name == 'venv':
             (self.root / '.venv').mkdir(exist_ok=True)
             (self.root / '.venv' / 'pyvenv.cfg').write_text(f'home = {sys.base_prefix}')
@@ -65,51 +59,6 @@ def recorder(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
     return recorder
 
 
-# Rejections
-
-
-@pytest.mark.parametrize(
-    ('version', 'implementation', 'status'),
-    [
-        *[('3.11', 'CPython', 0), ('3.12', 'CPython', 0), ('3.13', 'CPython', 0)],
-        *[('3.10', 'CPython', 1), ('3.14', 'CPython', 1), ('3.11', 'PyPy', 1)],
-    ],
-)
-def test_python_unsupported_is_rejected_by_name(
-    recorder, monkeypatch, capsys, version, implementation, status
-):
-    monkeypatch.setattr(setup_venv, 'PYTHON_VERSION', version)
-    monkeypatch.setattr(platform, 'python_implementation', lambda: implementation)
-    assert setup_venv.main(['build']) == status
-    assert bool(recorder.commands) == (status == 0)
-    text = capsys.readouterr().err
-    for word in (f'{implementation} {version} ({sys.executable})', '3.11, 3.12, 3.13', 'PYTHON='):
-        assert (word in text) == (status == 1)
-
-
-def test_python_old_parses_setup_venv():
-    source = (ROOT / 'tools' / 'setup_venv.py').read_text(encoding='utf-8')
-    ast.parse(source, feature_version=(3, 6))
-    assert '__future__' not in source
-
-
-def test_machine_without_tools_lists_all_of_them(tmp_path, monkeypatch):
-    for program in ('c++', 'mycc'):
-        (tmp_path / program).touch(mode=0o755)
-    monkeypatch.setenv('PATH', str(tmp_path))
-    monkeypatch.setenv('CC', 'mycc -m64')
-    monkeypatch.setenv('CXX', 'no-such-compiler')
-    monkeypatch.setattr(platform, 'machine', lambda: 'aarch64')
-    monkeypatch.setattr(setup_venv.importlib.util, 'find_spec', lambda _: None)
-    text = '\n'.join(setup_venv.machine_problems())
-    for word in ('Linux aarch64', 'no-such-compiler is not', 'cmake is not', 'ensurepip'):
-        assert word in text
-    assert 'mycc' not in text
-
-
-# Inputs and stamps
-
-
 def test_extras_are_added_and_kept(recorder):
     assert recorder.run('build', '--with', 'onnx')[-1] == 'stavpr_lab'
     assert recorder.run('build', '--with', 'dev') == ['torch', 'pip']
@@ -117,24 +66,6 @@ def test_extras_are_added_and_kept(recorder):
     installed = re.findall(r'locked/(\w+)\.txt', recorder.commands['pip'])
     assert installed == ['base', 'onnx', 'dev']
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
-
-
-def test_lock_has_every_requirement_of_every_python_with_a_hash():
-    folder = ROOT / 'requirements'
-    base = (folder / 'locked' / 'base.txt').read_text()
-    files = {extra: (folder / 'locked' / f'{extra}.txt').read_text() for extra in LOCKED}
-    for name in (*setup_venv.BASE, *LOCKED):
-        locked = dict(EXACT.findall(base + files.get(name, '')))
-        for package, version in EXACT.findall((folder / f'{name}.txt').read_text()):
-            assert locked[package.lower().replace('_', '-')] == version
-    for text in (base, *files.values()):
-        entries = text.replace(' \\\n', ' ').splitlines()[1:]
-        assert all(re.search(r' --hash=sha256:[0-9a-f]{64}( |$)', entry) for entry in entries)
-    found = dict(EXACT.findall(base))
-    pins = dict(EXACT.findall((folder / 'constraints.txt').read_text()))
-    assert {name: found[name] for name in pins if name in found} == {
-        name: version for name, version in pins.items() if name in found
-    }
 
 
 def test_pins_are_for_the_first_release_of_this_python():
@@ -153,24 +84,6 @@ def test_pins_are_for_the_first_release_of_this_python():
     assert compared > 200
 
 
-@pytest.mark.parametrize('step', ['venv', 'pip'])
-def test_interrupted_installation_starts_anew(recorder, checkout, step):
-    recorder.run('setup')
-    stamp = checkout / '.venv' / 'setup.json'
-    stamp.write_text(stamp.read_text()[:9])
-    recorder.fails = step
-    assert setup_venv.main(['setup']) == 130
-    recorder.fails = ''
-    assert recorder.run('setup') == ['venv', 'torch', 'pip']
-    recorder.fails = 'pip'
-    assert recorder.run('setup', '--with', 'dev') == ['torch', 'pip']
-    recorder.fails = ''
-    assert recorder.run('setup') == ['venv', 'torch', 'pip']
-
-
-# Commands and their environment
-
-
 def test_environment_has_no_other_ros(checkout, monkeypatch):
     kept = {'ROS_DOMAIN_ID': '7', 'STAVPR_DATA': '/data'}
     variables = kept | dict.fromkeys(setup_venv.FOREIGN, 'x') | {
@@ -187,6 +100,3 @@ def test_environment_has_no_other_ros(checkout, monkeypatch):
         'PIP_USER': '0',
         **dict.fromkeys(('VIRTUAL_ENV', 'AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH'), venv),
     }
-
-
-# The files of the repository

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from stavpr_lab.demonstration.street.laps import drive_laps, RingWorld
-from stavpr_lab.demonstration.street.objects import _from_camera
-from stavpr_lab.demonstration.street.rendering import _on_ground, center_line_ahead
+from stavpr_lab.demonstration.street.rendering import center_line_ahead
 from stavpr_lab.demonstration.street.street import CELL
 from stavpr_lab.demonstration.street.traverses import (
     GOOD_LIGHT,
@@ -85,12 +84,3 @@ def test_center_line_ahead_of_closed_street_agrees_with_poses(image):
     line = RingWorld(5).center_line
     cells = (int(along / CELL) + 1 + np.arange(80)) % (len(line) - 1)
     assert np.abs(found - line[cells, :2]).max() < 1e-3  # the ends meet to 0.2 mm
-
-
-def test_points_of_rigid_street_seen_on_ground_are_where_they_are():
-    street, along, across = RingWorld(5).streets[0], 123.3, 1.2
-    line = center_line_ahead(street, along)
-    for ahead, beside in ((4.0, -3.0), (21.7, 5.0), (40.2, -9.0)):
-        z, right = _from_camera(line, along, ahead, beside)
-        found = _on_ground(line, along, across, (right - across) / z, z)
-        assert found == pytest.approx((ahead, beside), abs=0.02)

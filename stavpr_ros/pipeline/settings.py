@@ -195,7 +195,6 @@ class NodeSettings:
     subgoal_distance: float
     subgoal_width: int
     relative_pose: str
-    verifier: str
     camera_transform: str
     pipeline: PipelineSettings
 

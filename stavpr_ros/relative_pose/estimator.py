@@ -19,7 +19,6 @@ from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, vie
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import Edge, LANDMARK_RADIUS, MatchedPair, NEIGHBORS, Source
 from stavpr_ros.relative_pose.pnp import MIN_INLIERS, PnpPose, solve_pnp
-from stavpr_ros.relative_pose.verification import verified_edge, Verifier
 
 METHODS = ('auto', 'none', 'aligned', 'pnp')
 VIEWS, LANDMARKS = 64, 32  # places kept: about 300 kB and 100 kB each
@@ -43,11 +42,10 @@ class EdgeEstimator:
 
     :param method: ``auto``: PnP where it is possible, else aligned by odometry; ``pnp`` and
         ``aligned``: that alone; ``none``.
-    :param verifier: accepts or refutes each edge; None = none.
     """
 
-    def __init__(self, method: str = 'auto', verifier: Verifier | None = None) -> None:
-        self.method, self.verifier = method, verifier
+    def __init__(self, method: str = 'auto') -> None:
+        self.method = method
         self._source: tuple[PlaceMap | GrowingMap, Camera] | None = None
         self._last: tuple[PlaceMap | GrowingMap, np.ndarray] | None = None
         self._views: OrderedDict[int, View | None] = OrderedDict()
@@ -67,19 +65,9 @@ class EdgeEstimator:
         no pose.
 
         :param query_camera, place_camera: of the two images; None = unknown.
-        :param obstacle: why there is no time for PnP and the verifier; empty = there is.
-        :raises InputError: the verifier returned no valid edge.
+        :param obstacle: why there is no time for PnP; empty = there is.
         """
-        if obstacle and self.verifier is not None:
-            return Edge(Source.DROPPED, f'verifier: {obstacle}')
         edge = self._estimated(pair, query_camera, place_camera, obstacle)
-        if self.verifier is not None and self.method != 'none':
-            refutation = Edge(
-                Source.REFUTED, 'the verifier did not confirm it', inliers=edge.inliers
-            )
-            edge = (
-                verified_edge(self.verifier, pair, query_camera, place_camera, edge) or refutation
-            )
         return replace(edge, independent=self._is_independent(pair, edge))
 
     def _is_independent(self, pair: MatchedPair, edge: Edge) -> bool:

@@ -119,8 +119,6 @@ class EdgePublisher:
             return Edge(Source.NONE, 'parameter relative_pose is none')
         if pair is None:
             return NO_POSE
-        if self._estimator.verifier is not None:
-            return Edge(Source.NONE, 'the loop closure of this header has it, verified')
         edge = self._estimator.without_pnp(pair, query_camera, place_camera)
         return edge or Edge(Source.NONE, 'the loop closure of this header has it, by PnP')
 

@@ -14,7 +14,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
-from stavpr_ros.parameters import EXPECTED, PARAMETERS, RENAMED
+from stavpr_ros.parameters import EXPECTED, PARAMETERS, REMOVED, RENAMED
 
 PACKAGE = 'stavpr_ros'
 PACKAGES = {PACKAGE, 'stavpr_nav'}  # with launch files that use this module
@@ -24,6 +24,7 @@ TYPES: dict[str, type] = {row.name: type(row.default) for row in PARAMETERS} | {
     'use_sim_time': bool
 }
 TYPES |= {old: TYPES[new] for old, new in RENAMED.items()}
+TYPES |= dict.fromkeys(REMOVED, str)  # given to the node, which warns
 CAMERA = '{camera}'  # in a text, the name of each of several cameras
 
 
@@ -168,6 +169,7 @@ def _check(names: list[str], needs: str) -> OpaqueFunction:
 def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareLaunchArgument]:
     sentences = {row.name: row.sentence for row in PARAMETERS}
     sentences |= {old: f'Earlier name of {new}.' for old, new in RENAMED.items()}
+    sentences |= {name: f'Removed in 1.0: {remedy}.' for name, remedy in REMOVED.items()}
     sentences['use_sim_time'] = 'Take the time from the topic /clock.'
     params_file = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'stavpr.yaml'])
     rows: dict[str, tuple[Any, str]] = {

@@ -12,7 +12,14 @@ from rclpy.parameter import Parameter
 from stavpr_ros.checks import require_plain
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.output_file import require_room
-from stavpr_ros.parameters import BY_NAME, EXPECTED, NodeParameter, PARAMETERS, RENAMED
+from stavpr_ros.parameters import (
+    BY_NAME,
+    EXPECTED,
+    NodeParameter,
+    PARAMETERS,
+    REMOVED,
+    RENAMED,
+)
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.sources.video_topic import FFMPEG, FOXGLOVE
@@ -79,13 +86,16 @@ def declare_parameters(node: ManagedNode) -> dict[str, Any]:
 
 
 def unknown_parameters(names: Iterable[str]) -> list[str]:
-    """Return a warning for each unknown parameter, with the most similar or the new name."""
+    """Return a warning for each unknown parameter, with the most similar name or a remedy."""
     warnings = []
     for name in names:
         if name in BY_NAME or name.startswith(_RCLPY_PARAMETERS):
             continue
         if name in RENAMED:
             warnings.append(renamed(name))
+            continue
+        if name in REMOVED:
+            warnings.append(f'parameter {name!r} was removed in 1.0: {REMOVED[name]}')
             continue
         near = difflib.get_close_matches(name, BY_NAME, 1)
         hint = f': did you mean {near[0]}?' if near else ': see `ros2 param list`'

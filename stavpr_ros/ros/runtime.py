@@ -28,7 +28,6 @@ from stavpr_ros.pipeline.saving import (
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
 from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
-from stavpr_ros.relative_pose.verification import load_verifier
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.bond import Bond, make_bond
 from stavpr_ros.ros.edges import EdgePublisher
@@ -111,9 +110,8 @@ class Runtime:
         self._subgoal = SubgoalPublisher(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
         self._output = Output(node, settings.queue_size, settings.robot_id)
-        verifier = load_verifier(settings.verifier) if settings.verifier else None
         self._edges = EdgePublisher(
-            EdgeEstimator(settings.relative_pose, verifier),
+            EdgeEstimator(settings.relative_pose),
             settings.robot_id,
             self._output.publish_closure,
             self._statistics,

@@ -1,14 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Stand-in for the targets of the bridges, and for the recognition node, as a process of its own.
+Stand-in for RTAB-Map, and for the recognition node, as a process of its own.
 
-``bridge_target.py TARGET`` publishes a drive of two laps, its keyframes in the messages of the
-target, and loop closures; it writes the edges that come back as JSON.
+``bridge_target.py`` publishes a drive of two laps, its keyframes in the messages of RTAB-Map, and
+loop closures; it writes the edges that come back as JSON.
 """
 
 import json
-import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -21,7 +20,6 @@ from rclpy.qos import QoSProfile
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.ros.messages import pose_message, time_message
-from stavpr_slam.ros.graph_messages import pose_array
 from test_pose_graph import circle, LAP, planar_poses, SECOND
 from test_pose_graph_node import odometry_message
 
@@ -74,17 +72,14 @@ def closures(drive: Drive, on_map: bool) -> list[LoopClosure]:
 
 
 class Target(Node):
-    """The target of one bridge."""
+    """RTAB-Map, as far as the bridge uses it."""
 
-    def __init__(self, target: str) -> None:
+    def __init__(self) -> None:
         super().__init__('target')
         self.edges: list[dict] = []
-        targets = {'rtabmap': self._rtabmap, 'hydra': self._hydra, 'kimera': self._kimera}
-        self.keyframes = targets.get(target, self._swarm)()
+        self.keyframes = self._rtabmap()
         self.closures = self.create_publisher(LoopClosure, 'stavpr/loop_closure', QOS)
-        self.odometry, self.other = (
-            self.create_publisher(Odometry, topic, QOS) for topic in ('odom', 'place_odom')
-        )
+        self.odometry = self.create_publisher(Odometry, 'odom', QOS)
         self.received = False  # the bridge has received a closure
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
@@ -115,101 +110,6 @@ class Target(Node):
 
         return publisher, publish
 
-    def _hydra(self):
-        """
-        Interpret edges as Hydra does: between the nodes nearest to two stamps, within 1 s.
-
-        MIT-SPARK/Hydra src/backend/external_loop_closure_receiver.cpp: key_from, key_to are stamps
-        in ns, the pose is to_T_from; src/backend/backend_module.cpp: a between factor (to, from).
-        """
-
-        def add(edge) -> None:
-            def nearest(key: int) -> int:
-                assert key <= max(self.stamps.values())
-                found = min(self.stamps, key=lambda number: abs(self.stamps[number] - key))
-                assert abs(self.stamps[found] - key) < SECOND
-                return found
-
-            self._add_graph_edge(nearest(edge.key_to), nearest(edge.key_from), edge)
-
-        return self._graph('pose_graph', 'external_loop_closures', add)
-
-    def _kimera(self):
-        """
-        Interpret edges as Kimera does.
-
-        MIT-SPARK/Kimera-PGMO kimera_pgmo/src/kimera_pgmo_interface.cpp: key_from, key_to are keys
-        of nodes, the pose is from_T_to, a between factor (from, to).
-        """
-
-        def add(edge) -> None:
-            assert {edge.key_from, edge.key_to} <= self.stamps.keys()
-            self._add_graph_edge(edge.key_from, edge.key_to, edge)
-
-        return self._graph('pose_graph_incremental', 'pose_graph_incremental', add)
-
-    def _add_graph_edge(self, first: int, second: int, edge) -> None:
-        assert (edge.robot_from, edge.robot_to, edge.type) == (3, 3, edge.LOOPCLOSE)
-        covariance = np.array(edge.covariance).reshape(6, 6)
-        self._add(first, second, pose_array(edge.pose), covariance, edge.type)
-
-    def _graph(self, nodes: str, edges: str, add):
-        from pose_graph_tools_msgs.msg import PoseGraph, PoseGraphNode
-
-        self.stamps: dict[int, int] = {}  # of nodes, by their numbers
-
-        def on_graph(message) -> None:
-            for edge in message.edges:
-                add(edge)
-
-        self.create_subscription(PoseGraph, edges, on_graph, QOS)
-        publisher = self.create_publisher(PoseGraph, nodes, QOS)
-
-        def publish(number: int, stamp: int, pose) -> None:
-            self.stamps[number] = stamp
-            known = [PoseGraphNode(robot_id=robot, key=number + robot - 3) for robot in (3, 4)]
-            for node in known:
-                node.header.stamp = time_message(stamp)
-            publisher.publish(PoseGraph(nodes=known))
-
-        return publisher, publish
-
-    def _swarm(self):
-        from cslam_common_interfaces.msg import (
-            InterRobotLoopClosure,
-            IntraRobotLoopClosure,
-            KeyframeOdom,
-        )
-
-        def on_closure(message) -> None:
-            t, o = message.transform.translation, message.transform.rotation
-            pose, within = [t.x, t.y, t.z, o.x, o.y, o.z, o.w], hasattr(message, 'keyframe0_id')
-            assert message.success
-            if within:
-                numbers = message.keyframe0_id, message.keyframe1_id
-            else:
-                assert (message.robot0_id, message.robot1_id) == (1, 0)
-                numbers = message.robot0_keyframe_id, message.robot1_keyframe_id
-            self._add(*numbers, pose, np.eye(6), 0 if within else 1)
-
-        for kind, topic in (
-            (IntraRobotLoopClosure, 'cslam/intra_robot_loop_closure'),
-            (InterRobotLoopClosure, '/cslam/inter_robot_loop_closure'),
-        ):
-            self.create_subscription(kind, topic, on_closure, QOS)
-        publishers = [
-            self.create_publisher(KeyframeOdom, topic, QOS)
-            for topic in ('cslam/keyframe_odom', '/r1/cslam/keyframe_odom')
-        ]
-
-        def publish(number: int, stamp: int, pose) -> None:
-            message = KeyframeOdom(id=number)
-            message.odom = odometry_message(stamp, to_poses(pose))
-            for publisher in publishers:
-                publisher.publish(message)
-
-        return publishers[0], publish
-
     def _add(self, first: int, second: int, pose, covariance: np.ndarray, kind: int) -> None:
         """Note an edge; pose: of the second node in the frame of the first one."""
         deviations = np.sqrt(np.linalg.eigvalsh(covariance)).tolist()
@@ -221,9 +121,9 @@ class Target(Node):
         )  # fmt: skip
 
 
-def main(target: str, on_map: bool) -> None:
+def main() -> None:
     rclpy.init()
-    node, drive = Target(target), Drive()
+    node, drive = Target(), Drive()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     publisher, publish = node.keyframes
@@ -241,16 +141,14 @@ def main(target: str, on_map: bool) -> None:
     while not node.received:  # the bridge may not know these publishers yet
         node.closures.publish(LoopClosure())  # has no relative pose: becomes no edge
         executor.spin_once(timeout_sec=0.2)
-    for message in closures(drive, on_map):
+    for message in closures(drive, on_map=False):
         node.closures.publish(message)
     for image in range(2 * LAP - 1):
-        for each in (node.odometry, node.other):
-            each.publish(odometry_message(stamp_of(image), to_poses(drive.at(image))))
+        node.odometry.publish(odometry_message(stamp_of(image), to_poses(drive.at(image))))
         if image % KEYFRAME == 0:  # known before the odometry after it
             publish(image // KEYFRAME + 1, stamp_of(image + 0.3), drive.at(image + 0.3))
         executor.spin_once(timeout_sec=0.01)
-    expected = EDGES - (target == 'swarm_slam')
-    wait_until(lambda: len(node.edges) >= expected)
+    wait_until(lambda: len(node.edges) >= EDGES)
     for _ in range(10):  # for edges too many
         executor.spin_once(timeout_sec=0.05)
     print(json.dumps(node.edges), flush=True)
@@ -259,4 +157,4 @@ def main(target: str, on_map: bool) -> None:
 
 
 if __name__ == '__main__':
-    main(sys.argv[1], 'map' in sys.argv[2:])
+    main()

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Breaks of the odometry that closures prove: where they are, and when they end."""
 
-from dataclasses import replace
 import tracemalloc
 
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_slam.pose_graph import breaks, PoseGraph
-from stavpr_slam.pose_graph.closures import BETWEEN_NODES, between_nodes
+from stavpr_slam.pose_graph.closures import BETWEEN_NODES
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.transforms import planar_poses
@@ -21,36 +20,6 @@ def chain_of(poses: np.ndarray) -> KeyframeChain:
     for i, pose in enumerate(poses):
         chain.add((i + 1) * SECOND, pose)
     return chain
-
-
-def test_merge_session_restores_the_chain():
-    chain = chain_of(planar_poses(circle(1)))
-    for node in (20, 40):
-        chain.split(node)
-    assert chain.splits == [20, 40]
-    assert np.bincount(chain.session).tolist() == [20, 20, 60]
-    chain.merge_session(20)
-    assert np.bincount(chain.session).tolist() == [40, 60]
-    assert (chain.splits, chain.sessions) == ([40], 2)
-    assert chain.previous[[20, 40]].tolist() == [19, -1]
-    assert set(chain.recording.tolist()) == {0}
-
-
-def test_split_moves_the_closures_between_its_keyframes():
-    truth = circle(2)
-    graph = PoseGraph()
-    for i, pose in enumerate(odometry_of(truth)):
-        graph.add_odometry((i + 1) * SECOND, pose)
-        if i >= LAP:
-            made = closure(truth, i, i - LAP)
-            graph.add_closure(replace(made, query_stamp=made.query_stamp - SECOND // 4))
-    graph.update()
-    whole = graph._closures.copy()
-    for node, begins, moved in ((LAP + 30, True, [30]), (LAP + 30, False, [])):
-        graph._split(node, begins)
-        anew = between_nodes([graph._resolved(each) for each in graph._known])
-        assert graph._closures.tobytes() == anew.tobytes()
-        assert np.flatnonzero(graph._closures.query != whole.query).tolist() == moved
 
 
 @pytest.mark.parametrize('counted', [False, True])

@@ -220,7 +220,7 @@ def test_pose_graph_in_a_long_solution_delays_no_odometry_and_ends_at_once(peer,
     os.kill(solver, signal.SIGSTOP)
     saving = peer.save.call_async(SaveMap.Request(path='drive.tum'))
     delays = [peer.delay((i + 1) * SECOND, poses[i]) for i in range(1, 100)]
-    assert max(delays) < 10  # on a busy machine; benchmarks/live_graph.py measures it
+    assert max(delays) < 10  # on a busy machine
     assert peer.call(peer.reset, Trigger.Request()).success
     peer.wait_until(saving.done)
     assert 'reset' in saving.result().message
@@ -293,7 +293,7 @@ def test_pose_graph_diagnoses_closures_that_it_cannot_use(peer, running):
     peer.until_diagnosed(DiagnosticStatus.WARN, '100 of 100 closures are of stamps without')
     assert peer.call(peer.reset, Trigger.Request()).success
     for source, remedy in (
-        (RelativePose.REFUTED, 'are refuted by PnP or the verifier'),
+        (RelativePose.REFUTED, 'are refuted by PnP'),
         (RelativePose.DROPPED, 'are dropped, as PnP is slower'),
     ):
         publish(source=source)

@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from stavpr_ros.mapping.transforms import inverse, to_poses
+from stavpr_ros.mapping.transforms import inverse
 from stavpr_slam.pose_graph import optimize, PoseGraph, runs
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
@@ -24,13 +24,6 @@ def chain():
         chain.add((i + 1) * SECOND, pose)
     chain.split(25)
     return chain
-
-
-def test_runs_end_at_edges_sessions_and_after_the_longest(chain):
-    found = runs.Runs.of(chain, {3, 17, 38})
-    assert np.flatnonzero(found.variable).tolist() == [0, 3, 10, 17, 20, 25, 35, 38]
-    assert found.before[[0, 2, 3, 12, 25, 26, 39]].tolist() == [-1, 0, 0, 10, -1, 25, 38]
-    assert found.after[[1, 4, 24, 26, 39]].tolist() == [3, 10, -1, 35, -1]
 
 
 def step_covariance(step: np.ndarray, noise: OdometryNoise) -> np.ndarray:
@@ -54,23 +47,6 @@ def test_path_errors_are_sums_over_the_steps(chain, side):
         step = inverse(T[k - 1]) @ T[k]
         expected += change @ step_covariance(step, NOISE) @ change.T
     assert found[0] == pytest.approx(expected, rel=1e-5, abs=1e-9)
-
-
-def test_filled_run_continues_to_its_moved_end(chain):
-    found = runs.Runs.of(chain, set())
-    values = chain.transforms.copy()
-    values[20] = values[20] @ _moved(0.2, -0.1, 0.02)
-    filled = found.filled(values)
-    assert np.array_equal(filled[found.variable], values[found.variable])
-    off = [to_poses(inverse(chain.transforms[k]) @ filled[k])[:2] for k in range(10, 21)]
-    assert (np.diff(np.linalg.norm(off, axis=1)) > 0).all()
-    before, after = (inverse(filled[k]) @ filled[k + 1] for k in (18, 19))
-    assert before == pytest.approx(after, abs=0.01)  # no jump at the end
-
-
-def _moved(x, y, yaw):
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 
 
 def test_optimize_with_runs_agrees_with_all_keyframes(monkeypatch):

@@ -114,5 +114,5 @@ def test_package_runs_without_its_docstrings(tmp_path):
     (tmp_path / 'a.g2o').write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n')
     call = [sys.executable, '-OO', '-c', OPTIMIZED, 'optimize_graph', str(tmp_path / 'a.g2o')]
     text = subprocess.check_output(call, text=True)
-    assert 'Publishes loop closures by PnP' in text
+    assert 'Adds loop closures to RTAB-Map' in text
     assert '2 poses, 0 closures' in text

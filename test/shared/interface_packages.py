@@ -4,9 +4,7 @@
 Message packages of other projects, built for the tests of the bridges.
 
 data/interfaces has only the interfaces that the bridges use, with the fields of the published
-definitions (comments left out): rtabmap_msgs 0.22.1 (github.com/introlab/rtabmap_ros, BSD),
-pose_graph_tools_msgs (github.com/MIT-SPARK/pose_graph_tools, BSD), cslam_common_interfaces
-(github.com/lajoiepy/cslam_interfaces, MIT).
+definitions (comments left out): rtabmap_msgs 0.22.1 (github.com/introlab/rtabmap_ros, BSD).
 """
 
 import os

@@ -12,12 +12,6 @@ TARGETS = {
     'rtabmap': ('rtabmap', 'RtabmapBridge', 'Adds loop closures to RTAB-Map as user closures.'),
     'rtabmap_global_pose': ('rtabmap', 'GlobalPoseBridge', 'Publishes the pose on a map as '
                             '``global_pose``, a prior of RTAB-Map; without its messages.'),
-    'hydra': ('pose_graph_tools', 'HydraBridge', 'Publishes loop closures on '
-              '``external_loop_closures`` of Hydra.'),
-    'kimera': ('pose_graph_tools', 'KimeraBridge', 'Publishes loop closures on '
-               '``pose_graph_incremental`` of Kimera-PGMO and Kimera-Distributed.'),
-    'swarm_slam': ('swarm_slam', 'SwarmSlamBridge', 'Publishes loop closures by PnP for '
-                   'Swarm-SLAM.'),
     'robot_localization': ('poses', 'RobotLocalizationBridge', 'Publishes ``~/pose`` for a '
                            '``poseN`` of robot_localization, once per relocalization.'),
 }  # fmt: skip
@@ -25,13 +19,13 @@ HELP = """usage: bridge TARGET [--ros-args -p NAME:=VALUE ... -r stavpr/loop_clo
        bridge --help
 
 Passes the loop closures of the recognition node on (stavpr/loop_closure, stavpr_msgs/LoopClosure).
-Targets that take edges between their keyframes require the same odometry as the recognition node
-on the topic `odom`. Counts and remedies are in /diagnostics.
+The target rtabmap requires the same odometry as the recognition node on the topic `odom`. Counts
+and remedies are in /diagnostics.
 
 targets and their parameters:
 {targets}
-Only rtabmap requires rtabmap_msgs, hydra and kimera pose_graph_tools_msgs, swarm_slam
-cslam_common_interfaces. For Nav2: parameter publish_initialpose of the recognition node.
+Only rtabmap requires rtabmap_msgs. For Nav2: parameter publish_initialpose of the recognition
+node.
 
 exit codes: 0 stopped by a signal; 1 an invalid parameter, or a missing package; 2 usage
 """

@@ -368,7 +368,7 @@ class PoseGraphNode(ManagedNode):
             ],
             'without a usable relative pose, see relative_pose.reason of the closures: check '
             'camera_info, camera_transform and the odometry': counts['without relative pose'],
-            'refuted by PnP or the verifier: the recognition node finds wrong places, raise its '
+            'refuted by PnP: the recognition node finds wrong places, raise its '
             'min_probability, or camera_info is not of the images': counts['refuted closures'],
             'dropped, as PnP is slower than they come: set max_rate or keyframe_distance of the '
             'recognition node, or free a processor core': counts['dropped closures'],

@@ -3,7 +3,6 @@
 """What all bridges have in common: parameters, loop closures in, counts, diagnostics."""
 
 from collections import Counter
-from collections.abc import Iterable
 import importlib
 import math
 from typing import Any, ClassVar
@@ -131,34 +130,13 @@ class EdgeBridge(Bridge):
         ),
         'pnp_only': (False, 'only edges by PnP, none that are aligned by odometry'),
     }
-    ROBOTS: ClassVar[dict[str, tuple[Any, str]]] = {
-        'robot_id': (0, 'number of this robot in the target'),
-        'place_robot_id': (
-            -1,
-            'number of the robot that recorded the map, for operation localization; -1 = the '
-            'places are of this drive',
-        ),
-    }
 
     def __init__(self) -> None:
         super().__init__()
         self._pending: list[tuple[LoopClosure, Closure]] = []
         self._sent: set[tuple[int, int]] = set()
-        self.robot = int(self.given.get('robot_id', 0))
-        other = int(self.given.get('place_robot_id', -1))
-        self.place_robot = self.robot if other < 0 else other
-        gap = self.seconds('max_keyframe_gap')
-        self.keyframes = {
-            robot: ExternalKeyframes(gap) for robot in (self.robot, self.place_robot)
-        }
-        topics = {self.place_robot: 'place_odom', self.robot: 'odom'}
-        for robot, topic in topics.items():
-            self.create_subscription(
-                Odometry,
-                topic,
-                lambda message, robot=robot: self._on_odometry(message, robot),
-                ODOMETRY_QOS,
-            )
+        self.keyframes = ExternalKeyframes(self.seconds('max_keyframe_gap'))
+        self.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
 
     def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
         """Pass an edge on."""
@@ -168,29 +146,22 @@ class EdgeBridge(Bridge):
         """Return whether the target takes edges; they wait until it does."""
         return True
 
-    def add_keyframes(self, keyframes: Iterable[tuple[int, int, int]]) -> None:
-        """
-        Add keyframes of the target, and send the closures that waited for them.
-
-        :param keyframes: robot, stamp (ns), and number of each; those of other robots are ignored.
-        """
-        for robot, stamp, number in keyframes:
-            if robot in self.keyframes and stamp > 0:
-                self.keyframes[robot].add(stamp, number)
+    def add_keyframe(self, stamp: int, number: int) -> None:
+        """Add a keyframe of the target, stamp in ns, and send the closures that waited for it."""
+        if stamp > 0:
+            self.keyframes.add(stamp, number)
         self._send_pending()
 
     def on_timer(self) -> None:
         """Send what waited for the target, and publish the diagnostics."""
         self._send_pending()
         self.counts['waiting'] = len(self._pending)
-        self.counts['keyframes'] = sum(len(each) for each in self.keyframes.values())
+        self.counts['keyframes'] = len(self.keyframes)
         super().on_timer()
 
-    def _on_odometry(self, message: Odometry, robot: int) -> None:
+    def _on_odometry(self, message: Odometry) -> None:
         try:
-            self.keyframes[robot].odometry.add(
-                nanoseconds(message.header.stamp), odometry_pose(message)
-            )
+            self.keyframes.odometry.add(nanoseconds(message.header.stamp), odometry_pose(message))
         except InputError as error:
             self.counts['invalid_odometry'] += 1
             self.get_logger().warning(f'odometry rejected: {error}', throttle_duration_sec=10.0)
@@ -198,10 +169,8 @@ class EdgeBridge(Bridge):
     def take(self, message: LoopClosure) -> str:
         """Let an edge wait for its keyframes."""
         relative = message.relative_pose
-        if message.query_index < 0 and self.place_robot == self.robot:
+        if message.query_index < 0:
             return 'on_a_map'
-        if message.query_index >= 0 and self.place_robot != self.robot:
-            return 'not_on_a_map'
         closure = closure_of(message, appearance=False)
         if closure is None:
             return 'without_relative_pose'
@@ -218,20 +187,18 @@ class EdgeBridge(Bridge):
 
     def _send_pending(self) -> None:
         """Send the edges whose keyframes are known; those of later stamps wait."""
-        queries, places = self.keyframes[self.robot], self.keyframes[self.place_robot]
+        keyframes = self.keyframes
         if not self.ready():
             return
         waiting = []
         for message, closure in self._pending:
-            if closure.query_stamp > queries.newest or not len(places):
+            if closure.query_stamp > keyframes.newest:
                 waiting.append((message, closure))
                 continue
-            query, place = queries.near(closure.query_stamp), places.near(closure.place_stamp)
+            query, place = map(keyframes.near, (closure.query_stamp, closure.place_stamp))
             if query is None or place is None:
                 self.counts['no_keyframe'] += 1
-            elif (place[0], query[0]) in self._sent or (
-                place[0] == query[0] and self.place_robot == self.robot
-            ):
+            elif (place[0], query[0]) in self._sent or place[0] == query[0]:
                 self.counts['same_keyframes'] += 1
             else:
                 self._sent.add((place[0], query[0]))

@@ -45,7 +45,7 @@ class RtabmapBridge(EdgeBridge):
 
     def _on_info(self, message: Any) -> None:
         if message.ref_id > 0:
-            self.add_keyframes([(self.robot, nanoseconds(message.header.stamp), message.ref_id)])
+            self.add_keyframe(nanoseconds(message.header.stamp), message.ref_id)
 
     def send(self, edge: KeyframeEdge, message: LoopClosure) -> None:
         """Request the link from the place to the query."""
