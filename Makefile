@@ -96,7 +96,7 @@ check: ceilings ## ruff, mypy, and the tests without ROS and processes, on the s
 	@test -d .venv || $(MAKE) development
 	@$(RUN) ruff check .
 	@$(RUN) mypy
-	@$(RUN) bash -c 'PYTHONPATH="$(SOURCES):$$PYTHONPATH" $(PYTEST) -m "quick and not long" $(ARGS)'
+	@$(RUN) bash -c 'PYTHONPATH="$(SOURCES):$$PYTHONPATH" $(PYTEST) -m "quick and not slow and not long" $(ARGS)'
 
 test-long: development ## run the tests that take minutes each (ARGS=)
 	@$(TEST) $(PYTEST) -m long $(ARGS)

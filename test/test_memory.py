@@ -77,6 +77,7 @@ def test_opened_map_whose_file_changes_is_an_error(path, small_map):
         _ = opened.features.strips
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not Path('/proc/self/statm').exists(), reason='resident memory is read from /proc'
 )

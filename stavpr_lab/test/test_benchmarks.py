@@ -34,6 +34,7 @@ from stavpr_ros.relative_pose.pair import Source
 PEAKS = Peaks(1e9, 1e10)
 
 
+@pytest.mark.slow
 def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     monkeypatch.setattr(peaks, 'measure_peaks', lambda *_: PEAKS)
     monkeypatch.setattr(matching, 'CITY', 200)
