@@ -20,7 +20,7 @@ CEILINGS = {
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_204,
     'lines of the method (filter, prepare, recognition)': 8_481,
-    'lines of all tests': 34_795,
+    'lines of all tests': 34_797,
     'lines of benchmarks and tools': 8_058,
     'lines of docs and README': 4_128,
     'parameters of the node': 52,
