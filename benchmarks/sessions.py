@@ -10,18 +10,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
+import time
 
 from data import data_folder
 import numpy as np
 from results import RESULTS, table
-from stavpr_lab.demonstration.days import MAPS, PRECISIONS
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
+from stavpr_ros.maintenance.same_places import with_last_related
+from stavpr_ros.maintenance.upkeep import update_map
 from stavpr_ros.mapping import build_map, merge_maps, PlaceMap, select_places
 from stavpr_ros.mapping.versions import Version
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, upkeep
-from stavpr_ros.recognition.same_places import with_last_related
+from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
+from stavpr_ros.threads import limit_threads
 
 HEADING = '## Real sessions'
 TEXT = """
@@ -30,10 +32,11 @@ last one is matched on it; sums of the orders. Nordland and the track have two s
 images of the second update the map, the odd ones are matched. The office is driven in two laps on
 two days, each lap is a session. Truth of the office and of the track: the best path of a whole
 session. Poisoned drives (images of another route, mirrored ones, but for the closed laps of the
-office the second half before the first): those that change a map, of all. The last
-of the maps is updated and matched in int8, with room for six times the places of the first session
-in the memory of 1.5 sessions in float32.
+office the second half before the first): those that change a map, of all. Milliseconds of an image
+on one thread, mean of the orders' medians.
 """
+MAPS = 'first session', 'all sessions', 'updated map', 'updated map in int8'
+PRECISIONS = 'float32', 'float32', 'float32', 'int8'  # of MAPS
 LAP = 207  # images of the office
 
 
@@ -133,17 +136,23 @@ def measure(
     query: Session,
     route: Route,
     precision: str,
-) -> np.ndarray:
-    """Return right and wrong matches of a query; positions by the stamps of the map."""
+) -> tuple[np.ndarray, float]:
+    """
+    Return right and wrong matches of a query, and the median time of an image, ms.
+
+    :param positions: by the stamps of the map.
+    """
     one = PlaceRecognizer(place_map, RecognizerSettings(), precision=precision)
-    counts = np.zeros(2, int)
+    counts, times = np.zeros(2, int), []
     for i in range(len(query.drive)):
+        began = time.thread_time()
         match = one.update(query.drive.features[i : i + 1], int(query.drive.stamps[i]))
+        times.append(1e3 * (time.thread_time() - began))
         if match.accepted:
             image = i - len(match.window_stamps) + 1 + match.position
             off = abs(query.position[image] - positions[int(place_map.stamps[match.place_index])])
             counts[int(min(off, route.period - off) > route.tolerance)] += 1
-    return counts
+    return counts, float(np.median(times))
 
 
 def poisoned(session: Session, other: PlaceMap, is_closed: bool) -> Iterator[PlaceMap]:
@@ -157,7 +166,8 @@ def poisoned(session: Session, other: PlaceMap, is_closed: bool) -> Iterator[Pla
 
 def drive_route(route: Route, other: PlaceMap) -> list[str]:
     """Return the cells of a route."""
-    counts, places, changes = np.zeros((4, 2), int), np.zeros(4, int), []
+    counts, places, times = np.zeros((4, 2), int), np.zeros(4, int), np.zeros(4)
+    changes: list[str] = []
     images = changed = poisons = 0
     for order in route.orders:
         positions: dict[int, float] = {}
@@ -169,27 +179,25 @@ def drive_route(route: Route, other: PlaceMap) -> list[str]:
         everything = first = merge_maps([drives[0]], ['0'])
         for number, drive in enumerate(drives[1:], 1):
             everything = with_last_related(merge_maps([everything, drive], ['', str(number)]))
-        maps = [first, everything]
-        for precision in PRECISIONS:
-            updated, version = drives[0], Version('', base_places=len(first))
-            settings = upkeep.UpkeepSettings(precision=precision)
-            for number, drive in enumerate(drives[1:], 1):
-                for bad in poisoned(order[number], other, np.isfinite(route.period)):
-                    after, _, _ = update(updated, bad, version, 'poisoned', settings)
-                    poisons, changed = poisons + 1, changed + (len(after) != len(updated))
-                updated, version, text = update(updated, drive, version, str(number), settings)
-                changes.append(text)
-            maps.append(updated)
-        for row, (each, precision) in enumerate(
-            zip(maps, ('float32', 'float32', *PRECISIONS), strict=True)
-        ):
-            counts[row] += measure(each, positions, order[-1], route, precision)
+        updated, version = drives[0], Version('', base_places=len(first))
+        for number, drive in enumerate(drives[1:], 1):
+            for bad in poisoned(order[number], other, np.isfinite(route.period)):
+                after, _, _ = update(updated, bad, version, 'poisoned')
+                poisons, changed = poisons + 1, changed + (len(after) != len(updated))
+            updated, version, text = update(updated, drive, version, str(number))
+            changes.append(text)
+        maps = first, everything, updated, updated
+        for row, (each, precision) in enumerate(zip(maps, PRECISIONS, strict=True)):
+            matches, ms = measure(each, positions, order[-1], route, precision)
+            counts[row] += matches
+            times[row] += ms / len(route.orders)
             places[row] += len(each)
         images += len(order[-1].drive)
     recall = ' '.join(f'{right / images:.3f}' for right, _ in counts)
+    took = ' '.join(f'{ms:.2f}' for ms in times)
     wrong, sizes = (' '.join(map(str, each.tolist())) for each in (counts[:, 1], places))
     print(*changes, sep='\n')
-    return [route.name, str(images), recall, wrong, sizes, f'{changed} of {poisons}']
+    return [route.name, str(images), recall, wrong, sizes, took, f'{changed} of {poisons}']
 
 
 def update(
@@ -197,11 +205,10 @@ def update(
     drive: PlaceMap,
     version: Version,
     name: str,
-    settings: upkeep.UpkeepSettings,
 ) -> tuple[PlaceMap, Version, str]:
     """Return a map after a drive, its version, and what has changed; a rejected one: why."""
     try:
-        place_map, version = upkeep.update_map(place_map, drive, name, version, settings)
+        place_map, version = update_map(place_map, drive, name, version)
     except InputError as error:
         return place_map, version, str(error)
     return place_map, version, '; '.join(version.changes)
@@ -209,10 +216,11 @@ def update(
 
 def main() -> None:
     """Write the rows, with each route those so far."""
+    limit_threads(1)
     listed = list(routes(data_folder()))
     others = [route.orders[0][0].drive for route in [*listed[2:], *listed[:2]]]
     maps = ', '.join(MAPS)
-    columns = ['route', 'images', f'recall: {maps}', 'wrong', 'places', 'poisoned']
+    columns = ['route', 'images', f'recall: {maps}', 'wrong', 'places', 'ms', 'poisoned']
     target, rows = RESULTS / 'days.md', []
     for route, other in zip(listed, others, strict=True):
         rows.append(drive_route(route, other))

@@ -261,10 +261,9 @@ GROUPS: dict[str, tuple[NodeParameter, ...]] = {
         NodeParameter(
             'update_map',
             False,
-            'Localization: what drives show that are certain where they are becomes part of the '
-            'map, as by `stavpr map update`: in its file, by ~/save_map without a path, and on '
-            'deactivation or shutdown. Of max_places images at most. With precision int8, '
-            'six drives are kept.',
+            'Localization: drives that are certain where they are become sessions of the map, as '
+            'by `stavpr map update`: in its file, by ~/save_map without a path, and on '
+            'deactivation or shutdown. Of max_places images at most. The latest three are kept.',
         ),
         NodeParameter(
             'maps_folder',

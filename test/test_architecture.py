@@ -30,7 +30,7 @@ ROS |= {
 }
 CORE = {
     *('alignment', 'sources', 'features', 'mapping', 'filter', 'prepare', 'recognition'),
-    *('relative_pose', 'pipeline'),
+    *('maintenance', 'relative_pose', 'pipeline'),
 }
 MAY_IMPORT = {
     'alignment': set(),
@@ -40,6 +40,7 @@ MAY_IMPORT = {
     'filter': {'alignment'},
     'prepare': {'alignment', 'features', 'mapping', 'filter'},
     'recognition': {'alignment', 'features', 'mapping', 'filter', 'prepare'},
+    'maintenance': {'alignment', 'features', 'mapping', 'filter', 'prepare', 'recognition'},
     'stavpr_fleet': {'alignment', 'features', 'mapping', 'filter', 'prepare', 'recognition'},
     'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
     'pipeline': CORE - {'pipeline'},

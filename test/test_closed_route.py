@@ -14,9 +14,9 @@ from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.filter.place_filter import PlaceFilter
+from stavpr_ros.maintenance.same_places import with_seam
 from stavpr_ros.mapping import load_map, merge_maps, save_map, select_places
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.same_places import with_seam
 from test_direction import recognize
 from test_relative_motion import poses_of
 

@@ -121,7 +121,7 @@ def test_next_call_or_start_takes_up_the_drives_once(
     assert waiting(path)
     log = Mock()
     if isinstance(error, Killed):
-        take_up_earlier_drives(path, 'float32', log)
+        take_up_earlier_drives(path, log)
     else:
         assert update_own_map(pipeline, at_once, log)
     assert not log.error.called
@@ -136,7 +136,7 @@ def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path,
     (folder / 'drive 1.stavpr').write_bytes(b'cut off')
     save_map(built(OTHER), folder / 'drive 2.stavpr')
     log = Mock()
-    take_up_earlier_drives(path, 'float32', log)
+    take_up_earlier_drives(path, log)
     assert 'drive 1 does not update' in log.error.call_args.args[0]
     assert 'drive 2 does not update' in log.warning.call_args.args[0]
     assert (current_version(path).number, waiting(path)) == (3, ['drive 1.stavpr'])
@@ -161,7 +161,7 @@ def test_load_map_keeps_the_drives_on_the_other_map(pipeline, path, monkeypatch)
             pipeline.change(loaded=other)
     assert pipeline.save_state.path == path
     pipeline.change(loaded=other)
-    take_up_earlier_drives(path, 'float32', Mock())
+    take_up_earlier_drives(path, Mock())
     assert is_updated(path)
 
 

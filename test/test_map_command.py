@@ -16,6 +16,7 @@ import pytest
 from stavpr_ros.commands.map import main
 from stavpr_ros.commands.program import until_unread
 from stavpr_ros.errors import FeatureMismatchError, InputError
+from stavpr_ros.maintenance.near_duplicates import without_duplicates
 from stavpr_ros.mapping import (
     GrowingMap,
     load_map,
@@ -25,7 +26,6 @@ from stavpr_ros.mapping import (
     select_places,
     select_session,
 )
-from stavpr_ros.prepare.near_duplicates import without_duplicates
 
 
 @pytest.fixture(scope='module')

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_ros.errors import InputError
+from stavpr_ros.maintenance.same_places import with_same_places
 from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map, thumbnail_of
 from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair, Source, TRIANGULATION_RADIUS

@@ -14,6 +14,7 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
 from stavpr_ros.filter.model import FilterSettings, MODEL
 from stavpr_ros.filter.place_filter import PlaceFilter
+from stavpr_ros.maintenance.same_places import with_same_places
 from stavpr_ros.mapping import (
     GrowingMap,
     load_map,
@@ -26,7 +27,6 @@ from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.same_places import with_same_places
 from stavpr_ros.recognition.sessions import layout_of
 
 pytestmark = pytest.mark.usefixtures('one_thread')

@@ -10,12 +10,12 @@ from pipelines import at, localizing, message, process, save, SECOND, settings_o
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.maintenance.same_places import SURE, with_last_related, with_same_places
 from stavpr_ros.mapping import load_map, PlaceMap, save_map
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.recognition import Status
-from stavpr_ros.recognition.same_places import SURE, with_last_related, with_same_places
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 UPSTAIRS = route_images(40, seed=3)

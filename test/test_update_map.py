@@ -30,8 +30,7 @@ def test_drives_update_the_file_by_save_map_and_at_the_end(robot, start, path):
     start(map_path=path, update_map=True, sequence_length=20)
     robot.drive(REBUILT)
     response = robot.does(SaveMap, 'save_map')
-    places = len(load_map(path))
-    assert response.places == places > len(ROUTE)
+    assert response.places == len(load_map(path)) == 2 * len(ROUTE)
     assert 'which load_map reads' in response.message
     learned = current_version(path)
     assert learned.map_id == load_map(path).map_id
@@ -41,8 +40,8 @@ def test_drives_update_the_file_by_save_map_and_at_the_end(robot, start, path):
     assert robot.transition('deactivate')
     robot.until_logged(f'updates {path}')
     assert current_version(path).map_id == load_map(path).map_id
-    assert len(current_version(path).missed) == len(learned.missed)
-    assert current_version(path).use != learned.use
+    assert current_version(path).parent == learned.map_id
+    assert len(load_map(path)) == 2 * len(ROUTE) + 150
 
 
 def test_drive_on_another_route_leaves_the_file_as_it_is(robot, start, path):
@@ -59,9 +58,3 @@ def test_images_of_drives_are_kept_up_to_max_places(robot, start, path, updates)
     node = start(map_path=path, update_map=updates, max_places=100)
     robot.drive(ROUTE[:110])
     assert [len(each) for each in node.runtime.pipeline.operation.take_drives()] == [100] * updates
-
-
-def test_drive_is_kept_whole_in_int8(robot, start, path):
-    start(map_path=path, update_map=True, sequence_length=20, precision='int8')
-    robot.drive(REBUILT)
-    assert robot.does(SaveMap, 'save_map').places == 2 * len(ROUTE)

@@ -18,18 +18,15 @@ def results():
     return list(run(DAYS, 5))
 
 
-def test_updated_map_knows_the_detour_and_stays_small(results):
-    first, everything, updated, int8 = np.array([day.recall for day in results]).T
-    assert 'added' in ' '.join(results[1].changes[0])
+def test_updated_map_knows_the_detour_and_keeps_four_drives(results):
+    first, updated, int8 = np.array([day.recall for day in results]).T
+    assert all('added the drive' in ' '.join(day.changes) for day in results)
     for day in (2, 3):  # the second and third day on which the road is closed
         assert updated[day] > first[day] + 0.05
     assert updated[4] >= first[4] - 0.03
-    assert results[-1].places[2] <= 1.5 * results[-1].places[0]
-    assert results[-1].places[1] == 6 * results[-1].places[0]
-    assert everything.min() > 0.5
-    assert [day.vanished[0] for day in results] == [0, 0, 0, 0, 13]
-    assert (int8 >= everything - 0.02).all()
-    assert results[-1].places[3] <= 6 * results[-1].places[0]  # in the memory of 1.5 in float32
+    assert (int8 >= updated - 0.02).all()
+    assert [day.places[1] / day.places[0] for day in results] == [2, 3, 4, 4, 4]
+    assert [day.vanished > 0 for day in results] == [False] * 4 + [True]
 
 
 def test_results_are_a_table_and_a_plot(results, tmp_path):

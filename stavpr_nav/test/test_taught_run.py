@@ -9,8 +9,7 @@ import pytest
 from stavpr_nav.taught_run import positions, read_velocities, taught_places, taught_run
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import descriptor_map, merge_maps
-from stavpr_ros.mapping.merging import keep_places
+from stavpr_ros.mapping import descriptor_map, merge_maps, select_places
 
 SECOND = 10**9
 HEAD = 'stamp,speed,turn\n'
@@ -132,7 +131,11 @@ def test_session_that_an_update_has_divided_and_renewed_is_one_run():
     both = replace(both, stamps=both.stamps + 10**9)
     stamps = both.stamps.copy()
     stamps[5:9] = np.arange(4) + 10**18
-    divided = keep_places(replace(both, stamps=stamps), np.delete(np.arange(60), range(14, 17)))
+    divided = select_places(replace(both, stamps=stamps), np.delete(np.arange(60), range(14, 17)))
+    monday, tuesday = both.sessions
+    index = np.repeat(np.arange(3, dtype=np.int32), (14, 13, 30))
+    sessions = monday, replace(monday, id='monday-2'), tuesday
+    divided = replace(divided, sessions=sessions, session_index=index)
     for velocities in (None, velocities_from(1)):
         taught = taught_places(divided, velocities, 'monday')
         assert taught.tolist() == [*range(27)]

@@ -333,9 +333,9 @@ def main(args: list[str] | None = None) -> int:
         if len(arguments.input) > 1:
             return _build_each(arguments, sys.argv[1:] if args is None else args)
         arguments.input = arguments.input[0]
+        from stavpr_ros.maintenance.same_places import with_seam
         from stavpr_ros.mapping import save_map
         from stavpr_ros.prepare.prepared_map import statistics_of_map
-        from stavpr_ros.recognition.same_places import with_seam
 
         state = 'nothing was written; the same command continues the work'
         place_map, journal = _build(arguments)

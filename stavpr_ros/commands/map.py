@@ -191,28 +191,6 @@ def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
     )
     action.add_argument('--topic', help="the bag's image topic, if there are several")
     add_camera(action)
-    action.add_argument(
-        '--max-places',
-        type=int,
-        default=0,
-        metavar='N',
-        help='places of the map, above which those that helped least to recognize are removed; '
-        'with room for two drives or more, the first and the last ones are kept whole (the memory '
-        'of one and a half sessions in float32)',
-    )
-    action.add_argument(
-        '--precision',
-        choices=('float32', 'int8'),
-        default='float32',
-        help='of the node that loads the map; int8 has room for six sessions (%(default)s)',
-    )
-    action.add_argument(
-        '--max-age',
-        type=int,
-        default=5,
-        metavar='DRIVES',
-        help='in a row that pass a stretch unrecognized until it is renewed (%(default)s)',
-    )
     add('log', _log, 'Show the versions of a map, and what each update added and removed.', 'map')
     action = add('rollback', _rollback, 'Make an earlier version the map again.', 'map')
     action.add_argument('--to', metavar='ID', default='', help='of the version (the one before)')
@@ -329,9 +307,9 @@ def _verified(path: str) -> 'PlaceMap':
 def _compact(arguments: argparse.Namespace) -> None:
     from dataclasses import replace
 
+    from stavpr_ros.maintenance.near_duplicates import without_duplicates
     from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.mapping.stored_features import StoredFeatures
-    from stavpr_ros.prepare.near_duplicates import without_duplicates
 
     place_map = _verified(arguments.map)
     assert isinstance(place_map.features, StoredFeatures)
@@ -352,8 +330,8 @@ def _compact(arguments: argparse.Namespace) -> None:
 
 
 def _merge(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.maintenance.same_places import with_same_places
     from stavpr_ros.mapping import merge_maps
-    from stavpr_ros.recognition.same_places import with_same_places
     from stavpr_ros.sources.folder import text_of
 
     maps = [_verified(path) for path in arguments.maps]
@@ -387,7 +365,7 @@ def _sessions(arguments: argparse.Namespace) -> None:
 
 
 def _close(arguments: argparse.Namespace) -> None:
-    from stavpr_ros.recognition.same_places import with_seam
+    from stavpr_ros.maintenance.same_places import with_seam
 
     place_map = with_seam(_verified(arguments.map), is_closed=True)
     say(f'the last place shows place {place_map.seam}')
@@ -416,9 +394,9 @@ def _colmap(arguments: argparse.Namespace) -> None:
 
 
 def _recover(arguments: argparse.Namespace) -> int:
+    from stavpr_ros.maintenance.same_places import with_last_related
     from stavpr_ros.mapping.journal import SUFFIX
     from stavpr_ros.mapping.journal_map import recover
-    from stavpr_ros.recognition.same_places import with_last_related
 
     journal = arguments.journal
     if arguments.output is None and not journal.endswith(SUFFIX):
@@ -431,18 +409,18 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 
 def _update(arguments: argparse.Namespace) -> None:
+    from stavpr_ros.maintenance.upkeep import update_file
+    from stavpr_ros.mapping import open_map
     from stavpr_ros.output_file import FileVersion
-    from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
     from stavpr_ros.sources.folder import text_of
 
-    settings = UpkeepSettings(arguments.max_places, arguments.max_age, arguments.precision)
     opened, place_map = FileVersion.of(arguments.map), _verified(arguments.map)
     name = text_of(Path(arguments.drive).stem)[:40]
     with _drive(arguments, place_map) as drive:
-        version = update_file(arguments.map, opened, place_map, drive, settings, name)
+        version = update_file(arguments.map, opened, place_map, drive, name)
     for change in version.changes:
         say(change)
-    places = len(version.use) or len(place_map)
+    places = len(open_map(arguments.map))
     say(f'{arguments.map}: {places} places, id {version.map_id}, was {place_map.map_id}')
 
 

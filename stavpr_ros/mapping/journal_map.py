@@ -126,7 +126,7 @@ def recover(
         suffix. That may be the map that is continued, which is replaced then; beside another map,
         a numbered name is taken.
     :param relate: relates places of the last session to places of the map, see
-        :func:`stavpr_ros.recognition.same_places.with_last_related`.
+        :func:`stavpr_ros.maintenance.same_places.with_last_related`.
     :raises JournalError: no journal, one without places, or one that is being written.
     :raises OutputError: the map cannot be written; the journal stays.
     """

@@ -123,31 +123,6 @@ def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
     )
 
 
-def keep_places(place_map: PlaceMap, places: np.ndarray, shortest: int = 10) -> PlaceMap:
-    """
-    Return a map of selected places, in which no path leads across those left out.
-
-    :param places: ascending, (m,), int64.
-    :param shortest: places; parts of sessions with fewer are left out as well.
-    :raises InputError: nothing is left.
-    """
-    index = place_map.session_index
-    runs = np.zeros(len(place_map), np.int32) if index is None else index
-    begins = (np.diff(places, prepend=-2) > 1) | (np.diff(runs[places], prepend=-1) != 0)
-    parts = [part for part in np.split(places, np.flatnonzero(begins)) if len(part) >= shortest]
-    if not parts:
-        raise InputError('no place is left')
-    chosen = select_places(place_map, np.concatenate(parts))
-    if index is None and len(parts) == 1:
-        return chosen
-    sessions: list[Session] = []
-    for part in parts:
-        session = place_map.session(int(part[0])) or Session('first')
-        sessions.append(replace(session, id=_free_id(session.id, sessions)))
-    numbers = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
-    return replace(chosen, sessions=tuple(sessions), session_index=numbers, error_risks=None)
-
-
 def _free_id(base: str, sessions: list[Session]) -> str:
     """Return the id, or the first numbered one that no other session has."""
     others = {session.id for session in sessions}

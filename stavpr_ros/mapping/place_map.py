@@ -125,7 +125,7 @@ class PlaceMap:
     :param camera: of its images; None = unknown, or another one of each session.
     :param same_as: of each place, itself, or the place of an earlier session, or of the start of a
         closed route, that shows the same, shape (n,), int32; None = unknown. By
-        :mod:`stavpr_ros.recognition.same_places`.
+        :mod:`stavpr_ros.maintenance.same_places`.
     :param threshold: distance below which mode paper matches where its own is not set, above 0; as
         :func:`stavpr_ros.recognition.threshold.suggest_threshold` returns it; None = unknown.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not

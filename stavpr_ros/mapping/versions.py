@@ -19,14 +19,13 @@ from typing import Any
 from stavpr_ros.errors import InputError, MapFileError, OutputError
 from stavpr_ros.mapping.map_container import read_json
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.map_schema import integer, list_of, number, record, text
+from stavpr_ros.mapping.map_schema import integer, list_of, record, text
 from stavpr_ros.mapping.place_map import PlaceMap
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output
 
 SUFFIX = '.history'
 KEPT = 10  # versions; older ones, and those of a branch that was left, are deleted
-MAX_PLACES = 2**24
 
 
 @dataclass(frozen=True)
@@ -41,9 +40,7 @@ class Version:
     :param time: when it was made, seconds since 1970.
     :param base_places: number of places before the first update.
     :param changes: what the update added and removed, and why: sentences.
-    :param use: of each place, the decayed number of drives that were recognized there; empty = 1.
-    :param missed: of each place, the drives in a row that passed it unrecognized; empty = 0.
-    :param drives: the last ones, see :data:`stavpr_ros.recognition.same_drive.Row`.
+    :param drives: the last ones, see :data:`stavpr_ros.maintenance.same_drive.Row`.
     """
 
     map_id: str
@@ -53,8 +50,6 @@ class Version:
     time: int = 0
     base_places: int = 0
     changes: tuple[str, ...] = ()
-    use: tuple[float, ...] = ()
-    missed: tuple[int, ...] = ()
     drives: tuple[tuple[str, int, str], ...] = ()
 
 
@@ -70,8 +65,6 @@ _check = record(
         **dict.fromkeys(('number', 'time', 'base_places'), integer(0, 2**40)),
         'drive': text(4096),
         'changes': list_of(text(4096), 0, 4096),
-        'use': list_of(number, 0, MAX_PLACES),
-        'missed': list_of(integer(0, 2**31), 0, MAX_PLACES),
         'drives': list_of(_drive, 0, KEPT),
     }
 )
@@ -114,32 +107,29 @@ def save_version(
     statistics: MapStatistics | None,
 ) -> Version:
     """
-    Replace a map by its next version; a map with the id of the present one stays as it is.
+    Replace a map by its next version.
 
     :param opened: the file when it was read; another one is not replaced.
     :param before: the present version; version: the next one, whose id and parent are filled in.
     :raises OutputError: it cannot be written, or the file has changed; the map stays as it is.
     """
-    folder, map_id = history_of(path), place_map.map_id
+    folder = history_of(path)
     try:
         folder.mkdir(exist_ok=True)
-        if map_id != before.map_id:
-            map_id = _write_version(path, place_map, before, statistics)
+        map_id = _write_version(path, place_map, before, statistics)
     except OSError as error:
         raise OutputError(f'{folder} cannot be written ({error}): {path} is untouched') from error
     version = replace(
         version,
         map_id=map_id,
-        # a drive that has changed the use of the places only
-        parent=before.parent if map_id == before.map_id else before.map_id,
+        parent=before.map_id,
         number=before.number + 1,
         base_places=before.base_places,
         time=int(time.time()),
     )
     content = json.dumps(asdict(version), allow_nan=False)
     write_output(folder / f'{map_id}.json', content, JSON, True)
-    if map_id != before.map_id:
-        _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
+    _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
     _clean(folder, [each.map_id for each in versions(path)])
     return version
 
@@ -207,6 +197,8 @@ def _read(folder: Path, map_id: str) -> Version | None:
         data = read_json(file.read_bytes(), file.name)
         if isinstance(data, dict):
             data.setdefault('drives', [])  # records without it are older
+            for name in ('use', 'missed'):  # and these had numbers of each place
+                data.pop(name, None)
         _check(data, file.name)
         if data['map_id'] != map_id:
             raise ValueError('it is of another version')
@@ -214,6 +206,5 @@ def _read(folder: Path, map_id: str) -> Version | None:
         return None
     except (OSError, ValueError) as error:
         raise MapFileError(f'{file} is damaged ({error}): move it elsewhere') from error
-    lists = {name: tuple(data[name]) for name in ('changes', 'use', 'missed')}
-    lists['drives'] = tuple(map(tuple, data['drives']))
-    return Version(**data | lists)
+    drives = tuple(map(tuple, data['drives']))
+    return Version(**data | {'changes': tuple(data['changes']), 'drives': drives})

@@ -17,12 +17,12 @@ import time
 from typing import Any
 
 from stavpr_ros.errors import InputError, MapFileError, OutputTakenError
-from stavpr_ros.mapping import load_map, PlaceMap, save_map
+from stavpr_ros.maintenance.upkeep import update_file
+from stavpr_ros.mapping import load_map, open_map, PlaceMap, save_map
 from stavpr_ros.mapping.journal_map import DAMAGED
 from stavpr_ros.mapping.versions import history_of, versions
 from stavpr_ros.output_file import explained, FileVersion, numbered
 from stavpr_ros.pipeline.operations import Operation
-from stavpr_ros.recognition.upkeep import update_file, UpkeepSettings
 from stavpr_ros.units import DATED, SECOND
 
 LOCK = '.lock'
@@ -46,13 +46,10 @@ def write_drives(operation: Operation, on_worker: OnWorker) -> None:
             on_worker(lambda: operation.return_drives(drives))
 
 
-def take_up_drives(
-    path: str, precision: str, log: 'Logger | Any', on_update: Callable[[], object]
-) -> int:
+def take_up_drives(path: str, log: 'Logger | Any', on_update: Callable[[], object]) -> int:
     """
     Let the drives that were written update the file of their map, oldest first; delete them.
 
-    :param precision: in which the map is loaded.
     :param on_update: called after each update.
     :returns: places of the last version; 0 = there is none, the log has the reasons.
     :raises StavprError: a file that cannot be read or written; map and drives stay as they are.
@@ -68,16 +65,16 @@ def take_up_drives(
         for file in files:
             name, opened, place_map = file.stem, FileVersion.of(path), load_map(path)
             try:
-                drive, settings = load_map(file), UpkeepSettings(precision=precision)
+                drive = load_map(file)
             except MapFileError as error:
                 damaged = file.rename(file.with_name(file.name + DAMAGED))
                 log.error(f'{name} does not update {path}: {error}; {damaged} is kept')
                 continue
             try:
                 if name not in (version.drive for version in versions(path)):
-                    version = update_file(path, opened, place_map, drive, settings, name)
+                    version = update_file(path, opened, place_map, drive, name)
                     on_update()
-                    places = len(version.use)
+                    places = len(open_map(path))
                     changes = '; '.join(version.changes)
                     log.info(f'{name} updates {path}, {places} places: {changes}')
             except InputError as error:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.maintenance.same_places import SURE
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of, verify_map
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import image_change, KeyframeSelector, small_gray
@@ -25,7 +26,6 @@ from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.recognition.recognizer import SequenceRecognizer
-from stavpr_ros.recognition.same_places import SURE
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
+from stavpr_ros.maintenance.same_places import with_last_related
 from stavpr_ros.mapping import PlaceMap, save_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
@@ -15,7 +16,6 @@ from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
 from stavpr_ros.pipeline.drives import OnWorker, take_up_drives, write_drives
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
-from stavpr_ros.recognition.same_places import with_last_related
 
 
 def write_map(pipeline: Pipeline, on_worker: OnWorker, path: str, overwrite: Force) -> int:
@@ -46,14 +46,13 @@ def update_own_map(pipeline: Pipeline, on_worker: OnWorker, log: 'Logger | Any')
     if not operation.drives:
         return 0
     write_drives(operation, on_worker)
-    precision = pipeline.settings.precision
-    return take_up_drives(state.path, precision, log, lambda: state.own(state.path))
+    return take_up_drives(state.path, log, lambda: state.own(state.path))
 
 
-def take_up_earlier_drives(path: str, precision: str, log: 'Logger | Any') -> None:
+def take_up_earlier_drives(path: str, log: 'Logger | Any') -> None:
     """Let the drives of an earlier run update the file of its map, before it is loaded."""
     try:
-        take_up_drives(path, precision, log, lambda: None)
+        take_up_drives(path, log, lambda: None)
     except Exception as error:  # any error: the node must start
         cause = str(error) if isinstance(error, StavprError) else repr(error)
         log.error(f'the drives of an earlier run are not in {path}: {cause}')

@@ -129,8 +129,7 @@ class Runtime:
             continued = recovered if settings.operation != 'loop_closure' else ''
             if map_path := settings.map_path or continued:
                 if self.updates_map:
-                    precision = settings.pipeline.precision
-                    take_up_earlier_drives(map_path, precision, node.get_logger())
+                    take_up_earlier_drives(map_path, node.get_logger())
                 self.load(map_path)
         except BaseException:
             self.close()

@@ -1,10 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A map that is updated day by day, beside the first session alone and all sessions kept.
+A map that is updated day by day, beside the first session alone.
 
 ``python3 -m stavpr_lab.demonstration.days 30 benchmarks/results/days`` (``make days``) drives
-the synthetic street and writes a table and a plot, in half an hour; a third argument is the seed
+the synthetic street and writes a table and a plot, in ten minutes; a third argument is the seed
 of another street.
 """
 
@@ -20,16 +20,15 @@ from stavpr_lab.demonstration.street.days import DAY, Days
 from stavpr_lab.demonstration.street.traverses import EPOCH
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, merge_maps, PlaceMap
+from stavpr_ros.maintenance.upkeep import update_map
+from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.mapping.versions import Version
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.same_places import with_last_related
-from stavpr_ros.recognition.upkeep import update_map, UpkeepSettings
 
 TOLERANCE = 8.0  # meters from the right position
 DETOUR = -1000.0  # meters, of positions in the detour
-MAPS = ('first session', 'all sessions', 'updated map', 'updated map in int8')
-PRECISIONS = 'float32', 'int8'  # of the updated maps
+MAPS = ('first session', 'updated map', 'updated map in int8')
+PRECISIONS = 'float32', 'float32', 'int8'  # of MAPS
 
 
 @dataclass(frozen=True)
@@ -40,16 +39,16 @@ class Day:
     :param recall: share of the images that are rightly matched.
     :param wrong: number of wrong matches.
     :param places: of the map after the day.
-    :param vanished: places of the updated maps after the day that show replaced buildings.
-    :param changes: of the updates.
+    :param vanished: places of the updated map after the day that show replaced buildings.
+    :param changes: of the update.
     """
 
     number: int
     recall: tuple[float, ...]
     wrong: tuple[int, ...]
     places: tuple[int, ...]
-    vanished: tuple[int, ...]
-    changes: tuple[tuple[str, ...], ...]
+    vanished: int
+    changes: tuple[str, ...]
 
 
 def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
@@ -84,45 +83,40 @@ def run(days: Days, count: int) -> Iterator[Day]:
     """Yield the results of days 1 to ``count``; the drive of day 0 is the map."""
     positions: dict[int, float] = {}
     first = drive_of(days, 0, positions)
-    updated = dict.fromkeys(PRECISIONS, (first, Version('', base_places=len(first))))
-    everything = merge_maps([first], ['day 0'])
+    updated, version = first, Version('', base_places=len(first))
     for number in range(1, count + 1):
-        drive, changes = drive_of(days, number, positions), []
-        measured = [measure(each, drive, positions) for each in (first, everything)]
-        for precision, (place_map, version) in updated.items():
-            measured.append(measure(place_map, drive, positions, precision))
-            settings, name = UpkeepSettings(precision=precision), f'day {number}'
-            try:
-                updated[precision] = update_map(place_map, drive, name, version, settings)
-                changes.append(updated[precision][1].changes)
-            except InputError as error:
-                changes.append((str(error),))
-        everything = with_last_related(merge_maps([everything, drive], ['', f'day {number}']))
+        drive, maps = drive_of(days, number, positions), (first, updated, updated)
+        measured = [
+            measure(one, drive, positions, precision)
+            for one, precision in zip(maps, PRECISIONS, strict=True)
+        ]
+        try:
+            updated, version = update_map(updated, drive, f'day {number}', version)
+            changes = version.changes
+        except InputError as error:
+            changes = (str(error),)
         recall, wrong = zip(*measured, strict=True)
-        maps = [place_map for place_map, _ in updated.values()]
         begin, low, high = days.built
         rebuilt = EPOCH + begin * DAY if number >= begin else 0
-        vanished = tuple(
-            sum(each < rebuilt and low <= positions[each] < high for each in one.stamps.tolist())
-            for one in maps
+        vanished = sum(
+            each < rebuilt and low <= positions[each] < high for each in updated.stamps.tolist()
         )
-        places = tuple(map(len, (first, everything, *maps)))
-        yield Day(number, recall, wrong, places, vanished, tuple(changes))
+        places = tuple(map(len, (first, updated, updated)))
+        yield Day(number, recall, wrong, places, vanished, changes)
 
 
 def table(results: list[Day]) -> str:
     """Return the results as a table in Markdown."""
     lines = [
-        f'| day | recall: {", ".join(MAPS)} | wrong | places of the updated maps | '
-        'of them vanished | update | in int8 |',
-        '|' + '---|' * 7,
+        f'| day | recall: {", ".join(MAPS)} | wrong | places of the updated map | '
+        'of them vanished | update |',
+        '|' + '---|' * 6,
     ]
     for day in results:
         recall = ' '.join(f'{value:.3f}' for value in day.recall)
-        numbers = (day.wrong, day.places[2:], day.vanished)
-        wrong, places, vanished = (' '.join(map(str, each)) for each in numbers)
-        text = ' | '.join('; '.join(each) for each in day.changes)
-        lines.append(f'| {day.number} | {recall} | {wrong} | {places} | {vanished} | {text} |')
+        wrong, text = ' '.join(map(str, day.wrong)), '; '.join(day.changes)
+        cells = (day.number, recall, wrong, day.places[-1], day.vanished, text)
+        lines.append(f'| {" | ".join(map(str, cells))} |')
     return '\n'.join(lines)
 
 
