@@ -102,6 +102,18 @@ def test_map_of_one_session_has_no_gaps(town):
     assert here.place_probabilities().shape == (PLACES,)
 
 
+def test_all_sessions_are_compared_and_the_start_names_their_time(town):
+    four = merge_maps(town[:1] * 4, 'abcd')
+    one = recognizer(replace(four, same_as=np.tile(np.arange(PLACES, dtype=np.int32), 4)))
+    query = features_of(route(0), 1.0, 9)
+    for i in range(80):  # also where the camera is certainly on the map
+        one.update(query[i : i + 1])
+        assert np.isfinite(one.newest_row()).all()
+    assert one.place_probabilities().sum() > 0.99
+    assert one.start_notes == '4 sessions: an image takes 4 times the time of one'
+    assert recognizer(town[0]).start_notes == ''
+
+
 def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
     """Exactly: a border is where a map alone ends."""
     merged, query = merge_maps(town, 'abc'), features_of(route(0), 1.0, 9)[60:90]

@@ -11,7 +11,7 @@ from stavpr_lab.commands import build_descriptor_map, evaluate
 from stavpr_lab.features.descriptors import read_descriptors
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import load_map
+from stavpr_ros.mapping import load_map, merge_maps, save_map
 
 
 @pytest.fixture(scope='module')
@@ -55,6 +55,13 @@ def test_evaluate_names_a_result_that_cannot_be_wrong(run, pair, tmp_path):
     for options, shown in (([*pair, '--tolerance', 40], 0), (twice, 1), (pair, None)):
         code, _, errors = run(*options, '--json', tmp_path / 'a.json', '--force')
         assert (code, [text in errors for text in texts]) == (0, [shown == 0, shown == 1])
+
+
+def test_evaluate_names_the_time_of_several_sessions(run, small_map, route, tmp_path):
+    save_map(merge_maps([small_map, small_map], 'ab'), tmp_path / 'both.stavpr')
+    both = ['--map', tmp_path / 'both.stavpr', '--query', write_images(tmp_path / 'query', route)]
+    code, shown, _ = run(*both, '--json', tmp_path / 'a.json')
+    assert (code, '2 sessions: an image takes 2 times the time of one' in shown) == (0, True)
 
 
 def test_evaluate_exports_strips_of_images(run, route, tmp_path):

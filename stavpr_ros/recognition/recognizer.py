@@ -24,7 +24,6 @@ from stavpr_ros.prepare.blocks import blocks, Int8Features
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.matcher import make_matcher, precision_of
 from stavpr_ros.prepare.prepared_map import prepare_map
-from stavpr_ros.prepare.several_sessions import SeveralSessions
 from stavpr_ros.recognition.cells import CellAgreement
 from stavpr_ros.recognition.filter_window import FilterWindow
 from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
@@ -43,7 +42,7 @@ from stavpr_ros.recognition.relative_motion import (
     UNUSUAL,
     with_odometry_test,
 )
-from stavpr_ros.recognition.sessions import layout_of
+from stavpr_ros.recognition.sessions import layout_of, time_note
 from stavpr_ros.recognition.settings import PAPER, RecognizerSettings
 from stavpr_ros.recognition.window import QueryWindow
 from stavpr_ros.threads import one_thread
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
 
 EARLY = 0.95  # minimum probability of a match by the newest images alone
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
-MANY = 2  # places of a position, in the mean: more are not all compared
 TIMED = 3  # images, to compare the time of one with the time budget
 
 
@@ -383,8 +381,9 @@ class PlaceRecognizer(SequenceRecognizer):
                     settings.sequence.length,
                 )
         # of the start, for the log: statistics that were learned again, an error rate that is not
-        # kept, and the time budget
-        self.start_notes = '; '.join(filter(None, [prepared.note, settings.error_note]))
+        # kept, the time of several sessions, and the time budget
+        notes = prepared.note, settings.error_note, time_note(place_map)
+        self.start_notes = '; '.join(filter(None, notes))
         if settings.time_budget_ms and len(features):
             if backend != 'cpu':
                 raise SettingsError(
@@ -392,14 +391,6 @@ class PlaceRecognizer(SequenceRecognizer):
                     "the first stage is of backend 'cpu'; take that, or 0"
                 )
             self._keep_time_budget(prepared.features, features[:1])
-        same_as, matcher = place_map.same_as, self._matcher
-        is_many = same_as is not None and len(same_as) > MANY * len(np.unique(same_as))
-        is_filtered = (
-            isinstance(self._window, FilterWindow) and settings.applied_spatial.aligns_strips
-        )
-        if same_as is not None and is_many and is_filtered and isinstance(matcher, CpuMatcher):
-            arguments = self._window.layout.runs, same_as, self.place_probabilities
-            self._matcher = SeveralSessions(matcher, *arguments)
 
     def set_limits(
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
@@ -462,8 +453,6 @@ class PlaceRecognizer(SequenceRecognizer):
         super().reset()
         if self._centering is not None:
             self._centering.reset()
-        if isinstance(self._matcher, SeveralSessions):
-            self._matcher.reset()
 
     def distances(self, features: LocalFeatures) -> np.ndarray:
         """

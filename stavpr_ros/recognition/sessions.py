@@ -80,3 +80,9 @@ def in_places(
     path[:, 1] = layout.names_of(path[:, 1])
     direction = layout.direction_of(match.nearest.middle)
     return replace(match, nearest=nearest, path=path, sequences=sequences, direction=direction)
+
+
+def time_note(place_map: PlaceMap) -> str:
+    """Return what several sessions cost, for the log of a start, '' of a map of one."""
+    count = len(place_map.sessions)
+    return f'{count} sessions: an image takes {count} times the time of one' if count > 1 else ''

@@ -286,12 +286,15 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         settings_json,
     )
     from stavpr_lab.evaluation.report import Report
+    from stavpr_ros.recognition.sessions import time_note
 
     began = time.perf_counter()
     settings = recognizer_settings(arguments)
     sequences = load_sequences(arguments)
     if sequences.reference is not None:
         settings = replace(settings, error_risks=sequences.reference.error_risks)
+        if note := time_note(sequences.reference):
+            print(note)
     if settings.error_note:
         print(settings.error_note)
     truth = sequences.drive.truth.kind
