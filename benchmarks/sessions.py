@@ -137,11 +137,7 @@ def measure(
     route: Route,
     precision: str,
 ) -> tuple[np.ndarray, float]:
-    """
-    Return right and wrong matches of a query, and the median time of an image, ms.
-
-    :param positions: by the stamps of the map.
-    """
+    """Return right and wrong matches, and ms of an image; positions by the stamps of the map."""
     one = PlaceRecognizer(place_map, RecognizerSettings(), precision=precision)
     counts, times = np.zeros(2, int), []
     for i in range(len(query.drive)):
@@ -166,8 +162,7 @@ def poisoned(session: Session, other: PlaceMap, is_closed: bool) -> Iterator[Pla
 
 def drive_route(route: Route, other: PlaceMap) -> list[str]:
     """Return the cells of a route."""
-    counts, places, times = np.zeros((4, 2), int), np.zeros(4, int), np.zeros(4)
-    changes: list[str] = []
+    counts, places, times, changes = np.zeros((4, 2), int), np.zeros(4, int), np.zeros(4), []
     images = changed = poisons = 0
     for order in route.orders:
         positions: dict[int, float] = {}
@@ -201,10 +196,7 @@ def drive_route(route: Route, other: PlaceMap) -> list[str]:
 
 
 def update(
-    place_map: PlaceMap,
-    drive: PlaceMap,
-    version: Version,
-    name: str,
+    place_map: PlaceMap, drive: PlaceMap, version: Version, name: str
 ) -> tuple[PlaceMap, Version, str]:
     """Return a map after a drive, its version, and what has changed; a rejected one: why."""
     try:
