@@ -1,14 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A recognizer after its reset gives the same answers as a new one, with every option."""
+"""A loop closer after its reset, as test_golden_streams has the recognizers of maps."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
-from places import features_of, map_of, route_strips
+from places import features_of, route_strips
 import pytest
-from stavpr_ros.mapping import merge_maps
-from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.recognition import Match, RecognizerSettings
 from stavpr_ros.recognition.loop_closer import LoopCloser
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -18,16 +17,6 @@ DRIVE = features_of(np.concatenate([ROUTE[:, :95], route_strips(9, 30), ROUTE[:,
 DRIVE.strips[:, 70:95] = DRIVE.strips[:, 69:70]  # a stop before the detour
 POSES = np.tile([0.0, 0, 0, 0, 0, 0, 1], (2 * N, 1))
 POSES[:, 0] = 1.1 * np.arange(2 * N)
-
-
-def map_of_drives(count):
-    """Return a map of so many drives on the route; of a closed route for 0."""
-    if count == 0:
-        same_as = np.append(np.arange(N - 20), np.arange(20)).astype(np.int32)
-        return map_of(features_of(ROUTE[:, same_as], 0.5, 1), same_as=same_as)
-    maps = [map_of(features_of(ROUTE, 0.5, seed), POSES[:N]) for seed in range(count)]
-    same_as = np.tile(np.arange(N, dtype=np.int32), count)
-    return replace(merge_maps(maps, [str(i) for i in range(count)]), same_as=same_as)
 
 
 def drive(recognizer, features, image):
@@ -42,22 +31,6 @@ def assert_same(one, new, features):
     ]
     assert [first for first, _ in pairs] == [second for _, second in pairs]
     assert sum('Status.MATCH' in first for first, _ in pairs) > 10
-
-
-@pytest.mark.parametrize(('drives', 'changes', 'precision'), [
-    (1, {}, 'int8'),
-    (1, {'direction': 'both'}, 'float32'),
-    (1, {'mode': 'paper', 'threshold': 0.5}, 'float32'),
-    (5, {}, 'float32'),  # parts of some are compared
-    (0, {'odometry_error': 0.0}, 'float32'),
-])  # fmt: skip
-def test_recognizer_after_a_reset_answers_as_a_new_one(drives, changes, precision):
-    place_map, settings = map_of_drives(drives), RecognizerSettings(**changes)
-    one, new = (PlaceRecognizer(place_map, settings, precision=precision) for _ in range(2))
-    for image in range(len(DRIVE)):
-        drive(one, DRIVE, image)
-    one.reset()
-    assert_same(one, new, DRIVE)
 
 
 @pytest.mark.parametrize('precision', ['float32', 'int8'])

@@ -20,7 +20,7 @@ CEILINGS = {
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_201,
     'lines of the method (filter, prepare, recognition)': 7_510,
-    'lines of all tests': 34_568,
+    'lines of all tests': 34_541,
     'lines of benchmarks and tools': 8_058,
     'lines of docs and README': 4_044,
     'parameters of the node': 52,
