@@ -50,10 +50,8 @@ def _run(_: object) -> None:
                 settings = PipelineSettings(mode=mode, precision=precision, backend='cpu')
                 Localizer(settings, route, extractor, SaveState())
                 RouteCloser(settings, None, extractor, SaveState())
-                if mode == 'robust':  # maps of several sessions, and the first stage
+                if mode == 'robust':  # maps of several sessions
                     Localizer(settings, both, extractor, SaveState())
-        settings = PipelineSettings(backend='cpu', time_budget_ms=1e-3)
-        Localizer(settings, route, extractor, SaveState())
     OffsetFilter().update(*[describe_columns(images[0])] * 2)
     for compile_kernels in plugins.load(plugins.KERNELS).values():
         compile_kernels()
