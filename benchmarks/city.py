@@ -1,14 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Mode robust in a city: a real map among simulated places, compared exactly and by the first stage.
+Mode robust in a city: a real map among simulated places.
 
 The simulated places are a route of images whose features have the mean, the covariance (of all
 strips together, its ``RANK`` largest directions) and the correlation from image to image of the
 real map: a first-order autoregressive Gaussian, each strip made unit norm. The real places lie
 together within it. ``PYTHONPATH=. python benchmarks/city.py --places 1000000`` adds to
-``benchmarks/results/city.json``, and writes the tables of results/performance.md from it and from
-the results of ``soak.py --output benchmarks/results/node-NAME.json``.
+``benchmarks/results/city.json``, and writes the table of results/performance.md from it.
 """
 
 import argparse
@@ -34,13 +33,12 @@ from stavpr_ros.threads import thread_count
 
 RANK, PIECE = 256, 4096
 AT = 0.37  # where in the city the real places begin
-ALWAYS = 1e-6  # ms: no exact matching is as fast
 CASES = {  # map, query, tolerance, speed of the query
     'gardens_point': ('gardens_point/day_left', 'gardens_point/day_right', 2, '1x'),
     'walk_night': ('walk_by_night/left_day', 'walk_by_night/right_night', 2, '1x'),
     'corridor': ('corridor/ref', 'corridor/query', 3, '1x'),
     'nordland': ('nordland_64x32/summer', 'nordland_64x32/winter', 3, '1x'),
-    # on these, exact matching makes errors
+    # on these, matching makes errors
     'night_map': ('walk_by_night/right_night', 'walk_by_night/left_day', 2, 'vary'),
     'night_map_half': ('walk_by_night/right_night', 'walk_by_night/right_day', 2, '0.5x'),
     'nordland_vary': ('nordland_64x32/winter', 'nordland_64x32/summer', 3, 'vary'),
@@ -92,14 +90,14 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
 
 
 def drive(
-    features: LocalFeatures, query: LocalFeatures, true: np.ndarray, tolerance: int, budget: float
-) -> dict[str, Any]:
+    features: LocalFeatures, query: LocalFeatures, true: np.ndarray, tolerance: int
+) -> dict[str, float]:
     """
-    Return precision, recall, matches and times of a query.
+    Return precision, recall and times of a query.
 
     :param true: place of each image.
     """
-    settings = RecognizerSettings(mode='robust', time_budget_ms=budget)
+    settings = RecognizerSettings(mode='robust')
     place_map = descriptor_map(features)
     began = time.perf_counter()
     recognizer = PlaceRecognizer(place_map, settings, 'cpu', 'int8')
@@ -117,7 +115,6 @@ def drive(
     return {
         'precision': float(right[accepted].mean()) if accepted.any() else 1.0,
         'recall': float((right & accepted).mean()),
-        'answers': np.where(accepted, middles, -1),
         'wall_ms_p50': 1e3 * float(np.median(wall[length:])),
         'wall_ms_p99': 1e3 * float(np.percentile(wall[length:], 99)),
         'processor_ms': 1e3 * float(np.median(used[length:])),
@@ -138,12 +135,6 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
     features, first = city(real, n, seed)
     if save is not None:
         save_map(descriptor_map(features), save, force=True)
-    exact, stage = (
-        drive(features, query, first + indices, tolerance, budget) for budget in (0, ALWAYS)
-    )
-    answers = exact.pop('answers'), stage.pop('answers')
-    changed = (answers[0] < 0) != (answers[1] < 0)
-    is_elsewhere = (~changed) & (np.abs(answers[0] - answers[1]) > tolerance)
     return {
         'case': name,
         'places': n,
@@ -152,10 +143,7 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
         'threads': thread_count(),
         'commit': commit(),
         'load': os.getloadavg()[0],
-        'exact': exact,
-        'first_stage': stage,
-        'statuses_changed': int(changed.sum()),
-        'places_moved': int(is_elsewhere.sum()),
+        'exact': drive(features, query, first + indices, tolerance),
     }
 
 
@@ -163,16 +151,14 @@ def lines(results: list[dict[str, Any]]) -> list[str]:
     """Return the table of the results."""
     rows = []
     for one in results:
-        both = one['exact'], one['first_stage']
+        exact = one['exact']
         rows.append([
             *(one['case'], f'{one["places"]:,}'),
-            *(f'{of["precision"]:.3f} / {of["recall"]:.3f}' for of in both),
-            f'{one["statuses_changed"]}, {one["places_moved"]}',
-            *(f'{of["processor_ms"]:.0f}' for of in both),
+            f'{exact["precision"]:.3f} / {exact["recall"]:.3f}',
+            f'{exact["processor_ms"]:.0f}',
             *(f'{one["threads"]}', f'{one["load"]:.1f}'),
         ])  # fmt: skip
-    head = ('case', 'places', 'exact P / R', 'first stage P / R', 'statuses, places changed')
-    return table((*head, 'exact ms', 'first stage ms', 'threads', 'load'), rows)
+    return table(('case', 'places', 'precision / recall', 'ms', 'threads', 'load'), rows)
 
 
 def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -184,30 +170,11 @@ def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(of_cases.values())
 
 
-def node_lines(folder: Path) -> list[str]:
-    """Return the table of ``soak.py``'s results on city maps."""
-    rows = []
-    for path in sorted(folder.glob('node-*.json')):
-        one = json.loads(path.read_text(encoding='utf-8'))
-        rows.append([
-            path.stem.removeprefix('node-'),
-            ' '.join(one['parameters']),
-            f'{one["rate_hz"]:.0f}',
-            f'{one["processed"]} of {one["images_published"]}',
-            f'{one["latency_ms_p50"]:.0f} / {one["latency_ms_p99"]:.0f}',
-            f'{one["memory_mb_end"]:.0f}',
-            f'{one.get("load_before", float("nan")):.1f}',
-        ])  # fmt: skip
-    head = ('run', 'parameters', 'images/s', 'processed', 'p50 / p99, ms', 'resident, MB', 'load')
-    return table(head, rows) if rows else []
-
-
 def write_page(results: list[dict[str, Any]], page: Path) -> None:
-    """Write the tables to a page."""
+    """Write the table to a page."""
     cases = list(CASES)
     results = sorted(results, key=lambda one: (one['places'], cases.index(one['case'])))
-    lines_of_page = [*lines(results), '', *node_lines(RESULTS)]
-    written_between(page, BEGIN, END, lines_of_page)
+    written_between(page, BEGIN, END, lines(results))
 
 
 def written_between(page: Path, begin: str, end: str, content: list[str]) -> None:

@@ -48,9 +48,6 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             ]
             if peers:
                 axes.plot(*zip(*peers, strict=True), style, color='gray', ms=4, label=name)
-        if stage == 'image_distances':
-            for row in (row for row in rows if row.stage == 'first_stage'):
-                axes.plot(row.n, 1e3 * row.median_s, 'k*', ms=10, label='first stage')
         axes.set(xscale='log', yscale='log', title=title, xlabel='places', ylabel='ms')
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)

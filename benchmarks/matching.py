@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from run import Run
 
 SIZES = (2_000, 20_000, 100_000, 1_000_000)
-CITY = 200_000  # from here on, a CPU measures mode robust in int8 and the first stage alone
+CITY = 200_000  # from here on, a CPU measures mode robust in int8 alone
 QUICK_LIMIT = 20_000  # most places of --quick
 DIMENSIONS = (224, 512)  # of the gradient features, and of projected ones
 GRAPH = ROOT / 'docs' / 'performance.png'
@@ -65,7 +65,7 @@ def measure_stages(run: 'Run', options: argparse.Namespace) -> None:
         robust_stages(run, n, options.seed)
     for n in options.sizes:
         if n >= CITY and run.device == 'cpu':
-            run.skip('frame', n, 0, 'float32 and mode paper: too large, see first_stage')
+            run.skip('frame', n, 0, 'float32 and mode paper: too large')
             city_stages(run, n, options.dimensions[0], options.seed)
             continue
         for d in options.dimensions:

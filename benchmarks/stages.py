@@ -217,10 +217,8 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 
 
 def city_stages(run: Run, n: int, d: int, seed: int) -> None:
-    """Measure the image distances of a map in int8 and its first stage, on a CPU."""
-    from stavpr_ros.filter.paths import BLOCK, TOP
+    """Measure the image distances of a map in int8, on a CPU."""
     from stavpr_ros.prepare.cpu_matcher import CpuMatcher
-    from stavpr_ros.prepare.first_stage import BYTES, FirstStage
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
@@ -229,18 +227,12 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     query = make_features(1, d, STRIPS, seed)
     weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
     places = Int8Features(rounded, weights, query.settings)
-    exact = CpuMatcher(places, SPATIAL)
-    probable = np.linspace(0, n - BLOCK, TOP).astype(np.int64)
-    stage = FirstStage(exact, places, lambda: probable)
+    matcher = CpuMatcher(places, SPATIAL)
     arguments = np.ascontiguousarray(query.strips[:, 0]), query.weights[:, 0]
     sizes = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k)
     works = [bounds.product(sizes, 'int8'), bounds.spatial_alignment(sizes)]
-    call = partial(exact.distances, *arguments)
+    call = partial(matcher.distances, *arguments)
     run.measure('image_distances', (n, d), call, works, precision='int8')
-    reduced = [bounds.product(Sizes(n, BYTES // STRIPS * STRIPS, 1), 'int8')]
-    call = partial(stage.distances, *arguments)
-    peer = Peer('exact', timed(partial(exact.distances, *arguments)), 'all places exactly')
-    run.measure('first_stage', (n, d), call, reduced, [peer], 'int8', 'robust')
 
 
 def process_stages(run: Run, n: int, precision: str, seed: int) -> None:

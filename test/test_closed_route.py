@@ -115,13 +115,6 @@ def test_odometry_is_not_compared_over_the_seam(open_map, drift):
     assert all(match.accepted for match in matches[20:])
 
 
-def test_first_stage_compares_the_places_beyond_the_seam(closed_map):
-    query = laps(60, 60 + LAP, 0.8, 2)
-    coarse = recognize(closed_map, query, replace(FORWARD, time_budget_ms=1e-6))
-    exact = recognize(closed_map, query, FORWARD)
-    assert [match.place_index for match in coarse] == [match.place_index for match in exact]
-
-
 def test_states_that_moved_back_have_the_same_past():
     """The filter goes on as if it had been there: the same belief and path, a lap before."""
     n, lap, again = 300, 200, 100

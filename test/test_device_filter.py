@@ -194,9 +194,6 @@ def test_recognizer_equals_that_of_cpu(device, mode, precision, sessions):
 
 def test_settings_that_need_the_cpu_are_rejected(device):
     place_map, _ = drive_map(False)
-    settings = RecognizerSettings(mode='robust', time_budget_ms=1.0)
-    with pytest.raises(SettingsError, match='first stage is of backend'):
-        PlaceRecognizer(place_map, settings, device)
     options = RobustOptions(place_filter=False)
     with pytest.raises(SettingsError, match='mode paper only'):
         PlaceRecognizer(place_map, RecognizerSettings(robust_options=options), device)

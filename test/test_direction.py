@@ -154,13 +154,6 @@ def test_device_equals_cpu(device):
     assert match.direction == -1
 
 
-def test_first_stage_compares_the_probable_places_of_both_directions():
-    place_map, query = map_of(view(0, 0.6)), features_of(route_strips(0, N)[:, ::-1], 0.8, 9)
-    coarse = recognize(place_map, query, replace(BOTH, time_budget_ms=1e-6))
-    exact = recognize(place_map, query)
-    assert [match.place_index for match in coarse] == [match.place_index for match in exact]
-
-
 @pytest.mark.parametrize('turn', [90, -90])
 def test_odometry_is_compared_with_the_map_backward(turn):
     """A map that turns left turns right on the way back."""

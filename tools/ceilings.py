@@ -14,17 +14,17 @@ import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
-    'lines of stavpr_ros': 32_373,
+    'lines of stavpr_ros': 32_131,
     'lines of stavpr_fleet': 1_198,
     'lines of stavpr_slam': 4_378,
     'lines of stavpr_nav': 1_628,
-    'lines of stavpr_lab': 12_201,
-    'lines of the method (filter, prepare, recognition)': 7_510,
-    'lines of all tests': 34_541,
-    'lines of benchmarks and tools': 8_058,
-    'lines of docs and README': 4_044,
-    'parameters of the node': 52,
-    'numbers in constants of the method': 172,
+    'lines of stavpr_lab': 12_198,
+    'lines of the method (filter, prepare, recognition)': 7_321,
+    'lines of all tests': 34_379,
+    'lines of benchmarks and tools': 8_014,
+    'lines of docs and README': 4_029,
+    'parameters of the node': 51,
+    'numbers in constants of the method': 167,
 }
 METHOD = ('filter', 'prepare', 'recognition')
 

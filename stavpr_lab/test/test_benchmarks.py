@@ -46,7 +46,7 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     robust = {row['stage'] for row in rows if row['mode'] in ('', 'robust')}
     assert robust == {
         *('decoding', 'extraction', '1080p raw to features', '1080p JPEG to features'),
-        *report.ROBUST_STAGES, 'distance_matrix', 'frame', 'first_stage',
+        *report.ROBUST_STAGES, 'distance_matrix', 'frame',
     }  # fmt: skip
     paper = {row['stage'] for row in rows if row['mode'] == 'paper'}
     assert paper == {'lm_dtw', 'selection', 'path_trace', 'frame'}

@@ -52,8 +52,6 @@ def _run(_: object) -> None:
                 RouteCloser(settings, None, extractor, SaveState())
                 if mode == 'robust':  # maps of several sessions
                     Localizer(settings, both, extractor, SaveState())
-        settings = PipelineSettings(backend='cpu', time_budget_ms=1e-3)
-        Localizer(settings, route, extractor, SaveState())
     OffsetFilter().update(*[describe_columns(images[0])] * 2)
     for compile_kernels in plugins.load(plugins.KERNELS).values():
         compile_kernels()

@@ -51,7 +51,6 @@ from stavpr_ros.filter.paths import (
     BLOCK,
     find_most_probable,
     NO_PLACES,
-    TOP,
     trace_back,
 )
 from stavpr_ros.filter.protocol import Filter
@@ -207,11 +206,6 @@ class PlaceFilter(Filter):
         return Belief(
             *backtrack(*states, self._origins, self._steps, newest, images_ago, self._scale)
         )
-
-    def probable_blocks(self) -> np.ndarray:
-        """Return the first places of the ``TOP`` blocks with the most probable places, (m,)."""
-        count = min(TOP, len(self._maxima))
-        return np.argpartition(self._maxima, -count)[-count:] * BLOCK
 
     def most_probable(self, excluded: np.ndarray) -> tuple[int, float]:
         """See :meth:`Filter.most_probable`."""

@@ -54,7 +54,6 @@ class PipelineSettings:
     mode: str = default('mode')
     backend: str = default('backend')
     precision: str = default('precision')
-    time_budget_ms: float = default('time_budget_ms')
     model_path: str = default('model_path')
     features: str = default('features')
     feature_settings: str = default('feature_settings')

@@ -13,8 +13,8 @@ alignment of :mod:`stavpr_ros.alignment` makes one distance of the W x W strip d
 
 A matcher has the prepared places in its memory (:mod:`.matcher`; on the CPU :mod:`.cpu_matcher`),
 in float32 or int8 (:class:`.blocks.Int8Features`), or the places of a route that grows
-(:mod:`.route_features`). Maps too large for a time budget get a :mod:`.first_stage`. Passes over
-a map go block by block (:mod:`.blocks`), since it may exceed the memory:
+(:mod:`.route_features`). Passes over a map go block by block (:mod:`.blocks`), since it may
+exceed the memory:
 
 >>> import numpy as np
 >>> from stavpr_ros.alignment import SpatialSettings

@@ -110,21 +110,6 @@ class CpuMatcher:
                 out[x] = self._without_dtw(queries, x, weights[:, x])
         return out
 
-    def distances_at(self, strips: np.ndarray, firsts: np.ndarray, size: int) -> np.ndarray:
-        """
-        Return the distances of one image to chunks of places, where strips are aligned.
-
-        :param firsts: first place of each chunk, multiples of the kernels' lanes, (m,).
-        :returns: shape (m, size), float32; +inf behind the last place.
-        """
-        out = np.full((len(firsts), size), np.inf, np.float32)
-        tiled = int8.tiled if isinstance(self._map, tuple) else dot.tiled
-        dot.image_distances_at(
-            self._map, tiled(strips[:, None]), self._a, self._band, self._is_rigid,
-            self.places, firsts, out,
-        )  # fmt: skip
-        return out
-
     def _without_dtw(self, queries: Any, x: int, weights: np.ndarray) -> np.ndarray:
         """Return the distances of image x by the other strategies, (n,)."""
         W, n = self._weights.shape

@@ -5,7 +5,6 @@
 from abc import ABC, abstractmethod
 from dataclasses import replace
 import math
-import time
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
@@ -15,13 +14,10 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.filter.model import MODEL
-from stavpr_ros.filter.paths import BLOCK
-from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.prepare.blocks import blocks, Int8Features
-from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.blocks import blocks
 from stavpr_ros.prepare.matcher import make_matcher, precision_of
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.recognition.cells import CellAgreement
@@ -52,7 +48,6 @@ if TYPE_CHECKING:
 
 EARLY = 0.95  # minimum probability of a match by the newest images alone
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
-TIMED = 3  # images, to compare the time of one with the time budget
 
 
 class Verdict(NamedTuple):
@@ -381,16 +376,9 @@ class PlaceRecognizer(SequenceRecognizer):
                     settings.sequence.length,
                 )
         # of the start, for the log: statistics that were learned again, an error rate that is not
-        # kept, the time of several sessions, and the time budget
+        # kept, and the time of several sessions
         notes = prepared.note, settings.error_note, time_note(place_map)
         self.start_notes = '; '.join(filter(None, notes))
-        if settings.time_budget_ms and len(features):
-            if backend != 'cpu':
-                raise SettingsError(
-                    f'time_budget_ms = {settings.time_budget_ms} with backend {str(backend)!r}: '
-                    "the first stage is of backend 'cpu'; take that, or 0"
-                )
-            self._keep_time_budget(prepared.features, features[:1])
 
     def set_limits(
         self, threshold: float | None, min_probability: float, max_error: float = 0.0
@@ -408,40 +396,6 @@ class PlaceRecognizer(SequenceRecognizer):
     def is_standstill(self) -> bool:
         """Whether the newest image equals the one before, up to noise."""
         return self._window.is_standstill
-
-    def _keep_time_budget(
-        self, prepared: LocalFeatures | Int8Features, image: LocalFeatures
-    ) -> None:
-        budget, exact = self._settings.time_budget_ms, self._milliseconds(image)
-        text = f'exact matching takes {exact:.3g} ms an image, time_budget_ms = {budget:g}'
-        if exact > budget:
-            from stavpr_ros.prepare.first_stage import FirstStage
-
-            assert isinstance(self._matcher, CpuMatcher)
-            self._matcher = FirstStage(self._matcher, prepared, self._probable_places)
-            text += f': with a first stage {self._milliseconds(image):.3g} ms'
-        self.start_notes = '; '.join(filter(None, [self.start_notes, text]))
-
-    def _milliseconds(self, image: LocalFeatures) -> float:
-        """Return the least time of a few updates by an image, after one that compiles."""
-        self.reset()
-        seconds = []
-        for _ in range(1 + TIMED):
-            began = time.perf_counter()
-            self.update(image)
-            seconds.append(time.perf_counter() - began)
-        self.reset()
-        return 1e3 * min(seconds[1:])
-
-    def _probable_places(self) -> np.ndarray:
-        """Return the first places of the most probable blocks of the filter."""
-        assert isinstance(self._window, FilterWindow)
-        assert isinstance(self._window.filter, PlaceFilter)
-        layout, blocks = self._window.layout, self._window.filter.probable_blocks()
-        if self._settings.moves_against or layout.lap:  # the last column may have the first place
-            ends = np.minimum(blocks + BLOCK, layout.width(self.places)) - 1
-            return np.minimum(layout.names_of(blocks), layout.names_of(ends))
-        return layout.pass_before(blocks - 1) + 1
 
     @property
     def places(self) -> int:

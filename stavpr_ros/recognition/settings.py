@@ -81,9 +81,6 @@ class RecognizerSettings:
     :param odometry_error: of a distance by odometry, as a share of it; where query and places have
         poses, the path of a match is compared with them; 0 = never. See
         :mod:`stavpr_ros.recognition.relative_motion`.
-    :param time_budget_ms: of :class:`PlaceRecognizer`, for an image; maps whose exact matching
-        takes longer get a first stage (:mod:`stavpr_ros.prepare.first_stage`). 0 = always
-        exact.
     :param min_probability: mode robust: a window is matched when its probability is above it;
         above 0, below 1.
     :param max_error: mode robust: rate of wrong matches that chooses this probability instead
@@ -102,7 +99,6 @@ class RecognizerSettings:
     mode: str = default('mode')
     robust_options: RobustOptions | None = None
     odometry_error: float = default('odometry_error')
-    time_budget_ms: float = default('time_budget_ms')
     min_probability: float = default('min_probability')
     max_error: float = default('max_error')
     direction: str = default('direction')
@@ -126,19 +122,11 @@ class RecognizerSettings:
             least_probability(self.max_error)  # rejects a rate out of range
         require_at_least('nms_radius', self.nms_radius, 0, 'places')
         require_between('odometry_error', self.odometry_error, 0, 1, '(share of the distance)')
-        require_at_least('time_budget_ms', self.time_budget_ms, 0)
         require_choice('direction', self.direction, DIRECTIONS)
         if self.moves_against and not self.has_probability:
             raise SettingsError(
                 f'direction = both is of mode robust: in mode {self.mode}, sequences of the map '
                 'are along it; take forward'
-            )
-        if self.time_budget_ms and not (
-            self.has_probability and self.applied_spatial.aligns_strips
-        ):
-            raise SettingsError(
-                f'time_budget_ms = {self.time_budget_ms}: the first stage is of mode robust with '
-                'strategy adaptive, vanilla or rigid, without vertical alignment; take 0'
             )
 
     @property

@@ -203,8 +203,6 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     radius = 'other candidates are farther from the match than this (%(default)s)'
     add_parameter(group, 'nms_radius', radius, metavar='PLACES')
     add_parameter(group, 'backend', '(%(default)s)', default='cpu')
-    budget = 'for an image; a coarse first stage where it takes longer; 0 = exact (%(default)g)'
-    add_parameter(group, 'time_budget_ms', budget, metavar='MS')
     add_parameter(group, 'precision', 'of the map (%(default)s)')
 
 

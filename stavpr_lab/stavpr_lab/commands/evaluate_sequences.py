@@ -99,7 +99,6 @@ def recognizer_settings(arguments: argparse.Namespace) -> RecognizerSettings:
         ),
         sequence=SequenceSettings(arguments.sequence_length, arguments.beta),
         nms_radius=arguments.nms_radius,
-        time_budget_ms=arguments.time_budget_ms,
     )
 
 
@@ -113,7 +112,7 @@ def settings_json(arguments: argparse.Namespace, sequences: Sequences) -> dict[s
         *('mode', 'min_probability', 'max_error', 'sequence_length', 'beta', 'nms_radius'),
         'direction',
         *('strategy', 'sigma', 'xi', 'vertical'),
-        *('backend', 'precision', 'time_budget_ms', 'late_closures', 'odometry'),
+        *('backend', 'precision', 'late_closures', 'odometry'),
     ]
     settings: dict[str, Any] = {}
     for name in names:

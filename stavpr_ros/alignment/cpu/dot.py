@@ -201,25 +201,6 @@ def image_distances(features, queries, weights, xi, is_rigid, out):
 
 
 @parallel_kernel
-def image_distances_at(features, queries, weights, xi, is_rigid, n, firsts, out):
-    """
-    Image distances of one image to a part of the map images, as :func:`image_distances`.
-
-    :param n: map images.
-    :param firsts: first map image of each chunk, multiples of LANES below n, (m,).
-    :param out: shape (m, map images of a chunk), a multiple of LANES; written up to image n.
-    """
-    W, size = weights.shape[0], out.shape[1]
-    for i in nb.prange(len(firsts)):
-        count = min(size, n - firsts[i])
-        d = np.empty(((W + TILE - 1) // TILE * TILE, W, size), np.float32)
-        edge = np.empty((W + 1) * SLOT, np.float32)
-        lanes = np.empty(size, np.float32)
-        _align_block(features, queries, 0, firsts[i], count, weights, xi, is_rigid, d, edge, lanes)
-        out[i, :count] = lanes[:count]
-
-
-@parallel_kernel
 def vertical_image_distances(features, queries, cell_weights, weights, xi, out):
     """
     Image distances from strip distances that are themselves aligned.

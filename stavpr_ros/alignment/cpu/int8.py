@@ -411,27 +411,3 @@ def cosine_distances(features, queries, out):
                 cosine = whole * load(lengths, first + y) * splat(query_reciprocals[x, 0])
                 store(lanes, y, one - cosine)
             out[x, first : first + count] = lanes[:count]
-
-
-@parallel_kernel
-def smallest_distances(features, queries, chunk, out, nearest):
-    """
-    Smallest distance between any strip of one image and each place's only strip.
-
-    :param features, queries: as in :func:`block_distances`; W = 1 and Q = 1.
-    :param chunk: places, a divisor of ``IMAGES``.
-    :param out: shape (n,), written.
-    :param nearest: shape (chunks,), written: the smallest of each chunk.
-    """
-    n = len(out)
-    for block in nb.prange((n + IMAGES - 1) // IMAGES):
-        first = block * IMAGES
-        count = min(IMAGES, n - first)
-        d = np.empty((queries[1].shape[1], 1, IMAGES), np.float32)
-        block_distances(features, queries, 0, first, count, d)
-        for i in range(1, len(d)):
-            for y in range(count):
-                d[0, 0, y] = min(d[0, 0, y], d[i, 0, y])
-        out[first : first + count] = d[0, 0, :count]
-        for low in range(0, count, chunk):
-            nearest[(first + low) // chunk] = d[0, 0, low : min(low + chunk, count)].min()
