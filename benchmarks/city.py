@@ -24,8 +24,9 @@ from results import commit, cpu_model, RESULTS, table, write_json
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import descriptor_map, save_map
+from stavpr_ros.mapping import descriptor_map, PlaceMap, save_map
 from stavpr_ros.mapping.builder import extract_features
+from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
@@ -49,6 +50,9 @@ BEGIN, END = '<!-- written by benchmarks/city.py -->', '<!-- end -->'
 
 class HalfFeatures(LocalFeatures):
     """Features in float16, read as float32: a city's fit into memory."""
+
+    def __post_init__(self) -> None:
+        """Accept float16, which features of a map are not."""
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
         strips, weights = self.strips[:, images].astype(np.float32), self.weights[:, images]
@@ -89,8 +93,19 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
     return HalfFeatures(half, weights, real.settings, real.cells), first
 
 
+def reduced(
+    features: LocalFeatures, query: LocalFeatures, dimension: int
+) -> tuple[PlaceMap, LocalFeatures]:
+    """Return a city and a query, projected as ``map compact --pca`` does."""
+    place_map = with_principal_components(descriptor_map(features), dimension)
+    projection = place_map.projection
+    assert projection is not None
+    strips = unit_norm(projection.apply(query.strips))
+    return place_map, LocalFeatures(strips, query.weights, place_map.settings)
+
+
 def drive(
-    features: LocalFeatures, query: LocalFeatures, true: np.ndarray, tolerance: int
+    place_map: PlaceMap, query: LocalFeatures, true: np.ndarray, tolerance: int
 ) -> dict[str, float]:
     """
     Return precision, recall and times of a query.
@@ -98,7 +113,6 @@ def drive(
     :param true: place of each image.
     """
     settings = RecognizerSettings(mode='robust')
-    place_map = descriptor_map(features)
     began = time.perf_counter()
     recognizer = PlaceRecognizer(place_map, settings, 'cpu', 'int8')
     start, matches, wall, used = time.perf_counter() - began, [], [], []
@@ -123,7 +137,9 @@ def drive(
     }
 
 
-def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dict[str, Any]:
+def measure(
+    name: str, n: int, images: int, seed: int, pca: int, save: Path | None
+) -> dict[str, Any]:
     """Return the numbers of one case."""
     folder, (reference, query_folder, tolerance, speed) = data_folder(), CASES[name]
     extractor = FeatureExtractor('gradient')
@@ -133,17 +149,21 @@ def measure(name: str, n: int, images: int, seed: int, save: Path | None) -> dic
     indices = indices[:images]
     query = query[indices]
     features, first = city(real, n, seed)
+    place_map = descriptor_map(features)
+    if pca:
+        place_map, query = reduced(features, query, pca)
     if save is not None:
-        save_map(descriptor_map(features), save, force=True)
+        save_map(place_map, save, force=True)
     return {
         'case': name,
         'places': n,
+        'dimension': place_map.dimension,
         'images': len(query),
         'cpu': cpu_model(),
         'threads': thread_count(),
         'commit': commit(),
         'load': os.getloadavg()[0],
-        'exact': drive(features, query, first + indices, tolerance),
+        'exact': drive(place_map, query, first + indices, tolerance),
     }
 
 
@@ -153,18 +173,20 @@ def lines(results: list[dict[str, Any]]) -> list[str]:
     for one in results:
         exact = one['exact']
         rows.append([
-            *(one['case'], f'{one["places"]:,}'),
+            *(one['case'], f'{one["places"]:,}', f'{one["dimension"]}'),
             f'{exact["precision"]:.3f} / {exact["recall"]:.3f}',
-            f'{exact["processor_ms"]:.0f}',
+            *(f'{exact["processor_ms"]:.0f}', f'{exact["wall_ms_p50"]:.0f}'),
             *(f'{one["threads"]}', f'{one["load"]:.1f}'),
         ])  # fmt: skip
-    return table(('case', 'places', 'precision / recall', 'ms', 'threads', 'load'), rows)
+    head = 'case', 'places', 'dimensions', 'precision / recall', 'processor ms'
+    head += 'elapsed ms', 'threads', 'load'
+    return table(head, rows)
 
 
 def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Add results to a file, each case and size once, the newest last; return all."""
     before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
-    of_cases = {(one['case'], one['places']): one for one in (*before, *new)}
+    of_cases = {(one['case'], one['places'], one['dimension']): one for one in (*before, *new)}
     if new:
         write_json(path, [*of_cases.values()])
     return list(of_cases.values())
@@ -173,7 +195,9 @@ def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def write_page(results: list[dict[str, Any]], page: Path) -> None:
     """Write the table to a page."""
     cases = list(CASES)
-    results = sorted(results, key=lambda one: (one['places'], cases.index(one['case'])))
+    results = sorted(
+        results, key=lambda one: (one['places'], cases.index(one['case']), one['dimension'])
+    )
     written_between(page, BEGIN, END, lines(results))
 
 
@@ -191,13 +215,15 @@ def main() -> None:
     parser.add_argument('--cases', nargs='+', choices=CASES, default=list(CASES))
     parser.add_argument('--images', type=int, default=200, help='of a query (%(default)s)')
     parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--pca', type=int, default=0, metavar='D', help='as map compact --pca')
     parser.add_argument('--save-map', type=Path, help='of the last case, for soak.py --map')
     parser.add_argument('--output', type=Path, default=RESULTS / 'city.json', help='JSON file')
     arguments = parser.parse_args()
     rows = merged(arguments.output, [])
     for n in arguments.places:
         for case in arguments.cases:
-            one = measure(case, n, arguments.images, arguments.seed, arguments.save_map)
+            options = arguments.images, arguments.seed, arguments.pca, arguments.save_map
+            one = measure(case, n, *options)
             rows = merged(arguments.output, [one])
             print('\n'.join(lines([one])[2:3]), flush=True)
     print('\n'.join(lines(rows)))
