@@ -23,12 +23,8 @@ from stavpr_ros.errors import (
     MapFileError,
     OutputError,
     SettingsError,
-    UnavailableError,
 )
-from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import (
-    descriptor_map,
     load_map,
     open_map,
     PlaceMap,
@@ -39,7 +35,6 @@ from stavpr_ros.mapping import (
 from stavpr_ros.mapping.map_file import save_error_risks
 from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.stored_features import StoredFeatures
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 
 
 @pytest.fixture(scope='module')
@@ -192,22 +187,6 @@ def test_features_extracted_now_are_those_of_a_kept_map(kind):
     query = kept.extractor(model=str(VERSION2 / 'tiny.onnx')).extract(route_images(8))
     np.testing.assert_allclose(query.strips, kept.features.strips, rtol=0, atol=1e-5)
     np.testing.assert_allclose(query.weights, kept.features.weights, rtol=0, atol=1e-5)
-
-
-def test_map_of_descriptors_matches_descriptors_without_a_network(tmp_path):
-    """They are random, so that a place is similar to no other."""
-    rows = np.random.default_rng(0).standard_normal((1, 60, 16)).astype(np.float32)
-    rows /= np.linalg.norm(rows, axis=2, keepdims=True)
-    source = settings_class('descriptors')(source='netvlad')
-    settings = FeatureSettings('descriptors', source, 1)
-    features = LocalFeatures(rows, np.ones((1, 60), np.float32), settings)
-    save_map(descriptor_map(features), tmp_path / 'map')
-    place_map = open_map(tmp_path / 'map')
-    recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='robust'))
-    found = [recognizer.update(features[i : i + 1]) for i in range(20, 45)][-1]
-    assert (found.status, found.sequence.last) == (Status.MATCH, 44)
-    with pytest.raises(UnavailableError, match='not from images'):
-        place_map.extractor()
 
 
 def test_map_without_optional_parts_has_three_parts(example, tmp_path):

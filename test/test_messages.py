@@ -72,9 +72,6 @@ def places(extractor, features):
     return route
 
 
-# ------------------------------------------------ ~/match
-
-
 def test_stamps_after_2038_wrap_as_in_the_messages_of_others():
     for seconds in (0, 2**31 - 1, 2**31, 2**32 - 1):
         message = time_message(seconds * SECOND + 5)
@@ -85,9 +82,6 @@ def test_stamps_after_2038_wrap_as_in_the_messages_of_others():
 def test_status_equals_the_constants_of_the_message():
     constants = {name: getattr(PlaceMatch, name) for name in Status.__members__}
     assert constants == {status.name: status.value for status in Status}
-
-
-# ------------------------------------------------ candidates, loop closures, poses
 
 
 def test_loop_closure_message_needs_a_match(places):
@@ -173,14 +167,8 @@ def test_matched_pose_message_rotates_about_the_axes_of_the_map(extractor, featu
     np.testing.assert_allclose(message.pose.covariance[21::7], expected, rtol=1e-9)
 
 
-# ------------------------------------------------ times, poses, images, the map
-
-
 def test_image_message_of_a_strided_image():
     image = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)[:, ::2]
     message = image_message(HEADER, image)
     assert (message.height, message.width, message.step) == (6, 4, 12)
     assert bytes(message.data) == image.tobytes()
-
-
-# ------------------------------------------------ drawn images
