@@ -8,10 +8,20 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+from pipelines import localizing, process
 import pytest
-from stavpr_ros.errors import FeatureMismatchError, ImageError, SettingsError, UnavailableError
+from stavpr_ros.errors import (
+    FeatureMismatchError,
+    ImageError,
+    InputError,
+    SettingsError,
+    UnavailableError,
+)
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
+from stavpr_ros.mapping import build_map, load_map, save_map
+from stavpr_ros.recognition import Status
+from stavpr_ros.sources.frame import Frame
 import torch
 from torch import nn
 
@@ -137,6 +147,32 @@ def test_vector_of_a_whole_image_as_of_megaloc(saved, batch):
     product = maps @ weights
     expected = product / np.linalg.norm(product, axis=1, keepdims=True)
     np.testing.assert_allclose(features.strips[0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'named'),
+    [
+        ({'strips': 7}, r'vector of 512 numbers .* not 7 and flatten'),
+        ({'pooling': 'gem'}, 'not 1 and gem'),
+        ({'layer': 'y', 'strips': 9}, r'Wf = 8 .*W = 9'),
+        ({'layer': 'y', 'pooling': 'max'}, "pooling = 'max'"),
+    ],
+)
+def test_settings_that_do_not_fit_the_layer_are_rejected_before_any_image(saved, changes, named):
+    path = saved(RESHAPE, s=np.array((-1, 512)))
+    with pytest.raises((InputError, SettingsError), match=named):
+        extractor(path, **{'layer': 'z'} | changes)
+
+
+def test_map_of_vectors_localizes_in_the_pipeline(saved, route, tmp_path):
+    network, path = saved(RESHAPE, s=np.array((-1, 512))), tmp_path / 'vectors.stavpr'
+    frames = [Frame(image, i + 1, '') for i, image in enumerate(route)]
+    save_map(build_map(frames, extractor(network, 'z'), progress=False), path)
+    assert load_map(path).features.strips.shape == (1, 60, 512)
+    noise = np.random.default_rng(0).normal(0, 10, (20, *route[0].shape))
+    images = np.clip(route[20:40] + noise, 0, 255).astype(np.uint8)
+    last = process(localizing(str(path), model_path=str(network)), images)[-1]
+    assert (last.status, last.place_index) == (Status.MATCH, 37)
 
 
 MEAN = helper.make_node('ReduceMean', ['y'], ['m'], axes=[0, 2, 3], keepdims=1)
