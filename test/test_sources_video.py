@@ -126,16 +126,15 @@ def test_display_matrix_is_applied(tmp_path, matrix, turned):
         np.testing.assert_allclose(image, turned(QUARTERS[0]), atol=60)
 
 
-def test_frames_that_the_edit_list_hides_are_not_shown(tmp_path):
+@pytest.mark.parametrize(
+    ('name', 'later', 'options', 'first'),
+    [('cut.mp4', -1, {'avoid_negative_ts': 'disabled'}, 30), ('later.mkv', 7.5, {}, 0)],
+    ids=['those that the edit list hides are not shown', 'they count from the first one'],
+)
+def test_times_of_frames_of_a_copy(tmp_path, name, later, options, first):
     whole = write_video(tmp_path / 'whole.mp4', codec='libx264', options={'g': '60'})
-    path = copy_video(whole, tmp_path / 'cut.mp4', -1, avoid_negative_ts='disabled')
-    Output(path).check(np.arange(30) / RATE, colored_images()[30:])
-
-
-def test_times_count_from_the_first_frame(tmp_path):
-    whole = write_video(tmp_path / 'whole.mp4')
-    path = copy_video(whole, tmp_path / 'later.mkv', 7.5)
-    Output(path).check(np.arange(FRAMES) / RATE)
+    path = copy_video(whole, tmp_path / name, later, **options)
+    Output(path).check(np.arange(FRAMES - first) / RATE, colored_images()[first:])
 
 
 def test_times_of_a_variable_rate_are_kept(tmp_path):
@@ -286,13 +285,20 @@ def test_size_in_the_header_is_limited(tmp_path):
 
 
 @pytest.mark.parametrize(
-    'text', ['ffconcat version 1.0\nfile other.mp4\n', '#EXTM3U\nother.mp4\n']
+    ('content', 'sentence'),
+    [
+        (b'', 'is damaged, cut off, no video'),
+        (b'no video' * 99, 'is damaged, cut off, no video'),
+        (b'ffconcat version 1.0\nfile other.mp4\n', 'no video that FFmpeg decodes'),
+        (b'#EXTM3U\nother.mp4\n', 'no video that FFmpeg decodes'),
+    ],
 )
-def test_playlist_with_the_name_of_a_video_is_not_followed(tmp_path, text):
+def test_other_content_with_the_name_of_a_video_is_an_error(tmp_path, content, sentence):
+    """A playlist is not followed."""
     write_video(tmp_path / 'other.mp4', colored_images(3))
-    path = tmp_path / 'phone.mp4'
-    path.write_text(text)
-    with pytest.raises(SourceError, match='no video that FFmpeg decodes'):
+    path = tmp_path / 'phone.mov'
+    path.write_bytes(content)
+    with pytest.raises(SourceError, match=rf'phone\.mov .*{sentence}'):
         open_source(path)
 
 
@@ -308,14 +314,6 @@ def test_mutated_videos_give_images_or_errors_of_our_own(tmp_path, suffix, codec
     path.write_bytes(content.tobytes())
     with suppress(StavprError):
         assert all(frame.image.ndim == 3 for frame in open_source(path))
-
-
-@pytest.mark.parametrize('content', [b'', b'no video' * 99])
-def test_other_content_is_an_error(tmp_path, content):
-    path = tmp_path / 'phone.mov'
-    path.write_bytes(content)
-    with pytest.raises(SourceError, match=r'phone\.mov is damaged, cut off, no video'):
-        open_source(path)
 
 
 @pytest.mark.parametrize(
