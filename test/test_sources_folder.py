@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image
 import pytest
-from stavpr_ros.errors import ImageError, InputError, left_out, SourceError
+from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.order import natural_key
@@ -32,18 +32,66 @@ def test_natural_key_sorts_numbered_copies_behind_their_name(mark):
     assert sorted({*expected}, key=natural_key) == expected
 
 
-def test_folder_yields_frames_in_order(tmp_path):
-    fill(tmp_path, ['10.png', '9.PNG', '11.bmp', '.hidden.png'])
-    (tmp_path / 'notes.txt').write_text('no image')
-    (tmp_path / 'folder.png').mkdir()
-    source = open_source(tmp_path)
+FOREIGN = ('@eaDir', '#recycle', '$RECYCLE.BIN', '__MACOSX', 'lost+found', 'Thumbnails')
+OTHER = ('a.gif', 'b.ico', 'c.avifs', '._1.png')
+DRIVES = {  # files; images that are read; counts of those that are left out
+    'numbers': (['10.png', '9.PNG', '11.bmp', '.no.png'], ['9.PNG', '10.png', '11.bmp'], {}),
+    'sub-folders': (
+        ['10/1.png', '9/b/1.png', '.hidden/1.png', '9/2.png', '9/a.png'],
+        ['9/2.png', '9/a.png', '9/b/1.png', '10/1.png'],
+        {},
+    ),
+    'a stray image': (
+        ['overview.png', *(f'drive/{i}.png' for i in range(5))],
+        [f'drive/{i}.png' for i in range(5)],
+        {'beside': 1},
+    ),
+    'stray sub-folders': (['1.png', '2.png', 'x/3.png'], ['1.png', '2.png'], {'below': 1}),
+    'of other programs': (
+        [f'{name}/{i}.png' for name in (*FOREIGN, 'a/@eaDir') for i in range(9)]
+        + ['a/1.png', 'a/2.png'],
+        ['a/1.png', 'a/2.png'],
+        {'foreign': 7},
+    ),
+    # a raw image beside its JPEG is not missing, and of HEIC and JPEG the JPEG is read
+    'of other formats': (
+        ['1.jpg', '2.jpg', '1.ARW', '2.heic', '3.avif', '4.dng', 'notes.txt'],
+        ['1.jpg', '2.jpg'],
+        {'format': 2},
+    ),
+    'of a telephone': (['0.jpg', '0.MOV', '1.jpg', '1.MOV'], ['0.jpg', '1.jpg'], {'video': 2}),
+    'no images': ([*OTHER, '1.png', '2.png'], ['1.png', '2.png'], {'format': 3}),
+    # a bag that is cut off, and metadata of another program, are no bag of images
+    'a bag': (['drive_0.mcap', '1.png', '2.png'], ['1.png', '2.png'], {'bag': 1}),
+    'metadata': (['metadata.yaml', '1.png', '2.png'], ['1.png', '2.png'], {}),
+}
+
+
+@pytest.mark.parametrize('name', DRIVES)
+@pytest.mark.parametrize('folder', ['drive', 'drive.bag', 'drive.mp4'])
+def test_images_of_a_drive_are_read_in_order_and_others_counted(tmp_path, name, folder):
+    files, images, counts = DRIVES[name]
+    (tmp_path / folder / 'folder.png').mkdir(parents=True)
+    for i, file in enumerate(files):
+        path = tmp_path / folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text('camera: front\nfps: 10\n')
+        if path.suffix.lower() in {'.png', '.jpg', '.bmp'} and path.name != '._1.png':
+            cv2.imwrite(str(path), np.full((4, 6, 3), i, np.uint8))
+    source = open_source(tmp_path / folder)
     frames = list(source)
     assert isinstance(source, FolderSource)
-    assert len(source) == 3
-    assert [frame.identifier for frame in frames] == ['9.PNG', '10.png', '11.bmp']
-    assert [frame.image[0, 0].tolist() for frame in frames] == [[10] * 3, [0] * 3, [20] * 3]
-    assert {frame.stamp for frame in frames} == {0}
-    assert len(list(source)) == 3
+    assert [frame.identifier for frame in frames] == images
+    assert [frame.image[0, 0, 0] for frame in frames] == [files.index(name) for name in images]
+    assert (len(source), {frame.stamp for frame in frames}) == (len(images), {0})
+    assert source.left_out == counts
+
+
+def test_folder_of_other_formats_alone_is_refused(tmp_path):
+    for name in ('1.ARW', '3.avif', '4.dng'):
+        (tmp_path / name).write_bytes(b'content')
+    with pytest.raises(SourceError, match='left out: 3 images of a format that is'):
+        FolderSource(tmp_path)
 
 
 def test_folder_records_have_stamps_by_rate(tmp_path):
@@ -108,61 +156,6 @@ def test_folder_with_names_not_utf8_is_read(tmp_path):
         list(open_source(tmp_path))
 
 
-def test_folder_without_images_yields_those_of_sub_folders(tmp_path):
-    for name in ('10', '9/b', '.hidden', '9'):
-        (tmp_path / name).mkdir(parents=True, exist_ok=True)
-    fill(tmp_path, ['10/1.png', '9/b/1.png', '.hidden/1.png', '9/2.png', '9/a.png'])
-    expected = ['9/2.png', '9/a.png', '9/b/1.png', '10/1.png']
-    assert [frame.identifier for frame in FolderSource(tmp_path)] == expected
-
-
-def test_folder_with_more_images_in_sub_folders_yields_the_drive(tmp_path):
-    """Stray images beside the drive, or sub-folders beside it: the others are counted."""
-    (tmp_path / 'drive').mkdir()
-    fill(tmp_path, ['overview.png', *(f'drive/{i}.png' for i in range(5))])
-    source = FolderSource(tmp_path)
-    assert [frame.identifier for frame in source] == [f'drive/{i}.png' for i in range(5)]
-    assert source.left_out == {'beside': 1}
-    fill(tmp_path, ['1.png'])
-    source = FolderSource(tmp_path)
-    assert [frame.identifier for frame in source] == ['1.png', 'overview.png']
-    assert left_out(source.left_out) == 'left out: 5 images in sub-folders of the drive'
-
-
-def test_folder_ignores_folders_that_other_programs_add(tmp_path):
-    foreign = ('@eaDir', '#recycle', '$RECYCLE.BIN', '__MACOSX', 'lost+found', 'Thumbnails')
-    for name in (*foreign, '.@__thumb', 'a/@eaDir'):
-        (tmp_path / name).mkdir(parents=True)
-        fill(tmp_path, [f'{name}/{i}.png' for i in range(9)])
-    fill(tmp_path, ['a/1.png', 'a/2.png'])
-    source = FolderSource(tmp_path)
-    assert [frame.identifier for frame in source] == ['a/1.png', 'a/2.png']
-    assert source.left_out == {'foreign': 7}
-
-
-def test_folder_counts_images_of_other_formats_once(tmp_path):
-    """A raw image beside its JPEG is not missing, and of HEIC and JPEG the JPEG is read."""
-    fill(tmp_path, ['1.jpg', '2.jpg'])
-    for name in ('1.ARW', '2.heic', '3.avif', '4.dng', 'notes.txt'):
-        (tmp_path / name).write_bytes(b'content')
-    source = FolderSource(tmp_path)
-    assert [frame.identifier for frame in source] == ['1.jpg', '2.jpg']
-    assert left_out(source.left_out, {'damaged': 1}).startswith('left out: 2 images of a format')
-    for image in ('1.jpg', '2.jpg', '2.heic'):
-        (tmp_path / image).unlink()
-    with pytest.raises(SourceError, match='left out: 3 images of a format that is'):
-        FolderSource(tmp_path)
-
-
-def test_photos_of_a_telephone_with_a_video_each_are_the_drive(tmp_path):
-    for number in range(3):
-        cv2.imwrite(str(tmp_path / f'{number}.jpg'), np.full((8, 8), number, np.uint8))
-        (tmp_path / f'{number}.MOV').write_bytes(b'of the same moment')
-    source = open_source(tmp_path)
-    assert len(source) == 3
-    assert left_out(source.left_out) == 'left out: 3 videos among images (to read one, name it)'
-
-
 LFS = b'version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 48213\n'
 
 
@@ -191,23 +184,6 @@ def test_sources_whose_content_is_elsewhere_are_named(tmp_path, name):
     (tmp_path / name).write_bytes(LFS)
     with pytest.raises(SourceError, match=r'is a pointer of Git LFS .*: run `git lfs pull`'):
         open_source(tmp_path / name)
-
-
-@pytest.mark.parametrize(('names', 'counts'), [
-    (['a.gif', 'b.ico', 'c.avifs', '._1.png'], {'format': 3}),
-    (['drive_0.mcap'], {'bag': 1}),
-    (['metadata.yaml'], {}),
-])  # fmt: skip
-@pytest.mark.parametrize('folder', ['drive', 'drive.bag', 'drive.mp4'])
-def test_files_of_other_kinds_beside_images_are_counted(tmp_path, names, counts, folder):
-    """Bags that are cut off, and metadata of another program, are no bag of images."""
-    (tmp_path / folder).mkdir()
-    for name in names:
-        (tmp_path / folder / name).write_text('camera: front\nfps: 10\n')
-    fill(tmp_path / folder, ['1.png', '2.png'])
-    source = open_source(tmp_path / folder)
-    assert [frame.identifier for frame in source] == ['1.png', '2.png']
-    assert source.left_out == counts
 
 
 def test_images_beside_the_metadata_of_a_bag_do_not_hide_it(tmp_path):
