@@ -7,6 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from stavpr_ros.errors import SettingsError
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.extractor import cut_strips, normalize
 from stavpr_ros.features.gradient import FLOOR, Gradient, GradientSettings, PER_THREAD
 from stavpr_ros.features.registry import RESIZE_METHODS
@@ -131,3 +133,18 @@ def test_area_averages_equal_opencv(height, width, seed, blur):
     expected = cv2.resize(gray, (64, 64), interpolation=cv2.INTER_AREA)
     padded = made._prepare(cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB))
     np.testing.assert_array_equal(padded, np.pad(expected, 1, mode='edge'))
+
+
+@pytest.mark.parametrize('bad', [{'cell': 1}, {'cell': 15}, {'size': 16}, {'orientations': 1}])
+def test_gradient_settings_out_of_range_are_rejected(bad):
+    with pytest.raises(SettingsError):
+        GradientSettings(**bad)
+
+
+def test_images_that_are_views_have_the_same_features():
+    """BGR reversed to RGB, as OpenCV's images are, and crops."""
+    image = np.random.default_rng(0).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    extractor = FeatureExtractor('gradient')
+    for view in (image[..., ::-1], image[10:, 20:], image[::-1]):
+        expected = extractor.extract([view.copy()])
+        np.testing.assert_array_equal(extractor.extract([view]).strips, expected.strips)

@@ -91,3 +91,5 @@ def test_kind_of_a_missing_package_names_it(monkeypatch):
     monkeypatch.setattr(plugins, 'load', lambda group: {})
     with pytest.raises(SettingsError, match='in the package stavpr_lab'):
         settings_class('vgg16')
+    with pytest.raises(SettingsError, match=r"'teleport'.*take one of gradient"):
+        settings_class('teleport')

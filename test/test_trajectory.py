@@ -15,30 +15,29 @@ from stavpr_ros.mapping import distance, rotation, Trajectory
 from stavpr_ros.sources.bag import ODOMETRY, read_odometry
 
 
+def passed(*stamps_and_x, **options):
+    """Return a trajectory with a pose at each of these seconds and x."""
+    trajectory = Trajectory(**options)
+    for seconds, x in stamps_and_x:
+        trajectory.add(round(seconds * SECOND), turned(0, x=x))
+    return trajectory
+
+
 def turned(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
     """Return a pose at x, turned about an axis."""
     half = math.radians(degrees) / 2
     return np.array([x, 0, 0, *(math.sin(half) * part for part in axis), math.cos(half)])
 
 
-def test_trajectory_outside_its_poses_returns_none():
-    trajectory = Trajectory(timeout=0.5)
-    assert trajectory.at(SECOND) is None
-    trajectory.add(2 * SECOND, turned(0, x=1))
-    trajectory.add(3 * SECOND, turned(0, x=2))
-    assert trajectory.at(0) is None
-    assert trajectory.at(2 * SECOND - 1) is None
-    assert trajectory.at(3_500_000_000)[0] == 2
-    assert trajectory.at(3_500_000_001) is None
-
-
-def test_trajectory_across_long_gap_returns_none():
-    trajectory = Trajectory(timeout=0.5)
-    for second in (1, 6, 12):
-        trajectory.add(second * SECOND, turned(0, x=second))
-    assert trajectory.at(2 * SECOND)[0] == 2
+def test_trajectory_outside_its_poses_or_across_a_long_gap_returns_none():
+    assert Trajectory().at(SECOND) is None
+    trajectory = passed((2, 1), (3, 2), timeout=0.5)
+    for stamp, x in ((0, None), (2 * SECOND - 1, None), (3_500_000_000, 2), (3_500_000_001, None)):
+        pose = trajectory.at(stamp)
+        assert (pose if pose is None else pose[0]) == x
+    trajectory = passed((1, 1), (6, 6), (12, 12), timeout=0.5)
+    assert (trajectory.at(2 * SECOND)[0], trajectory.at(12 * SECOND)[0]) == (2, 12)
     assert trajectory.at(7 * SECOND) is None
-    assert trajectory.at(12 * SECOND)[0] == 12
 
 
 def test_trajectory_returns_copies():
@@ -52,18 +51,13 @@ def test_trajectory_returns_copies():
 
 
 def test_trajectory_sorts_late_and_replaces_equal_stamps():
-    trajectory = Trajectory(timeout=0.5)
-    for stamp, x in ((10, 0), (20, 10), (15, 8), (20, 12)):
-        trajectory.add(stamp * SECOND // 10, turned(0, x=x))
+    trajectory = passed((1.0, 0), (2.0, 10), (1.5, 8), (2.0, 12), timeout=0.5)
     assert len(trajectory) == 3
-    assert trajectory.at(1_250_000_000)[0] == 4
-    assert trajectory.at(1_750_000_000)[0] == 10
+    assert (trajectory.at(1_250_000_000)[0], trajectory.at(1_750_000_000)[0]) == (4, 10)
 
 
 def test_trajectory_after_clock_jump_starts_over():
-    trajectory = Trajectory(timeout=0.5)
-    for stamp in (10 * SECOND, 11 * SECOND, 10_500_000_000):
-        trajectory.add(stamp, turned(0))
+    trajectory = passed((10, 0), (11, 0), (10.5, 0), timeout=0.5)
     assert len(trajectory) == 3
     trajectory.add(10_499_999_999, turned(0, x=5))
     assert len(trajectory) == 1
@@ -79,10 +73,8 @@ def test_trajectory_keeps_at_most_capacity():
         assert len(trajectory) >= min(i, 14)
         assert trajectory.at(i)[0] == i
     assert trajectory.at(1000 - 17) is None
-    one = Trajectory(capacity=1)
-    one.add(1, turned(0))
-    one.add(2, turned(0, x=2))
-    assert (len(one), one.at(2)[0]) == (1, 2)
+    one = passed((1, 0), (2, 2), capacity=1)
+    assert (len(one), one.at(2 * SECOND)[0]) == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -103,11 +95,8 @@ def test_trajectory_with_invalid_pose_changes_nothing(pose, words):
         trajectory.add(1, np.array(pose))  # so early that it would clear the trajectory
     assert len(trajectory) == 1
     assert trajectory.at(2 * SECOND) is not None
-
-
-def test_trajectory_with_invalid_stamp_fails():
     with pytest.raises(InputError, match='stamp 0'):
-        Trajectory().add(0, turned(0))
+        trajectory.add(0, turned(0))
 
 
 def test_trajectory_normalizes_quaternions():
@@ -167,22 +156,20 @@ def test_read_odometry_returns_sorted_poses(tmp_path, ros1):
     assert Trajectory.from_arrays(when, poses).at(5 * SECOND + 5)[0] == pytest.approx(1.5)
 
 
-def test_read_odometry_of_missing_topic_fails(tmp_path):
-    path = write_odometry(tmp_path / 'bag', [SECOND])
-    with pytest.raises(SourceError, match=r"'/other' is not in .*: expected one of /odom"):
-        read_odometry(path, '/other')
-    with pytest.raises(SourceError, match=r'std_msgs/msg/String in .*: expected one of /odom'):
-        read_odometry(path, '/text')
-    with pytest.raises(SourceError, match='no messages'):
-        read_odometry(write_odometry(tmp_path / 'empty', []), '/odom')
-    with pytest.raises(SourceError, match=r'cannot be read: .*No such file'):
-        read_odometry(tmp_path / 'missing', '/odom')
-
-
-def test_read_odometry_with_clock_jump_fails(tmp_path):
-    path = write_odometry(tmp_path / 'bag', [9 * SECOND, 10 * SECOND, 3 * SECOND, 4 * SECOND])
-    with pytest.raises(SourceError, match=r'back by 7\.0 s at message 2'):
-        read_odometry(path, '/odom')
+@pytest.mark.parametrize(
+    ('stamps', 'name', 'topic', 'sentence'),
+    [
+        ([1], 'bag', '/other', r"'/other' is not in .*: expected one of /odom"),
+        ([1], 'bag', '/text', r'std_msgs/msg/String in .*: expected one of /odom'),
+        ([], 'bag', '/odom', 'no messages'),
+        ([1], 'missing', '/odom', r'cannot be read: .*No such file'),
+        ([9, 10, 3, 4], 'bag', '/odom', r'back by 7\.0 s at message 2'),
+    ],
+)
+def test_read_odometry_of_what_is_no_odometry_fails(tmp_path, stamps, name, topic, sentence):
+    write_odometry(tmp_path / 'bag', [stamp * SECOND for stamp in stamps])
+    with pytest.raises(SourceError, match=sentence):
+        read_odometry(tmp_path / name, topic)
 
 
 def test_from_arrays_counts_invalid_poses_unless_all_are():

@@ -75,9 +75,13 @@ class Target(Node):
     """RTAB-Map, as far as the bridge uses it."""
 
     def __init__(self) -> None:
+        from rtabmap_msgs.msg import Info
+        from rtabmap_msgs.srv import AddLink
+
         super().__init__('target')
         self.edges: list[dict] = []
-        self.keyframes = self._rtabmap()
+        self.create_service(AddLink, 'rtabmap/add_link', self._add_link)
+        self.keyframes = self.create_publisher(Info, 'rtabmap/info', QOS)
         self.closures = self.create_publisher(LoopClosure, 'stavpr/loop_closure', QOS)
         self.odometry = self.create_publisher(Odometry, 'odom', QOS)
         self.received = False  # the bridge has received a closure
@@ -88,37 +92,21 @@ class Target(Node):
             counts = {pair.key: pair.value for pair in status.values}
             self.received |= int(counts.get('closures', 0)) > 0
 
-    def _rtabmap(self):
-        from rtabmap_msgs.msg import Info
-        from rtabmap_msgs.srv import AddLink
+    def _add_link(self, request, response):
+        """Note an edge: the pose is that of the second node in the frame of the first one."""
+        link = request.link
+        t, o = link.transform.translation, link.transform.rotation
+        covariance = np.linalg.inv(np.array(link.information).reshape(6, 6))
+        self.edges.append({
+            'nodes': [link.from_id, link.to_id], 'pose': [t.x, t.y, t.z, o.x, o.y, o.z, o.w],
+            'type': link.type, 'deviations': np.sqrt(np.linalg.eigvalsh(covariance)).tolist(),
+        })  # fmt: skip
+        return response
 
-        def add_link(request, response):
-            link = request.link
-            t, o = link.transform.translation, link.transform.rotation
-            pose = [t.x, t.y, t.z, o.x, o.y, o.z, o.w]
-            information = np.array(link.information).reshape(6, 6)
-            self._add(link.from_id, link.to_id, pose, np.linalg.inv(information), link.type)
-            return response
-
-        self.create_service(AddLink, 'rtabmap/add_link', add_link)
-        publisher = self.create_publisher(Info, 'rtabmap/info', QOS)
-
-        def publish(number: int, stamp: int, pose) -> None:
-            message = Info(ref_id=number)
-            message.header.stamp = time_message(stamp)
-            publisher.publish(message)
-
-        return publisher, publish
-
-    def _add(self, first: int, second: int, pose, covariance: np.ndarray, kind: int) -> None:
-        """Note an edge; pose: of the second node in the frame of the first one."""
-        deviations = np.sqrt(np.linalg.eigvalsh(covariance)).tolist()
-        self.edges.append(
-            {
-                'nodes': [first, second], 'pose': np.asarray(pose).tolist(), 'type': kind,
-                'deviations': deviations,
-            }
-        )  # fmt: skip
+    def publish_keyframe(self, number: int, stamp: int) -> None:
+        message = self.keyframes.msg_type(ref_id=number)
+        message.header.stamp = time_message(stamp)
+        self.keyframes.publish(message)
 
 
 def main() -> None:
@@ -126,18 +114,14 @@ def main() -> None:
     node, drive = Target(), Drive()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    publisher, publish = node.keyframes
 
     def wait_until(done) -> None:
         end = time.monotonic() + TIMEOUT
         while not done() and time.monotonic() < end:
             executor.spin_once(timeout_sec=0.05)
 
-    wait_until(
-        lambda: all(
-            each.get_subscription_count() for each in (publisher, node.odometry, node.closures)
-        )
-    )
+    publishers = node.keyframes, node.odometry, node.closures
+    wait_until(lambda: all(each.get_subscription_count() for each in publishers))
     while not node.received:  # the bridge may not know these publishers yet
         node.closures.publish(LoopClosure())  # has no relative pose: becomes no edge
         executor.spin_once(timeout_sec=0.2)
@@ -146,7 +130,7 @@ def main() -> None:
     for image in range(2 * LAP - 1):
         node.odometry.publish(odometry_message(stamp_of(image), to_poses(drive.at(image))))
         if image % KEYFRAME == 0:  # known before the odometry after it
-            publish(image // KEYFRAME + 1, stamp_of(image + 0.3), drive.at(image + 0.3))
+            node.publish_keyframe(image // KEYFRAME + 1, stamp_of(image + 0.3))
         executor.spin_once(timeout_sec=0.01)
     wait_until(lambda: len(node.edges) >= EDGES)
     for _ in range(10):  # for edges too many
