@@ -284,13 +284,12 @@ def test_camera_with_invalid_numbers_is_rejected(changes, words):
 
 def test_map_file_holds_the_camera(small_map, tmp_path):
     camera = replace(DISTORTED, mount=MOUNTED.mount)
+    for one in (replace(small_map, camera=camera), small_map):
+        save_map(one, tmp_path / 'a.stavpr', force=True)
+        assert load_map(tmp_path / 'a.stavpr').camera == one.camera
     with_camera = replace(small_map, camera=camera)
-    save_map(with_camera, tmp_path / 'a.stavpr')
-    assert load_map(tmp_path / 'a.stavpr').camera == camera
-    save_map(small_map, tmp_path / 'b.stavpr')
-    assert load_map(tmp_path / 'b.stavpr').camera is None
-    assert merge_maps([with_camera] * 2, ['a', 'b']).camera == camera
-    assert merge_maps([with_camera, small_map], ['a', 'b']).camera is None
+    for others, expected in ((with_camera, camera), (small_map, None)):
+        assert merge_maps([with_camera, others], ['a', 'b']).camera == expected
 
 
 def test_map_file_holds_several_cameras(small_map, tmp_path):

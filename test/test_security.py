@@ -2,32 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The SROS 2 policy allows the node exactly what it does, and others no more than they need."""
 
-from pathlib import Path
-from xml.etree import ElementTree
-
+from policy import allowed, POLICY
 import pytest
 from rclpy.parameter import Parameter
 from stavpr_ros.ros.node import PlaceRecognitionNode
 
-POLICY = Path(__file__).parents[1] / 'config' / 'sros2_policy.xml'
 BOTH_CAMERAS = {'/image', *(f'/image/{name}' for name in ('compressed', 'ffmpeg', 'foxglove'))}
 
 
-@pytest.fixture(scope='module')
-def policy():
-    """Return the allowed names by enclave and right, such as ``policy['node']['publish']``."""
-    rules = {}
-    for enclave in ElementTree.parse(POLICY).iter('enclave'):
-        rights = rules.setdefault(enclave.get('path').removeprefix('/stavpr/'), {})
-        for group in enclave.find('profiles/profile'):
-            for right in group.attrib:
-                names = {entry.text.replace('~', '/stavpr') for entry in group}
-                rights[right] = rights.get(right, set()) | names
-    return rules
-
-
 @pytest.mark.parametrize('transport', ['raw', 'compressed'])
-def test_policy_of_the_node_is_what_it_uses(policy, context, transport):
+def test_policy_of_the_node_is_what_it_uses(context, transport):
     given = {'autostart': False, 'operation': 'mapping', 'image_transport': transport}
     overrides = [Parameter(name, value=value) for name, value in given.items()]
     node = PlaceRecognitionNode(context=context, parameter_overrides=overrides)
@@ -47,16 +31,19 @@ def test_policy_of_the_node_is_what_it_uses(policy, context, transport):
     names['subscribe'].add('/clock')  # with use_sim_time
     names['publish'] |= {'/tf', '/initialpose', '/bond'}  # with publish_tf, and for Nav2
     names['subscribe'].add('/bond')
-    assert names == {'request': set(), **policy['node']}
+    assert names == {'request': set(), **allowed('stavpr')}
 
 
-def test_policy_of_the_others_fits_the_node(policy):
-    node = policy['node']
-    for other in ('operator', 'reader'):
-        assert policy[other]['subscribe'] <= node['publish'] | {'/clock'}
-    assert policy['operator']['request'] <= node['reply']
-    assert 'request' not in policy['reader']
-    assert node['subscribe'] - {'/bond'} <= policy['sensors']['publish']
+def test_policy_of_the_others_fits_the_node():
+    node, operator, reader, sensors = (
+        allowed(name) for name in ('stavpr', 'stavpr_operator', 'stavpr_reader', 'stavpr_sensors')
+    )
+    for other in (operator, reader):
+        names = {name.replace('/stavpr_operator/', '/stavpr/') for name in other['subscribe']}
+        assert names <= node['publish'] | {'/clock'}
+    assert operator['request'] <= node['reply']
+    assert 'request' not in reader
+    assert node['subscribe'] - {'/bond'} <= sensors['publish']
 
 
 def test_policy_has_no_comment_that_sros2_takes_for_an_enclave():

@@ -48,16 +48,18 @@ def test_watch_of_steady_camera_estimates_losses(hertz, loss, jitter):
     assert 0.75 * lost - INTERVALS / 2 <= missing(stamps, kept) <= lost
 
 
-def test_watch_of_irregular_camera_estimates_nothing():
-    rng = np.random.default_rng(0)
-    assert missing(np.cumsum(rng.exponential(1 / 30, 1000))) == 0
-    assert missing(np.cumsum(np.tile([0.001, 0.001, 0.098], 300))) == 0  # bursts
+STEADY = np.arange(100) / 30
 
 
-def test_watch_of_pause_and_unknown_stamps_estimates_nothing():
-    steady = np.arange(100) / 30
-    assert missing([*steady, *(steady + 60), *(steady + 120)]) == 0
-    # reordered or equal stamps
-    assert missing([*steady, 2.0, 2.0, *(steady[1:] + steady[-1])]) == 0
-    watch = StampWatch(0)
-    assert [watch.update(0) for _ in range(100)] == [(0, 0)] * 100
+@pytest.mark.parametrize(
+    'seconds',
+    [
+        np.cumsum(np.random.default_rng(0).exponential(1 / 30, 1000)),
+        np.cumsum(np.tile([0.001, 0.001, 0.098], 300)),  # bursts
+        [*STEADY, *(STEADY + 60), *(STEADY + 120)],  # pauses
+        [*STEADY, 2.0, 2.0, *(STEADY[1:] + STEADY[-1])],  # reordered or equal stamps
+        [-START / 1e9] * 100,  # unknown ones
+    ],
+)
+def test_watch_of_an_irregular_camera_estimates_nothing(seconds):
+    assert missing(seconds) == 0

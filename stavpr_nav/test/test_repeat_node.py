@@ -4,15 +4,14 @@
 
 from dataclasses import replace
 import math
-from pathlib import Path
 import signal
 import time
-from xml.etree import ElementTree
 
 from domain import DOMAIN
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
+from policy import allowed
 from processes import Process, TIMEOUT
 import pytest
 import rclpy
@@ -37,7 +36,6 @@ from stavpr_ros.ros.messages import image_message
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import Trigger
 
-POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
 PERIOD = 0.1  # seconds between two images
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FAST = {'max_acceleration': 100.0, 'max_speed': 2.0}
@@ -410,16 +408,10 @@ def test_security_policy_allows_what_the_nodes_use(context, repeat, tmp_path, na
         right: {topic for topic, _ in names if '/_action/' not in topic}
         for right, names in (('publish', published), ('subscribe', subscribed), ('reply', replied))
     }
-    allowed = {}
-    for enclave in ElementTree.parse(POLICY).iter('enclave'):
-        if enclave.get('path') == f'/stavpr/{name}':
-            for group in enclave.find('profiles/profile'):
-                (right,) = group.attrib
-                names = {entry.text.replace('~', f'/{name}') for entry in group}
-                allowed[right] = names
-    assert allowed.pop('execute', {'/repeat'}) == {'/repeat'}
+    rights = allowed(name)
+    assert rights.pop('execute', {'/repeat'}) == {'/repeat'}
     optional = {'/clock', '/image/compressed', '/cmd_vel', '/odom'}
-    assert {r: n - optional for r, n in allowed.items()} == {
+    assert {r: n - optional for r, n in rights.items()} == {
         r: n - optional for r, n in used.items()
     }
     if name == 'teach':
