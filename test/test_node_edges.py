@@ -5,6 +5,7 @@
 import threading
 from types import SimpleNamespace
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
@@ -66,6 +67,7 @@ def closing(robot, start, route):
 
     def drive(camera_info=None, **parameters):
         closures = robot.listen(LoopClosure, '/stavpr/loop_closure', 1000)
+        poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
         start(
             operation='loop_closure',
             map_path='',
@@ -87,6 +89,8 @@ def closing(robot, start, route):
             return [closure for closure in closures if not closure.is_late]
 
         robot.until(lambda: len(on_time()) >= count > 5, 'a closure for each match')
+        robot.until(lambda: bool(poses), 'poses')
+        assert {pose.header.frame_id for pose in poses} == {'wheels'}  # of the odometry
         return [match for match in matches if match.status == PlaceMatch.MATCH], on_time()
 
     return drive

@@ -4,7 +4,6 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import cycle
 import threading
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,10 +13,10 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import QoSProfile
 from robot import image_message, LENGTH, SECOND
-from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
+from stavpr_msgs.msg import PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import load_map, save_map, select_places
+from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.pipeline import read_map
 from stavpr_ros.ros import map_loading, runtime
 from stavpr_ros.ros.qos import LATCHED
@@ -294,29 +293,3 @@ def test_node_records_a_session_on_a_map_and_publishes_where_the_robot_is(
     both = load_map(tmp_path / 'both.stavpr')
     assert [session.id for session in both.sessions] == ['route', 'recorded-1']
     assert node.state == 'active'
-
-
-def test_node_on_a_folder_of_maps_names_the_map_and_its_probability(
-    robot, start, route, small_map, tmp_path
-):
-    for name, places in (('ground', slice(0, 30)), ('upper', slice(30, 60))):
-        floor = select_places(small_map, np.arange(60)[places])
-        save_map(floor, tmp_path / f'{name}.stavpr')
-    start(map_path=str(tmp_path))
-    robot.until_map(sessions=['ground', 'upper'])
-    candidates = robot.listen(PlaceCandidates, '/stavpr/candidates')
-    frames = cycle(route[40:55])  # until the topic is discovered
-    matches = {}
-
-    def is_received():
-        match = robot.show(next(frames))
-        matches[match.header.stamp.sec] = match
-        last = matches.get(candidates[-1].header.stamp.sec) if candidates else None
-        return last is not None and last.status == PlaceMatch.MATCH
-
-    robot.until(is_received, 'candidates of a match')
-    last = candidates[-1]
-    assert matches[last.header.stamp.sec].session == last.candidates[0].session
-    assert len(last.session_probabilities) == 2
-    assert 'set a path' in robot.refuses(SaveMap, 'save_map')
-    assert 'folder' in robot.refuses(SetOperation, 'set_operation', operation='mapping')

@@ -235,23 +235,6 @@ def test_matched_pair_has_thumbnails_of_one_session(small_map, route, tmp_path):
     assert min(pipeline.operation.matched_pair(match, 'pnp').thumbnails) == 3
 
 
-@pytest.mark.parametrize('has_poses', [True, False])
-def test_matched_pair_is_not_made_where_a_map_has_no_edges(
-    has_poses, small_map, route, tmp_path, monkeypatch
-):
-    poses = small_map.poses if has_poses else None
-    save_map(replace(small_map, poses=poses), tmp_path / 'map.stavpr')
-    pipeline = localizing(str(tmp_path / 'map.stavpr'))
-    match = process(pipeline, route[:LENGTH], poses=True)[-1]
-    assert match.accepted
-    monkeypatch.setattr(SequenceBuffer, 'at', lambda *_: pytest.fail('copied'))
-    monkeypatch.setattr(type(pipeline.places.thumbnails), '__getitem__', pytest.fail)
-    assert pipeline.operation.matched_pair(match, 'none' if has_poses else 'auto') is None
-
-
-# ------------------------------------------------ changes of operation and map
-
-
 @pytest.mark.parametrize('images', [(6, 0, 6), (6, 6, 6)])
 def test_change_of_operation_keeps_the_places(route, images):
     """A recorded route becomes the map, an empty one loses nothing: against a list of stamps."""

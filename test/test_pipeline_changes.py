@@ -12,17 +12,15 @@ from pipelines import (
     message,
     process,
     recorded,
-    save,
     SECOND,
-    settings_of,
     stamps_of,
     statuses,
 )
 import pytest
-from stavpr_ros.errors import ImageError, InputError, OutputError
-from stavpr_ros.mapping import load_map, save_map, thumbnail_of
+from stavpr_ros.errors import ImageError, InputError
+from stavpr_ros.mapping import save_map, thumbnail_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
-from stavpr_ros.pipeline import OPERATIONS, Pipeline
+from stavpr_ros.pipeline import OPERATIONS
 from stavpr_ros.recognition import Status
 from stavpr_ros.recognition.verification import (
     GeometricEvidence,
@@ -149,9 +147,6 @@ def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tm
     assert (match.status, match.inliers) == (Status.MATCH, -1)
 
 
-# ------------------------------------------------ errors, resets, relocalization
-
-
 class Failing:
     """A function that raises ``error`` while that is set."""
 
@@ -221,21 +216,3 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     if operation == 'loop_closure':
         assert matches[-1].match.first_image_index == places
     assert matches[-1].match.path[-1].tolist() == [4, 8]
-
-
-# ------------------------------------------------ saving
-
-
-def test_saving_that_fails_leaves_places_unsaved_and_the_file_unchanged(route, tmp_path):
-    path = tmp_path / 'recorded.stavpr'
-    pipeline = Pipeline(settings_of(), 'mapping')
-    process(pipeline, route[:3])
-    with pytest.raises(OutputError, match='make it first'):
-        save(pipeline, tmp_path / 'missing' / 'recorded.stavpr')
-    assert (save(pipeline, path), pipeline.save_state.path, pipeline.unsaved) == (3, str(path), 0)
-    process(pipeline, route[3:4], first=3)
-    with pytest.raises(OutputError, match='exists already'):
-        save(pipeline, path)
-    assert (stamps_of(load_map(path)), pipeline.unsaved) == ([1, 2, 3], 1)
-    assert save(pipeline, path, overwrite=True) == 4
-    assert stamps_of(load_map(path)) == [1, 2, 3, 4]

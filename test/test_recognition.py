@@ -69,15 +69,6 @@ def test_recognizer_at_threshold_does_not_match(small_map, route):
         assert recognize_all(recognizer(small_map, float(threshold)), query)[-1].status is status
 
 
-def test_recognizer_without_a_threshold_takes_that_of_the_map(small_map):
-    place_map = replace(small_map, threshold=0.3)
-    for threshold, applied in ((None, 0.3), (0.1, 0.1)):
-        settings = RecognizerSettings(threshold, sequence=SHORT, mode='paper')
-        recognizer = PlaceRecognizer(place_map, settings)
-        match = [recognizer.update(place_map.features[i : i + 1]) for i in range(5)][-1]
-        assert (match.status, match.threshold) == (Status.MATCH, applied)
-
-
 @pytest.mark.parametrize('mode', ['paper', 'robust'])
 def test_recognizer_on_empty_map_never_matches(small_map, mode):
     answers = recognize_all(recognizer(empty_map(small_map), mode=mode), small_map.features[:7])
