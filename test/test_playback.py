@@ -31,7 +31,6 @@ from stavpr_ros.ros.playback import Playback
 from stavpr_ros.ros.replay import Replayer, ReplayOptions
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_messages import list_topics, read_messages
-from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord, RecordedTopic
 from std_msgs.msg import Empty, String
 from std_srvs.srv import Trigger
@@ -43,9 +42,6 @@ def images(count, gap=SECOND):
     """One image a second from second 100 on, its stamp that of the odometry beside it."""
     pixels = np.zeros((2, 3, 3), np.uint8)
     return [ImageRecord.of_image(pixels + i, FIRST + i * gap) for i in range(count)]
-
-
-# time
 
 
 def playing(rate, *times):
@@ -64,9 +60,6 @@ def test_playback_after_a_pause_continues_where_it_stopped():
     assert playback.now_ns() == FIRST + 2 * SECOND
 
 
-# parts of a source, and its other topics
-
-
 @pytest.mark.parametrize('ros1', [False, True])
 def test_bag_with_start_and_duration_yields_that_part(tmp_path, ros1):
     path = tmp_path / ('one.bag' if ros1 else 'two')
@@ -77,15 +70,6 @@ def test_bag_with_start_and_duration_yields_that_part(tmp_path, ros1):
     records = read_messages(path, ['/odom'], start=3, duration=2)
     assert [record.time_ns // SECOND for record in records] == [102, 103]
     assert len(list(BagSource(path).records(start=100))) == 0
-
-
-def test_folder_with_start_and_duration_yields_that_part(tmp_path, route):
-    for i in range(10):
-        (tmp_path / f'{i}.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
-    source = FolderSource(tmp_path)
-    stamps = [record.stamp_ns for record in source.records(10, start=0.3, duration=0.4)]
-    assert stamps == [400_000_000, 500_000_000, 600_000_000, 700_000_000]
-    assert len(list(source.records(10, start=7.0))) == 0
 
 
 def test_messages_of_ros1_are_those_of_ros2(tmp_path):
@@ -116,9 +100,6 @@ def test_message_class_imports_packages_of_messages_only():
     for name in (*unknown, 'x', '../a/msg/B'):
         with pytest.raises(UnavailableError, match='is not installed'):
             message_class(name)
-
-
-# messages over ROS
 
 
 @contextmanager
@@ -327,23 +308,20 @@ def test_replay_command_with_keys_loops_over_a_part_of_a_bag(context, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('options', 'error'),
+    ('name', 'options', 'error'),
     [
-        (['--also', '/nothing'], '0 topics /nothing'),
-        (['--odometry', '/text'], '0 topics /text nav_msgs/msg/Odometry with messages'),
+        ('bag', ['--also', '/nothing'], '0 topics /nothing'),
+        ('bag', ['--odometry', '/text'], '0 topics /text nav_msgs/msg/Odometry with messages'),
+        ('images', ['--odometry'], 'no bag, which --odometry and --also require'),
     ],
 )
 def test_replay_command_of_a_part_that_is_missing_fails(
-    tmp_path, capsys, monkeypatch, options, error
+    tmp_path, capsys, monkeypatch, name, options, error
 ):
-    path = write_odometry(tmp_path / 'bag', [FIRST], images=images(1))
+    write_odometry(tmp_path / 'bag', [FIRST], images=images(1))
+    (tmp_path / 'images').mkdir()
+    (tmp_path / 'images/0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
     monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
     monkeypatch.setenv(process.PROFILES_VARIABLE, '')  # what the command sets ends with the test
-    assert replay.main([str(path), *options]) == 1
+    assert replay.main([str(tmp_path / name), *options]) == 1
     assert error in capsys.readouterr().err
-
-
-def test_replay_command_of_a_folder_with_odometry_fails(tmp_path, capsys):
-    (tmp_path / '0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
-    assert replay.main([str(tmp_path), '--odometry']) == 1
-    assert 'no bag, which --odometry and --also require' in capsys.readouterr().err

@@ -181,18 +181,6 @@ def test_early_matches_are_compared_since_the_first_of_them():
     assert all(match.accepted for match in matches[95:])
 
 
-def test_reset_forgets_the_way():
-    places, query = corridor()
-    one = PlaceRecognizer(driven_map(places, track(90)), settings_of())
-    drive(one, query, track(-90))
-    one.reset()
-    fresh = drive(PlaceRecognizer(driven_map(places, track(90)), settings_of()), query, track(90))
-    again = drive(one, query, track(90))
-    assert [match.probability for match in again[LENGTH:]] == [
-        match.probability for match in fresh[LENGTH:]
-    ]
-
-
 def test_loop_closure_compares_the_way_with_its_route():
     """The second lap turns left where the first turned right; evicted places change nothing."""
     first, second = corridor()

@@ -100,6 +100,9 @@ def test_folder_records_have_stamps_by_rate(tmp_path):
     records = list(FolderSource(tmp_path, on_error=lambda _: None).records(4))
     assert [record.stamp_ns for record in records] == [250_000_000, 750_000_000]
     assert [record.time_ns for record in records] == [250_000_000, 750_000_000]
+    records = FolderSource(tmp_path, on_error=lambda _: None).records(4, start=0.3, duration=4)
+    assert [record.stamp_ns for record in records] == [750_000_000]
+    assert not list(FolderSource(tmp_path, on_error=lambda _: None).records(4, start=7.0))
     with pytest.raises(InputError, match='0 frames per second'):
         next(FolderSource(tmp_path).records(0))
 

@@ -161,13 +161,9 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
 def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     pipeline = recorded(route, count=30)
     views, publishers = views_of('map_path')
-    for i in range(30):
-        views.publish(
-            header(),
-            process(pipeline, route[30 + i : 31 + i], 30 + i, True)[0],
-            pipeline.operation,
-            '',
-        )
+    for i in range(30, 60):
+        (match,) = process(pipeline, route[i : i + 1], i, True)
+        views.publish(header(), match, pipeline.operation, '')
     sizes = [len(message.poses) for message in publishers.messages('map_path')]
     assert sizes[0] == 31
     assert all(b >= a * GROWTH for a, b in pairwise(sizes))
@@ -262,16 +258,12 @@ def test_node_publishes_the_topics_of_the_layouts(robot, start):
     assert panels(foxglove['layout']) == set(foxglove['configById'])
 
 
-def test_node_publishes_the_route_for_a_late_subscriber_without_an_image(robot, start):
-    start()
+def test_node_publishes_for_viewers_and_navigation(robot, start, route):
+    """The route for a late subscriber, without an image; the others with the first match."""
+    start(publish_initialpose=True)
     routes = robot.listen(Path, '/stavpr/map_path', LATCHED)
     robot.until(lambda: routes, 'the route')
-    assert len(routes[0].poses) == 60
-    assert routes[0].header.frame_id == 'map'
-
-
-def test_node_publishes_for_viewers_and_navigation(robot, start, route):
-    start(publish_initialpose=True)
+    assert (len(routes[0].poses), routes[0].header.frame_id) == (60, 'map')
     markers = robot.listen(MarkerArray, '/stavpr/markers')
     poses = robot.listen(PoseWithCovarianceStamped, '/initialpose')
     robot.until(lambda: robot.node.count_publishers('/initialpose') == 1, 'the publisher')

@@ -73,11 +73,20 @@ def solve(truth, closures, odometry=None, stamps=None):
     return optimize(at, odometry_of(truth) if odometry is None else odometry, closures)
 
 
-def graph_of(odometry):
-    """Return a graph of an odometry, an image each second, without closures."""
-    graph = PoseGraph()
+def graph_of(odometry, closures=(), late=0, every=0, begin=0):
+    """
+    Return a graph of a drive, an image each second.
+
+    :param closures: each is added so many images late.
+    :param every: images, from ``begin`` on, after which the graph is updated; 0 = never.
+    """
+    graph, waiting = PoseGraph(), list(closures)
     for i, pose in enumerate(odometry):
         graph.add_odometry((i + 1) * SECOND, pose)
+        while waiting and waiting[0].query_stamp <= (i + 1 - late) * SECOND:
+            graph.add_closure(waiting.pop(0))
+        if every and i >= begin and i % every == 0:
+            graph.update()
     return graph
 
 
@@ -99,13 +108,7 @@ def test_optimize_with_closures_corrects_drift(drive):
 def test_burst_of_late_closures_ends_as_all_at_once(drive):
     """60 closures come together when the drive is over, the others as the robot drives."""
     truth, closures = drive
-    graph, odometry = PoseGraph(), odometry_of(truth)
-    for i, pose in enumerate(odometry):
-        graph.add_odometry((i + 1) * SECOND, pose)
-        if i - LAP >= 60:
-            graph.add_closure(closures[i - LAP])
-        if i % 10 == 9:
-            graph.update()
+    graph = graph_of(odometry_of(truth), closures[60:], every=10)
     for each in closures[:60]:
         graph.add_closure(each)
     live = error(to_poses(graph.update()), truth)
@@ -166,14 +169,7 @@ def test_optimize_carried_robot_cuts_where_the_odometry_stands():
 
 def test_update_carried_robot_is_found_within_80_images():
     truth, odometry, closures = carried_drive()
-    graph = PoseGraph()
-    waiting = list(closures)
-    for i, pose in enumerate(odometry[:222]):
-        graph.add_odometry((i + 1) * SECOND, pose)
-        while waiting and waiting[0].query_stamp <= (i - 9) * SECOND:
-            graph.add_closure(waiting.pop(0))
-        if i > LAP and i % 4 == 0:
-            graph.update()
+    graph = graph_of(odometry[:222], closures, late=10, every=4, begin=LAP + 1)
     graph.update()
     found = np.array([graph.at((i + 1) * SECOND) for i in range(222)])
     assert error(found, truth[:222]) < 1.5

@@ -5,11 +5,11 @@
 import numpy as np
 import pytest
 from stavpr_ros.mapping.transforms import inverse
-from stavpr_slam.pose_graph import optimize, PoseGraph, runs
+from stavpr_slam.pose_graph import optimize, runs
 from stavpr_slam.pose_graph.keyframes import ChainSettings, KeyframeChain
 from stavpr_slam.pose_graph.path_errors import OdometryNoise
 from stavpr_slam.pose_graph.transforms import adjoints, planar_poses
-from test_pose_graph import circle, closure, LAP, odometry_of, SECOND
+from test_pose_graph import circle, closure, graph_of, LAP, odometry_of, SECOND
 
 NOISE = OdometryNoise(0.05, 0.012)
 
@@ -61,14 +61,8 @@ def test_optimize_with_runs_agrees_with_all_keyframes(monkeypatch):
 
 def test_update_splits_runs_where_edges_arrive():
     truth = circle(3)
-    graph, closures = PoseGraph(), []
-    for i, pose in enumerate(odometry_of(truth, drift=0.3, seed=4)):
-        graph.add_odometry((i + 1) * SECOND, pose)
-        if i >= LAP:
-            closures.append(closure(truth, i, i - LAP, independent=i % 7 == 0))
-            graph.add_closure(closures[-1])
-        if i % 9 == 0:
-            graph.update()
+    closures = [closure(truth, i, i - LAP, independent=i % 7 == 0) for i in range(LAP, 3 * LAP)]
+    graph = graph_of(odometry_of(truth, drift=0.3, seed=4), closures, every=9)
     graph.update()
     online = graph.solved.copy()
     final = graph.update(final=True)
