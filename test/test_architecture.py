@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 from ceilings import CEILINGS, excess, sizes
-import cv2
+from evaluation_commands import write_images
 import numpy as np
 import pytest
 
@@ -123,9 +123,8 @@ def test_mapping_and_localization_with_gradient_load_no_torch(tmp_path):
     Where torch is not installed and a driver of CUDA is, as on a Jetson; the memory stays
     small, once the kernels are compiled.
     """
-    rng = np.random.default_rng(0)
-    for i, image in enumerate(rng.integers(0, 256, (40, 48, 64, 3), np.uint8)):
-        cv2.imwrite(str(tmp_path / f'{i:02}.png'), image)
+    noise = np.random.default_rng(0).integers(0, 256, (40, 48, 64, 3), np.uint8)
+    folder = str(write_images(tmp_path / 'images', noise))
     code = f"""
 import ctypes, sys
 library = ctypes.CDLL
@@ -138,10 +137,10 @@ from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 output = ['--output', {str(tmp_path / 'map')!r}, '--features', 'gradient']
-assert main(['--input', {str(tmp_path)!r}, *output]) == 0
+assert main(['--input', {folder!r}, *output]) == 0
 place_map = open_map({str(tmp_path / 'map')!r})
 extractor, recognizer = place_map.extractor(), PlaceRecognizer(place_map, RecognizerSettings())
-images = [frame.image for frame in open_source({str(tmp_path)!r})]
+images = [frame.image for frame in open_source({folder!r})]
 for image in images:
     match = recognizer.update(extractor.extract([image]))
 assert choose_backend('auto') == choose_device('auto') == 'cpu'

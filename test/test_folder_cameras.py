@@ -5,7 +5,7 @@
 from itertools import chain
 from pathlib import Path
 
-import cv2
+from evaluation_commands import write_images
 import pytest
 from stavpr_ros.commands import build_map
 from stavpr_ros.errors import SourceError
@@ -76,9 +76,7 @@ def test_data_sets_of_one_camera_are_read(data_folder):
 
 def test_commands_choose_a_camera(tmp_path, capsys, route):
     for camera in ('cam0', 'cam1'):
-        (tmp_path / camera).mkdir()
-        for i, image in enumerate(route[:4]):
-            cv2.imwrite(str(tmp_path / camera / f'{i}.png'), image)
+        write_images(tmp_path / camera, route[:4])
     options = ['--input', str(tmp_path), '--output', str(tmp_path / 'map.stavpr')]
     assert build_map.main(options) == 1
     assert 'has images of 2 cameras, cam0 (4), cam1 (4)' in capsys.readouterr().err

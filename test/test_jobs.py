@@ -6,7 +6,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-import cv2
+from evaluation_commands import write_images
 from fixtures import route_images
 import pytest
 from stavpr_ros.commands import build_map, jobs
@@ -21,11 +21,7 @@ BUILD_MAP = 'stavpr_ros.commands.build_map'
 def drives(tmp_path_factory):
     """Return folders of images of two drives."""
     root = tmp_path_factory.mktemp('drives')
-    for seed, name in enumerate(NAMES):
-        (root / name).mkdir()
-        for i, image in enumerate(route_images(30, seed)):
-            cv2.imwrite(str(root / name / f'{i:03}.png'), image)
-    return [str(root / name) for name in NAMES]
+    return [str(write_images(root / n, route_images(30, i))) for i, n in enumerate(NAMES)]
 
 
 def ids(folder):

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from unittest.mock import patch
 
+from evaluation_commands import write_images
 from fixtures import route_images
 from map_examples import example_map
 from map_files import changed
@@ -224,13 +225,9 @@ def test_hand_made_codes_are_rejected_by_name(place_map, tmp_path, codes, text):
 
 
 def test_build_map_writes_statistics(tmp_path):
-    from PIL import Image
-
-    (tmp_path / 'images').mkdir()
-    for i, image in enumerate(route_images(12)):
-        Image.fromarray(image).save(tmp_path / 'images' / f'{i:02}.png')
+    images = write_images(tmp_path / 'images', route_images(12))
     output = tmp_path / 'map'
-    assert build_map_main(['--input', str(tmp_path / 'images'), '--output', str(output)]) == 0
+    assert build_map_main(['--input', str(images), '--output', str(output)]) == 0
     found = open_map(output)
     learned = statistics_of_map(load_map(output)).parts()
     for name, array in found.features.statistics.parts().items():

@@ -90,20 +90,6 @@ def test_features_that_are_not_finite_are_rejected(saved):
         extractor(path, scale=1e36)
 
 
-@pytest.mark.parametrize(
-    ('changes', 'error', 'named'),
-    [
-        ({'layer': 'fire'}, SettingsError, r"no layer 'fire'.*y"),
-        ({'channels': 'hsv'}, SettingsError, 'take one of rgb, bgr'),
-        ({'sha256': '0' * 64}, FeatureMismatchError, 'sha256'),
-        ({'path': Path(__file__)}, UnavailableError, 'no usable ONNX model'),
-    ],
-)
-def test_wrong_settings_are_rejected_by_name(saved, changes, error, named):
-    with pytest.raises(error, match=named):
-        extractor(**{'path': saved()} | changes)
-
-
 @pytest.mark.parametrize('batch', ['b', 1, 4])
 def test_batch_of_convolutions_may_be_stated(saved, batch):
     made = extractor(saved(shape=(batch, 3, 64, 64)))
@@ -206,18 +192,21 @@ def test_nodes_after_the_layer_are_not_computed(saved):
 
 
 @pytest.mark.parametrize(
-    ('changes', 'named'),
+    ('network', 'changes', 'named'),
     [
-        ({'shape': (1, 3, 96, 96)}, r'\(1, 3, 96, 96\).* not \(n, 3, 64, 64\): set size = 96'),
-        ({'shape': ('b', 3, 64, 96)}, 'square RGB images'),
-        ({'shape': ('b', 64, 64, 3)}, r'\(0, 64, 64, 3\).*square RGB images'),
-        ({'shape': ('b', 1, 64, 64)}, 'square RGB images'),
-        ({'dtype': onnx.TensorProto.UINT8}, "input 'x' is of ONNX type 2, expected 1"),
+        ({}, {'layer': 'fire'}, r"no layer 'fire'.*y"),
+        ({}, {'channels': 'hsv'}, 'take one of rgb, bgr'),
+        ({}, {'sha256': '0' * 64}, 'sha256'),
+        ({'shape': (1, 3, 96, 96)}, {}, r'\(1, 3, 96, 96\).* not \(n, 3, 64, 64\): set size = 96'),
+        ({'shape': ('b', 3, 64, 96)}, {}, 'square RGB images'),
+        ({'shape': ('b', 64, 64, 3)}, {}, r'\(0, 64, 64, 3\).*square RGB images'),
+        ({'shape': ('b', 1, 64, 64)}, {}, 'square RGB images'),
+        ({'dtype': onnx.TensorProto.UINT8}, {}, "input 'x' is of ONNX type 2, expected 1"),
     ],
 )
-def test_other_inputs_are_rejected_by_name(saved, changes, named):
-    with pytest.raises((SettingsError, UnavailableError), match=named):
-        extractor(saved(**changes))
+def test_other_inputs_and_settings_are_rejected_by_name(saved, network, changes, named):
+    with pytest.raises((FeatureMismatchError, SettingsError, UnavailableError), match=named):
+        extractor(saved(**network), **changes)
 
 
 @pytest.mark.parametrize(
@@ -235,6 +224,8 @@ def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(saved, node, 
 
 
 def test_weights_in_another_file_are_rejected_with_the_remedy(saved, tmp_path):
+    with pytest.raises(UnavailableError, match='no usable ONNX model'):
+        extractor(Path(__file__))
     model = onnx.load(saved())
     path = tmp_path / 'b.onnx'
     onnx.save(model, path, save_as_external_data=True, location='b.bin', size_threshold=0)

@@ -11,7 +11,7 @@ import sys
 import threading
 from xml.etree import ElementTree
 
-import cv2
+from evaluation_commands import write_images
 import numpy as np
 from processes import DOMAIN, environment, TIMEOUT
 import pytest
@@ -234,14 +234,12 @@ def test_replay_after_a_signal_ends_at_once(tmp_path, subscribe, sent):
 
 
 def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, route, replay):
-    for i, image in enumerate(route[:4]):
-        cv2.imwrite(str(tmp_path / f'{i}.png'), image)
-    (tmp_path / '2.png').write_bytes(b'damaged')
-    subscriber = subscribe()
-    code, output, errors = replay(tmp_path, '--fps', '20', '--rate', '2')
+    folder, subscriber = write_images(tmp_path / 'images', route[:4]), subscribe()
+    (folder / '002.png').write_bytes(b'damaged')
+    code, output, errors = replay(folder, '--fps', '20', '--rate', '2')
     assert code == 0
     assert '1 skipped' in output
-    assert '2.png: 7 bytes are no image' in errors
+    assert '002.png: 7 bytes are no image' in errors
     assert errors.endswith('left out: 1 images that are damaged\n')
     assert subscriber.milliseconds() == [50, 100, 200]
 

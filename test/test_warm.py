@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import cv2
+from evaluation_commands import write_images
 import numpy as np
 from processes import environment, TIMEOUT
 import pytest
@@ -45,10 +46,8 @@ def test_nothing_is_compiled_after_warm(tmp_path, route):
     """In an empty cache folder, by operations on maps of one and several sessions, and graphs."""
     dice = np.random.default_rng(0)
     for day in ('monday', 'tuesday'):
-        (tmp_path / day).mkdir()
-        for number, image in enumerate(route):
-            noise = dice.integers(0, 20, image.shape).astype(np.uint8)
-            cv2.imwrite(str(tmp_path / day / f'{number:02}.png'), cv2.add(image, noise))
+        noise = dice.integers(0, 20, (len(route), *route[0].shape)).astype(np.uint8)
+        write_images(tmp_path / day, map(cv2.add, route, noise))
     edges = [(i, i + 1) for i in range(39)] + [(i, i + 20) for i in range(20)]
     lines = [f'EDGE_SE2 {i} {j} {i % 2} 0 0 9 0 0 9 0 9' for i, j in edges]
     (tmp_path / 'graph.g2o').write_text('\n'.join(lines))

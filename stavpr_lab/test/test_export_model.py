@@ -247,18 +247,12 @@ def test_export_names_what_is_wrong(run, repository, tmp_path, name, options, co
     assert not path.exists()
 
 
-# ------------------------------------------------ quantized networks
-
-
-@pytest.fixture(scope='module')
-def quantized(repository, tmp_path_factory):
-    """Return ONNX files of a network in float32 and, quantized with its calibration, in int8."""
+def test_int8_layer_of_quantized_numbers_is_rejected(repository, tmp_path):
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, quantize_static
 
-    folder = tmp_path_factory.mktemp('int8')
     network = original(repository, 'pooled', backbone='ResNet50', fc_output_dim=16)
-    batch = batch_of(images(8))
-    torch.onnx.export(network, (batch,), folder / 'net.onnx', dynamo=False, opset_version=17,
+    batch, path = batch_of(images(8)), tmp_path / 'int8.onnx'
+    torch.onnx.export(network, (batch,), tmp_path / 'net.onnx', dynamo=False, opset_version=17,
                       input_names=['image'], dynamic_axes={'image': {0: 'batch'}})  # fmt: skip
 
     class Reader(CalibrationDataReader):
@@ -268,13 +262,7 @@ def quantized(repository, tmp_path_factory):
         def get_next(self):
             return self.left.pop() if self.left else None
 
-    for name in ('QDQ', 'QOperator'):
-        quantize_static(folder / 'net.onnx', folder / f'{name}.onnx', Reader(), QuantFormat[name])
-    return folder
-
-
-def test_int8_layer_of_quantized_numbers_is_rejected(quantized):
-    path = quantized / 'QOperator.onnx'
+    quantize_static(tmp_path / 'net.onnx', path, Reader(), QuantFormat.QOperator)
     node = next(n for n in onnx.load(path).graph.node if n.op_type == 'QLinearConv')
     settings = settings_class('onnx')(model=str(path), layer=node.output[0], size=SIZE)
     with pytest.raises((SettingsError, UnavailableError), match='quantized numbers'):

@@ -14,13 +14,6 @@ from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.messages import time_message
 
 
-@pytest.fixture
-def context():
-    rclpy.init(domain_id=DOMAIN)
-    yield rclpy.get_default_context()
-    rclpy.try_shutdown()
-
-
 def offsets(share: float, coherent: bool) -> np.ndarray:
     """Return how far the chosen places of 200 closures are from their own."""
     false = FalsePlaces(share, coherent, 1)
@@ -41,7 +34,7 @@ def test_false_places_coherent_are_runs():
     assert not (changes % RUN).any()
 
 
-def test_false_closure_is_relayed_with_the_stamps_of_its_place(context, monkeypatch):
+def test_false_closure_is_relayed_with_the_stamps_of_its_place(default_context, monkeypatch):
     sent = []
     monkeypatch.setattr(
         rclpy.publisher.Publisher, 'publish', lambda _, message: sent.append(message)

@@ -8,7 +8,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 from geometry_msgs.msg import TransformStamped
-from processes import DOMAIN, SECOND
+from processes import SECOND
 import pytest
 import rclpy
 from sensor_msgs.msg import CameraInfo
@@ -17,13 +17,6 @@ from stavpr_ros.ros.sensors import CameraInput
 from stavpr_slam.pose_graph import PoseGraph
 from stavpr_slam.ros.graph_messages import closure_of
 from test_pose_graph import circle, odometry_of
-
-
-@pytest.fixture
-def context():
-    rclpy.init(domain_id=DOMAIN)
-    yield rclpy.get_default_context()
-    rclpy.try_shutdown()
 
 
 @pytest.mark.parametrize(
@@ -55,7 +48,7 @@ def test_pose_graph_with_stamps_that_jump_back_begins_a_session():
     assert 'the stamps jumped back' in graph.chain.breaks[0][1]
 
 
-def test_camera_transform_of_tf_is_looked_up(context, monkeypatch):
+def test_camera_transform_of_tf_is_looked_up(default_context, monkeypatch):
     """A stand-in of the interface of tf2_ros: Buffer, TransformListener, lookup_transform."""
     asked, ended = [], []
 
@@ -76,7 +69,7 @@ def test_camera_transform_of_tf_is_looked_up(context, monkeypatch):
         unregister=lambda: ended.append(True)
     )
     monkeypatch.setitem(sys.modules, 'tf2_ros', module)
-    node = rclpy.create_node('camera_test', context=context)
+    node = rclpy.create_node('camera_test', context=default_context)
     camera = CameraInput(node, '')
     k = [300.0, 0.0, 159.5, 0.0, 300.0, 119.5, 0.0, 0.0, 1.0]
     camera._on_info(CameraInfo(width=320, height=240, k=k))

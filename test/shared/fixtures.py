@@ -137,6 +137,16 @@ def context():
 
 
 @pytest.fixture
+def default_context():
+    """Yield the default ROS context, initialized."""
+    import rclpy
+
+    rclpy.init(domain_id=DOMAIN)
+    yield rclpy.get_default_context()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
 def image_input(context, request):
     """Return the input of a node, by its transport: images are given to it and ``passed`` on."""
     from stavpr_ros.pipeline.statistics import Statistics
