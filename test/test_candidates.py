@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Candidates: non-maximum suppression against a plain loop, and those of a recognizer."""
 
-import dataclasses
 import math
 
 from hypothesis import given
@@ -86,14 +85,5 @@ def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
         assert len(ranked) == 4 or mode == 'robust'  # of other places, nothing is left
     one.reset()
     assert one.ranked(3) == []
-
-
-def test_ranked_on_empty_map_is_empty(small_map):
-    optional = {'stamps': small_map.stamps[:0], 'ids': (), 'poses': None, 'thumbnails': ()}
-    empty = dataclasses.replace(small_map, features=small_map.features[0:0], **optional)
-    one = PlaceRecognizer(empty, RecognizerSettings(mode='paper', sequence=SHORT))
-    for i in range(6):
-        one.update(small_map.features[i : i + 1])
-    assert one.ranked(5) == []
     with pytest.raises(InputError, match='-1'):
         one.ranked(-1)

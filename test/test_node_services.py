@@ -19,8 +19,6 @@ from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.pipeline import read_map
 from stavpr_ros.ros import map_loading, runtime
-from stavpr_ros.ros.qos import LATCHED
-from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 PAPER = {'mode': 'paper', 'threshold': 0.2}  # certain after one window
@@ -274,22 +272,3 @@ def test_relocalize_returns_the_last_match_with_candidates_and_pose(robot, start
     response = robot.does(Relocalize, 'relocalize')  # though there is no match
     assert (str(response.match), response.message) == (str(strange), strange.reason)
     assert (response.has_pose, response.pose) == (False, PoseWithCovarianceStamped())
-
-
-def test_node_records_a_session_on_a_map_and_publishes_where_the_robot_is(
-    robot, start, route, map_file, tmp_path
-):
-    node = start(operation='mapping', localized_probability=0.05)
-    localized = robot.listen(Bool, '/stavpr/localized', LATCHED)
-    matches = robot.drive(route[20:40])
-    assert {match.status for match in matches} <= {PlaceMatch.MATCH, PlaceMatch.MAPPED}
-    assert matches[-1].status == PlaceMatch.MATCH
-    assert abs(matches[-1].newest_index - 39) <= 1
-    assert matches[-1].map_id == load_map(map_file).map_id
-    robot.until(lambda: bool(localized) and localized[-1].data, 'being localized')
-    robot.until_map(state='growing', places=80, sessions=['route'])
-    robot.until_diagnosed('recognition', DiagnosticStatus.OK, 'images matched')
-    robot.does(SaveMap, 'save_map', path=str(tmp_path / 'both.stavpr'))
-    both = load_map(tmp_path / 'both.stavpr')
-    assert [session.id for session in both.sessions] == ['route', 'recorded-1']
-    assert node.state == 'active'

@@ -71,7 +71,9 @@ def test_recognizer_at_threshold_does_not_match(small_map, route):
 
 @pytest.mark.parametrize('mode', ['paper', 'robust'])
 def test_recognizer_on_empty_map_never_matches(small_map, mode):
-    answers = recognize_all(recognizer(empty_map(small_map), mode=mode), small_map.features[:7])
+    one = recognizer(empty_map(small_map), mode=mode)
+    answers = recognize_all(one, small_map.features[:7])
+    assert one.ranked(5) == []
     assert answers[-1].status is Status.NO_MATCH
     assert answers[-1].place_index == -1
     assert 'empty' in answers[-1].reason

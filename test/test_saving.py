@@ -71,11 +71,6 @@ def test_save_recorded_map_that_fails_logs_the_loss(mapping, tmp_path):
     assert at_the_end(mapping, '') == lost
 
 
-def test_save_recorded_map_with_a_busy_worker_logs_it(mapping):
-    ((level, text),) = at_the_end(mapping, 'x', Mock(side_effect=TimeoutError))
-    assert (level, 'the worker is still busy' in text) == ('error', True)
-
-
 def test_save_recorded_map_of_a_route_writes_to_save_path_only(route, tmp_path):
     path = tmp_path / 'loop.stavpr'
     pipeline = Pipeline(settings_of(), 'loop_closure')

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from pipelines import settings_of
 import pytest
+from raw_images import padded
 from stavpr_ros.commands.build_map import _Images
 from stavpr_ros.errors import ImageError
 from stavpr_ros.features import FeatureExtractor
@@ -52,11 +53,10 @@ def block_means(image, divisor):
 def raw(image, encoding='rgb8', padding=0):
     """Return the message of an image with padded rows."""
     rows = np.ascontiguousarray(ENCODERS[encoding](image))
-    rows = rows.reshape(len(rows), -1).view(np.uint8)
-    rows = np.pad(rows, ((0, 0), (0, padding)))
+    step, data = padded(rows.reshape(len(rows), -1).view(np.uint8), padding)
     height, width = image.shape[:2]
     fields = {'height': height, 'width': width, 'encoding': encoding, 'is_bigendian': 0}
-    return SimpleNamespace(**fields, step=rows.shape[1], data=rows.reshape(-1))
+    return SimpleNamespace(**fields, step=step, data=data)
 
 
 def compressed(image, suffix):

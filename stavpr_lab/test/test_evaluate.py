@@ -386,6 +386,7 @@ LOOP, PAIR = '--query x --loop-closure --truth y', '--map x --query y'
         (f'{PAIR} --remove-from-map 3-4', 2, "'3-4': expected two whole"),
         (f'{PAIR} --exclude-places 9', 2, 'goes with --loop-closure'),
         (f'{PAIR} --map-poses z', 2, '--truth poses'),
+        (f'{PAIR} c --window 3', 2, '--window goes with one --query'),
         (f'{PAIR} --json /missing/x.json', 1, 'does not exist'),
         (f'{PAIR} --output {__file__}', 1, 'takes a folder'),
     ],

@@ -144,9 +144,3 @@ def test_evaluate_of_several_queries_equals_each(run, pair, vectors, tmp_path):
     for name in ('sequence', 'single', 'decision', 'calibration', 'map_id'):
         assert one[name] == other[name]
     assert (tmp_path / 'out' / 'other' / 'report.html').is_file()
-
-
-def test_several_queries_reject_options_of_one(capfd):
-    with pytest.raises(SystemExit):
-        evaluate.main(['--map', 'a', '--query', 'b', 'c', '--window', '3'])
-    assert '--window goes with one --query' in capfd.readouterr().err

@@ -176,7 +176,9 @@ def test_from_file_reads_arrays(tmp_path, array):
     np.save(tmp_path / 'truth.npy', array)
     np.savez(tmp_path / 'one.npz', anything=array)
     np.savez_compressed(tmp_path / 'several.npz', truth=array, other=np.zeros(2))
-    for name in ('truth.npy', 'one.npz', 'several.npz'):
+    cv2.imwrite(str(tmp_path / 'truth.png'), MATRIX.astype(np.uint8))
+    cv2.imwrite(str(tmp_path / 'truth.bmp'), (MATRIX * 255).astype(np.uint8))
+    for name in ('truth.npy', 'one.npz', 'several.npz', 'truth.png', 'truth.bmp'):
         np.testing.assert_array_equal(GroundTruth.from_file(tmp_path / name, 3, 5).pairs, PAIRS)
 
 
@@ -212,12 +214,6 @@ def test_from_file_of_a_pickle_or_an_archive_without_arrays_raises(tmp_path):
         archive.writestr('truth', 'no array')
     with pytest.raises(SourceError, match=r'text\.npz has truth: expected one array'):
         GroundTruth.from_file(tmp_path / 'text.npz', 3, 5)
-
-
-def test_from_file_reads_black_and_white_images(tmp_path):
-    for name, white in (('truth.png', 1), ('truth.bmp', 255)):
-        cv2.imwrite(str(tmp_path / name), (MATRIX * white).astype(np.uint8))
-        np.testing.assert_array_equal(GroundTruth.from_file(tmp_path / name, 3, 5).pairs, PAIRS)
 
 
 def test_from_file_of_an_invalid_image_raises(tmp_path):
