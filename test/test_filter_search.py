@@ -8,7 +8,7 @@ from itertools import pairwise, product
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
-from places import features_of, map_of, route_strips
+from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.filter.motion import MAX_LAG
@@ -35,8 +35,7 @@ def recognizer(route):
 
 
 def drive(recognizer, strips, noise=1.0, seed=1):
-    features = features_of(strips, noise, seed)
-    return [recognizer.update(features[i : i + 1]) for i in range(len(features))]
+    return recognize_all(recognizer, features_of(strips, noise, seed))
 
 
 def at_speed(first, last, speed):

@@ -3,7 +3,7 @@
 """Means of places over the latest images, and loop closure on a new street in a known light."""
 
 import numpy as np
-from places import features_of, route_strips
+from places import features_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.filter.place_means import DELAY, IMAGES, NEAREST, PlaceMeans, PRIOR
 from stavpr_ros.recognition import RecognizerSettings
@@ -59,7 +59,7 @@ def drive(strips, noise=0.3):
     """Return the matches of a route with images of these strips."""
     features = features_of(strips, noise)
     closer = LoopCloser(RecognizerSettings(mode='robust'), EXCLUDED, features.settings)
-    return [closer.update(features[i : i + 1]) for i in range(len(features))]
+    return recognize_all(closer, features)
 
 
 def with_shared_content(seed, amount):

@@ -8,7 +8,7 @@ from map_examples import example_map
 import map_reader
 import numpy as np
 import oracle
-from places import features_of, map_of, route_strips
+from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
@@ -57,8 +57,7 @@ def recognizer(place_map, mode='robust'):
 
 
 def recognize(place_map, query, mode='robust'):
-    one = recognizer(place_map, mode)
-    return [one.update(query[i : i + 1]) for i in range(len(query))]
+    return recognize_all(recognizer(place_map, mode), query)
 
 
 def test_filter_of_sessions_equals_plain_loops():

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from places import recognize_all
 import pytest
-from robot import image_message
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.errors import FeatureMismatchError
 from stavpr_ros.features import FeatureExtractor
@@ -53,8 +53,7 @@ def thermal_map(folders):
 
 
 def matches(place_map, query):
-    recognizer = PlaceRecognizer(place_map, RecognizerSettings())
-    results = [recognizer.update(query[i : i + 1]) for i in range(len(query))]
+    results = recognize_all(PlaceRecognizer(place_map, RecognizerSettings()), query)
     return [result.newest_index for result in results if result.status is Status.MATCH]
 
 
@@ -149,10 +148,3 @@ def test_pipeline_finds_the_range_before_its_first_place(drives, thermal_map, op
     expected = thermal_map.features.strips[:, 20:]
     np.testing.assert_allclose(places.features.strips, expected, atol=1e-6)
     assert places.snapshot().settings == thermal_map.settings
-
-
-def test_pipeline_of_images_of_8_bits_begins_at_once(drives):
-    pipeline = Pipeline(PipelineSettings(features='gradient'), 'mapping')
-    image = np.repeat(scale((LOW, HIGH))(drives[0][0])[..., None], 3, 2)
-    assert pipeline.operation.process(image_message(image), 1).status is Status.MAPPED
-    assert pipeline.places.settings.value_range is None

@@ -12,19 +12,6 @@ import setup_venv
 GROUPS = ('torch', *(f'locked/{name}' for name in ('base', *setup_venv.LOCKED_EXTRAS)))
 
 
-@pytest.fixture
-def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Make a checkout in which nothing is installed and every requirement is ``fake``."""
-    for name in ('requirements/locked', 'stavpr_msgs', 'stavpr_ros'):
-        (tmp_path / name).mkdir(parents=True)
-    for name in GROUPS:
-        (tmp_path / 'requirements' / f'{name}.txt').write_text('fake==1\n')
-    (tmp_path / 'requirements' / 'constraints.txt').touch()
-    monkeypatch.setattr(setup_venv, 'ROOT', tmp_path)
-    monkeypatch.setattr(setup_venv, 'machine_problems', list)
-    return tmp_path
-
-
 class Recorder:
     """Replaces ``run_logged``: records the commands."""
 
@@ -48,8 +35,16 @@ class Recorder:
 
 
 @pytest.fixture
-def recorder(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
-    recorder = Recorder(checkout)
+def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    """Record in a checkout in which nothing is installed and every requirement is ``fake``."""
+    for name in ('requirements/locked', 'stavpr_msgs', 'stavpr_ros'):
+        (tmp_path / name).mkdir(parents=True)
+    for name in GROUPS:
+        (tmp_path / 'requirements' / f'{name}.txt').write_text('fake==1\n')
+    (tmp_path / 'requirements' / 'constraints.txt').touch()
+    recorder = Recorder(tmp_path)
+    monkeypatch.setattr(setup_venv, 'ROOT', tmp_path)
+    monkeypatch.setattr(setup_venv, 'machine_problems', list)
     monkeypatch.setattr(setup_venv, 'run_logged', recorder)
     return recorder
 
