@@ -430,8 +430,8 @@ RENAMED = {'keyframe_angle': 'keyframe_angle_deg'}
 # parameters without effect, named in a warning until version 1.1: what to do instead
 REMOVED = {
     'verifier': 'verify closures in a node of your own, which subscribes to ~/loop_closure',
-    'time_budget_ms': '`stavpr map compact MAP OUTPUT --pca 64` and precision int8 match a '
-    'million places within 60 ms',
+    'time_budget_ms': 'reduce the map by `stavpr map compact MAP OUTPUT --pca 64`, and take '
+    'precision int8',
 }
 
 

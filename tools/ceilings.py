@@ -22,7 +22,7 @@ CEILINGS = {
     'lines of the method (filter, prepare, recognition)': 7_321,
     'lines of all tests': 33_671,
     'lines of benchmarks and tools': 8_040,
-    'lines of docs and README': 4_029,
+    'lines of docs and README': 4_030,
     'parameters of the node': 51,
     'numbers in constants of the method': 167,
 }
