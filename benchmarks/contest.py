@@ -3,10 +3,11 @@
 """
 The contest of three methods: today's, today's less single mechanisms, and a small filter.
 
-``python benchmarks/contest.py``; ``--quick``: fewer drives; ``--rows a c``, ``--features g``. Rows:
-a, mode robust with its defaults; b, the same with one mechanism removed, each in a process of its
-own; c, the small filter of contest_filter.py on the same distances. Whatever is fitted is fitted
-without the set that it is shown on. Writes contest.md and contest.json to benchmarks/results/.
+``python benchmarks/contest.py``; ``--quick``: fewer drives; ``--rows a c``, ``--features g``.
+Rows: a, mode robust with its defaults; b, the same with one mechanism removed, each in a process
+of its own; c, the small filter of contest_filter.py on the same distances. What is fitted is
+fitted without the set that it is shown on. Writes contest.md and contest.json to
+benchmarks/results/.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,13 +24,14 @@ from accuracy import short_cases
 from contest_filter import SmallFilter, SmallModel
 import cv2
 from data import data_folder
-import numpy as np
 from numba.core.caching import NullCache
+import numpy as np
 from off_map import extracted, extractor, Pair, stretches
 from off_map_page import HYBRID, KINDS
 from results import environment, heading, options_parser, table, write_json, write_lines
 from sessions import LAP, path
-from stavpr_lab.evaluation.drive import Drive as ChangedDrive, DriveChanges
+from stavpr_lab.evaluation.drive import Drive as ChangedDrive
+from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -60,7 +62,9 @@ DAMAGES = 'dark', 'covered', 'rolled', 'rain', 'crop 0.14'
 ERRORS = 0.05, 0.01
 SURE = float(np.log(1 / (1 / least_probability(0.01) - 1)))  # log odds of today's .01
 A = {'p': 0, 'lead': 1, 'cells': 2, 'recent': 3}  # columns of the quantities of row a
-C = {'belief': 0, 'lead': 1, 'cells': 2, 'creep': 3, 'share': 4}  # of row c
+C = {'belief': 0, 'lead': 1, 'cells': 2, 'excess': 3, 'share': 4, 'uneven': 5}  # of row c
+LIKELY, SURE_OF_OWN = 0.5, 3.4  # log odds of the regression alone, as today's limits
+CERTAIN, MOST_CHECKED = 6.0, 7.0  # log odds of the belief at most; after the checks
 
 
 # ------------------------------------------------ sets
@@ -294,7 +298,6 @@ def _no_stamps() -> None:
 
 
 SETTINGS = RecognizerSettings()
-# numbers of HOUSE's list of mechanisms are not used: names only
 MECHANISMS: dict[str, Callable[[], Any]] = {
     'evenness of z': _constants(checks, UNEVEN_WEIGHT=0.0),
     'excess motion': _constants(checks, EXCESS_WEIGHT=0.0),
@@ -402,7 +405,8 @@ def recorded(drive: Drive, with_small: bool) -> tuple[np.ndarray, np.ndarray]:
         cells = CellAgreement(window.cells._cells, strips_of, LENGTH)
     for i, stamp in enumerate(drive.stamps.tolist()):
         recorder.recognizer.update(drive.features[i : i + 1], stamp)
-        if not with_small or window.is_standstill:
+        is_dark = small.count and window.change.is_dark_stretch(small.by_place)
+        if not with_small or (window.is_standstill and not is_dark):
             continue
         kept.append(i)
         small.update(recorder.recognizer.newest_row()[:n])
@@ -413,16 +417,18 @@ def recorded(drive: Drive, with_small: bool) -> tuple[np.ndarray, np.ndarray]:
         l, agreeing = min(small.count, LENGTH), 0.0
         if cells is not None:
             agreeing = cells.lead(np.ones(l, bool), shown.path, shown.competitor)
-        creep = max(window.change.excess(max(shown.speed, 0.0)), 0.0)
         image = kept[len(kept) - l + shown.position]
         row = image, round(shown.place), 0 if l == LENGTH else l, 0.0
+        excess = window.change.excess(max(shown.speed, 0.0))
+        uneven = checks.unevenness(shown.path, shown.z)
         leads = np.log1p(l * shown.lead), np.log1p(max(agreeing, 0.0))
-        rows.append((*row, _log_odds(shown.belief), *leads, creep, shown.share))
+        rows.append((*row, _log_odds(shown.belief), *leads, excess, shown.share, uneven))
     width = 4 + len(A), 4 + len(C)
-    return tuple(
+    of_today, of_small = (
         np.array(each, float).reshape(-1, size)
         for each, size in zip((recorder.rows, rows), width, strict=True)
-    )  # type: ignore
+    )
+    return (of_today, np.arange(len(drive.images))), (of_small, np.array(kept))
 
 
 def record(feature: str, mechanism: str, quick: bool, sets: Path, to: Path) -> None:
@@ -431,6 +437,8 @@ def record(feature: str, mechanism: str, quick: bool, sets: Path, to: Path) -> N
         MECHANISMS[mechanism]()
     with sets.open('rb') as file:
         every = list(drives(pickle.load(file), quick))
+    if mechanism:  # nothing is fitted on it
+        every = [replace(d, stamps=d.stamps[:0]) if d.use == 'fit' else d for d in every]
     began = time.perf_counter()
     windows = [recorded(each, not mechanism) for each in every]
     to.write_bytes(pickle.dumps(windows))
@@ -462,19 +470,18 @@ class Windows:
     def of(cls, every: Sequence[Drive], rows: Sequence[np.ndarray], feature: str) -> 'Windows':
         """Judge what windows show; images that have no whole window are of no place."""
         parts = []
-        for number, (drive, of_drive) in enumerate(zip(every, rows, strict=True)):
+        for number, (drive, (of_drive, moved)) in enumerate(zip(every, rows, strict=True)):
             whole = of_drive[:, 2] == 0
             early, full = of_drive[~whole], of_drive[whole]
             full = full[np.unique(full[:, 0], return_index=True)[1]]
             counted = _counted(drive.images)
-            at = np.searchsorted(full[:, 0], counted, 'right') - 1
-            shown = np.zeros((len(counted), of_drive.shape[1]))
-            shown[:, 1], shown[:, 3:5] = -1, _log_odds(0)
             # an image of a camera at rest has the match of the last one that moved
-            known = at >= 0
-            shown[known] = full[at[known]]
-            at_rest = known & (drive.images[full[at][:, 0].astype(int)] != drive.images[counted])
-            shown[at_rest, 1], shown[at_rest, 3:5] = -1, _log_odds(0)
+            last = moved[np.searchsorted(moved, counted, 'right') - 1]
+            full = np.append(full, np.full((1, full.shape[1]), np.inf), axis=0)
+            at = np.searchsorted(full[:, 0], last)
+            shown = full[at]
+            is_missing = shown[:, 0] != last
+            shown[is_missing], shown[is_missing, 1], shown[is_missing, 3:5] = 0, -1, _log_odds(0)
             images = np.append(counted, early[:, 0]).astype(int)
             both = np.concatenate([shown, early])
             right = has = unseen = np.zeros(len(images), bool)
@@ -545,18 +552,15 @@ class Scores(NamedTuple):
 
     log_odds: np.ndarray
     thresholds: tuple[np.ndarray, ...]
-    weights: dict[str, list[float]] = {}
+    weights: dict[str, list[float]]
 
 
-def left_out(windows: Windows, every: Sequence[Drive], columns: Sequence[int]) -> Scores:
-    """
-    Score each window by a fit on drives without its groups, with thresholds of the same drives.
-
-    :param columns: of the quantities; none = the score of the row itself.
-    """
+def left_out(row: 'Row', every: Sequence[Drive]) -> Scores:
+    """Score each window by a fit on drives without its groups, with thresholds of the same."""
+    windows = row.scored
     features, groups = np.unique(windows.feature), [frozenset(d.groups) for d in every]
     constants = (windows.feature[:, None] == features).astype(float)
-    x = np.concatenate([windows.x[:, list(columns)], constants], axis=1)
+    x = np.concatenate([windows.x, constants], axis=1)
     weights, log_odds = fit_weights(windows, every), windows.score.copy()
     thresholds = tuple(np.zeros(len(x)) for _ in (0.5, *ERRORS))
     sets = np.array([d.kind for d in every])[windows.drive]
@@ -566,16 +570,30 @@ def left_out(windows: Windows, every: Sequence[Drive], columns: Sequence[int]) -
         own = np.array([each == fold for each in groups])[windows.drive]
         train = (weights > 0) & np.array([not each & fold for each in groups])[windows.drive]
         score = log_odds
-        if len(columns):
+        if windows.x.shape[1]:
             of_windows = weights[train] / weights[train].mean()
             w = fit(x[train], windows.right[train], of_windows)
             of_fold[' '.join(sorted(fold))] = np.round(w, 3).tolist()
             score = x @ w
+            if row.recent:
+                score = score + row.recent * recent_odds(windows, score)
             log_odds[own] = score[own]
         rows = train & is_drive & ~windows.early
         for threshold, error in zip(thresholds[1:], ERRORS, strict=True):
             threshold[own] = least_score(score[rows], windows.right[rows], sets[rows], error)
     return Scores(log_odds, thresholds, of_fold)
+
+
+def recent_odds(windows: Windows, scores: np.ndarray) -> np.ndarray:
+    """Return the log odds of the share of a drive's windows that are likely, at most 0, (M,)."""
+    odds, before = np.zeros(len(scores)), None
+    for i in np.flatnonzero(~windows.early):
+        if before != (windows.feature[i], windows.drive[i]):
+            before, recent = (windows.feature[i], windows.drive[i]), evidence.RecentWindows()
+        odds[i] = min(_log_odds(recent.share, evidence.MIN_RECENT), 0.0)
+        is_likely, is_sure = scores[i] > LIKELY, scores[i] > SURE_OF_OWN
+        recent.add(np.inf if is_sure else 0.0 if is_likely else -np.inf)  # between the limits
+    return odds
 
 
 def least_score(scores: np.ndarray, right: np.ndarray, sets: np.ndarray, error: float) -> float:
@@ -727,9 +745,12 @@ not seen the set: groups are Gardens Point with the walk, corridor, Nordland, of
 halves of the tower, reverse drives, and each pair of unrelated routes with both its groups.
 
 Rows: a, mode robust as it is; a refit, its quantities with weights fitted like c's; c, the small
-filter (benchmarks/contest_filter.py); c less share, without the share of recent windows that
-agree. *Equal matches off the map*: the threshold at which as many images off the map are matched
-as by row a at .5, and at its .01.
+filter (benchmarks/contest_filter.py: belief, lead, cells, creep, share of recent windows that
+agree); c less share, without the last one; checks, the odds of its belief, at most e^6, are
+multiplied by today's factor of evenness and excess motion instead of creep; recent, instead of the
+share, w min(0, ln(r / (1 - r))) is added, with today's share r of likely and sure windows. Today's
+w is 2.5 in units of a fitted regression; w is not fitted. *Equal matches off the map*: the
+threshold at which as many images off the map are matched as by row a at .5, and at its .01.
 """
 REMOVED = """
 Change of recall at equal matches off the map, mean of the sets and the worst set. Terms of the
@@ -738,6 +759,42 @@ regression are compared with a refit without them, the others with row a.
 
 
 # ------------------------------------------------ command
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """
+    A row of the contest.
+
+    :param quantities: of the regression, (M, Q); none = the row has log odds.
+    :param recent: weight of the log odds of :class:`RecentWindows`, below one half.
+    """
+
+    windows: Windows
+    quantities: np.ndarray | None = None
+    recent: float = 0.0
+
+    @property
+    def scored(self) -> Windows:
+        """Return the windows with the quantities of the regression."""
+        x = self.windows.x[:, :0] if self.quantities is None else self.quantities
+        return replace(self.windows, x=x)
+
+
+def small_rows(windows: Windows) -> Iterator[tuple[str, Row]]:
+    """Yield the rows of the small filter: as it is, and with mechanisms of today's method."""
+    belief, lead, cells, excess, share, uneven = windows.x.T
+    creep = np.clip(excess - checks.EXCESS, 0, 1)
+    yield 'c', Row(windows, np.stack([belief, lead, cells, creep, share], 1))
+    yield 'c less share', Row(windows, np.stack([belief, lead, cells, creep], 1))
+    certain = np.clip(belief, -CERTAIN, CERTAIN)
+    plain = np.stack([certain, lead, cells, creep], 1)
+    yield 'c, recent 5', Row(windows, plain, 5.0)
+    checked = certain - checks.UNEVEN_WEIGHT * uneven - checks.EXCESS_WEIGHT * creep
+    after = np.stack([np.clip(checked, -MOST_CHECKED, MOST_CHECKED), lead, cells], 1)
+    yield 'c, checks', Row(windows, after)
+    for weight in (2.5, 5.0):
+        yield f'c, checks, recent {weight:g}', Row(windows, after, weight)
 
 
 def results_of(
@@ -750,23 +807,22 @@ def results_of(
         rows = {f: [each[side] for each in shown[f, mechanism]] for f in features}
         return Windows.pooled([Windows.of(every, rows[f], f) for f in features])
 
-    now, equal = pooled('', 0), {feature: {} for feature in features}
-    rows: dict[str, tuple[Windows, Sequence[int]]] = {'a': (now, ()), 'a refit': (now, range(4))}
-    if with_small:
-        small = pooled('', 1)
-        rows |= {'c': (small, list(C.values())), 'c less share': (small, list(C.values())[:-1])}
+    now = pooled('', 0)
+    rows = {'a': Row(now), 'a refit': Row(now, now.x)}
+    rows |= dict(small_rows(pooled('', 1))) if with_small else {}
     if any(mechanism for _, mechanism in shown):
-        rows |= {f'b {name}': (now, columns) for name, columns in TERMS.items()}
+        rows |= {f'b {name}': Row(now, now.x[:, columns]) for name, columns in TERMS.items()}
     for mechanism in dict.fromkeys(name for _, name in shown if name):
-        rows[f'b {mechanism}'] = pooled(mechanism, 0), ()
+        rows[f'b {mechanism}'] = Row(pooled(mechanism, 0))
     results: dict[str, dict[str, Any]] = {feature: {} for feature in features}
-    for name, (windows, columns) in rows.items():
-        scores = left_out(windows, every, columns)
+    equal: dict[str, dict[str, int]] = {feature: {} for feature in features}
+    for name, row in rows.items():
+        scores = left_out(row, every)
         for feature in features:
-            row = numbers(windows, every, feature, scores, equal[feature])
-            results[feature][name] = row
-            if name in ('a refit', 'c', 'c less share'):
-                row['weights'] = scores.weights
+            cells = numbers(row.windows, every, feature, scores, equal[feature])
+            results[feature][name] = cells
+            if name in ('a refit', 'c', 'c, checks'):
+                cells['weights'] = scores.weights
     return results
 
 

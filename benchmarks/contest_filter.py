@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.compilation import kernel
-from stavpr_ros.filter.evidence import APART, best_elsewhere
+from stavpr_ros.filter.evidence import APART, best_elsewhere, lead_of
 
 CLOSE = 2  # places to either side that the belief in a place adds up
 LINE, ON_LINE = 5, 1.5  # images to either side of the line, places that they may be off it
@@ -72,8 +72,8 @@ class SmallWindow(NamedTuple):
 
     :param place: of the image at ``position``.
     :param belief: probability of the places around it.
-    :param lead: of its straight path over the best one elsewhere, mean z.
-    :param path, competitor: place of each image on both, (l,) each, or empty.
+    :param lead: of its best straight path over the best one elsewhere, mean -z.
+    :param path, competitor: place of each image on both, (l,) each, or empty; z: along the path.
     :param share: of the latest windows that follow the one before, .5 for each that is missing.
     """
 
@@ -84,6 +84,7 @@ class SmallWindow(NamedTuple):
     path: np.ndarray
     competitor: np.ndarray
     share: float
+    z: np.ndarray
 
     @property
     def speed(self) -> float:
@@ -103,18 +104,18 @@ class SmallFilter:
         self.model = model = model or SmallModel()
         V, self._steps = len(model.speeds), model.steps()
         states = np.full((V, n), model.start / (V * n), np.float32)
-        self._states = deque([(states, 1 - model.start)], model.lag + 1)
-        self._likelihoods: deque[np.ndarray] = deque(maxlen=model.lag)
-        self._near = np.full((model.length, n), np.inf, np.float32)  # z of near paths, a ring
-        self._places: deque[float] = deque(maxlen=LINE)  # of the latest middle images
+        self._states = deque([(states, 1 - model.start)], model.length)
+        self._likelihoods: deque[np.ndarray] = deque(maxlen=model.length)
+        self._z = np.full((model.length, n), np.inf, np.float32)  # a ring
+        self._last = 0.0  # place of the latest whole window
         self._agree: deque[bool] = deque(maxlen=model.length)
         self.count = 0
 
     def update(self, z: np.ndarray) -> None:
         """Add an image that moved, by its z-normalized distances, (n,)."""
         s, mu = self.model, self.model.level
-        z = np.minimum(z, np.float32(s.most))
-        likelihoods = np.exp(s.weight * (mu * z - mu * mu / 2)).astype(np.float32)
+        near = np.minimum(z, np.float32(s.most))
+        likelihoods = np.exp(s.weight * (mu * near - mu * mu / 2)).astype(np.float32)
         states, off = self._states[-1]
         if self.count:
             states, off = advance(states, off, self._steps, s.change, s.leave, s.enter)
@@ -122,10 +123,14 @@ class SmallFilter:
         total = float(states.sum(dtype=np.float64)) + off
         self._states.append((states / np.float32(total), off / total))
         self._likelihoods.append(likelihoods)
-        near = self._near[self.count % s.length]
-        near[:] = z
-        near[1:], near[:-1] = np.minimum(near[1:], z[:-1]), np.minimum(near[:-1], z[1:])
+        self._z[self.count % s.length] = z
         self.count += 1
+
+    @property
+    def by_place(self) -> np.ndarray:
+        """Return the probability of each place for the newest image, (n,)."""
+        by_place: np.ndarray = self._states[-1][0].sum(axis=0)
+        return by_place
 
     def beliefs(self, lag: int) -> np.ndarray:
         """Return the probability of each place for the image ``lag`` images ago and later ones."""
@@ -148,34 +153,33 @@ class SmallFilter:
         if l < 2:
             return None
         position = (l - 1) // 2
-        beliefs = self.beliefs(l - 1 - position)
-        places, own = zip(*map(_most_probable, beliefs), strict=True)
-        place, is_full = places[0], l == self.model.length
-        if is_full:
-            place = self._on_line(places)
-            last = self._places[-1] if self._places else place
-            self._agree.append(own[0] > 0.5 and -1 <= place - last <= MAX_STEP)
-            self._places.append(place)
+        beliefs = self.beliefs(l - 1)
+        places, masses = np.array([_most_probable(belief) for belief in beliefs]).T
+        place = self._on_line(places[max(position - LINE, 0) :], min(position, LINE))
+        if l == self.model.length:
+            last = self._last if self._agree else place
+            self._agree.append(masses[position] > 0.5 and -1 <= place - last <= MAX_STEP)
+            self._last = place
         n, at = beliefs.shape[1], round(place)
+        path = follow(beliefs, position, min(max(at, 0), n - 1))
         rows = (self.count - l + np.arange(l)) % self.model.length
-        arguments = self._near, rows, n, np.arange(l), position
+        arguments = self._z, rows, n, np.arange(l), position
         around = np.array([[0, max(at - CLOSE, 0)], [min(at + CLOSE + 1, n), n]])
-        score, path = best_elsewhere(*arguments, around)
         apart = np.array([[max(at - APART, 0), min(at + APART + 1, n)]])
+        score, _ = best_elsewhere(*arguments, around)
         other, competitor = best_elsewhere(*arguments, apart)
         missing = self.model.length - len(self._agree)
         share = (sum(self._agree) + missing / 2) / self.model.length
-        lead = max(score - max(other, 0.0), 0.0)
-        return SmallWindow(place, position, own[0], lead, path, competitor, share)
+        lead, z = lead_of(score, other), self._z[rows, path]
+        return SmallWindow(place, position, masses[position], lead, path, competitor, share, z)
 
-    def _on_line(self, places: tuple[float, ...]) -> float:
-        """Return the place on the line through the images around, if they are near to it."""
-        around = np.array([*self._places, *places[: LINE + 1]])
-        offsets = np.arange(len(around)) - len(self._places)
+    def _on_line(self, places: np.ndarray, position: int) -> float:
+        """Return the place of an image on the line through those around, if they are near it."""
+        around = places[: position + LINE + 1]
+        offsets = np.arange(len(around)) - position
         line = np.polynomial.polynomial.polyfit(offsets, around, 1)
-        off = np.abs(around - line[0] - line[1] * offsets).max()
-        on_map = len(places) and 0 <= line[0]
-        return float(line[0]) if off < ON_LINE and on_map else places[0]
+        is_even = np.abs(around - line[0] - line[1] * offsets).max() < ON_LINE
+        return max(float(line[0]), 0.0) if is_even else float(places[position])
 
 
 def _most_probable(belief: np.ndarray) -> tuple[float, float]:
@@ -188,6 +192,26 @@ def _most_probable(belief: np.ndarray) -> tuple[float, float]:
 
 
 # ------------------------------------------------ kernels
+
+
+@kernel
+def follow(beliefs: np.ndarray, position: int, place: int) -> np.ndarray:
+    """
+    Return the most probable places that a path through a place can have, (l,), int64.
+
+    :param beliefs: probability of each place for each image, (l, n).
+    :param position: of the image at the place.
+    """
+    l, n = beliefs.shape
+    path = np.full(l, place)
+    for way in (1, -1):
+        for i in range(position + way, l if way > 0 else -1, way):
+            before, path[i] = path[i - way], path[i - way]
+            for step in range(-1, int(MAX_STEP) + 1):
+                y = before + way * step
+                if 0 <= y < n and beliefs[i, y] > beliefs[i, path[i]]:
+                    path[i] = y
+    return path
 
 
 @kernel
