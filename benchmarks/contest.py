@@ -13,6 +13,7 @@ benchmarks/results/.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import multiprocessing
+import os
 from pathlib import Path
 import pickle
 import sys
@@ -104,7 +105,7 @@ def damaged(image: np.ndarray, damage: str) -> np.ndarray:
     """Return an image of a darker, covered, rolled or wet camera, or of one that sees less."""
     h, w = image.shape[:2]
     kind, _, share = damage.partition(' ')
-    out = image.astype(np.float32)
+    out: Any = image.astype(np.float32)
     if kind == 'dark':
         out *= 0.35
     elif kind == 'covered':
@@ -134,7 +135,7 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
             source = [replace(f, image=damaged(f.image, damage)) for f in source]
         return extracted(source, by)
 
-    sets, places = Sets([], []), {}
+    sets, places = Sets([], []), dict[str, PlaceMap]()
     named = {'walk_day': 'day', 'walk_night': 'night', 'walk_night_map': 'night map'}
     for case in short_cases(folder):
         reference, query = extracted(case.places, making), extracted(case.query, making)
@@ -158,7 +159,8 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
         'track', 'running_track/lap1', 'running_track/lap2', None, 7)  # fmt: skip
     for kind, first, second, end, tolerance in laps:
         lap, other = (_cut(read(name), end) for name in (first, second))
-        position = path(*(_cut(read(name, '', gradient), end) for name in (first, second)), end)
+        truths = (_cut(read(name, '', gradient), end) for name in (first, second))
+        position = path(next(truths), next(truths), bool(end))
         n, off = len(lap), np.arange(-tolerance, tolerance + 1)
         around = position[:, None] + off
         around = around % n if end else np.clip(around, 0, n - 1)
@@ -280,7 +282,7 @@ def _no_refinement() -> None:
         uneven = checks.unevenness(path, near)
         return path, path, near, masses, uneven, near[moves & np.isfinite(near)]
 
-    choice.refined = refined
+    vars(choice)['refined'] = refined
 
 
 def _no_straight_paths() -> None:
@@ -290,8 +292,8 @@ def _no_straight_paths() -> None:
 
 
 def _no_stamps() -> None:
-    refined = choice.refined
-    choice.refined = lambda z, path, exponents, numbers, stamps, *rest: refined(
+    refined = refine.refined
+    vars(choice)['refined'] = lambda z, path, exponents, numbers, stamps, *rest: refined(
         z, path, exponents, numbers, np.zeros_like(stamps), *rest
     )
     choice.PathChoice.learn_times = lambda *_: None  # type: ignore
@@ -347,8 +349,7 @@ class Recorder:
         self.window: Any = recognizer._window
         self._match, self._newest = self.window.match, self.window.match_newest
         self._push = self.window.push
-        self.window.match, self.window.match_newest = self.match, self.match_newest
-        self.window.push = self.push
+        vars(self.window).update(match=self.match, match_newest=self.match_newest, push=self.push)
         filter_window.own_evidence = self._own_evidence  # type: ignore
         self.rows: list[tuple[float, ...]] = []
         self._evidence: list[tuple[float, ...]] = []
@@ -386,15 +387,19 @@ class Recorder:
 
 
 def _log_odds(p: float, least: float = 1e-4) -> float:
-    p = min(max(p, least), 1 - least)
+    p = float(min(max(p, least), 1 - least))
     return float(np.log(p / (1 - p)))
 
 
-def recorded(drive: Drive, with_small: bool) -> tuple[np.ndarray, np.ndarray]:
+Shown = tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def recorded(drive: Drive, with_small: bool) -> Shown:
     """
     Return what windows show by today's method and by the small filter.
 
-    :returns: rows of :class:`Recorder`, and the same with the quantities ``C``, log odds of 0.
+    :returns: rows of :class:`Recorder` and the images that moved, of all; the same of the small
+        filter, with the quantities ``C`` and log odds of 0.
     """
     recorder, rows = Recorder(drive.places), []
     n, kept = len(drive.places), []
@@ -465,12 +470,17 @@ class Windows:
     right: np.ndarray
     has_match: np.ndarray
     unseen: np.ndarray
+    drives: tuple[Drive, ...]
+
+    def each(self, value: Callable[[Drive], Any]) -> np.ndarray:
+        """Return a value of the drive of each window, (M,)."""
+        return np.array([value(drive) for drive in self.drives])[self.drive]
 
     @classmethod
-    def of(cls, every: Sequence[Drive], rows: Sequence[np.ndarray], feature: str) -> 'Windows':
+    def of(cls, drives: Sequence[Drive], rows: Sequence[Any], feature: str) -> 'Windows':
         """Judge what windows show; images that have no whole window are of no place."""
         parts = []
-        for number, (drive, (of_drive, moved)) in enumerate(zip(every, rows, strict=True)):
+        for number, (drive, (of_drive, moved)) in enumerate(zip(drives, rows, strict=True)):
             whole = of_drive[:, 2] == 0
             early, full = of_drive[~whole], of_drive[whole]
             full = full[np.unique(full[:, 0], return_index=True)[1]]
@@ -495,13 +505,14 @@ class Windows:
                 np.full(len(images), feature), np.full(len(images), number), is_early,
                 both[:, 4:], both[:, 3], right, has, unseen,
             ))  # fmt: skip
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+        return cls(*map(np.concatenate, zip(*parts, strict=True)), tuple(drives))
 
     @classmethod
     def pooled(cls, parts: Sequence['Windows']) -> 'Windows':
         """Return windows of several kinds of features as one."""
-        names = cls.__dataclass_fields__
-        return cls(*(np.concatenate([getattr(each, name) for each in parts]) for name in names))
+        names = [name for name in cls.__dataclass_fields__ if name != 'drives']
+        columns = (np.concatenate([getattr(each, name) for each in parts]) for name in names)
+        return cls(*columns, parts[0].drives)
 
 
 def _counted(images: np.ndarray) -> np.ndarray:
@@ -528,14 +539,12 @@ def fit(x: np.ndarray, right: np.ndarray, weights: np.ndarray, ridge: float = 1e
     return w
 
 
-def fit_weights(windows: Windows, every: Sequence[Drive]) -> np.ndarray:
+def fit_weights(windows: Windows) -> np.ndarray:
     """Return the weight of each window: equal for groups and kinds of negatives, 0 = not used."""
-    label = np.array([d.kind if d.truth is None else d.groups[0] for d in every])[windows.drive]
-    is_detour = np.array([d.unseen is not None for d in every])[windows.drive]
-    is_negative = np.array([d.truth is None for d in every])[windows.drive]
-    used = (windows.has_match | windows.unseen | is_negative) & np.array(
-        [d.use != 'decide' for d in every]
-    )[windows.drive]
+    label = windows.each(lambda d: d.kind if d.truth is None else d.groups[0])
+    is_detour = windows.each(lambda d: d.unseen is not None)
+    used = windows.has_match | windows.unseen | windows.each(lambda d: d.truth is None)
+    used &= windows.each(lambda d: d.use != 'decide')
     weights = np.zeros(len(label))
     for feature in np.unique(windows.feature):
         for name in np.unique(label):
@@ -543,7 +552,7 @@ def fit_weights(windows: Windows, every: Sequence[Drive]) -> np.ndarray:
             for part in own & ~is_detour, own & is_detour:
                 for early, share in ((False, 1.0), (True, 0.25)):
                     rows = part & (windows.early == early)
-                    weights[rows] = share / max(np.count_nonzero(rows), 1)
+                    weights[rows] = share / max(int(np.count_nonzero(rows)), 1)
     return weights
 
 
@@ -555,20 +564,18 @@ class Scores(NamedTuple):
     weights: dict[str, list[float]]
 
 
-def left_out(row: 'Row', every: Sequence[Drive]) -> Scores:
+def left_out(row: 'Row') -> Scores:
     """Score each window by a fit on drives without its groups, with thresholds of the same."""
     windows = row.scored
-    features, groups = np.unique(windows.feature), [frozenset(d.groups) for d in every]
+    features, groups = np.unique(windows.feature), windows.each(lambda d: frozenset(d.groups))
     constants = (windows.feature[:, None] == features).astype(float)
     x = np.concatenate([windows.x, constants], axis=1)
-    weights, log_odds = fit_weights(windows, every), windows.score.copy()
+    weights, log_odds = fit_weights(windows), windows.score.copy()
     thresholds = tuple(np.zeros(len(x)) for _ in (0.5, *ERRORS))
-    sets = np.array([d.kind for d in every])[windows.drive]
-    is_drive = np.array([d.truth is not None and d.unseen is None for d in every])[windows.drive]
     of_fold = {}
     for fold in sorted(set(groups), key=sorted):
-        own = np.array([each == fold for each in groups])[windows.drive]
-        train = (weights > 0) & np.array([not each & fold for each in groups])[windows.drive]
+        own = groups == fold
+        train = (weights > 0) & np.array([not each & fold for each in groups])
         score = log_odds
         if windows.x.shape[1]:
             of_windows = weights[train] / weights[train].mean()
@@ -578,56 +585,48 @@ def left_out(row: 'Row', every: Sequence[Drive]) -> Scores:
             if row.recent:
                 score = score + row.recent * recent_odds(windows, score)
             log_odds[own] = score[own]
-        rows = train & is_drive & ~windows.early
+        rows = train & ~windows.early
         for threshold, error in zip(thresholds[1:], ERRORS, strict=True):
-            threshold[own] = least_score(score[rows], windows.right[rows], sets[rows], error)
+            threshold[own] = least_score(score[rows], windows.right[rows], weights[rows], error)
     return Scores(log_odds, thresholds, of_fold)
 
 
 def recent_odds(windows: Windows, scores: np.ndarray) -> np.ndarray:
     """Return the log odds of the share of a drive's windows that are likely, at most 0, (M,)."""
-    odds, before = np.zeros(len(scores)), None
+    odds, before, recent = np.zeros(len(scores)), None, evidence.RecentWindows()
     for i in np.flatnonzero(~windows.early):
         if before != (windows.feature[i], windows.drive[i]):
-            before, recent = (windows.feature[i], windows.drive[i]), evidence.RecentWindows()
+            before = windows.feature[i], windows.drive[i]
+            recent = evidence.RecentWindows()
         odds[i] = min(_log_odds(recent.share, evidence.MIN_RECENT), 0.0)
         is_likely, is_sure = scores[i] > LIKELY, scores[i] > SURE_OF_OWN
         recent.add(np.inf if is_sure else 0.0 if is_likely else -np.inf)  # between the limits
     return odds
 
 
-def least_score(scores: np.ndarray, right: np.ndarray, sets: np.ndarray, error: float) -> float:
-    """Return the score above which the mean share of wrong matches, by set, is ``error``."""
-    grid = np.quantile(scores, np.linspace(0, 1, 400))
-    shares = []
-    for name in np.unique(sets):
-        own = sets == name
-        order = np.argsort(scores[own])
-        ascending, wrong = scores[own][order], ~right[own][order]
-        above = np.append(np.cumsum(wrong[::-1])[::-1], 0)
-        first = np.searchsorted(ascending, grid, 'right')
-        shares.append(above[first] / np.maximum(len(ascending) - first, 1))
-    kept = np.mean(shares, axis=0) <= error
-    return float(grid[int(np.argmax(kept))])
+def least_score(scores: np.ndarray, right: np.ndarray, weights: np.ndarray, error: float) -> float:
+    """Return the score above which a share ``error`` of the matches is wrong, by weights."""
+    order = np.argsort(-scores)
+    wrong = np.cumsum((weights * ~right)[order]) / np.cumsum(weights[order])
+    kept = np.flatnonzero(wrong <= error)
+    return float(scores[order[kept[-1]]]) - 1e-9 if len(kept) else np.inf
 
 
 def numbers(
-    windows: Windows, every: Sequence[Drive], feature: str, scores: Scores, equal: dict[str, int]
+    windows: Windows, feature: str, scores: Scores, equal: dict[str, int]
 ) -> dict[str, Any]:
     """
     Return recall, precision and matched negatives at all limits.
 
     :param equal: matched negatives of row a, by limit; empty = this is row a.
     """
-    own = (windows.feature == feature) & ~windows.early
-    kinds = np.array([d.kind for d in every])[windows.drive]
-    is_detour = np.array([d.unseen is not None for d in every])[windows.drive]
-    decides = np.array([d.use != 'fit' for d in every])[windows.drive]
-    is_negative = own & np.isin(kinds, NEGATIVES)
-    negatives = {name: is_negative & (kinds == name) for name in NEGATIVES[:-1]}
+    kinds, is_detour = windows.each(lambda d: d.kind), windows.each(lambda d: d.unseen is not None)
+    of_feature = (windows.feature == feature) & windows.each(lambda d: d.use != 'fit')
+    own = of_feature & ~windows.early
+    negatives = {name: own & (kinds == name) for name in NEGATIVES[:-1]}
     negatives['unseen'] = own & windows.unseen & is_detour
     off = np.any(list(negatives.values()), axis=0)
-    on = own & windows.has_match & ~is_detour & decides
+    on = own & windows.has_match & ~is_detour
     score, descending = scores.log_odds, np.sort(scores.log_odds[off])[::-1]
     limits = dict(zip(('.5', '.05', '.01'), scores.thresholds, strict=True))
     if not equal:
@@ -655,13 +654,9 @@ def numbers(
         }
     place = [windows.right[on & (kinds == kind)] for kind in SETS]
     result['place alone'] = [round(float(each.mean()), 3) for each in place if len(each)]
-    early = (windows.feature == feature) & windows.early & (score > SURE)
-    positive = early & windows.has_match
-    result['early'] = [
-        int((positive & windows.right).sum()),
-        int((positive & ~windows.right).sum()),
-        int((early & np.isin(kinds, NEGATIVES)).sum()),
-    ]
+    early, right = of_feature & windows.early & (score > SURE), windows.right
+    parts = windows.has_match & right, windows.has_match & ~right, np.isin(kinds, NEGATIVES)
+    result['early'] = [int((early & part).sum()) for part in parts]
     return result
 
 
@@ -703,8 +698,8 @@ def page(about: dict[str, Any], results: dict[str, dict[str, Any]]) -> list[str]
                     ' '.join(str(each) for each in row[limit]['negatives'].values()),
                 ])  # fmt: skip
         images = ' '.join(str(each) for each in now['images'].values())
-        off = f'matched: {", ".join(NEGATIVES)} (of {images})'
-        lines += table(['row, limit', *sets, off], cells)
+        last = f'matched: {", ".join(NEGATIVES)} (of {images})'
+        lines += table(['row, limit', *sets, last], cells)
         names = [name for name in rows if not name.startswith('b ')]
         lines += ['The place alone, right of all images:', '']
         cells = [[name, *(f'{each:.3f}' for each in rows[name]['place alone'])] for name in names]
@@ -740,9 +735,10 @@ Data: drives of one session in which the camera moves (the same, at half, double
 30 % of the images lost; damaged ones without the other speeds); of Nordland, the second half of
 the query decides and the first one is fitted on. Off the map: floors that look alike, reverse
 drives, unrelated routes, and stretches that the map lacks. Only images in the middle of a whole
-window of images that moved count. Whatever is fitted (weights and thresholds at .05 and .01) has
-not seen the set: groups are Gardens Point with the walk, corridor, Nordland, office, track, two
-halves of the tower, reverse drives, and each pair of unrelated routes with both its groups.
+window of images that moved count. The weights and the thresholds at .05 and .01 (that share of the
+matches is wrong, each group and each kind off the map with the same weight) have not seen the set:
+groups are Gardens Point with the walk, corridor, Nordland, office, track, two halves of the tower,
+reverse drives, and each pair of unrelated routes with both its groups.
 
 Rows: a, mode robust as it is; a refit, its quantities with weights fitted like c's; c, the small
 filter (benchmarks/contest_filter.py: belief, lead, cells, creep, share of recent windows that
@@ -798,14 +794,14 @@ def small_rows(windows: Windows) -> Iterator[tuple[str, Row]]:
 
 
 def results_of(
-    every: Sequence[Drive], shown: dict[tuple[str, str], Any], features: Sequence[str],
+    drives: Sequence[Drive], shown: dict[tuple[str, str], Any], features: Sequence[str],
     with_small: bool,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
     """Return the numbers of all rows, by kind of features."""
 
     def pooled(mechanism: str, side: int) -> Windows:
         rows = {f: [each[side] for each in shown[f, mechanism]] for f in features}
-        return Windows.pooled([Windows.of(every, rows[f], f) for f in features])
+        return Windows.pooled([Windows.of(drives, rows[f], f) for f in features])
 
     now = pooled('', 0)
     rows = {'a': Row(now), 'a refit': Row(now, now.x)}
@@ -817,9 +813,9 @@ def results_of(
     results: dict[str, dict[str, Any]] = {feature: {} for feature in features}
     equal: dict[str, dict[str, int]] = {feature: {} for feature in features}
     for name, row in rows.items():
-        scores = left_out(row, every)
+        scores = left_out(row)
         for feature in features:
-            cells = numbers(row.windows, every, feature, scores, equal[feature])
+            cells = numbers(row.windows, feature, scores, equal[feature])
             results[feature][name] = cells
             if name in ('a refit', 'c', 'c, checks'):
                 cells['weights'] = scores.weights
@@ -850,6 +846,7 @@ def main(arguments: list[str] | None = None) -> int:
                 quick = '-quick' if options.quick else ''
                 to = cache / f'windows-{feature}{quick}-{mechanism.replace(" ", "_")}.pickle'
                 jobs[feature, mechanism] = feature, mechanism, options.quick, file, to
+        os.environ.update(OMP_NUM_THREADS='1', NUMBA_NUM_THREADS='1')  # of the processes
         pool = multiprocessing.get_context('spawn').Pool(options.jobs, maxtasksperchild=1)
         with pool:
             pool.starmap(record, [job for job in jobs.values() if not job[-1].exists()], 1)
