@@ -20,6 +20,7 @@ import sys
 from tempfile import TemporaryDirectory
 import time
 from typing import Any, NamedTuple
+import zlib
 
 from accuracy import short_cases
 from contest_filter import SmallFilter, SmallModel
@@ -35,7 +36,7 @@ from stavpr_lab.evaluation.drive import Drive as ChangedDrive
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment.settings import SpatialSettings
-from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.features import FeatureExtractor, LocalFeatures, registry
 from stavpr_ros.filter import checks, choice, evidence, refine
 from stavpr_ros.filter.model import MODEL
 from stavpr_ros.filter.motion import ImageChange
@@ -61,11 +62,12 @@ SETS = (
 NEGATIVES = 'floors', 'reverse', 'unrelated', 'unseen'
 DAMAGES = 'dark', 'covered', 'rolled', 'rain', 'crop 0.14'
 ERRORS = 0.05, 0.01
+EQUAL = 'as .5', 'as .01'  # of row a
+AND = ' and '  # between mechanisms that are removed together
 SURE = float(np.log(1 / (1 / least_probability(0.01) - 1)))  # log odds of today's .01
 A = {'p': 0, 'lead': 1, 'cells': 2, 'recent': 3}  # columns of the quantities of row a
 C = {'belief': 0, 'lead': 1, 'cells': 2, 'excess': 3, 'share': 4, 'uneven': 5}  # of row c
-LIKELY, SURE_OF_OWN = 0.5, 3.4  # log odds of the regression alone, as today's limits
-CERTAIN, MOST_CHECKED = 6.0, 7.0  # log odds of the belief at most; after the checks
+CERTAIN = 4.0  # log odds of the belief of row c at most, before the checks
 
 
 # ------------------------------------------------ sets
@@ -197,7 +199,7 @@ def _first(places: PlaceMap) -> PlaceMap:
     return _cut(places, MOST)
 
 
-def drives(sets: Sets, quick: bool) -> Iterator[Drive]:
+def drives_of(sets: Sets, quick: bool) -> Iterator[Drive]:
     """Yield all drives; ``quick``: two changes and fewer detours a pair, half of the negatives."""
     for kind, group, pair in sets.pairs:
         is_few, n = quick or kind in ('crops', 'damaged night'), len(pair.query)
@@ -257,7 +259,7 @@ def _constants(module: Any, **values: Any) -> Callable[[], None]:
 def _settings(**values: Any) -> Callable[[], None]:
     def apply() -> None:
         global SETTINGS  # noqa: PLW0603  (of this process)
-        SETTINGS = RecognizerSettings(**values)
+        SETTINGS = replace(SETTINGS, **values)
 
     return apply
 
@@ -438,14 +440,14 @@ def recorded(drive: Drive, with_small: bool) -> Shown:
 
 def record(feature: str, mechanism: str, quick: bool, sets: Path, to: Path) -> None:
     """Write what the windows of all drives show, without a mechanism; '' = with all."""
-    if mechanism:
-        MECHANISMS[mechanism]()
+    for name in filter(None, mechanism.split(AND)):
+        MECHANISMS[name]()
     with sets.open('rb') as file:
-        every = list(drives(pickle.load(file), quick))
+        drives = list(drives_of(pickle.load(file), quick))
     if mechanism:  # nothing is fitted on it
-        every = [replace(d, stamps=d.stamps[:0]) if d.use == 'fit' else d for d in every]
+        drives = [replace(d, stamps=d.stamps[:0]) if d.use == 'fit' else d for d in drives]
     began = time.perf_counter()
-    windows = [recorded(each, not mechanism) for each in every]
+    windows = [recorded(each, not mechanism) for each in drives]
     to.write_bytes(pickle.dumps(windows))
     print(feature, mechanism or 'now', f'{time.perf_counter() - began:.0f} s', flush=True)
 
@@ -462,6 +464,7 @@ class Windows:
     :param x: quantities; score: log odds, if the row has a probability.
     """
 
+    drives: tuple[Drive, ...]
     feature: np.ndarray
     drive: np.ndarray
     early: np.ndarray
@@ -470,7 +473,6 @@ class Windows:
     right: np.ndarray
     has_match: np.ndarray
     unseen: np.ndarray
-    drives: tuple[Drive, ...]
 
     def each(self, value: Callable[[Drive], Any]) -> np.ndarray:
         """Return a value of the drive of each window, (M,)."""
@@ -505,14 +507,15 @@ class Windows:
                 np.full(len(images), feature), np.full(len(images), number), is_early,
                 both[:, 4:], both[:, 3], right, has, unseen,
             ))  # fmt: skip
-        return cls(*map(np.concatenate, zip(*parts, strict=True)), tuple(drives))
+        columns = [np.concatenate(each) for each in zip(*parts, strict=True)]
+        return cls(tuple(drives), *columns)
 
     @classmethod
     def pooled(cls, parts: Sequence['Windows']) -> 'Windows':
         """Return windows of several kinds of features as one."""
         names = [name for name in cls.__dataclass_fields__ if name != 'drives']
         columns = (np.concatenate([getattr(each, name) for each in parts]) for name in names)
-        return cls(*columns, parts[0].drives)
+        return cls(parts[0].drives, *columns)
 
 
 def _counted(images: np.ndarray) -> np.ndarray:
@@ -583,7 +586,8 @@ def left_out(row: 'Row') -> Scores:
             of_fold[' '.join(sorted(fold))] = np.round(w, 3).tolist()
             score = x @ w
             if row.recent:
-                score = score + row.recent * recent_odds(windows, score)
+                # in units of today's evidence, for its limits of likely and sure windows
+                score = score + row.recent * recent_odds(windows, 2 * score - 1.6)
             log_odds[own] = score[own]
         rows = train & ~windows.early
         for threshold, error in zip(thresholds[1:], ERRORS, strict=True):
@@ -591,16 +595,15 @@ def left_out(row: 'Row') -> Scores:
     return Scores(log_odds, thresholds, of_fold)
 
 
-def recent_odds(windows: Windows, scores: np.ndarray) -> np.ndarray:
-    """Return the log odds of the share of a drive's windows that are likely, at most 0, (M,)."""
-    odds, before, recent = np.zeros(len(scores)), None, evidence.RecentWindows()
+def recent_odds(windows: Windows, own: np.ndarray) -> np.ndarray:
+    """Return the log odds of today's share r of a drive's likely windows, at most 0, (M,)."""
+    odds, before, recent = np.zeros(len(own)), None, evidence.RecentWindows()
     for i in np.flatnonzero(~windows.early):
         if before != (windows.feature[i], windows.drive[i]):
             before = windows.feature[i], windows.drive[i]
             recent = evidence.RecentWindows()
         odds[i] = min(_log_odds(recent.share, evidence.MIN_RECENT), 0.0)
-        is_likely, is_sure = scores[i] > LIKELY, scores[i] > SURE_OF_OWN
-        recent.add(np.inf if is_sure else 0.0 if is_likely else -np.inf)  # between the limits
+        recent.add(own[i])
     return odds
 
 
@@ -630,8 +633,7 @@ def numbers(
     score, descending = scores.log_odds, np.sort(scores.log_odds[off])[::-1]
     limits = dict(zip(('.5', '.05', '.01'), scores.thresholds, strict=True))
     if not equal:
-        equal['as .5'] = int(np.count_nonzero(score[off] > 0))
-        equal['as .01'] = int(np.count_nonzero(score[off] > SURE))
+        equal |= {k: int((score[off] > t).sum()) for k, t in zip(EQUAL, (0, SURE), strict=True)}
     for name, count in equal.items():
         limits[name] = np.full(len(score), descending[min(count, len(descending) - 1)])
     result: dict[str, Any] = {'images': {k: int(v.sum()) for k, v in negatives.items()}}
@@ -672,10 +674,12 @@ def page(about: dict[str, Any], results: dict[str, dict[str, Any]]) -> list[str]
     """Return the lines of the page."""
     lines = heading('The contest: mode robust, less one mechanism, and a small filter', about)
     lines += [*TEXT.strip().splitlines(), '']
+    if about['quick']:
+        lines += ['With `--quick`: at two changes a pair, half of the negatives and detours.', '']
     for feature, rows in results.items():
         now, sets = rows['a'], list(rows['a']['.5']['sets'])
         lines += [f'## {KINDS[feature]}', '', '### Equal matches off the map', '']
-        for limit in ('as .5', 'as .01'):
+        for limit in EQUAL:
             off = sum(now[limit]['negatives'].values()), sum(now['images'].values())
             lines += [f'Recall where {off[0]} of {off[1]} images off the map are matched:', '']
             cells = [
@@ -710,23 +714,27 @@ def page(about: dict[str, Any], results: dict[str, dict[str, Any]]) -> list[str]
             lines += ['### Less one mechanism', '', REMOVED.strip(), '']
             cells = []
             for name in removed:
-                basis = rows['a refit' if name.removeprefix('b ') in TERMS else 'a']
                 cell = [name.removeprefix('b ')]
-                for limit in ('as .5', 'as .01'):
-                    change = recalls(rows[name], limit) - recalls(basis, limit)
+                for limit in EQUAL:
+                    change = changes(rows, name, limit)
                     worst = int(change.argmin())
                     cell += [f'{change.mean():+.3f}', f'{change[worst]:+.3f} ({sets[worst]})']
-                cells.append([*cell, 'yes' if costs_nothing(rows, name) else ''])
+                cells.append([*cell, 'yes' if costs_nothing({feature: rows}, name) else ''])
             head = ['removed', 'as .5: mean', 'worst set', 'as .01: mean', 'worst set']
             lines += table([*head, 'costs nothing'], cells)
     return lines
 
 
-def costs_nothing(rows: dict[str, Any], name: str) -> bool:
-    """Whether a row loses less than .01 of recall in every set, at equal matches off the map."""
+def changes(rows: dict[str, Any], name: str, limit: str) -> np.ndarray:
+    """Return the change of recall of each set by a mechanism."""
     basis = rows['a refit' if name.removeprefix('b ') in TERMS else 'a']
-    changes = [recalls(rows[name], each) - recalls(basis, each) for each in ('as .5', 'as .01')]
-    return bool(np.min(changes) > -0.01)
+    return recalls(rows[name], limit) - recalls(basis, limit)
+
+
+def costs_nothing(results: dict[str, dict[str, Any]], name: str) -> bool:
+    """Whether a row loses less than .01 of recall in every set, at equal matches off the map."""
+    every = [changes(rows, name, each) for rows in results.values() for each in EQUAL]
+    return bool(np.min(every) > -0.01)
 
 
 TEXT = """
@@ -742,10 +750,10 @@ reverse drives, and each pair of unrelated routes with both its groups.
 
 Rows: a, mode robust as it is; a refit, its quantities with weights fitted like c's; c, the small
 filter (benchmarks/contest_filter.py: belief, lead, cells, creep, share of recent windows that
-agree); c less share, without the last one; checks, the odds of its belief, at most e^6, are
-multiplied by today's factor of evenness and excess motion instead of creep; recent, instead of the
-share, w min(0, ln(r / (1 - r))) is added, with today's share r of likely and sure windows. Today's
-w is 2.5 in units of a fitted regression; w is not fitted. *Equal matches off the map*: the
+agree); c less share, without the last one. With mechanisms of today's method: recent, instead of
+the share, today's share r of likely and sure windows, with its weight of 5; checks, the odds of
+its belief, at most e^4, are multiplied by today's factor of evenness and excess motion instead of
+creep; by today, both, and today's evidence instead of a fit. *Equal matches off the map*: the
 threshold at which as many images off the map are matched as by row a at .5, and at its .01.
 """
 REMOVED = """
@@ -784,13 +792,17 @@ def small_rows(windows: Windows) -> Iterator[tuple[str, Row]]:
     yield 'c', Row(windows, np.stack([belief, lead, cells, creep, share], 1))
     yield 'c less share', Row(windows, np.stack([belief, lead, cells, creep], 1))
     certain = np.clip(belief, -CERTAIN, CERTAIN)
-    plain = np.stack([certain, lead, cells, creep], 1)
-    yield 'c, recent 5', Row(windows, plain, 5.0)
-    checked = certain - checks.UNEVEN_WEIGHT * uneven - checks.EXCESS_WEIGHT * creep
-    after = np.stack([np.clip(checked, -MOST_CHECKED, MOST_CHECKED), lead, cells], 1)
-    yield 'c, checks', Row(windows, after)
-    for weight in (2.5, 5.0):
-        yield f'c, checks, recent {weight:g}', Row(windows, after, weight)
+    yield 'c, recent', Row(windows, np.stack([certain, lead, cells, creep], 1), evidence.RECENT)
+    odds = certain - checks.UNEVEN_WEIGHT * uneven - checks.EXCESS_WEIGHT * creep
+    odds = np.clip(odds, _log_odds(0), _log_odds(1))
+    checked = np.stack([odds, lead, cells], 1)
+    yield 'c, checks', Row(windows, checked)
+    yield 'c, checks, recent', Row(windows, checked, evidence.RECENT)
+    constants = np.array([registry.KINDS[KINDS[f]].with_cells for f in windows.feature])
+    own = constants + checked @ [evidence.POSTERIOR, evidence.LEAD, evidence.CELLS]
+    own = np.where(odds < 0, np.minimum(own, odds + evidence.GAIN), own)
+    score = own + evidence.RECENT * recent_odds(windows, own)
+    yield 'c by today', Row(replace(windows, score=score))
 
 
 def results_of(
@@ -817,9 +829,26 @@ def results_of(
         for feature in features:
             cells = numbers(row.windows, feature, scores, equal[feature])
             results[feature][name] = cells
-            if name in ('a refit', 'c', 'c, checks'):
+            if name in ('a refit', 'c'):
                 cells['weights'] = scores.weights
     return results
+
+
+def shown_by(
+    mechanisms: Sequence[str], features: Sequence[str], cache: Path, quick: bool, jobs: int
+) -> dict[tuple[str, str], list[Shown]]:
+    """Return what windows show without each mechanism, recorded in processes of their own."""
+    files = {}
+    for key in ((feature, mechanism) for feature in features for mechanism in mechanisms):
+        digest = f'{zlib.crc32(key[1].encode()):08x}'
+        files[key] = cache / f'windows-{key[0]}{"-quick" * quick}-{digest}.pickle'
+    todo = [
+        (*key, quick, cache / f'sets-{key[0]}.pickle', file)
+        for key, file in files.items() if not file.exists()
+    ]  # fmt: skip
+    with multiprocessing.get_context('spawn').Pool(jobs, maxtasksperchild=1) as pool:
+        pool.starmap(record, todo, 1)
+    return {key: pickle.loads(file.read_bytes()) for key, file in files.items()}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -832,27 +861,29 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument('--cache', type=Path, help='folder of features and windows, kept')
     parser.add_argument('--jobs', type=int, default=1, help='processes at a time')
     options = parser.parse_args(arguments)
-    about, began = environment(named_commit=options.commit), time.perf_counter()
-    folder, shown = data_folder(), {}
+    began = time.perf_counter()
+    about = environment(named_commit=options.commit) | {'quick': options.quick}
+    folder = data_folder()
     with TemporaryDirectory() as temporary:
         cache = options.cache or Path(temporary)
         cache.mkdir(parents=True, exist_ok=True)
-        jobs, gradient = {}, extractor('g', folder)
+        # of the processes: threads of several would wait for each other
+        os.environ.update(OMP_NUM_THREADS='1', NUMBA_NUM_THREADS='1')
+        gradient, mechanisms = extractor('g', folder), ['']
         for feature in options.features:
             if not (file := cache / f'sets-{feature}.pickle').exists():
                 sets = read_sets(folder, extractor(feature, folder), gradient)
                 file.write_bytes(pickle.dumps(sets))
-            for mechanism in ('', *(options.mechanisms if 'b' in options.rows else ())):
-                quick = '-quick' if options.quick else ''
-                to = cache / f'windows-{feature}{quick}-{mechanism.replace(" ", "_")}.pickle'
-                jobs[feature, mechanism] = feature, mechanism, options.quick, file, to
-        os.environ.update(OMP_NUM_THREADS='1', NUMBA_NUM_THREADS='1')  # of the processes
-        pool = multiprocessing.get_context('spawn').Pool(options.jobs, maxtasksperchild=1)
-        with pool:
-            pool.starmap(record, [job for job in jobs.values() if not job[-1].exists()], 1)
-        shown = {key: pickle.loads(job[-1].read_bytes()) for key, job in jobs.items()}
-        every = list(drives(pickle.loads(file.read_bytes()), options.quick))
-    results = results_of(every, shown, options.features, 'c' in options.rows)
+        drives = list(drives_of(pickle.loads(file.read_bytes()), options.quick))
+        if 'b' in options.rows:
+            mechanisms += options.mechanisms
+        run = options.features, cache, options.quick, options.jobs
+        shown = shown_by(mechanisms, *run)
+        results = results_of(drives, shown, options.features, 'c' in options.rows)
+        free = [name for name in mechanisms[1:] if costs_nothing(results, f'b {name}')]
+        if len(free) > 1:  # with all of them removed
+            shown |= shown_by([AND.join(free)], *run)
+            results = results_of(drives, shown, options.features, 'c' in options.rows)
     name = f'contest{"-quick" if options.quick else ""}'
     write_json(options.output / f'{name}.json', about | {'results': results})
     lines = page(about, results)
