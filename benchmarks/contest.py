@@ -412,8 +412,10 @@ def recorded(drive: Drive, with_small: bool) -> Shown:
         cells = CellAgreement(window.cells._cells, strips_of, LENGTH)
     for i, stamp in enumerate(drive.stamps.tolist()):
         recorder.recognizer.update(drive.features[i : i + 1], stamp)
-        is_dark = small.count and window.change.is_dark_stretch(small.by_place)
-        if not with_small or (window.is_standstill and not is_dark):
+        if not with_small:
+            continue
+        # at rest, unless the map's own images are equal there
+        if window.is_standstill and not window.change.is_dark_stretch(small.by_place):
             continue
         kept.append(i)
         small.update(recorder.recognizer.newest_row()[:n])

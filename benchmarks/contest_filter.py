@@ -72,7 +72,8 @@ class SmallWindow(NamedTuple):
 
     :param place: of the image at ``position``.
     :param belief: probability of the places around it.
-    :param lead: of its best straight path over the best one elsewhere, mean -z.
+    :param lead: of its best straight path over the best one elsewhere, mean -z; each image counts at
+        the nearest of three neighboring places.
     :param path, competitor: place of each image on both, (l,) each, or empty; z: along the path.
     :param share: of the latest windows that follow the one before, .5 for each that is missing.
     """
@@ -107,6 +108,7 @@ class SmallFilter:
         self._states = deque([(states, 1 - model.start)], model.length)
         self._likelihoods: deque[np.ndarray] = deque(maxlen=model.length)
         self._z = np.full((model.length, n), np.inf, np.float32)  # a ring
+        self._near = self._z.copy()  # the least of each place and its two neighbors
         self._last = 0.0  # place of the latest whole window
         self._agree: deque[bool] = deque(maxlen=model.length)
         self.count = 0
@@ -114,8 +116,8 @@ class SmallFilter:
     def update(self, z: np.ndarray) -> None:
         """Add an image that moved, by its z-normalized distances, (n,)."""
         s, mu = self.model, self.model.level
-        near = np.minimum(z, np.float32(s.most))
-        likelihoods = np.exp(s.weight * (mu * near - mu * mu / 2)).astype(np.float32)
+        likelihoods = mu * np.minimum(z, np.float32(s.most)) - mu * mu / 2
+        likelihoods = np.exp(s.weight * likelihoods).astype(np.float32)
         states, off = self._states[-1]
         if self.count:
             states, off = advance(states, off, self._steps, s.change, s.leave, s.enter)
@@ -124,6 +126,9 @@ class SmallFilter:
         self._states.append((states / np.float32(total), off / total))
         self._likelihoods.append(likelihoods)
         self._z[self.count % s.length] = z
+        near = self._near[self.count % s.length]
+        near[:] = z
+        near[1:], near[:-1] = np.minimum(near[1:], z[:-1]), np.minimum(near[:-1], z[1:])
         self.count += 1
 
     @property
@@ -163,11 +168,12 @@ class SmallFilter:
         n, at = beliefs.shape[1], round(place)
         path = follow(beliefs, position, min(max(at, 0), n - 1))
         rows = (self.count - l + np.arange(l)) % self.model.length
-        arguments = self._z, rows, n, np.arange(l), position
+        images = n, np.arange(l), position
         around = np.array([[0, max(at - CLOSE, 0)], [min(at + CLOSE + 1, n), n]])
         apart = np.array([[max(at - APART, 0), min(at + APART + 1, n)]])
-        score, _ = best_elsewhere(*arguments, around)
-        other, competitor = best_elsewhere(*arguments, apart)
+        score, _ = best_elsewhere(self._near, rows, *images, around)
+        other, _ = best_elsewhere(self._near, rows, *images, apart)
+        _, competitor = best_elsewhere(self._z, rows, *images, apart)
         missing = self.model.length - len(self._agree)
         share = (sum(self._agree) + missing / 2) / self.model.length
         lead, z = lead_of(score, other), self._z[rows, path]
