@@ -6,8 +6,7 @@ The contest of three methods: today's, today's less single mechanisms, and a sma
 ``python benchmarks/contest.py``; ``--quick``: fewer drives; ``--rows a c``, ``--features g``.
 Rows: a, mode robust with its defaults; b, the same with one mechanism removed, each in a process
 of its own; c, the small filter of contest_filter.py on the same distances. What is fitted is
-fitted without the set that it is shown on. Writes contest.md and contest.json to
-benchmarks/results/.
+fitted without the set that it is shown on. Writes benchmarks/results/contest.md.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +29,7 @@ from numba.core.caching import NullCache
 import numpy as np
 from off_map import extracted, extractor, Pair, stretches
 from off_map_page import HYBRID, KINDS
-from results import environment, heading, options_parser, table, write_json, write_lines
+from results import environment, heading, options_parser, table, write_lines
 from sessions import LAP, path
 from stavpr_lab.evaluation.drive import Drive as ChangedDrive
 from stavpr_lab.evaluation.drive import DriveChanges
@@ -561,23 +560,21 @@ def fit_weights(windows: Windows) -> np.ndarray:
     return weights
 
 
-class Scores(NamedTuple):
-    """Log odds of each window, (M,), and thresholds at .5 and at the errors, (M,) each."""
-
-    log_odds: np.ndarray
-    thresholds: tuple[np.ndarray, ...]
-    weights: dict[str, list[float]]
+Scores = tuple[np.ndarray, list[np.ndarray]]
 
 
 def left_out(row: 'Row') -> Scores:
-    """Score each window by a fit on drives without its groups, with thresholds of the same."""
+    """
+    Score each window by a fit on drives without its groups.
+
+    :returns: log odds of each window, (M,), and for each its thresholds at .5 and at the errors.
+    """
     windows = row.scored
     features, groups = np.unique(windows.feature), windows.each(lambda d: frozenset(d.groups))
     constants = (windows.feature[:, None] == features).astype(float)
     x = np.concatenate([windows.x, constants], axis=1)
     weights, log_odds = fit_weights(windows), windows.score.copy()
-    thresholds = tuple(np.zeros(len(x)) for _ in (0.5, *ERRORS))
-    of_fold = {}
+    thresholds = [np.zeros(len(x)) for _ in (0.5, *ERRORS)]
     for fold in sorted(set(groups), key=sorted):
         own = groups == fold
         train = (weights > 0) & np.array([not each & fold for each in groups])
@@ -585,7 +582,6 @@ def left_out(row: 'Row') -> Scores:
         if windows.x.shape[1]:
             of_windows = weights[train] / weights[train].mean()
             w = fit(x[train], windows.right[train], of_windows)
-            of_fold[' '.join(sorted(fold))] = np.round(w, 3).tolist()
             score = x @ w
             if row.recent:
                 # in units of today's evidence, for its limits of likely and sure windows
@@ -594,7 +590,7 @@ def left_out(row: 'Row') -> Scores:
         rows = train & ~windows.early
         for threshold, error in zip(thresholds[1:], ERRORS, strict=True):
             threshold[own] = least_score(score[rows], windows.right[rows], weights[rows], error)
-    return Scores(log_odds, thresholds, of_fold)
+    return log_odds, thresholds
 
 
 def recent_odds(windows: Windows, own: np.ndarray) -> np.ndarray:
@@ -632,8 +628,9 @@ def numbers(
     negatives['unseen'] = own & windows.unseen & is_detour
     off = np.any(list(negatives.values()), axis=0)
     on = own & windows.has_match & ~is_detour
-    score, descending = scores.log_odds, np.sort(scores.log_odds[off])[::-1]
-    limits = dict(zip(('.5', '.05', '.01'), scores.thresholds, strict=True))
+    score, thresholds = scores
+    descending = np.sort(score[off])[::-1]
+    limits = dict(zip(('.5', '.05', '.01'), thresholds, strict=True))
     if not equal:
         equal |= {k: int((score[off] > t).sum()) for k, t in zip(EQUAL, (0, SURE), strict=True)}
     for name, count in equal.items():
@@ -829,10 +826,7 @@ def results_of(
     for name, row in rows.items():
         scores = left_out(row)
         for feature in features:
-            cells = numbers(row.windows, feature, scores, equal[feature])
-            results[feature][name] = cells
-            if name in ('a refit', 'c'):
-                cells['weights'] = scores.weights
+            results[feature][name] = numbers(row.windows, feature, scores, equal[feature])
     return results
 
 
@@ -886,10 +880,8 @@ def main(arguments: list[str] | None = None) -> int:
         if len(free) > 1:  # with all of them removed
             shown |= shown_by([AND.join(free)], *run)
             results = results_of(drives, shown, options.features, 'c' in options.rows)
-    name = f'contest{"-quick" if options.quick else ""}'
-    write_json(options.output / f'{name}.json', about | {'results': results})
     lines = page(about, results)
-    write_lines(options.output / f'{name}.md', lines)
+    write_lines(options.output / f'contest{"-quick" * options.quick}.md', lines)
     print(*lines, f'took {time.perf_counter() - began:.0f} s', sep='\n')
     return 0
 

@@ -72,8 +72,8 @@ class SmallWindow(NamedTuple):
 
     :param place: of the image at ``position``.
     :param belief: probability of the places around it.
-    :param lead: of its best straight path over the best one elsewhere, mean -z; each image counts at
-        the nearest of three neighboring places.
+    :param lead: of its best straight path over the best one elsewhere, mean -z, of each image the
+        nearest of three neighboring places.
     :param path, competitor: place of each image on both, (l,) each, or empty; z: along the path.
     :param share: of the latest windows that follow the one before, .5 for each that is missing.
     """

@@ -155,28 +155,29 @@ def test_public_graph_one_closure_at_a_time_ends_like_all_at_once():
 
 
 def test_small_filter_equals_a_chain_of_all_states():
-    model, n, V = contest_filter.SmallModel(speeds=(0.5, 1.0, 2.0), length=5), 9, 3
-    z = np.random.default_rng(0).normal(size=(7, n)).astype(np.float32)
-    chain, off = np.zeros((V * n + 1, V * n + 1)), V * n
-    for v, y in np.ndindex(V, n):
+    model, n, off = contest_filter.SmallModel(speeds=(0.5, 1.0, 2.0), length=5), 9, 27
+    chain = np.zeros((off + 1, off + 1))
+    chain[off], chain[:off, off], chain[off, off] = model.enter / off, model.leave, 1 - model.enter
+    for v, y in np.ndindex(3, n):
         for step, share in enumerate((1 - model.leave) * model.steps()[v].astype(float), -1):
-            for to, p in (v - 1, 0.5), (v, 1 / model.change - 1), (v + 1, 0.5):
-                after = min(max(to, 0), V - 1) * n + y + step if 0 <= y + step < n else off
-                chain[v * n + y, after] += share * p * model.change
-        chain[v * n + y, off] += model.leave
-    chain[off] = model.enter / off
-    chain[off, off] = 1 - model.enter
+            for to, p in (
+                (v - 1, model.change / 2),
+                (v, 1 - model.change),
+                (v + 1, model.change / 2),
+            ):
+                after = min(max(to, 0), 2) * n + y + step if 0 <= y + step < n else off
+                chain[v * n + y, after] += share * p
     small, forward, rows = contest_filter.SmallFilter(n, model), [], []
     state = np.append(np.full(off, model.start / off), 1 - model.start)
-    for i, row in enumerate(z):
-        small.update(row)
-        near = model.weight * (model.level * np.minimum(row, model.most) - model.level**2 / 2)
-        rows.append(np.append(np.tile(np.exp(near), V), 1))
-        forward.append(((forward[-1] @ chain) if i else state) * rows[-1])
+    for z in np.random.default_rng(0).normal(size=(7, n)).astype(np.float32):
+        small.update(z)
+        log = model.weight * (model.level * np.minimum(z, model.most) - model.level**2 / 2)
+        rows.append(np.append(np.tile(np.exp(log), 3), 1))
+        forward.append((forward[-1] @ chain if forward else state) * rows[-1])
     messages = np.ones(off + 1)
     for back in range(4):
         belief = forward[-1 - back] * messages / (forward[-1 - back] @ messages)
-        expected = belief[:-1].reshape(V, n).sum(axis=0)
+        expected = belief[:off].reshape(3, n).sum(axis=0)
         np.testing.assert_allclose(small.beliefs(back)[0], expected, rtol=1e-4, atol=1e-7)
         messages = chain @ (rows[-1 - back] * messages)
 
