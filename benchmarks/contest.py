@@ -62,7 +62,7 @@ NEGATIVES = 'floors', 'reverse', 'unrelated', 'unseen'
 DAMAGES = 'dark', 'covered', 'rolled', 'rain', 'crop 0.14'
 ERRORS = 0.05, 0.01
 EQUAL = 'as .5', 'as .01'  # of row a
-AND = ' and '  # between mechanisms that are removed together
+AND = '; '  # between mechanisms that are removed together
 SURE = float(np.log(1 / (1 / least_probability(0.01) - 1)))  # log odds of today's .01
 A = {'p': 0, 'lead': 1, 'cells': 2, 'recent': 3}  # columns of the quantities of row a
 C = {'belief': 0, 'lead': 1, 'cells': 2, 'excess': 3, 'share': 4, 'uneven': 5}  # of row c
@@ -366,7 +366,7 @@ class Recorder:
         return evidence.own_evidence(constant, p, lead, l, cells)
 
     def match(self, radius: int) -> Any:
-        """Match a window."""
+        """Match a window, with the share of recent windows before it."""
         recent = self.window.recent.share
         return self._noted(self._match(radius), recent)
 
@@ -392,51 +392,65 @@ def _log_odds(p: float, least: float = 1e-4) -> float:
     return float(np.log(p / (1 - p)))
 
 
-Shown = tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+class SmallRecorder:
+    """
+    Drives the small filter on the distances of a recorder.
+
+    ``rows`` are as of the recorder, log odds of 0, with the quantities ``C``; ``kept`` are the
+    images that moved.
+
+    :param weighted: with today's weight of an image by its change.
+    """
+
+    def __init__(self, recorder: Recorder, weighted: bool) -> None:
+        self.recorder, self.window, self.weighted = recorder, recorder.window, weighted
+        self.filter, self.cells = SmallFilter(recorder.recognizer.places), None
+        if self.window.cells is not None:
+            strips_of = recorder.recognizer._matcher.strips_of
+            self.cells = CellAgreement(self.window.cells._cells, strips_of, LENGTH)
+        self.kept: list[int] = []
+        self.rows: list[tuple[float, ...]] = []
+
+    def update(self) -> None:
+        """Add the recorder's newest image, unless the camera is at rest."""
+        small, change = self.filter, self.window.change
+        # at rest, unless the map's own images are equal there
+        if self.window.is_standstill and not change.is_dark_stretch(small.by_place):
+            return
+        self.kept.append(self.recorder.image)
+        weight = change.weight(float(self.window.images['change'][-1])) / MODEL.weight
+        z = self.recorder.recognizer.newest_row()[: self.recorder.recognizer.places]
+        small.update(z, weight if self.weighted else 1.0)
+        if self.cells is not None:
+            self.cells.push(self.recorder.strips)
+        if (shown := small.window()) is None:
+            return
+        l, agreeing = min(small.count, LENGTH), 0.0
+        if self.cells is not None:
+            agreeing = self.cells.lead(np.ones(l, bool), shown.path, shown.competitor)
+        image = self.kept[len(self.kept) - l + shown.position]
+        row = image, round(shown.place), 0 if l == LENGTH else l, 0.0
+        excess = change.excess(max(shown.speed, 0.0))
+        uneven = checks.unevenness(shown.path, shown.z)
+        leads = np.log1p(l * shown.lead), np.log1p(max(agreeing, 0.0))
+        self.rows.append((*row, _log_odds(shown.belief), *leads, excess, shown.share, uneven))
+
+
+Shown = list[tuple[np.ndarray, np.ndarray]]
 
 
 def recorded(drive: Drive, with_small: bool) -> Shown:
-    """
-    Return what windows show by today's method and by the small filter.
-
-    :returns: rows of :class:`Recorder` and the images that moved, of all; the same of the small
-        filter, with the quantities ``C`` and log odds of 0.
-    """
-    recorder, rows = Recorder(drive.places), []
-    n, kept = len(drive.places), []
-    small, window = SmallFilter(n), recorder.window
-    cells = None
-    if window.cells is not None:
-        strips_of = recorder.recognizer._matcher.strips_of
-        cells = CellAgreement(window.cells._cells, strips_of, LENGTH)
+    """Return rows and images that moved, by today's method and by both forms of the filter."""
+    recorder = Recorder(drive.places)
+    small = [SmallRecorder(recorder, weighted) for weighted in (False, True)[: 2 * with_small]]
     for i, stamp in enumerate(drive.stamps.tolist()):
         recorder.recognizer.update(drive.features[i : i + 1], stamp)
-        if not with_small:
-            continue
-        # at rest, unless the map's own images are equal there
-        if window.is_standstill and not window.change.is_dark_stretch(small.by_place):
-            continue
-        kept.append(i)
-        small.update(recorder.recognizer.newest_row()[:n])
-        if cells is not None:
-            cells.push(recorder.strips)
-        if (shown := small.window()) is None:
-            continue
-        l, agreeing = min(small.count, LENGTH), 0.0
-        if cells is not None:
-            agreeing = cells.lead(np.ones(l, bool), shown.path, shown.competitor)
-        image = kept[len(kept) - l + shown.position]
-        row = image, round(shown.place), 0 if l == LENGTH else l, 0.0
-        excess = window.change.excess(max(shown.speed, 0.0))
-        uneven = checks.unevenness(shown.path, shown.z)
-        leads = np.log1p(l * shown.lead), np.log1p(max(agreeing, 0.0))
-        rows.append((*row, _log_odds(shown.belief), *leads, excess, shown.share, uneven))
-    width = 4 + len(A), 4 + len(C)
-    of_today, of_small = (
-        np.array(each, float).reshape(-1, size)
-        for each, size in zip((recorder.rows, rows), width, strict=True)
-    )
-    return (of_today, np.arange(len(drive.images))), (of_small, np.array(kept))
+        for each in small:
+            each.update()
+    rows = np.array(recorder.rows, float).reshape(-1, 4 + len(A))
+    return [(rows, np.arange(len(drive.images)))] + [
+        (np.array(each.rows, float).reshape(-1, 4 + len(C)), np.array(each.kept)) for each in small
+    ]
 
 
 def record(feature: str, mechanism: str, quick: bool, sets: Path, to: Path) -> None:
@@ -752,8 +766,9 @@ filter (benchmarks/contest_filter.py: belief, lead, cells, creep, share of recen
 agree); c less share, without the last one. With mechanisms of today's method: recent, instead of
 the share, today's share r of likely and sure windows, with its weight of 5; checks, the odds of
 its belief, at most e^4, are multiplied by today's factor of evenness and excess motion instead of
-creep; by today, both, and today's evidence instead of a fit. *Equal matches off the map*: the
-threshold at which as many images off the map are matched as by row a at .5, and at its .01.
+creep; by today, both, and today's evidence instead of a fit; alpha, today's weight of an image by
+its change. *Equal matches off the map*: the threshold at which as many images off the map are
+matched as by row a at .5, and at its .01.
 """
 REMOVED = """
 Change of recall at equal matches off the map, mean of the sets and the worst set. Terms of the
@@ -816,7 +831,10 @@ def results_of(
 
     now = pooled('', 0)
     rows = {'a': Row(now), 'a refit': Row(now, now.x)}
-    rows |= dict(small_rows(pooled('', 1))) if with_small else {}
+    if with_small:
+        rows |= dict(small_rows(pooled('', 1)))
+        weighted = dict(small_rows(pooled('', 2)))
+        rows['c by today, alpha'] = weighted['c by today']
     if any(mechanism for _, mechanism in shown):
         rows |= {f'b {name}': Row(now, now.x[:, columns]) for name, columns in TERMS.items()}
     for mechanism in dict.fromkeys(name for _, name in shown if name):

@@ -113,11 +113,11 @@ class SmallFilter:
         self._agree: deque[bool] = deque(maxlen=model.length)
         self.count = 0
 
-    def update(self, z: np.ndarray) -> None:
-        """Add an image that moved, by its z-normalized distances, (n,)."""
+    def update(self, z: np.ndarray, weight: float = 1.0) -> None:
+        """Add an image that moved, by its z-normalized distances, (n,), and its share of alpha."""
         s, mu = self.model, self.model.level
         likelihoods = mu * np.minimum(z, np.float32(s.most)) - mu * mu / 2
-        likelihoods = np.exp(s.weight * likelihoods).astype(np.float32)
+        likelihoods = np.exp(s.weight * weight * likelihoods).astype(np.float32)
         states, off = self._states[-1]
         if self.count:
             states, off = advance(states, off, self._steps, s.change, s.leave, s.enter)
