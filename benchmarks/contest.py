@@ -899,6 +899,7 @@ def main(arguments: list[str] | None = None) -> int:
             shown |= shown_by([AND.join(free)], *run)
             results = results_of(drives, shown, options.features, 'c' in options.rows)
     lines = page(about, results)
+    options.output.mkdir(parents=True, exist_ok=True)
     write_lines(options.output / f'contest{"-quick" * options.quick}.md', lines)
     print(*lines, f'took {time.perf_counter() - began:.0f} s', sep='\n')
     return 0
