@@ -20,7 +20,7 @@ CEILINGS = {
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_198,
     'lines of the method (filter, prepare, recognition)': 7_321,
-    'lines of all tests': 33_700,
+    'lines of all tests': 33_701,
     'lines of benchmarks and tools': 9_240,
     'lines of docs and README': 4_030,
     'parameters of the node': 51,
