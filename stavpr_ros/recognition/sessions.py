@@ -84,5 +84,5 @@ def in_places(
 
 def time_note(place_map: PlaceMap) -> str:
     """Return what several sessions cost, for the log of a start, '' of a map of one."""
-    count = len(place_map.sessions)
-    return f'{count} sessions: an image takes {count} times the time of one' if count > 1 else ''
+    n = len(place_map.sessions)
+    return f'{n} sessions: an image takes up to {n} times the time of one' if n > 1 else ''
