@@ -27,7 +27,7 @@ AT_HWCAP, HWCAP_ASIMDDP = 16, 1 << 20  # of Linux on aarch64: sys/auxv.h, asm/hw
 COMPILING = 'compiling kernels, once, one to two minutes'
 PACKAGE = Path(__file__).parent
 OWN_CACHE = PACKAGE / '__pycache__' / 'kernels'
-KERNELS = 375  # that `stavpr warm` compiles with all packages, for the progress bar
+KERNELS = 355  # that `stavpr warm` compiles with all packages, for the progress bar
 
 # Of numba's threading layers, the default's fallback aborts the process when two threads meet in
 # it.

@@ -15,20 +15,20 @@ from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.registry import evidence_of
-from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.model import MODEL
-from stavpr_ros.filter.motion import ImageChange, MAX_LAG
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.memory import aligned_zeros
-from stavpr_ros.prepare.blocks import PlaceChanges
+from stavpr_ros.method import Match, RecognizerSettings, Status
+from stavpr_ros.method.cells import CellAgreement
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.localizer import position_of, SequenceRecognizer
+from stavpr_ros.method.model import MODEL
+from stavpr_ros.method.motion import ImageChange
+from stavpr_ros.method.sessions import session_gap
+from stavpr_ros.method.settings import ROBUST
+from stavpr_ros.method.window import FilterWindow
+from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
-from stavpr_ros.recognition import Match, RecognizerSettings, Status
-from stavpr_ros.recognition.cells import CellAgreement
-from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer
-from stavpr_ros.recognition.sessions import session_gap
-from stavpr_ros.recognition.settings import ROBUST
 from stavpr_ros.threads import call_on_thread
 
 CHUNK = 32  # places that are fetched together
@@ -143,7 +143,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._matcher = CpuMatcher(
             LocalFeatures(self._strips, self._weights, city.settings), settings.applied_spatial
         )
-        self._learned = ImageChange(self._sampled, MODEL, settings.sequence.length)
+        self._learned = ImageChange(self._sampled, settings.sequence.length)
         self._learned.learn(changes.changes, _firsts(places, index.runs(places)))
         self._chunks = np.full(CHUNKS, -1)  # in each slot
         self._in_use = np.zeros(CHUNKS, bool)  # of this query, or all while the store fails
@@ -278,9 +278,7 @@ class FleetRecognizer(SequenceRecognizer):
         """Return the places that are most probable now."""
         if not len(self._order):
             return np.empty(0, np.int64)
-        probabilities = self._filter_window.layout.to_places(
-            self._filter_window.filter.places_of_states()
-        )
+        probabilities = self._filter_window.layout.to_places(self._filter_window.filter.by_place())
         top = np.argsort(-probabilities)[:LIKELY]
         return self._places[self._order][top[probabilities[top] > MIN_PROBABILITY]]
 
@@ -336,7 +334,7 @@ class FleetRecognizer(SequenceRecognizer):
         share = len(places) / len(self._city)
         model = replace(MODEL, start=MODEL.start * share, enter=MODEL.enter * share)
         sequence = self._settings.sequence
-        window = FilterWindow(sequence, len(places), model, layout, constant=self._constant)
+        window = FilterWindow(sequence, len(places), layout, constant=self._constant, model=model)
         if self._cells is not None:
             rows = self._sampled + self._order
             window.cells = CellAgreement(
@@ -345,17 +343,16 @@ class FleetRecognizer(SequenceRecognizer):
                 sequence.length,
             )
         window.recent = self._filter_window.recent  # the drive goes on
-        window.choice.learn_times(self._city.stamps[places])
         window.change.copy_statistics(self._learned, self._from_before[self._order])
         self._window = self._filter_window = window
         for image in self._images:
             self._push(image)
 
     def _push(self, image: _Image) -> None:
-        self._filter_window.change.next_query(image.strips)
-        if self._filter_window.cells is not None:
-            self._filter_window.cells.push(image.strips)
-        self._filter_window.add(image.z[self._order], image.stamp, image.change)
+        window = self._filter_window
+        window.change.next_query(image.strips)
+        z = window.layout.to_columns(image.z[self._order])
+        window.add(z, image.stamp, image.change, image.strips)
 
 
 def _firsts(places: np.ndarray, runs: np.ndarray) -> np.ndarray:

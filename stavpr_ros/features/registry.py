@@ -188,16 +188,17 @@ class Kind:
     :param settings: the frozen dataclass of its settings.
     :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use;
         '' for features that are not computed from images.
-    :param constant: of the evidence of a window (:mod:`stavpr_ros.filter.evidence`).
+    :param constant: of the evidence of a window (:mod:`stavpr_ros.method.evidence`).
     :param cells: of its strips, with its default settings.
-    :param with_cells: the constant where they are compared.
+    :param with_cells: the constant where they are compared; route: in loop closure.
     """
 
     settings: Any
     backbone: str = ''
-    constant: float = -6.8
+    constant: float = -5.1
     cells: Cells | None = None
     with_cells: float = 0.0
+    route: float = -5.3
 
 
 LAB = ('densenet161_places365', 'vgg16', 'vgg16_fc6', 'netvlad')
@@ -209,21 +210,23 @@ KINDS = {
         GradientSettings,
         f'{_FEATURES}.gradient:Gradient',
         cells=Cells(0, 8, 14, 2, dimension=224),
-        with_cells=-9.1,
+        with_cells=-6.9,
     ),
     'efficientnet_lite1': Kind(
         EfficientNetSettings,
         f'{_FEATURES}.efficientnet_lite:EfficientNetLite1',
-        constant=-8.4,
+        constant=-6.7,
         cells=Cells(0, 112, 7, 1, dimension=784),
-        with_cells=-12.0,
+        with_cells=-10.0,
+        route=-5.8,
     ),
     'hybrid': Kind(
         HybridSettings,
         f'{_FEATURES}.hybrid:Hybrid',
-        constant=-8.4,
+        constant=-6.7,
         cells=Cells(224, 112, 7, 1, dimension=1008),
-        with_cells=-12.0,
+        with_cells=-10.0,
+        route=-5.8,
     ),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),
     'descriptors': Kind(DescriptorSettings),
@@ -280,6 +283,11 @@ def evidence_of(kind: str, strips: int, dimension: int) -> tuple[float, Cells | 
     if entry.cells is None or (strips, dimension) != (7, entry.cells.dimension):
         return entry.constant, None
     return entry.with_cells, entry.cells
+
+
+def route_evidence_of(kind: str) -> float:
+    """Return the constant of the evidence of a kind of features in loop closure."""
+    return (KINDS.get(kind) or _all().get(kind) or Kind(None)).route
 
 
 def _kind(name: str) -> Kind:

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.filter.model import MODEL
 from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.method.model import STANDSTILL
 from stavpr_ros.prepare.blocks import blocks, PlaceChanges
 from stavpr_ros.prepare.centering import MeanCentering
 from stavpr_ros.progress import Progress
@@ -30,7 +30,7 @@ def without_duplicates(place_map: PlaceMap) -> PlaceMap:
         changes.add(strips)
     is_first = np.diff(np.zeros(n) if index is None else index, prepend=-1) != 0
     neighbors = changes.changes[0, ~is_first]
-    least = MODEL.standstill * (neighbors.mean(dtype=float) if len(neighbors) else 1)
+    least = STANDSTILL * (neighbors.mean(dtype=float) if len(neighbors) else 1)
     positions = np.full((n, 3), np.nan) if place_map.poses is None else place_map.poses[:, :3]
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moved = MIN_MOTION * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0

@@ -13,10 +13,10 @@ import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.method.localizer import PlaceRecognizer
+from stavpr_ros.method.match import Match
+from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition.match import Match
-from stavpr_ros.recognition.recognizer import PlaceRecognizer
-from stavpr_ros.recognition.settings import RecognizerSettings
 
 SURE = 0.9  # probability above which two places are taken to be the same
 AT_END = 60  # last places of a route, which are compared with its first ones
@@ -41,7 +41,8 @@ class SamePlaces:
         """Take the match of the window that ends with an image; only a full one counts."""
         if match.accepted and len(match.window_stamps) == length:
             window = image - length + 1 + match.path[:, 0]
-            self._near[window] = match.path[:, 1]
+            is_sure = match.path_probabilities > SURE  # beyond an end of the places, it is not
+            self._near[window[is_sure]] = match.path[is_sure, 1]
             self.middles[window[(len(window) - 1) // 2]] = match.place_index
 
     @property

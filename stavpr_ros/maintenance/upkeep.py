@@ -17,21 +17,21 @@ from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.filter.model import MODEL
 from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
 from stavpr_ros.maintenance.same_places import recognized, SamePlaces
 from stavpr_ros.mapping import merge_maps, PlaceMap, select_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.mapping.versions import current_version, KEPT, save_version, Version
+from stavpr_ros.method.error_rate import least_probability
+from stavpr_ros.method.localizer import PlaceRecognizer
+from stavpr_ros.method.model import MODEL
+from stavpr_ros.method.settings import RecognizerSettings
+from stavpr_ros.method.verification import GeometricSettings, PlaceVerifier
 from stavpr_ros.output_file import FileVersion
 from stavpr_ros.prepare.prepared_map import statistics_of_map
-from stavpr_ros.recognition.error_rate import least_probability
-from stavpr_ros.recognition.recognizer import PlaceRecognizer
-from stavpr_ros.recognition.settings import RecognizerSettings
-from stavpr_ros.recognition.verification import GeometricSettings, PlaceVerifier
 
 DRIVES = 3  # latest ones, which are kept beside the map before its first update
-MAX_ERROR = 0.01  # rate of wrong matches that a certain image keeps
+MAX_ERROR = 0.005  # rate of wrong matches that a certain image keeps
 MIN_IMAGES, MIN_CERTAIN = 40, 0.3  # certain images, and their share of those in motion
 MIN_SHARE = 0.5  # of the places of a session, which a drive passes
 MAX_LAPS = 2  # images of a drive in motion that are kept, times the places before the first update

@@ -20,12 +20,12 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import image_change, KeyframeSelector, small_gray
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method.localizer import SequenceRecognizer
+from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.pipeline.result import GeometricCheck, ImageResult
 from stavpr_ros.pipeline.save_state import SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.loop_closer import LoopCloser
-from stavpr_ros.recognition.recognizer import SequenceRecognizer
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes

@@ -14,9 +14,9 @@ import math
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import aligned_index
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.recognition import Candidate, Match, Status
-from stavpr_ros.recognition.match import Limits
-from stavpr_ros.recognition.verification import (
+from stavpr_ros.method import Candidate, Match, Status
+from stavpr_ros.method.match import Limits
+from stavpr_ros.method.verification import (
     GeometricEvidence,
     GeometricSettings,
     PlaceVerifier,

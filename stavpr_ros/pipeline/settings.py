@@ -18,11 +18,11 @@ from stavpr_ros.features.registry import AUTO, kinds, settings_class, settings_f
 from stavpr_ros.mapping.camera import mount_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
 from stavpr_ros.mapping.stores import is_address
+from stavpr_ros.method import RecognizerSettings
+from stavpr_ros.method.loop_closer import least_limit
+from stavpr_ros.method.verification import GeometricSettings
 from stavpr_ros.parameters import BY_NAME, default
 from stavpr_ros.pipeline.maps_folder import maps_folder
-from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.loop_closer import least_limit
-from stavpr_ros.recognition.verification import GeometricSettings
 
 OPERATIONS = BY_NAME['operation'].choices
 
@@ -37,7 +37,7 @@ class PipelineSettings:
     :param threshold: mode paper: a window is matched when its distance is below it; None = not
         set.
     :param min_probability, max_error: mode robust, see
-        :class:`stavpr_ros.recognition.RecognizerSettings`.
+        :class:`stavpr_ros.method.RecognizerSettings`.
     :param features: kind of the features of a route that starts without a map, or ``auto``.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
     :param candidates: nearest places that every match lists.

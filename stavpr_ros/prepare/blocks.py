@@ -22,6 +22,9 @@ from stavpr_ros.memory import aligned_empty
 from stavpr_ros.threads import thread_count
 
 PIECE = 256  # places read or centered at a time
+MAX_LAG = 5  # places apart up to which the changes of a map are learned
+LARGE_CHANGE = 0.97  # quantile of changes from place to place
+REST, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a slow one
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,23 @@ class PlaceChanges:
             self.changes[apart - 1, self._count + first - before : self._count + m] = out[first:]
         self._count += m
         self._latest = block[:, -len(self.changes) :].copy()
+
+
+def change_weights(changes: np.ndarray) -> np.ndarray:
+    """
+    Return how much each place counts, (n,): less where the camera was at rest or slow.
+
+    Nothing below a change from the place before of ``REST``, fully above ``SLOW`` of the large
+    changes, and in proportion between; the largest, from one drive to another, do not matter.
+
+    :param changes: of each place from the one before, (n,); the first does not matter.
+    """
+    large = float(np.quantile(changes, LARGE_CHANGE, method='lower')) if len(changes) else 0.0
+    if not large:
+        return np.ones(len(changes))
+    weights: np.ndarray = np.clip((changes / large - REST) / (SLOW - REST), 0, 1)
+    weights[:1] = 1
+    return weights
 
 
 @parallel_kernel

@@ -15,9 +15,14 @@ import numpy as np
 from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.filter.motion import change_weights
 from stavpr_ros.mapping.stored_features import MapStatistics
-from stavpr_ros.prepare.blocks import blocks, converted, converted_blocks, PlaceChanges
+from stavpr_ros.prepare.blocks import (
+    blocks,
+    change_weights,
+    converted,
+    converted_blocks,
+    PlaceChanges,
+)
 
 PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most

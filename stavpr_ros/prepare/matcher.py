@@ -24,7 +24,7 @@ class Matcher(Protocol):
     """
     Image distances to every place of a map.
 
-    Nothing is checked here: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
+    Nothing is checked here: see :class:`stavpr_ros.method.PlaceRecognizer`.
     """
 
     @property

@@ -5,8 +5,8 @@
 import numpy as np
 from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
-from stavpr_ros.filter.columns import ONE_SESSION
 
+ONE_SESSION: np.ndarray = np.zeros(1, np.int64)
 MIN_DEVIATION = 1e-3  # standard deviation of a row below which it carries no information
 
 

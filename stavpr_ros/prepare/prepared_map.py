@@ -12,11 +12,16 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
-from stavpr_ros.prepare.blocks import converted_blocks, Int8Features, PlaceChanges, rounded
+from stavpr_ros.prepare.blocks import (
+    converted_blocks,
+    Int8Features,
+    MAX_LAG,
+    PlaceChanges,
+    rounded,
+)
 from stavpr_ros.prepare.centering import MeanCentering, RANK, SAMPLE, STRENGTH
 
 METHOD = f'mean, whitening {RANK} of {SAMPLE} by {STRENGTH}, changes {MAX_LAG}, 2'

@@ -11,7 +11,7 @@ are places, so that a place is seldom rounded again.
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.filter.motion import change_weights, MAX_LAG
+from stavpr_ros.prepare.blocks import change_weights, MAX_LAG
 from stavpr_ros.prepare.centering import evenly_weighted, norms_of, unit_norm, Whitening
 from stavpr_ros.prepare.route_strips import grown, move_up, rounded_strips, RouteStrips
 

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 from stavpr_ros.mapping.camera import Camera
-from stavpr_ros.recognition.verification import mutual_matches
+from stavpr_ros.method.verification import mutual_matches
 from stavpr_ros.relative_pose.bundle import MIN_INVERSE_DEPTH, Observations, odometry_information
 
 RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.recognition import Match
+from stavpr_ros.method import Match
 
 NEIGHBORS = 4  # places before and after a place that its keypoints are triangulated with
 LANDMARK_RADIUS = 1  # places before and after the place whose landmarks are used as well

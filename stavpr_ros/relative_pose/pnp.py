@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from stavpr_ros.mapping.transforms import cross, inverse
-from stavpr_ros.recognition.verification import mutual_matches
+from stavpr_ros.method.verification import mutual_matches
 from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
 
 MIN_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most

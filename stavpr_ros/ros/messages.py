@@ -36,8 +36,8 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.mapping.transforms import turned
+from stavpr_ros.method import Status
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.sources.frame import ImageRecord
 from stavpr_ros.units import SECOND, WRAP

@@ -13,9 +13,9 @@ from rclpy.node import Node
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
+from stavpr_ros.method import Status
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.recognition import Status
 from stavpr_ros.ros.messages import matched_pose_message, newest_pose, transform_message
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from stavpr_ros.ros.worker import Beat

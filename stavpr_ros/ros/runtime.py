@@ -16,6 +16,7 @@ from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of, yaw_of
+from stavpr_ros.method import Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
@@ -26,7 +27,6 @@ from stavpr_ros.pipeline.saving import (
     take_up_earlier_drives,
 )
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
-from stavpr_ros.recognition import Status
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.bond import Bond, make_bond

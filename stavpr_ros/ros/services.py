@@ -11,10 +11,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
+from stavpr_ros.method import Status
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import update_own_map, write_map
-from stavpr_ros.recognition import Status
 from stavpr_ros.ros.messages import candidates_message, match_message, matched_pose_message
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime

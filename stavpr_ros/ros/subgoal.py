@@ -11,9 +11,9 @@ from sensor_msgs.msg import CompressedImage
 from stavpr_msgs.msg import PlaceCandidates
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.method import Candidate
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.recognition import Candidate
 from stavpr_ros.ros.messages import candidates_message
 from stavpr_ros.ros.output import is_requested
 from stavpr_ros.ros.rclpy_workarounds import until_shutdown

@@ -268,7 +268,8 @@ def ranked_candidates(
     The first is the nearest sequence, the second its second best. O(count x n).
 
     :param nearest: the nearest sequence; None if there is none.
-    :param sequences: all sequences, in any order; of equal costs the first is taken.
+    :param sequences: all sequences, in any order; the most probable first; else of equal costs
+        the first one.
     :param count: most candidates, at least 0.
     :param nms_radius: candidates are more than this many places from each other.
     :param positions: of places, between which the distance is measured; lap: of a closed route,
@@ -280,13 +281,15 @@ def ranked_candidates(
     if nearest is None or not count:
         return []
     costs, places, probabilities = sequences
-    costs, at_position = costs.copy(), positions(places)
+    # the costs of improbable places are equal: 1 up to the last digit
+    keys = costs.copy() if probabilities is None else -probabilities
+    keys[~np.isfinite(costs)], at_position = np.inf, positions(places)
     ranked = [nearest]
     while len(ranked) < count and len(costs):
         apart = np.abs(at_position - positions(ranked[-1].place))
-        costs[np.minimum(apart, np.abs(lap - apart) if lap else apart) <= nms_radius] = np.inf
-        best = int(np.argmin(costs))
-        if math.isinf(costs[best]):
+        keys[np.minimum(apart, np.abs(lap - apart) if lap else apart) <= nms_radius] = np.inf
+        best = int(np.argmin(keys))
+        if math.isinf(keys[best]):
             break
         probability = math.nan if probabilities is None else float(probabilities[best])
         ranked.append(Candidate(int(places[best]), float(costs[best]), probability))

@@ -19,8 +19,8 @@ from stavpr_ros.checks import (
 )
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.place_map import ErrorRisks
+from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.parameters import default
-from stavpr_ros.recognition.error_rate import least_probability
 
 DIRECTIONS = ('forward', 'both')
 MODES = ('paper', 'robust')
@@ -39,7 +39,7 @@ class RobustOptions:
     :param query_znorm: z-normalize the distances of an image to all places (:func:`z_normalized`):
         certain images are far from all places.
     :param place_filter: follow place and speed with a Bayes filter with a state off the
-        map (:mod:`stavpr_ros.filter.place_filter`) instead of matching each window by LM-DTW,
+        map (:mod:`stavpr_ros.method.filter`) instead of matching each window by LM-DTW,
         where one place may absorb a window.
     """
 
@@ -76,15 +76,15 @@ class RecognizerSettings:
     :param nms_radius: the second best's midpoint is more than this many places from the nearest
         one's.
     :param mode: ``robust``, with all options of
-        :class:`stavpr_ros.recognition.settings.RobustOptions`, or ``paper``, LM-DTW as published.
+        :class:`stavpr_ros.method.settings.RobustOptions`, or ``paper``, LM-DTW as published.
     :param robust_options: another choice of options than the mode's.
     :param odometry_error: of a distance by odometry, as a share of it; where query and places have
         poses, the path of a match is compared with them; 0 = never. See
-        :mod:`stavpr_ros.recognition.relative_motion`.
+        :mod:`stavpr_ros.method.relative_motion`.
     :param min_probability: mode robust: a window is matched when its probability is above it;
         above 0, below 1.
     :param max_error: mode robust: rate of wrong matches that chooses this probability instead
-        (:func:`stavpr_ros.recognition.error_rate.least_probability`), 0 = off. A
+        (:func:`stavpr_ros.method.error_rate.least_probability`), 0 = off. A
         ``min_probability`` other than the default applies as well where it is stricter.
     :param direction: mode robust: ``forward``, the camera moves along the map, or ``both``, it may
         move against it as well: a robot that reverses, or whose rear camera made the map.
@@ -169,7 +169,7 @@ class RecognizerSettings:
         spatial, sequence = self.applied_spatial, self.sequence
         mode = self.mode if self.robust_options is None else 'own options'
         return (
-            f'{mode} by evidence, version 3, length {sequence.length}, beta {sequence.beta:g}, '
+            f'{mode} by evidence, version 4, length {sequence.length}, beta {sequence.beta:g}, '
             f'{spatial.strategy}, sigma {spatial.sigma:g}, xi {spatial.xi}, '
             f'vertical {spatial.vertical}' + ', both directions' * self.moves_against
         )

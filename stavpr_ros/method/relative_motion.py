@@ -12,14 +12,11 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from stavpr_ros.recognition.match import WindowMatch
+from stavpr_ros.method.match import WindowMatch
+from stavpr_ros.method.model import ALONG, FARTHEST, LONGEST, UNUSUAL
 
-ALONG = 0.5  # deviation of a matched place along the track, places
 TURNS = 2  # degrees of freedom of the trajectory's shape; its length has one
-UNUSUAL = 0.05  # share of right paths that disagree more, below which probabilities are lowered
 MIN_IMAGES = 3
-LONGEST = 5  # windows of the trajectory that are compared
-FARTHEST = 5  # places from image to image
 MIN_DOUBT = 1e-9  # no probability is 1
 NO_PLACE = -FARTHEST - 1  # no match goes on from it
 Positions = Sequence[np.ndarray] | np.ndarray
@@ -122,7 +119,7 @@ def agreement(
     image to the newest with the path's. With the deviations sigma_i = hypot(``ALONG``
     spacings, ``error`` s_i) of an image s_i meters from the middle one, the sum
 
-        chi^2 = 2 mean_i (|r_i| / sigma_i)^2 + (length - length of path)^2 / sigma^2
+        chi^2 = 2 mean_i (abs(r_i) / sigma_i)^2 + (length - length of path)^2 / sigma^2
 
     of the distances r_i that remain has three degrees of freedom, since successive images deviate
     alike. The path has two places to be wrong about: its sigma has 2 ``ALONG``.

@@ -10,18 +10,14 @@ from stavpr_ros.alignment.device import lm_dtw, nearest_starts
 from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
-from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.device_filter import DevicePlaceFilter
-from stavpr_ros.filter.evidence import changed_images, FAR, straight_steps
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.device_filter import DevicePlaceFilter
+from stavpr_ros.method.match import WindowMatch, WindowSequences
+from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
+from stavpr_ros.method.sessions import in_places
+from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
-from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.sessions import in_places
-from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
 import torch
-from torch.nn.functional import pad
-
-PLACES_AT_ONCE = 1 << 17  # columns of straight paths: 0.25 GB at a time
 
 
 def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Tensor:
@@ -55,40 +51,6 @@ class DeviceBuffer(SequenceBuffer):
         """See :meth:`SequenceBuffer.at`; copied from the device."""
         flat = torch.from_numpy(self._ring(images)[:, None] * self.memory.shape[1] + columns)
         return self.memory.take(flat.to(self._device)).cpu().numpy()
-
-    def best_elsewhere(
-        self, numbers: np.ndarray, position: int, excluded: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        """See :meth:`SequenceBuffer.best_elsewhere`; waits for the device."""
-        counted = changed_images(numbers)
-        rows = torch.from_numpy(self._ring(len(numbers))[counted]).to(self._device)
-        steps = straight_steps(numbers, position)[:, counted]
-        reach, images = int(np.abs(steps).max()), steps.shape[1]
-        z = self.memory.index_select(0, rows)[:, : self.known]
-        z = pad(torch.where(z.isfinite(), z, float(FAR)), (reach, reach), value=float(FAR))
-        shifts = torch.from_numpy(steps + reach).to(self._device)[:, :, None]
-        columns = torch.arange(self.known, device=self._device)
-        sums = torch.cat(
-            [
-                z.expand(len(steps), -1, -1).gather(2, shifts + part).sum(dim=1)
-                for part in columns.split(PLACES_AT_ONCE)
-            ],
-            dim=1,
-        )
-        for first, end in np.maximum(excluded, 0).tolist():
-            sums[:, first:end] = torch.inf
-        least, speed, place = torch.stack(_smallest(sums)).tolist()
-        if not np.isfinite(least):
-            return -np.inf, np.empty(0, np.int64)
-        path = np.clip(int(place) + steps[int(speed)], 0, self.known - 1)
-        return -least / images, path
-
-
-def _smallest(sums: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return the smallest number of a matrix, its row and its column, (), float64 each."""
-    at = sums.argmin()
-    row, column = at // sums.shape[1], at % sums.shape[1]
-    return sums.flatten()[at].double(), row.double(), column.double()
 
 
 class RowColumns:
@@ -137,9 +99,13 @@ class DeviceFilterWindow(FilterWindow):
     def __init__(self, *arguments: Any, device: torch.device, **options: Any) -> None:
         self._device = device
         self._row_columns: RowColumns | None = None
-        self.buffer_class = partial(DeviceBuffer, device=device)
         self.filter_class = partial(DevicePlaceFilter, device=device)
         super().__init__(*arguments, **options)
+
+    def newest_row(self) -> np.ndarray:
+        """Return the row of the newest image, (n,), copied from the device."""
+        row: Any = self._newest
+        return row.cpu().numpy() if isinstance(row, torch.Tensor) else super().newest_row()
 
     def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
         if self._row_columns is None:  # the map has been learned
@@ -149,7 +115,7 @@ class DeviceFilterWindow(FilterWindow):
         return self._row_columns(row)
 
 
-class DeviceLmDtwWindow(QueryWindow):
+class DeviceLmDtwWindow(BufferWindow):
     """
     LM-DTW on a device; only a match waits for it.
 

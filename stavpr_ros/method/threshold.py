@@ -7,8 +7,8 @@ import numpy as np
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 WINDOWS = 24  # that are tried
 

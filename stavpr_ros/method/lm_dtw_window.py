@@ -12,20 +12,20 @@ from stavpr_ros.alignment.lm_dtw import (
     trace_sequence,
 )
 from stavpr_ros.alignment.settings import SequenceSettings
-from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.recognition.match import WindowMatch, WindowSequences
-from stavpr_ros.recognition.sessions import in_places
-from stavpr_ros.recognition.window import QueryWindow, SequenceBuffer
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.match import WindowMatch, WindowSequences
+from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
+from stavpr_ros.method.sessions import in_places
 
 
-class LmDtwWindow(QueryWindow):
+class LmDtwWindow(BufferWindow):
     """
-    LM-DTW on the CPU; its twin is in :mod:`stavpr_ros.recognition.device_windows`.
+    LM-DTW on the CPU; its twin is in :mod:`stavpr_ros.method.device_windows`.
 
     :param sequence: l and k.
     :param places: number of places n.
     :param layout: of the places.
-    :param normalizes, around: see :class:`stavpr_ros.recognition.window.QueryWindow`.
+    :param normalizes, around: see :class:`stavpr_ros.method.query_window.QueryWindow`.
     """
 
     def __init__(

@@ -6,17 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.filter.columns import ColumnLayout, ONE_SESSION
-from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.filter.motion import MAX_LAG
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
+from stavpr_ros.method.model import Model
+from stavpr_ros.prepare.blocks import MAX_LAG
+from stavpr_ros.prepare.normalization import ONE_SESSION
 
 
 def layout_of(
     place_map: PlaceMap,
     nms_radius: int,
-    model: FilterSettings,
+    model: Model,
     against: bool = False,
     length: int = 0,
 ) -> ColumnLayout:
@@ -41,7 +42,7 @@ def layout_of(
     return ColumnLayout(firsts, same_as.astype(np.int64), gap, against, repeated)
 
 
-def session_gap(nms_radius: int, model: FilterSettings) -> int:
+def session_gap(nms_radius: int, model: Model) -> int:
     """Return the number of columns between two sessions: no place is near to another session."""
     farthest = int(np.ceil(max(model.speeds))) + 1  # places from image to image
     return max(farthest, nms_radius) + 1

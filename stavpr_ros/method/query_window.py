@@ -4,8 +4,8 @@
 The window of a query: its latest images, and their distances to all places.
 
 A recognizer has one window, which is all that is reset between two queries beside running means:
-:class:`stavpr_ros.recognition.filter_window.FilterWindow` in mode robust, a window of
-:mod:`stavpr_ros.recognition.lm_dtw_window` where sequences are matched by LM-DTW.
+:class:`stavpr_ros.method.window.FilterWindow` in mode robust, a window of
+:mod:`stavpr_ros.method.lm_dtw_window` where sequences are matched by LM-DTW.
 """
 
 from abc import ABC, abstractmethod
@@ -15,21 +15,17 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import padded_width
 from stavpr_ros.checks import no_nan
-from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.evidence import best_elsewhere
 from stavpr_ros.memory import aligned_empty
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.match import WindowMatch
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.recognition.match import WindowMatch
 
 # An image of the window:
 # stamp       ns; 0 = unknown
 # change      from the image before; mode robust
-# weight      exponent alpha of its likelihood; mode robust
 # number      of the filter's last update; images of a camera at rest share one
 # is_matched  it had a match as the middle image
-WINDOW_IMAGE = np.dtype(
-    [('stamp', 'i8'), ('change', 'f8'), ('weight', 'f8'), ('number', 'i8'), ('is_matched', '?')]
-)
+WINDOW_IMAGE = np.dtype([('stamp', 'i8'), ('change', 'f8'), ('number', 'i8'), ('is_matched', '?')])
 
 
 class SequenceBuffer:
@@ -126,18 +122,6 @@ class SequenceBuffer:
         """
         return self.memory[self._ring(images)[:, None], columns]
 
-    def best_elsewhere(
-        self, numbers: np.ndarray, position: int, excluded: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        """
-        Return the largest mean of -z of straight paths of the newest images, and its path.
-
-        :param numbers, excluded, position: of
-            :func:`stavpr_ros.filter.evidence.best_elsewhere`.
-        """
-        rows = self._ring(len(numbers))
-        return best_elsewhere(self.memory, rows, self.known, numbers, position, excluded)
-
     def _ring(self, images: int | None = None) -> np.ndarray:
         """Return the rows of one copy of the newest images, oldest first, (images,)."""
         end = self.oldest + self.length
@@ -167,8 +151,8 @@ class QueryWindow(ABC):
     """
     The latest l images of a query, and the sequence of places that they show.
 
-    :param buffer: of their distances, empty.
-    :param layout: of the places in the columns of the buffer.
+    :param length: l.
+    :param layout: of the places in columns.
     :param normalizes: z-normalize the distances of each image.
     :param around: see :func:`stavpr_ros.prepare.normalization.z_normalized`.
 
@@ -177,14 +161,15 @@ class QueryWindow(ABC):
 
     def __init__(
         self,
-        buffer: SequenceBuffer,
+        length: int,
         layout: ColumnLayout,
         normalizes: bool = False,
         around: int = 0,
     ) -> None:
-        self.buffer, self.layout = buffer, layout
+        self.length, self.layout = length, layout
+        self.first = self.known = 0
         # one behind the other; at the end, the window moves to the front
-        self._images, self._end = np.empty(2 * buffer.length, WINDOW_IMAGE), 0
+        self._images, self._end = np.empty(2 * length, WINDOW_IMAGE), 0
         self.images = self._images[:0]
         self._normalizes, self._around = normalizes, around
 
@@ -198,6 +183,12 @@ class QueryWindow(ABC):
         """Whether the newest image equals the one before, up to noise; False without a filter."""
         return False
 
+    @property
+    def full(self) -> bool:
+        """As many images as the window is long have come."""
+        return len(self.images) == self.length
+
+    @abstractmethod
     def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
         """
         Add the newest image, and drop the oldest.
@@ -206,16 +197,20 @@ class QueryWindow(ABC):
         :param strips: its features, centered, (W, d).
         :param stamp: ns; 0 = unknown.
         """
-        self.buffer.push(self._as_columns(row))
-        self._append(stamp)
 
-    def _append(
-        self, stamp: int, change: float = 0.0, weight: float = 0.0, number: int = 0
-    ) -> None:
-        rows, before = self._images, min(len(self.images), self.buffer.length - 1)
+    @abstractmethod
+    def newest_row(self) -> np.ndarray:
+        """Return the distances of the newest image to the columns, (width,)."""
+
+    @abstractmethod
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """Return the distances of the images to columns, oldest first, (images, m), float32."""
+
+    def _append(self, stamp: int, change: float = 0.0, number: int = 0) -> None:
+        rows, before = self._images, min(len(self.images), self.length - 1)
         if self._end == len(rows):
             rows[:before], self._end = rows[self._end - before :], before
-        rows[self._end] = stamp, change, weight, number, False
+        rows[self._end] = stamp, change, number, False
         self._end += 1
         self.images = rows[self._end - before - 1 : self._end]
 
@@ -259,8 +254,51 @@ class QueryWindow(ABC):
 
     def reset(self) -> None:
         """Drop all images."""
-        self.buffer.clear()
         self.images, self._end = self._images[:0], 0
+
+    @abstractmethod
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        self.first += count
+
+
+class BufferWindow(QueryWindow):
+    """
+    A window whose distances are in a buffer.
+
+    :param buffer: empty; others: see :class:`QueryWindow`.
+    """
+
+    def __init__(
+        self,
+        buffer: SequenceBuffer,
+        layout: ColumnLayout,
+        normalizes: bool = False,
+        around: int = 0,
+    ) -> None:
+        super().__init__(buffer.length, layout, normalizes, around)
+        self.buffer = buffer
+
+    def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
+        """See :meth:`QueryWindow.push`."""
+        self.buffer.push(self._as_columns(row))
+        self._append(stamp)
+
+    def newest_row(self) -> np.ndarray:
+        """See :meth:`QueryWindow.newest_row`."""
+        return self.buffer.newest()
+
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`QueryWindow.at`."""
+        return self.buffer.at(columns[None])
+
+    def reset(self) -> None:
+        """Drop all images."""
+        super().reset()
+        self.buffer.clear()
 
     def grow(self, places: int) -> None:
         """Make room for more places."""
@@ -268,4 +306,5 @@ class QueryWindow(ABC):
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
+        super().evict(count)
         self.buffer.evict(count)

@@ -18,11 +18,7 @@ last one that was.
 from collections import deque
 
 import numpy as np
-
-IMAGES = 40  # T: time constant of the mean
-PRIOR = 10  # P: images at mean 0 that it starts from
-NEAREST = -1.5  # least z that counts: a single image must not determine the mean
-DELAY = 6  # latest images that do not count yet: a slow camera shows a place for as long
+from stavpr_ros.method.model import DELAY, MEAN_IMAGES, MEAN_PRIOR, NEAREST
 
 
 class PlaceMeans:
@@ -42,12 +38,12 @@ class PlaceMeans:
         """
         if len(z) > len(self._sums):
             self._sums = _extended(self._sums, len(z))
-        less: np.ndarray = z - self._sums[: len(z)] / np.float32(self._count + PRIOR)
+        less: np.ndarray = z - self._sums[: len(z)] / np.float32(self._count + MEAN_PRIOR)
         if len(z) and not is_standstill:
             compared = np.isfinite(z)
             self._latest.append(np.where(compared, np.maximum(z, NEAREST), np.float32(0)))
         if len(self._latest) > DELAY:
-            decay = np.float32(1 - 1 / IMAGES)
+            decay = np.float32(1 - 1 / MEAN_IMAGES)
             self._count = self._count * float(decay) + 1
             self._sums *= decay
             self._sums += _extended(self._latest.popleft(), len(self._sums))

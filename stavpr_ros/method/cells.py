@@ -6,7 +6,7 @@ Cells that agree: whether the same parts of two images are at the same places.
 The strips of several kinds of features are 7 x 7 cells of an image. A cell of the image and one of
 the place **agree** if each is the nearest one of the other, at most one row apart; c is the number
 of those that agree at one sideways shift, within one column. Unlike a distance, c is not changed
-by what all cells share, such as light. The quantity of :mod:`stavpr_ros.filter.evidence` is the
+by what all cells share, such as light. The quantity of :mod:`stavpr_ros.method.evidence` is the
 mean c along a path, less the same along its competitor, the nearest straight path elsewhere.
 """
 
@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from stavpr_ros.compilation import kernel, reassociating_kernel
 from stavpr_ros.features.registry import Cells
+from stavpr_ros.method.model import FEW, MAX_SHIFT
 
 SIDE = 7  # cells of a side of an image
-FEW = 10  # images that are all compared; of more, every second one
-MAX_SHIFT = 3  # columns
 
 
 class CellAgreement:
@@ -48,18 +47,17 @@ class CellAgreement:
         number = self._images[-1][0] + 1 if self._images else 0
         self._images.append((number, cells_of(strips[:, None], self._cells)[0], {}))
 
-    def lead(self, counted: np.ndarray, path: np.ndarray, competitor: np.ndarray) -> float:
+    def lead(self, path: np.ndarray, competitor: np.ndarray) -> float:
         """
         Return by how many cells a path agrees better than its competitor.
 
-        :param counted: which of the newest images count, (l,), bool.
-        :param path: column of each of these, (m,); competitor: likewise, or empty.
+        :param path: column of each of the newest images, (m,); competitor: likewise, or empty.
         """
-        images = np.array(self._images, object)[-len(counted) :][counted]
+        images = list(self._images)[-len(path) :]
         if len(images) > FEW:
-            is_even = np.array([image[0] % 2 == 0 for image in images])
-            images, path = images[is_even], path[is_even]
-            competitor = competitor[is_even] if len(competitor) else competitor
+            even = [i for i, image in enumerate(images) if image[0] % 2 == 0]
+            images, path = [images[i] for i in even], path[even]
+            competitor = competitor[even] if len(competitor) else competitor
         elsewhere = self._mean(images, competitor) if len(competitor) else 0.0
         return self._mean(images, path) - elsewhere
 

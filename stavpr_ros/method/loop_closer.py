@@ -11,28 +11,20 @@ from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.filter.model import MODEL
-from stavpr_ros.filter.refine import BAND
+from stavpr_ros.features.registry import route_evidence_of
+from stavpr_ros.method.lm_dtw_window import LmDtwWindow
+from stavpr_ros.method.localizer import position_of, SequenceRecognizer, Verdict
+from stavpr_ros.method.match import Limits, Match, Status
+from stavpr_ros.method.model import AROUND, BAND, CONFIRMED, LONGEST_GAP, LONGEST_WAIT
+from stavpr_ros.method.query_window import QueryWindow
+from stavpr_ros.method.settings import RecognizerSettings
+from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
 from stavpr_ros.prepare.matcher import precision_of, PRECISIONS
 from stavpr_ros.prepare.route_features import RouteFeatures
-from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
-from stavpr_ros.recognition.match import Limits, Match, Status
-from stavpr_ros.recognition.recognizer import position_of, SequenceRecognizer, Verdict
-from stavpr_ros.recognition.settings import RecognizerSettings
-from stavpr_ros.recognition.window import QueryWindow
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
-AROUND = 30  # places whose mean distance is subtracted: a route has been through several lights
-# A route's mean follows its light late: until then all its images change little. Most of a route
-# passes no earlier place: its model has fewer speeds, and comes to the map less.
-SPEEDS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.33, 2.0, 3.0, 4.5)
-ROUTE_MODEL = replace(MODEL, speeds=SPEEDS, enter=0.003, speed_weight=0)
 MIN_PLACES = 5  # fewer distances have no meaningful mean and deviation
-CERTAIN = 0.95  # probability above which half a window of matches confirms their path
-LONGEST_GAP = 3  # images from a match to the one that continues it, at most
-LONGEST_WAIT = 3  # windows; so many matches of a path wait for its confirmation, at most
 
 
 class LoopCloser(SequenceRecognizer):
@@ -77,7 +69,8 @@ class LoopCloser(SequenceRecognizer):
         precision = precision_of(precision, 0, False)
         require_choice('precision', precision, PRECISIONS)
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
-        super().__init__(settings, feature_settings, _route_window(settings), self._track)
+        window = _route_window(settings, feature_settings.kind)
+        super().__init__(settings, feature_settings, window, self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._matcher = CpuRouteMatcher(W, settings.applied_spatial)
@@ -101,7 +94,7 @@ class LoopCloser(SequenceRecognizer):
     @property
     def first(self) -> int:
         """Return the oldest place that is not evicted: the number of evicted ones."""
-        return self._window.buffer.first
+        return self._window.first
 
     def features(self) -> LocalFeatures:
         """Return the features of the places, strips (W, n, d), neither centered nor whitened."""
@@ -157,7 +150,7 @@ class LoopCloser(SequenceRecognizer):
         self._waiting += oldest
         if not self._window.is_standstill:
             self._path.append(verdict.probability)
-        certain = sum(probability > CERTAIN for probability in self._path)
+        certain = sum(probability > CONFIRMED for probability in self._path)
         length = self._settings.sequence.length
         if certain < length // 2 and len(self._path) < 2 * length:
             self._waiting.append(self._late(verdict, image))
@@ -200,7 +193,7 @@ class LoopCloser(SequenceRecognizer):
 
         It is a backward pass over the window. Windows without a match have none of it either.
         """
-        if not self._window.buffer.full:
+        if not self._window.full:
             return []
         match = self._window.match_oldest(
             self._settings.nms_radius, verdict.status is Status.MATCH
@@ -256,13 +249,13 @@ class LoopCloser(SequenceRecognizer):
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
 
 
-def _route_window(settings: RecognizerSettings) -> QueryWindow:
+def _route_window(settings: RecognizerSettings, kind: str) -> QueryWindow:
     """Return an empty window for a route without places."""
     options, sequence = settings.applied_options, settings.sequence
     if not options.place_filter:
         return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
-    arguments = sequence, 0, ROUTE_MODEL, None, options.query_znorm, AROUND, True
-    return FilterWindow(*arguments, constant=-math.inf)  # its probabilities are without evidence
+    constant = route_evidence_of(kind)
+    return FilterWindow(sequence, 0, None, True, AROUND, True, constant=constant)
 
 
 def least_limit(exclude: int, length: int) -> int:

@@ -28,9 +28,9 @@ import sys
 
 import numpy as np
 from stavpr_ros.compilation import kernel
-from stavpr_ros.filter.paths import Belief, CLOSE, NO_PLACES, sum_close
-
-ONE_SESSION: np.ndarray = np.zeros(1, np.int64)
+from stavpr_ros.method.filter import NO_PLACES
+from stavpr_ros.method.model import CLOSE
+from stavpr_ros.prepare.normalization import ONE_SESSION
 
 
 class ColumnLayout:
@@ -196,36 +196,45 @@ class ColumnLayout:
         ends = np.flatnonzero(np.diff(near) > 1)
         return np.stack([near[np.append(0, ends + 1)], near[np.append(ends, -1)] + 1], axis=1)
 
-    def merge_sessions(
-        self, belief: Belief, n: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    def merged(self, columns: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, int]:
         """
-        Let places of one position share their probability.
+        Let columns of positions within ``CLOSE`` of each other add up.
 
-        :param n: columns that the filter was updated with.
-        :returns: columns whose probability, close ones included, is not 0, ascending, their
-            probabilities, and which of them states of their own session lead to, bool; among them
-            the most probable one: of the session that is most probable at the most probable
-            position.
+        :param columns: ascending, (m,); probabilities: of each alone, (m,).
+        :returns: probabilities of the columns with the close ones, (m,), and the most probable
+            column of the most probable position.
         """
+        own = sums_near(columns, probabilities)
         if self.columns is None:
-            places, probabilities, own, index = _of_one_session(belief.places, belief.weights, n)
-            return places, probabilities, own, index
-        arguments = belief.places, belief.weights, self._shared, *self._sorted, self.lap
-        columns, probabilities, own, index = _merged(*arguments)
-        return columns, probabilities, own, index
+            return own, int(columns[np.argmax(own)])
+        positions = self._shared[columns]
+        shifts = (-self.lap, 0, self.lap) if self.lap else (0,)
+        around = np.concatenate([positions + shift for shift in shifts])
+        order = np.argsort(around, kind='stable')
+        sums = np.empty(len(around))
+        sums[order] = sums_near(around[order], np.tile(probabilities, len(shifts))[order])
+        sums = sums[len(columns) * (len(shifts) // 2) :][: len(columns)]
+        apart = np.abs(positions - positions[np.argmax(sums)])
+        apart = np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
+        best = int(np.argmax(np.where(apart <= CLOSE, own, -1)))
+        return np.minimum(sums, 1), int(columns[best])
 
 
 # ------------------------------------------------ kernels
 
 
 @kernel
-def _of_one_session(
-    places: np.ndarray, weights: np.ndarray, n: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Return what :meth:`ColumnLayout.merge_sessions` does where each place is a position."""
-    near, sums = sum_close(places, weights, n)
-    return near, sums, np.ones(len(near), np.bool_), int(np.argmax(sums))
+def sums_near(positions: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+    """Return the sums of probabilities within ``CLOSE`` of ascending positions, (m,)."""
+    sums, low = np.zeros(len(positions)), 0
+    for i in range(len(positions)):
+        while positions[low] < positions[i] - CLOSE:
+            low += 1
+        j = low
+        while j < len(positions) and positions[j] <= positions[i] + CLOSE:
+            sums[i] += probabilities[j]
+            j += 1
+    return sums
 
 
 @kernel
@@ -245,42 +254,3 @@ def _columns_near(
             end = np.searchsorted(positions, position + shifted * lap + radius, 'right')
             is_near[low:end] = True
     return np.sort(by_position[is_near])
-
-
-@kernel
-def _apart(a: int, b: int, lap: int) -> int:
-    """Return how far two positions are from each other, on a closed route by the shorter arc."""
-    return min(abs(a - b), abs(lap - abs(a - b))) if lap else abs(a - b)
-
-
-@kernel
-def _merged(
-    places: np.ndarray, weights: np.ndarray, shared: np.ndarray, by_position: np.ndarray,
-    positions: np.ndarray, lap: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:  # fmt: skip
-    """
-    Let places of one position share their probability: :meth:`ColumnLayout.merge_sessions`.
-
-    :param places, weights: of the belief, (m,); shared: position of each column.
-    :param by_position, positions, lap: as of :func:`_columns_near`.
-    """
-    near, sums = sum_close(places, weights, len(shared))
-    columns = _columns_near(by_position, positions, shared[places], CLOSE, lap)
-    own, probabilities = np.zeros(len(columns)), np.zeros(len(columns))
-    at = 0
-    for i in range(len(columns)):
-        while at < len(near) and near[at] < columns[i]:
-            at += 1
-        if at < len(near) and near[at] == columns[i]:
-            own[i] = sums[at]
-        for j in range(len(places)):
-            if _apart(shared[columns[i]], shared[places[j]], lap) <= CLOSE:
-                probabilities[i] += weights[j]
-        probabilities[i] = min(probabilities[i], 1.0)
-    best, index, largest = np.argmax(probabilities), 0, 0.0
-    for i in range(len(columns)):
-        is_close = _apart(shared[columns[i]], shared[columns[best]], lap) <= CLOSE
-        if is_close and own[i] > largest:
-            index, largest = i, own[i]
-    probabilities[index] = probabilities[best]
-    return columns, probabilities, own > 0, index

@@ -9,8 +9,8 @@ of its images that are matched. The least probability t for an error rate a is s
     (sum of the risks of n drives with matches above t + 1) / (n + 1) <= a
 
 (Angelopoulos et al., "Conformal Risk Control", ICLR 2024), rounded up. Each drive is of a route
-that the probability was not fitted on; early matches count. benchmarks/results/evidence.md lists
-the drives. The mean over drives like these is controlled, not every single drive.
+that the probability was not fitted on; early matches count. benchmarks/results/fit.md has the
+drives. The mean over drives like these is controlled, not every single drive.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from stavpr_ros.mapping.place_map import ErrorRisks
 
 # error rates, descending, and the least probability of matches that keep them
 ERRORS = np.array([0.1, 0.05, 0.03, 0.02, 0.01, 0.005])
-PROBABILITIES = np.array([0.1, 0.3, 0.45, 0.5, 0.95, 0.999])
+PROBABILITIES = np.array([0.0001, 0.0002, 0.004, 0.03, 0.5, 0.92])
 
 
 def least_probability(max_error: float, risks: ErrorRisks | None = None) -> float:

@@ -1,6 +1,23 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Image by image: distances of the newest image, nearest sequence of the window, status."""
+"""
+The chain, image by image (:meth:`PlaceRecognizer.update`).
+
+1. **Light**: the running mean of the query is subtracted, and the rest whitened
+   (:class:`stavpr_ros.prepare.centering.MeanCentering`).
+2. **Distances** to all places (:mod:`stavpr_ros.prepare.matcher`), normalized to **z**
+   (:func:`stavpr_ros.prepare.normalization.z_normalized`).
+3. **Motion**: whether the camera moved, and how much (:class:`.motion.ImageChange`).
+4. **Window and filter**: an image that moved advances the states
+   (:meth:`.window.FilterWindow.add`, :meth:`.filter.Filter.update`).
+5. **Place** of the middle image by all of the window, and its path
+   (:meth:`.filter.Filter.beliefs`, :func:`.path.centered_place`, :func:`.path.follow`).
+6. **Evidence**: belief, checks of the path, lead, cells, recent windows (:mod:`.evidence`).
+7. **Match**: the limits, odometry, and the newest images alone where the window shows nothing
+   (:meth:`SequenceRecognizer._decide`).
+
+Steps 3 to 6 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_window` instead.
+"""
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -10,20 +27,14 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import numpy as np
 from stavpr_ros.checks import require_type
 from stavpr_ros.devices import choose_backend
-from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import evidence_of
-from stavpr_ros.filter.model import MODEL
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.prepare.blocks import blocks
-from stavpr_ros.prepare.matcher import make_matcher, precision_of
-from stavpr_ros.prepare.prepared_map import prepare_map
-from stavpr_ros.recognition.cells import CellAgreement
-from stavpr_ros.recognition.filter_window import FilterWindow
-from stavpr_ros.recognition.lm_dtw_window import LmDtwWindow
-from stavpr_ros.recognition.match import (
+from stavpr_ros.method.cells import CellAgreement
+from stavpr_ros.method.match import (
     Candidate,
     distinct_places,
     Limits,
@@ -32,21 +43,25 @@ from stavpr_ros.recognition.match import (
     Status,
     WindowMatch,
 )
-from stavpr_ros.recognition.relative_motion import (
+from stavpr_ros.method.model import EARLY, UNUSUAL
+from stavpr_ros.method.query_window import QueryWindow
+from stavpr_ros.method.relative_motion import (
     Positions,
     RelativeMotion,
-    UNUSUAL,
     with_odometry_test,
 )
-from stavpr_ros.recognition.sessions import layout_of, time_note
-from stavpr_ros.recognition.settings import PAPER, RecognizerSettings
-from stavpr_ros.recognition.window import QueryWindow
+from stavpr_ros.method.sessions import time_note
+from stavpr_ros.method.settings import RecognizerSettings
+from stavpr_ros.method.window import FilterWindow
+from stavpr_ros.method.windows import window_of
+from stavpr_ros.prepare.blocks import blocks
+from stavpr_ros.prepare.matcher import make_matcher, precision_of
+from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.threads import one_thread
 
 if TYPE_CHECKING:
     import torch
 
-EARLY = 0.95  # minimum probability of a match by the newest images alone
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
 
 
@@ -129,7 +144,7 @@ class SequenceRecognizer(ABC):
     @property
     def window_fill(self) -> int:
         """Images in the window, up to l."""
-        return len(self._window.buffer)
+        return len(self._window.images)
 
     @property
     def threshold(self) -> float | None:
@@ -188,14 +203,14 @@ class SequenceRecognizer(ABC):
         :returns: shape (n,), float32; lower is nearer.
         """
         window = self._window
-        return window.layout.to_places(window.buffer.newest())
+        return window.layout.to_places(window.newest_row())
 
     def place_probabilities(self) -> np.ndarray:
         """Return the probability of each place for the newest image, (n,); mode paper: none."""
         window = self._window
         if not isinstance(window, FilterWindow):
             return np.empty(0)
-        return window.layout.sums_of_places(window.filter.places_of_states())
+        return window.layout.sums_of_places(window.filter.by_place())
 
     def window_columns(self, places: np.ndarray) -> np.ndarray:
         """
@@ -206,9 +221,8 @@ class SequenceRecognizer(ABC):
         :param places: shape (k,), int64.
         :returns: shape (m, k), float32, oldest image first, +inf for places not compared.
         """
-        buffer = self._window.buffer
-        columns = self._window.layout.columns_of(places - buffer.first)
-        return buffer.at(columns[None])
+        window = self._window
+        return window.at(window.layout.columns_of(places - window.first))
 
     def _require_one_image(self, features: Any, where: str, dimension: int) -> None:
         if not isinstance(features, LocalFeatures):
@@ -233,10 +247,10 @@ class SequenceRecognizer(ABC):
         """Decide on the window, and where it has no match, on its newest images."""
         window, radius = self._window, self._settings.nms_radius
         self._motion.trajectory.append(odometry_xy)
-        fill, length = len(window.images), window.buffer.length
+        fill, length = len(window.images), window.length
         reason = f'{fill} of {length} images in the window'
         verdict = Verdict(WindowMatch(), self._limits, Status.WARMING_UP, reason)
-        if window.buffer.full:
+        if window.full:
             verdict = self._verdict(window.match(radius), self._limits)
         runs = [verdict.run]
         if verdict.status is not Status.MATCH:
@@ -265,7 +279,7 @@ class SequenceRecognizer(ABC):
                 match,
                 (len(match.path) - 1) // 2,
                 accepted,
-                self._window.buffer.first,
+                self._window.first,
                 layout.session_of(match.nearest.middle),
             )
             if agreed < UNUSUAL:
@@ -342,7 +356,7 @@ class PlaceRecognizer(SequenceRecognizer):
         super().__init__(
             settings,
             place_map.settings,
-            _window_of(place_map, settings, backend),
+            window_of(place_map, settings, backend),
             () if poses is None else poses[:, :2],
         )
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
@@ -429,47 +443,15 @@ class PlaceRecognizer(SequenceRecognizer):
         """See :meth:`SequenceRecognizer.update`."""
         odometry_xy = position_of(pose)
         self._require_one_image(features, 'the map', self._dimension)
-        strips = features.strips[:, 0]
+        strips, weights = features.strips[:, 0], features.weights[:, 0]
         if self._centering is not None:
             strips = self._centering.next_query(strips)
         with one_thread(self._is_small):
-            row = self._matcher.distances(strips, features.weights[:, 0])
-            self._window.push(row, strips, stamp)
+            distances = self._matcher.distances(strips, weights)
+            self._window.push(distances, strips, stamp)
         if self._centering is not None:
             self._centering.note_standstill(self._window.is_standstill)
         return self._match(odometry_xy)
-
-
-def _window_of(
-    place_map: PlaceMap, settings: RecognizerSettings, backend: 'str | torch.device'
-) -> QueryWindow:
-    """Return an empty window for a map."""
-    options, n, sequence = settings.applied_options, len(place_map), settings.sequence
-    length = sequence.length if options.place_filter else 0
-    layout = layout_of(place_map, settings.nms_radius, MODEL, settings.moves_against, length)
-    if options.place_filter:
-        window: FilterWindow
-        arguments = sequence, n, MODEL, layout, options.query_znorm
-        W = place_map.settings.strips
-        constant, _ = evidence_of(place_map.settings.kind, W, place_map.features.dimension)
-        if isinstance(backend, str):
-            window = FilterWindow(*arguments, constant=constant)
-        else:
-            from stavpr_ros.recognition.device_windows import DeviceFilterWindow
-
-            window = DeviceFilterWindow(*arguments, constant=constant, device=backend)
-        window.choice.learn_times(place_map.stamps)
-        return window
-    if isinstance(backend, str):
-        return LmDtwWindow(sequence, n, layout, options.query_znorm)
-    if options != PAPER:
-        raise SettingsError(
-            f"options {options} with backend '{backend}': without the place filter, it runs mode "
-            "paper only; take 'cpu'"
-        )
-    from stavpr_ros.recognition.device_windows import DeviceLmDtwWindow
-
-    return DeviceLmDtwWindow(sequence, n, layout, backend)
 
 
 def position_of(pose: np.ndarray | None) -> np.ndarray:

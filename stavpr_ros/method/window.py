@@ -1,0 +1,327 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The window of mode robust: what the latest images show, by filter, paths and evidence."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from stavpr_ros.alignment.lm_dtw import SequenceMatch
+from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.method.cells import CellAgreement
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.evidence import probability_of, Quantities, RecentWindows, unevenness
+from stavpr_ros.method.filter import Filter, NEGLIGIBLE, PlaceFilter, SPACING
+from stavpr_ros.method.match import WindowMatch, WindowSequences
+from stavpr_ros.method.model import APART, CLOSE, MODEL, Model, ON_MAP, ROUTE_IMAGES, STRAIGHT
+from stavpr_ros.method.motion import ImageChange
+from stavpr_ros.method.path import centered_place, close_sums, follow
+from stavpr_ros.method.place_means import PlaceMeans
+from stavpr_ros.method.query_window import QueryWindow
+from stavpr_ros.method.sessions import in_places
+
+MIN_IMAGES = 2  # of a match by the newest images alone
+LEAST = 1e-9  # probability that shares are relative to
+NOT_COMPARED: np.ndarray = np.empty(0, np.float32)  # a row without distances
+
+
+class Shown(NamedTuple):
+    """
+    What the newest l images that moved show.
+
+    :param path: column of each, (l,), int64; position: of the image whose place is sought.
+    :param quantities: of the evidence; own: of the window alone; -inf = nothing is probable.
+    :param probability: of the place.
+    :param candidates, probabilities: columns of the image at the position, (m,) each.
+    :param shares: probability of the places of the path, given the place, (l,).
+    """
+
+    path: np.ndarray
+    position: int
+    quantities: Quantities
+    own: float
+    probability: float
+    candidates: np.ndarray
+    probabilities: np.ndarray
+    shares: np.ndarray
+
+
+class FilterWindow(QueryWindow):
+    """
+    The latest images of a query, a filter of those that moved, and what they show.
+
+    :param sequence: l and k.
+    :param places: number of places n.
+    :param layout: of the places.
+    :param normalizes, around: see :class:`stavpr_ros.method.query_window.QueryWindow`.
+    :param is_route: for loop closure: the mean z of each place is subtracted
+        (:mod:`stavpr_ros.method.place_means`), and paths are compared with no others.
+    :param constant: of the evidence (:class:`stavpr_ros.features.registry.Kind`).
+    :param cells: of the images; None = they are not compared.
+    :param model: of the filter.
+
+    ``change`` compares images, ``filter`` contains the states, ``recent`` is of the drive.
+    """
+
+    filter_class: Callable[..., Filter] = PlaceFilter
+
+    def __init__(
+        self,
+        sequence: SequenceSettings,
+        places: int,
+        layout: ColumnLayout | None = None,
+        normalizes: bool = False,
+        around: int = 0,
+        is_route: bool = False,
+        *,
+        constant: float = 0.0,
+        cells: CellAgreement | None = None,
+        model: Model = MODEL,
+    ) -> None:
+        layout = layout or ColumnLayout()
+        length, width = sequence.length, layout.width(places)
+        super().__init__(length, layout, normalizes, around)
+        self._is_route = is_route
+        self.filter: Filter = self.filter_class(width, length, model, layout.gaps)
+        self.change = ImageChange(layout.passes(places), length)
+        self._constant, self.cells, self.recent = constant, cells, RecentWindows()
+        self._means = PlaceMeans()
+        self._width, self._newest = width, NOT_COMPARED
+        self._shown: Shown | None = None  # by the latest images that moved
+        self._latest: Shown | None = None  # by half of them
+        self._repeated = slice(0, 0)  # columns that the latest path is in, beyond a lap
+
+    @property
+    def changes(self) -> tuple[float, ...]:
+        """Change of each image from the one before, oldest first."""
+        return tuple(self.images['change'].tolist())
+
+    @property
+    def is_standstill(self) -> bool:
+        """Whether the newest image equals the one before, up to noise."""
+        return self.change.is_standstill(float(self.images['change'][-1]))
+
+    def reset(self) -> None:
+        """Drop all images."""
+        super().reset()
+        self.filter.reset()
+        self.change.reset()
+        self._shown, self.recent, self.known = None, RecentWindows(), 0
+        self._newest = NOT_COMPARED
+        self._repeated, self._means = slice(0, 0), PlaceMeans()
+        if self.cells is not None:
+            self.cells.reset()
+
+    def grow(self, places: int) -> None:
+        """Make room for more places."""
+        self._width = places
+        self.filter.grow(places)
+        self.change.grow(places)
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        super().evict(count)
+        self.known, self._shown = max(0, self.known - count), None
+        for part in (self.filter, self.change, self._means):
+            part.evict(count)
+
+    def _counted(self, n: int) -> np.ndarray:
+        """See :meth:`QueryWindow._counted`; of places of a standstill, one."""
+        return self.change.distinct(n)
+
+    def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
+        """See :meth:`QueryWindow.push`."""
+        row, change = self._as_columns(row), self.change.next_query(strips)
+        if self._is_route:
+            row = self._means.subtracted(row, self.change.is_standstill(change))
+        self.add(row, stamp, change, strips)
+
+    def newest_row(self) -> np.ndarray:
+        """See :meth:`QueryWindow.newest_row`; as it was added, also of a camera at rest."""
+        more = np.full(self._width - len(self._newest), np.inf, np.float32)
+        return np.append(self._newest, more)
+
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`QueryWindow.at`."""
+        count = min(self.filter.count, self.length)
+        if not count:
+            return np.empty((0, len(columns)), np.float32)
+        rows = self.images['number'] - (self.filter.count - count)
+        return self.filter.z(columns, count)[rows]
+
+    def add(self, z: Any, stamp: int, change: float, strips: np.ndarray | None = None) -> None:
+        """
+        Add the newest image.
+
+        An image of a camera at rest adds nothing. Where the map's own images are equal, in a dark
+        tunnel, the camera may move.
+
+        :param z: z-normalized distances to the columns, (m,), float32.
+        :param change: from the image before.
+        """
+        self._newest, self.known = z, max(self.known, len(z))
+        if self._repeated.stop:
+            self.filter.move_back(self._repeated, self.layout.lap)
+            self._repeated = slice(0, 0)
+        moved = not self.filter.count or not self.change.is_standstill(change)
+        if not moved:
+            by_pass = self.layout.to_passes(self.filter.by_place())[: self.known]
+            moved = self.change.is_dark_stretch(by_pass)
+        if moved:
+            self.filter.update(z, self.change.weight(change))
+            if self.cells is not None and strips is not None:
+                self.cells.push(strips)
+            self._shown = self._latest = None
+        self._append(stamp, change, self.filter.count - 1)
+
+    def match(self, nms_radius: int) -> WindowMatch:
+        """Return the match of the middle image; of a camera at rest, as before it stopped."""
+        if not self.known:
+            return WindowMatch()
+        if (shown := self._shown) is None:
+            shown = self._shown = self._show(min(self.filter.count, self.length))
+            self.recent.add(shown.own)
+        # with the images before the window from which the filter follows states
+        before = (shown.path[-1] - shown.path[0]) * SPACING // self.length + CLOSE
+        self._repeated = self.layout.repeated(shown.path - before)
+        middle = int(self.images['number'][(len(self.images) - 1) // 2])
+        if middle == self.filter.count - 1:  # no later image shows its place: nor do early ones
+            if self._latest is None:
+                self._latest = self._show((len(shown.path) + 1) // 2)
+            least = min(shown.probability, self._latest.probability)
+            shown = shown._replace(probability=least)
+        return self._match(shown, self.images, middle, nms_radius)
+
+    def match_newest(self, nms_radius: int) -> WindowMatch:
+        """Return the match of the newest images: :meth:`QueryWindow.match_newest`."""
+        if self._is_route or not self.known:
+            return WindowMatch()
+        count = min(self.filter.count, self.length)
+        on_map = self.filter.beliefs(count).probabilities.sum(axis=1) > ON_MAP
+        since = count if on_map.all() else int(np.argmin(on_map[::-1]))
+        if since < MIN_IMAGES or (since == count == self.length):
+            return WindowMatch()
+        shown, numbers = self._show(since), self.images['number']
+        images = self.images[numbers > numbers[-1] - since]
+        middle = int(images['number'][(len(images) - 1) // 2])
+        return replace(self._match(shown, images, middle, nms_radius), images=len(images))
+
+    def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
+        """See :meth:`QueryWindow.match_oldest`."""
+        self.images['is_matched'][(len(self.images) - 1) // 2] = is_matched
+        if self.images['is_matched'][0] or not is_matched:
+            return WindowMatch()
+        oldest = int(self.images['number'][0])
+        count = self.filter.count - oldest
+        return self._match(self._show(count, 0), self.images, oldest, nms_radius)
+
+    def _show(self, l: int, position: int | None = None) -> Shown:
+        """Return what the newest l images that moved show."""
+        position = (l - 1) // 2 if position is None else position
+        columns, of_images = self.filter.beliefs(l)
+        columns = columns[: columns.searchsorted(self.known)]
+        of_images = of_images[:, : len(columns)]
+        if not of_images[position].any():
+            return self._nothing(l, position)
+        probabilities, at = self.layout.merged(columns, of_images[position])
+        belief = float(probabilities.max())
+        place = centered_place(columns, of_images, position, at)
+        path = follow(columns, of_images, position, round(place))
+        z = self.filter.z(path[:, None], l)[:, 0]
+        excess = 0.0
+        if l == self.length:
+            excess = self.change.excess(max(float(path[-1] - path[0]) / (l - 1), 0.0))
+        quantities = Quantities(belief, unevenness(path, z), excess)
+        quantities = self._compared(quantities, path, position)
+        own = quantities.own(self._constant)
+        # most of a route passes no earlier place: its windows say nothing about the next one
+        probability = probability_of(own, 0.5 if self._is_route else self.recent.share)
+        shares = close_sums(columns, of_images, path)
+        shares /= max(shares[position], LEAST)
+        shares = np.minimum(shares, 1)
+        return Shown(path, position, quantities, own, probability, columns, probabilities, shares)
+
+    def _compared(self, quantities: Quantities, path: np.ndarray, position: int) -> Quantities:
+        """Return quantities with those that compare the path with straight ones elsewhere."""
+        l, at = len(path), int(path[position])
+        steps = np.rint(np.outer(STRAIGHT, np.arange(l) - position)).astype(np.int64)
+        near, here = self.layout.around(at, APART), slice(at - CLOSE, at + CLOSE + 1)
+        score, _ = self.filter.best_straight(steps, here, near[:0])
+        if self._is_route:  # the camera may have passed there several times
+            return quantities._replace(lead=max(score, 0.0), images=ROUTE_IMAGES)
+        elsewhere, competitor = self.filter.best_straight(steps, slice(0, self.known), near)
+        lead = max(score - max(elsewhere, 0.0), 0.0)
+        cells = 0.0 if self.cells is None else self.cells.lead(path, competitor)
+        return quantities._replace(lead=lead, images=l, cells=cells)
+
+    def _nothing(self, l: int, position: int) -> Shown:
+        """Return what images show that are probably off the map: the most probable place now."""
+        path = np.full(l, int(np.argmax(self.filter.by_place()[: self.known])))
+        nothing = np.empty(0)
+        columns, none = nothing.astype(int), Quantities(0.0)
+        return Shown(path, position, none, -math.inf, 0.0, columns, nothing, np.ones(l))
+
+    def _match(
+        self, shown: Shown, images: np.ndarray, number: int, nms_radius: int
+    ) -> WindowMatch:
+        """
+        Return the match of an image.
+
+        :param images: of the window that are matched; number: of the image among these.
+        """
+        first = self.first
+        numbers = images['number'] - (self.filter.count - len(shown.path))
+        columns, shares = shown.path[numbers], shown.shares[numbers]
+        peak = float(shown.probabilities.max(initial=0.0))
+        row = number - (self.filter.count - len(shown.path))
+        certain = shown.probability * float(shown.shares[row])
+        shares = shares if certain > 0 else shares[:0]
+        place = int(shown.path[row])
+        share = certain / peak if peak > certain else 1.0  # no place is above the match
+        second, probability = self._second_best(shown, place, nms_radius)
+        probability *= share
+        path = np.empty((len(images), 2), np.int32)
+        path[:, 0], path[:, 1] = np.arange(len(images)), columns + first
+        match = SequenceMatch(
+            first=int(path[0, 1]),
+            last=int(path[-1, 1]),
+            middle=place + first,
+            distance=1 - certain,
+            second_best_index=second + first if probability > 0 else -1,
+            second_best_distance=1 - probability if probability > 0 else float('nan'),
+        )
+        sequences = partial(self._sequences, shown, share, self.known, first)
+        return in_places(WindowMatch(match, path, sequences, certain, shares), self.layout)
+
+    def _second_best(self, shown: Shown, place: int, radius: int) -> tuple[int, float]:
+        """Return the most probable column elsewhere, and its probability, 0 if none."""
+        near = self.layout.around(place, radius)
+        elsewhere = ~_inside(shown.candidates, near)
+        now = self.filter.by_place()[: self.known]
+        now[shown.candidates] = 0
+        for low, end in near.tolist():
+            now[max(low, 0) : max(end, 0)] = 0
+        second = int(np.argmax(now))
+        probability = float(now[second]) * NEGLIGIBLE
+        if elsewhere.any():
+            best = int(np.argmax(np.where(elsewhere, shown.probabilities, -1)))
+            if shown.probabilities[best] >= probability:
+                second, probability = int(shown.candidates[best]), float(shown.probabilities[best])
+        return second, probability
+
+    def _sequences(self, shown: Shown, share: float, n: int, first: int) -> WindowSequences:
+        """Return all places; improbable ones have a share of their probability now."""
+        probabilities = self.filter.by_place()[:n] * np.float64(NEGLIGIBLE)
+        probabilities[shown.candidates] = shown.probabilities
+        probabilities *= share
+        costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
+        return WindowSequences(costs, np.arange(first, first + n), probabilities)
+
+
+def _inside(columns: np.ndarray, slices: np.ndarray) -> np.ndarray:
+    """Return which columns are in one of the slices, (m,), bool."""
+    inside = (columns[:, None] >= slices[:, 0]) & (columns[:, None] < slices[:, 1])
+    return np.any(inside, axis=1)
