@@ -19,7 +19,7 @@ from map_files import array_of, parts_of, tensor, version2
 import numpy as np
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, open_map, PlaceMap, verify_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
 VALUES = (
     None, True, False, -1, 0, 1, 2, 7, 2**31, 2**63, 2**64, 10**400, 0.5, -0.0, 1e308,

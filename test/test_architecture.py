@@ -29,7 +29,7 @@ ROS |= {
     for name in ('std', 'sensor', 'geometry', 'nav', 'diagnostic', 'lifecycle', 'visualization')
 }
 CORE = {
-    *('alignment', 'sources', 'features', 'mapping', 'filter', 'prepare', 'recognition'),
+    *('alignment', 'sources', 'features', 'mapping', 'prepare', 'method'),
     *('maintenance', 'relative_pose', 'pipeline'),
 }
 MAY_IMPORT = {
@@ -37,12 +37,11 @@ MAY_IMPORT = {
     'sources': set(),
     'features': set(),
     'mapping': {'alignment', 'sources', 'features'},
-    'filter': {'alignment'},
-    'prepare': {'alignment', 'features', 'mapping', 'filter'},
-    'recognition': {'alignment', 'features', 'mapping', 'filter', 'prepare'},
-    'maintenance': {'alignment', 'features', 'mapping', 'filter', 'prepare', 'recognition'},
-    'stavpr_fleet': {'alignment', 'features', 'mapping', 'filter', 'prepare', 'recognition'},
-    'relative_pose': {'alignment', 'features', 'mapping', 'recognition'},
+    'prepare': {'alignment', 'features', 'mapping'},
+    'method': {'alignment', 'features', 'mapping', 'prepare'},
+    'maintenance': {'alignment', 'features', 'mapping', 'prepare', 'method'},
+    'stavpr_fleet': {'alignment', 'features', 'mapping', 'prepare', 'method'},
+    'relative_pose': {'alignment', 'features', 'mapping', 'method'},
     'pipeline': CORE - {'pipeline'},
     'ros': CORE,
     'commands': {'ros', *CORE},
@@ -134,7 +133,7 @@ from stavpr_ros.commands.build_map import main
 from stavpr_ros.devices import choose_backend, choose_device, why_no_cuda
 from stavpr_ros.mapping import open_map
 from stavpr_ros.pipeline import Pipeline
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 output = ['--output', {str(tmp_path / 'map')!r}, '--features', 'gradient']
 assert main(['--input', {folder!r}, *output]) == 0

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition import Candidate, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.match import ranked_candidates, WindowSequences
-from stavpr_ros.recognition.settings import RobustOptions
+from stavpr_ros.method import Candidate, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.match import ranked_candidates, WindowSequences
+from stavpr_ros.method.settings import RobustOptions
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 

@@ -12,11 +12,10 @@ import pytest
 from stavpr_ros.commands import build_map
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.filter.columns import ColumnLayout
-from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.maintenance.same_places import with_seam
 from stavpr_ros.mapping import load_map, merge_maps, save_map, select_places
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.columns import ColumnLayout
 from test_direction import recognize
 from test_relative_motion import poses_of
 
@@ -113,29 +112,6 @@ def test_odometry_is_not_compared_over_the_seam(open_map, drift):
     query = laps(60, 60 + 2 * LAP, 0.8, 2)
     matches = recognize(place_map, query, FORWARD, poses=poses_of(circle[60 : 60 + len(query)]))
     assert all(match.accepted for match in matches[20:])
-
-
-def test_states_that_moved_back_have_the_same_past():
-    """The filter goes on as if it had been there: the same belief and path, a lap before."""
-    n, lap, again = 300, 200, 100
-    rng = np.random.default_rng(0)
-    one = PlaceFilter(n, 9)
-    ones = np.ones(len(one.settings.speeds))
-    for image in range(30):
-        z = rng.normal(0, 1, n).astype(np.float32)
-        z[image + 220] -= 4
-        one.update(z, 0.28, ones)
-    before = one.belief(n, 5)
-    path = one.path(before.states[np.argmax(before.weights)], 8)
-    total = one.places_of_states().sum()
-    one.move_back(slice(n - again, n), lap)
-    after = one.belief(n, 5)
-    best = np.argmax(after.weights)
-    assert after.places[best] == before.places[np.argmax(before.weights)] - lap
-    assert after.weights[best] == pytest.approx(before.weights.max(), rel=1e-5)
-    np.testing.assert_array_equal(one.path(after.states[best], 8), path - lap)
-    assert one.places_of_states().sum() == pytest.approx(total)
-    assert one.places_of_states()[n - again :].max() == 0
 
 
 def test_columns_repeat_the_first_places():

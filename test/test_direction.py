@@ -13,11 +13,11 @@ from stavpr_ros.commands import build_map
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.filter.columns import ColumnLayout
 from stavpr_ros.mapping import load_map, merge_maps
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.settings import RobustOptions
 from stavpr_ros.pipeline import PipelineSettings
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.settings import RobustOptions
 from test_relative_motion import poses_of, track
 
 pytestmark = pytest.mark.usefixtures('one_thread')

@@ -21,7 +21,7 @@ from stavpr_ros.features.efficientnet_lite_file import EPSILON, FILE, HALVING, m
 from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import open_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 import torch
 from torch.nn import functional
 

@@ -10,9 +10,9 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.mapping import save_map
 from stavpr_ros.mapping.place_map import ErrorRisks
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.error_rate import least_probability
 
 
 def test_smaller_error_rates_choose_greater_probabilities():
@@ -36,14 +36,14 @@ def error_risks(risks=(3.0, 1.0, 0.0), units=39, method='robust'):
         (error_risks(), 0.1, 0.2),  # bounds 4 / 40, 2 / 40, 1 / 40
         (error_risks(), 0.0999, 0.6),
         (error_risks(), 0.025, 0.9),
-        (error_risks(), 0.01, 0.95),  # too few blocks, and the built-in table is stricter
+        (error_risks(), 0.005, 0.92),  # too few blocks, and the built-in table is stricter
         (
             error_risks((2.0, 0.9, 0.0), 9),
             0.09,
             0.9,
         ),  # too few: their mean is at most .09 above .9
         (error_risks((2.0, 0.9, 0.0), 9), 0.1, 0.9),
-        (error_risks((0.1, 0.0, 0.0), 2), 0.05, 0.3),  # above .2, their mean is .05: as built in
+        (error_risks((0.1, 0.0, 0.0), 2), 0.05, 0.2),  # their mean above .2 is .05
         (error_risks((39.0, 39.0, 39.0)), 0.1, 0.9),  # all wrong
     ],
 )
@@ -77,8 +77,8 @@ def test_impossible_error_risks_are_rejected(probabilities, risks, units):
     ('changes', 'probability', 'word'),
     [
         ({}, 0.6, ''),
-        ({'max_error': 0.01}, 0.95, '39 blocks, 0.025 at least'),
-        ({'sequence': SequenceSettings(12)}, 0.3, 'length 12'),
+        ({'max_error': 0.005}, 0.92, '39 blocks, 0.025 at least'),
+        ({'sequence': SequenceSettings(12)}, 0.0002, 'length 12'),
         ({'min_probability': 0.8}, 0.8, ''),
         ({'max_error': 0.0}, 0.5, ''),
     ],
@@ -96,14 +96,14 @@ def test_recognizer_keeps_the_error_rate_by_its_map_or_gives_the_reason(
     assert recognizer.threshold == match.threshold
     assert word in recognizer.start_notes
     assert bool(word) == bool(recognizer.start_notes)
-    assert PlaceRecognizer(small_map, settings).threshold == pytest.approx(0.7)
+    assert PlaceRecognizer(small_map, settings).threshold == pytest.approx(0.9998)
 
 
 def test_pipeline_publishes_the_threshold_of_its_map(small_map, tmp_path):
     risks = error_risks(method=RecognizerSettings(mode='robust').method)
     save_map(replace(small_map, error_risks=risks), tmp_path / 'route.stavpr')
     pipeline = Pipeline(PipelineSettings(max_error=0.05))
-    assert pipeline.operation.threshold == pytest.approx(0.7)
+    assert pipeline.operation.threshold == pytest.approx(0.9998)
     pipeline.change(loaded=read_map(str(tmp_path / 'route.stavpr'), pipeline.settings))
     assert pipeline.operation.threshold == pytest.approx(0.4)
     pipeline.change(replace(pipeline.settings, max_error=0.1))

@@ -6,20 +6,11 @@ import numpy as np
 from places import route_strips
 import pytest
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.filter.motion import (
-    ImageChange,
-    LOOK_AHEAD,
-    MAX_LAG,
-    MIN_SPEED_WEIGHT,
-    OFFSET,
-    SMOOTHED,
-    STRETCH,
-)
-from stavpr_ros.prepare.blocks import PlaceChanges
+from stavpr_ros.method.model import LOOK_AHEAD, STANDSTILL, STRETCH
+from stavpr_ros.method.motion import ImageChange, MIN_DISTINCT
+from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
 
 pytestmark = pytest.mark.usefixtures('one_thread')
-SETTINGS = FilterSettings()
 
 
 def drive_strips(places, seed=0):
@@ -35,7 +26,7 @@ def plain_change(a, b):
 
 def learned(strips):
     n = strips.shape[1]
-    change, seen = ImageChange(n, SETTINGS, 20), PlaceChanges(n, MAX_LAG)
+    change, seen = ImageChange(n, 20), PlaceChanges(n, MAX_LAG)
     seen.add(strips)
     change.learn(seen.changes)
     return change
@@ -43,7 +34,7 @@ def learned(strips):
 
 def learned_on_route(strips, room):
     """Return what is learned from one place after the other; memory grows to the room."""
-    route = ImageChange(5, SETTINGS, 20)
+    route = ImageChange(5, 20)
     for n in range(1, strips.shape[1] + 1):
         if n == 6:
             route.grow(room)
@@ -90,22 +81,10 @@ def test_next_query_is_change_from_image_before():
 def test_standstill_and_weight_are_relative_to_neighboring_places():
     change = learned(drive_strips(200))
     near = change.curve[1]
-    assert change.is_standstill(0.99 * SETTINGS.standstill * near)
-    assert not change.is_standstill(1.01 * SETTINGS.standstill * near)
-    for relative, alpha in ((0.0, 0.2), (0.1, 0.2), (0.5, 0.5), (1, 1), (1.5, 1.5), (3, 2)):
-        assert change.weight(relative * near) == pytest.approx(SETTINGS.weight * alpha)
-
-
-def test_speed_weights_are_of_smoothed_change_over_curve():
-    change = learned(drive_strips(300))
-    came = []
-    for seen in (0.1, 0.5, 0.9, 0.3, 0.2, 0.05, 0.6):
-        came.append(seen)
-        mean = np.log(np.mean(came[-SMOOTHED:]) + OFFSET)
-        there = np.array([change.expected_change(speed) for speed in SETTINGS.speeds])
-        off = (mean - np.log(there + OFFSET)) / SETTINGS.change_deviation
-        expected = np.exp(-(off**2) / 2) + MIN_SPEED_WEIGHT
-        np.testing.assert_allclose(change.speed_weights(seen), expected, rtol=1e-5)
+    assert change.is_standstill(0.99 * STANDSTILL * near)
+    assert not change.is_standstill(1.01 * STANDSTILL * near)
+    for relative, weight in ((0.0, 0.2), (0.1, 0.2), (0.5, 0.5), (1, 1), (1.5, 1.5), (3, 2)):
+        assert change.weight(relative * near) == pytest.approx(weight)
 
 
 def decaying_strips(places, similarity, seed=0):
@@ -140,38 +119,23 @@ def test_excess_is_of_motion_and_not_of_noise(noise):
     change, query = learned(decaying_strips(300, 0.6)), decaying_strips(60, 0.6, seed=1)
     query += noise / 20 * rng.standard_normal(query.shape).astype(np.float32)
     query /= np.linalg.norm(query, axis=2, keepdims=True)
-    likelihoods_of(change, query)
+    for i in range(query.shape[1]):
+        change.next_query(query[:, i])
     assert abs(change.excess(1.0)) < 0.04
     assert change.excess(0.25) > 0.2
     assert change.excess(2.0) < 0.0
 
 
-def likelihoods_of(change, query):
-    for i in range(query.shape[1]):
-        found = change.speed_likelihoods(change.next_query(query[:, i]))
-    return found
-
-
-@pytest.mark.parametrize('apart', [1, 2, 3])
-def test_speed_likelihoods_are_highest_at_speed_of_query(apart):
-    change, query = learned(drive_strips(400)), drive_strips(90, seed=1)[:, ::apart]
-    logs = [np.log(likelihoods_of(change, query[:, :i])) for i in range(8, 30)]
-    assert abs(SETTINGS.speeds[int(np.argmax(np.sum(logs, axis=0)))] - apart) <= 0.5
-
-
-def test_speed_likelihoods_reject_a_path_that_stands_while_images_change():
-    found = likelihoods_of(learned(drive_strips(300)), drive_strips(30, seed=2))
-    assert found[SETTINGS.speeds.index(0.0)] < 0.5
-    assert found[SETTINGS.speeds.index(1.0)] > 0.9
-
-
-def test_speed_likelihoods_under_noise_leave_the_speed_likely():
-    """Noise of the query alone looks like a higher speed."""
-    rng, query = np.random.default_rng(0), drive_strips(30, seed=3)
-    query = query + 0.4 * rng.standard_normal(query.shape) / np.sqrt(query.shape[2])
-    query = (query / np.linalg.norm(query, axis=2, keepdims=True)).astype(np.float32)
-    found = likelihoods_of(learned(drive_strips(300)), query)
-    assert found[SETTINGS.speeds.index(1.0)] > 0.9
+def test_equal_places_do_not_count_unless_few_would():
+    strips = drive_strips(60)
+    strips[:, 21:25] = strips[:, 20:21]
+    expected = np.isin(np.arange(60), range(21, 25), invert=True)
+    change, route = learned(strips), learned_on_route(strips, 60)
+    np.testing.assert_array_equal(change.distinct(60), expected)
+    np.testing.assert_array_equal(route.distinct(60), expected)
+    change.evict(22)
+    np.testing.assert_array_equal(change.distinct(38), expected[22:])
+    assert change.distinct(MIN_DISTINCT + 2).all()  # five of seven places do not
 
 
 def probable_at(place, n):

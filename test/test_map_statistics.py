@@ -17,10 +17,10 @@ from stavpr_ros.commands.map import main as map_main
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import load_map, open_map, save_map
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare import prepared_map
 from stavpr_ros.prepare.centering import MeanCentering
 from stavpr_ros.prepare.prepared_map import METHOD, statistics_of_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.threads import limit_threads
 
 SETTINGS = RecognizerSettings(mode='robust')

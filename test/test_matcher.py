@@ -11,16 +11,19 @@ import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import (
+    best_match,
     image_distances,
     match_sequence,
+    SequenceDistances,
     SequenceSettings,
     SpatialSettings,
     strip_distances,
 )
-from stavpr_ros.errors import SettingsError
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.prepare import prepare_map, z_normalized
 from stavpr_ros.prepare.cpu_matcher import CpuMatcher
 from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.threads import limit_threads
 
 ADAPTIVE = SpatialSettings()
@@ -134,3 +137,20 @@ def test_precision_auto_is_int8_on_large_maps_in_mode_robust(places, changes, pr
     other = 'int8' if precision == 'float32' and 'spatial' not in changes else 'float32'
     as_other = PlaceRecognizer(map_of(features), settings, precision=other).distances(query)
     assert np.array_equal(auto, as_other) == ('spatial' in changes)
+
+
+@pytest.mark.parametrize(('precision', 'strategy'), [('float32', 'none'), ('int8', 'adaptive')])
+def test_kernels_reject_arrays_of_other_shapes(precision, strategy):
+    features = features_of(route_strips(0, 40))
+    prepared = prepare_map(features, precision)
+    matcher = make_matcher(prepared.features, SpatialSettings(strategy), 'cpu', precision)
+    image, weights = features.strips[:, 0], features.weights[:, 0]
+    for function, arguments, words in [
+        (matcher.distances, (image[:, :-1], weights), r'strips: shape .*, expected \(7, n, 24\)'),
+        (matcher.distances, (image, weights[:3]), r'weights: shape \(3, 1\)'),
+        (prepared.centering.next_query, (image[:-1],), r'strips: shape .*, expected \(7, 24\)'),
+        (z_normalized, (np.ones(9, np.float32), None, np.ones(3, bool)), 'counted: shape'),
+        (best_match, (SequenceDistances(np.ones(9), np.ones(3, int)), 2), 'lengths: shape'),
+    ]:
+        with pytest.raises(InputError, match=words):
+            function(*arguments)

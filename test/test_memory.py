@@ -12,8 +12,8 @@ import pytest
 from stavpr_ros.errors import MapFileError
 from stavpr_ros.mapping import load_map, open_map, save_map, verify_map
 from stavpr_ros.memory import is_aligned
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources.frame import ImageRecord
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))

@@ -37,7 +37,7 @@ STEP, DEPTH, LAP = 24, 5.0, 30  # pixels between two places, meters to the scene
 AHEAD = 0.125  # of the query to its place, meters; there is a place each meter
 LEFT = '0 0 0 -1.5708 0 0'  # camera_transform of a camera that looks to the left
 ELSEWHERE = math.nan  # where the map has no place
-PROBABILITY = 0.8  # min_probability
+PROBABILITY = 0.3  # min_probability
 Status = PlaceMatch
 ROUTE, OFF_MAP = route_images(60), route_images(8, seed=9)
 
@@ -69,6 +69,7 @@ class Drive:
     infos: list[MapInfo] = field(default_factory=list)
     around: Any = None
     is_back: bool = False
+    length: int = LENGTH  # images of a window
 
     @property
     def map_id(self) -> str:
@@ -109,7 +110,7 @@ class Drive:
             return [match.header.stamp]
         stamps = [stamp for stamp in self.x if (stamp > self.reset) == (own > self.reset)]
         end = stamps.index(own) + 1
-        images = match.path[-1].query_index + 1 if match.path else LENGTH
+        images = match.path[-1].query_index + 1 if match.path else self.length
         return [time_message(stamp) for stamp in stamps[max(end - images, 0) : end]]
 
     def limit(self, match: PlaceMatch) -> float:
@@ -118,7 +119,7 @@ class Drive:
             return 0.2
         if 'not confirmed' in match.reason:
             return 0.0
-        return 0.05 if len(match.path) in range(1, LENGTH) else 1 - PROBABILITY
+        return 0.1 if len(match.path) in range(1, self.length) else 1 - PROBABILITY
 
 
 def is_close(a: float, b: float, error: float = 1e-6) -> bool:
@@ -182,9 +183,8 @@ PLACE_MATCH: Checks = {
         math.isnan(m.distance) == (m.sequence_first < 0) and (not matched(m) or
         is_close(m.distance, 0, 0.001))),
     'threshold': ('as applied: MATCH means distance < threshold; mode robust: 1 - the '
-        'probability that applies: of min_probability or max_error; at least 0.95 of fewer images '
-        'than a full window, up to 0.9 of a camera at rest, 1 of a path that is not confirmed '
-        'yet (operation loop_closure)',
+        'probability that applies: of min_probability or max_error; at least 0.9 of fewer images '
+        'than a full window, 1 of a path that is not confirmed yet (operation loop_closure)',
         lambda m, d: (is_close(m.threshold, d.limit(m)) or m.status == Status.INVALID_IMAGE or
         (nanoseconds(m.header.stamp) in d.at_rest and 0.0999 < m.threshold < d.limit(m))) and
         (not matched(m) or m.distance < m.threshold)),
@@ -344,7 +344,7 @@ LOOP_CLOSURE: Checks = {
         lambda m, d: (m.relative_pose.query_index, m.relative_pose.place_index) ==
         (m.query_index, m.place_index)),
     'pairs': ('the whole window, from its oldest image to its newest',
-        lambda m, d: len({pair.query_stamp.sec for pair in m.pairs}) in (range(2, LENGTH + 1)
+        lambda m, d: len({pair.query_stamp.sec for pair in m.pairs}) in (range(2, d.length + 1)
         if d.operation == 'localization' else [LENGTH]) and
         (np.diff([nanoseconds(pair.query_stamp) for pair in m.pairs]) >= 0).all()),
 }
@@ -470,6 +470,7 @@ def running(robot: Robot, drive: Drive, **parameters: Any) -> Iterator[Any]:
         'operation': drive.operation,
         'map_path': drive.path,
         'min_probability': PROBABILITY,
+        'sequence_length': drive.length,
         'keyframe_distance': 0.001,  # an image without odometry is not taken
     } | parameters)  # fmt: skip
     try:
@@ -577,9 +578,9 @@ def drives(robot, small_map, tmp_path_factory):
 
     path = str(tmp_path_factory.mktemp('map') / 'route.stavpr')
     save_map(small_map, path)
-    early = Drive(path=path, places=load_map(path))
+    early = Drive(path=path, places=load_map(path), length=8)
     with running(robot, early):
-        show(robot, early, range(40, 46))
+        show(robot, early, range(40, 50))
 
     back = Drive(**on_map, is_back=True)
     with running(robot, back, direction='both'):
@@ -649,7 +650,7 @@ def test_drives_show_what_the_fields_distinguish(drives):
     """Or a check would hold for want of messages."""
     robust, paper, mapping, loop, _, _, early, back = drives
     assert {match.status for drive in drives for match in drive.matches} == set(range(8))
-    assert {0.2, 0.05} == {round(match.threshold, 6) for match in early.matches}
+    assert {1 - PROBABILITY, 0.1} == {round(match.threshold, 6) for match in early.matches}
     assert 0.0 in {match.threshold for match in loop.matches}
     assert any(matched(match) for match in back.matches)
     for drive in (robust, paper):

@@ -15,8 +15,8 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
+from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import ImageResult
-from stavpr_ros.recognition import Match, Status
 from stavpr_ros.relative_pose.pair import matched_pair
 from stavpr_ros.ros.messages import (
     BESIDE,

@@ -20,9 +20,9 @@ from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping.transforms import matrices
+from stavpr_ros.method import Status
+from stavpr_ros.method.match import Match
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.recognition import Status
-from stavpr_ros.recognition.match import Match
 from stavpr_ros.ros.messages import matched_pose_message, pose_message
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
 from test_visualization import header, Publishers

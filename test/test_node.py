@@ -12,7 +12,7 @@ from robot import image_message, LENGTH, SECOND
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.ros import output
 from stavpr_ros.ros.messages import nanoseconds
 from std_msgs.msg import Float32, Int32

@@ -13,8 +13,8 @@ from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import LoopClosure, PlaceMatch, RelativePose
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping.camera import FORWARD, mount_of
+from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.pipeline.statistics import Statistics
-from stavpr_ros.recognition.loop_closer import LoopCloser
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.pair import Edge, Source
 from stavpr_ros.ros import edges

@@ -111,7 +111,7 @@ def test_jump_back_of_the_simulated_clock_resets_the_window(robot, start, set_cl
     """The stamps of the images go on."""
     start(use_sim_time=True)
     set_clock(1000)
-    assert robot.statuses(route[:6]) == 2 * [WARMING_UP] + 4 * [MATCH]
+    assert robot.statuses(route[:6]) == 4 * [WARMING_UP] + 2 * [MATCH]
     set_clock(5000)
     assert robot.show(route[6]).status == MATCH
     set_clock(4950)

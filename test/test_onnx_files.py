@@ -20,7 +20,7 @@ from stavpr_ros.errors import (
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class, settings_class
 from stavpr_ros.mapping import build_map, load_map, save_map
-from stavpr_ros.recognition import Status
+from stavpr_ros.method import Status
 from stavpr_ros.sources.frame import Frame
 import torch
 from torch import nn

@@ -9,11 +9,11 @@ from parameter_files import configuration_yaml, documentation_markdown
 import pytest
 from stavpr_ros.devices import BACKENDS
 from stavpr_ros.errors import MapFileError, SettingsError
+from stavpr_ros.method.settings import MODES
+from stavpr_ros.method.verification import METHODS
 from stavpr_ros.parameters import BY_NAME, PARAMETERS
 from stavpr_ros.pipeline import node_settings, NodeSettings, OPERATIONS, PipelineSettings, read_map
 from stavpr_ros.prepare.matcher import PRECISIONS
-from stavpr_ros.recognition.settings import MODES
-from stavpr_ros.recognition.verification import METHODS
 from stavpr_ros.relative_pose.estimator import METHODS as EDGE_METHODS
 import yaml
 

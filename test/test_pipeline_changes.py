@@ -20,13 +20,13 @@ import pytest
 from stavpr_ros.errors import ImageError, InputError
 from stavpr_ros.mapping import save_map, thumbnail_of
 from stavpr_ros.mapping.keyframes import KeyframeSettings
-from stavpr_ros.pipeline import OPERATIONS
-from stavpr_ros.recognition import Status
-from stavpr_ros.recognition.verification import (
+from stavpr_ros.method import Status
+from stavpr_ros.method.verification import (
     GeometricEvidence,
     GeometricSettings,
     PlaceVerifier,
 )
+from stavpr_ros.pipeline import OPERATIONS
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 
@@ -52,7 +52,7 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     assert match.candidates == ()
     pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
     match = process(pipeline, route[13:14], first=13)[0]
-    assert match.threshold == pytest.approx(0.05)
+    assert match.threshold == pytest.approx(0.5)
 
 
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):

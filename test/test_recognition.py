@@ -12,7 +12,7 @@ from stavpr_ros.alignment.lm_dtw import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import build_map, load_map, PlaceMap
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.sources import open_source
 
 SHORT = SequenceSettings(length=5, beta=2.0)

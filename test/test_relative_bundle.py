@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.recognition.verification import mutual_matches
+from stavpr_ros.method.verification import mutual_matches
 from stavpr_ros.relative_pose.bundle import odometry_information, SHIFT, TURN
 from stavpr_ros.relative_pose.landmarks import triangulate
 from test_pnp import motions, points_ahead, pose, views_of

@@ -7,8 +7,8 @@ from dataclasses import fields
 import numpy as np
 from places import features_of, route_strips
 import pytest
-from stavpr_ros.recognition import Match, RecognizerSettings
-from stavpr_ros.recognition.loop_closer import LoopCloser
+from stavpr_ros.method import Match, RecognizerSettings
+from stavpr_ros.method.loop_closer import LoopCloser
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 N = 120
@@ -36,7 +36,7 @@ def assert_same(one, new, features):
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
 def test_loop_closer_after_a_reset_answers_as_a_new_one_on_its_route(precision):
     """The route stays; another one has the same without any window, by a reset at each image."""
-    options = {'limit': 150, 'precision': precision}
+    options = {'limit': 240, 'precision': precision}
     one, new = (LoopCloser(RecognizerSettings(), 30, DRIVE.settings, **options) for _ in 'ab')
     for image in range(len(DRIVE)):
         drive(one, DRIVE, image)

@@ -9,7 +9,9 @@ from places import features_of, recognize_all
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.filter.paths import CLOSE
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.model import CLOSE
+from stavpr_ros.method.settings import options_of, PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare.centering import (
     MeanCentering,
     norms_of,
@@ -19,8 +21,6 @@ from stavpr_ros.prepare.centering import (
     Whitening,
 )
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.settings import options_of, PAPER, ROBUST, RobustOptions
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 

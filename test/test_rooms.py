@@ -5,13 +5,10 @@
 import doctest
 
 import pytest
-from stavpr_ros import filter as filter_room
-from stavpr_ros import prepare, recognition
+from stavpr_ros import method, prepare
 
 
-@pytest.mark.parametrize(
-    'room', [filter_room, prepare, recognition], ids=lambda room: room.__name__
-)
+@pytest.mark.parametrize('room', [method, prepare], ids=lambda room: room.__name__)
 def test_example_at_the_head_of_a_room_runs(room):
     result = doctest.testmod(room)
     assert result.attempted > 5

@@ -7,13 +7,10 @@ from dataclasses import replace
 from map_examples import example_map
 import map_reader
 import numpy as np
-import oracle
 from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
-from stavpr_ros.filter.model import FilterSettings, MODEL
-from stavpr_ros.filter.place_filter import PlaceFilter
 from stavpr_ros.maintenance.same_places import with_same_places
 from stavpr_ros.mapping import (
     GrowingMap,
@@ -25,16 +22,13 @@ from stavpr_ros.mapping import (
 )
 from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method.model import MODEL
+from stavpr_ros.method.sessions import layout_of
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.sessions import layout_of
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 LENGTH, PLACES = 10, 90
-LIVELY = FilterSettings(
-    speeds=(0.0, 1.0, 2.5), levels=(-1.0, -2.0), keep_level=0.7, keep_speed=0.6, spread=0.15,
-    leave=0.07, enter=0.2, start=0.6,
-)  # fmt: skip
 
 
 def route(seed):
@@ -58,36 +52,6 @@ def recognizer(place_map, mode='robust'):
 
 def recognize(place_map, query, mode='robust'):
     return recognize_all(recognizer(place_map, mode), query)
-
-
-def test_filter_of_sessions_equals_plain_loops():
-    sizes, rng = (6, 1, 9), np.random.default_rng(0)
-    n = sum(sizes)
-    index = np.repeat(np.arange(3, dtype=np.int32), sizes)
-    layout = layout_of(PlaceMapOf(index), 2, LIVELY)
-    plain = oracle.PlaceFilter(LIVELY, (0, 6, 7))
-    one = PlaceFilter(layout.width(n), 4, LIVELY, layout.gaps)
-    for image in range(12):
-        z, weights = rng.standard_normal(n).astype(np.float32), rng.uniform(0.1, 1, 3)
-        alpha = 0.0 if image == 5 else 0.4
-        one.update(layout.to_columns(z), alpha, weights)
-        plain.update(z, alpha, weights)
-        found = one.places_of_states()
-        np.testing.assert_allclose(
-            found[layout.columns], plain.a.sum(axis=(0, 1)), rtol=1e-4, atol=2e-6
-        )
-        assert not found[layout.gaps].any()
-        assert 1 - found.sum() == pytest.approx(sum(plain.off), abs=2e-5)
-
-
-class PlaceMapOf:
-    """What the layout reads of a map."""
-
-    def __init__(self, session_index):
-        self.session_index, self.same_as, self.seam = session_index, None, None
-
-    def __len__(self):
-        return len(self.session_index)
 
 
 def test_map_of_one_session_has_no_gaps(town):

@@ -14,8 +14,8 @@ from stavpr_ros.maintenance.same_places import SURE, with_last_related, with_sam
 from stavpr_ros.mapping import load_map, PlaceMap, save_map
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
+from stavpr_ros.method import Status
 from stavpr_ros.pipeline import Pipeline, read_map
-from stavpr_ros.recognition import Status
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 UPSTAIRS = route_images(40, seed=3)

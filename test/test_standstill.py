@@ -6,10 +6,10 @@ import numpy as np
 from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.features import FeatureSettings
-from stavpr_ros.filter.motion import change_weights
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.loop_closer import LoopCloser
+from stavpr_ros.method.motion import change_weights
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.loop_closer import LoopCloser
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 PLACES, STOP, STANDING, D = 160, 70, 400, 32

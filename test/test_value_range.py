@@ -12,9 +12,9 @@ from sensor_msgs.msg import CompressedImage, Image
 from stavpr_ros.errors import FeatureMismatchError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, extract_features, load_map, save_map
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.settings import PipelineSettings
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_writer import write_bag

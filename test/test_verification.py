@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.recognition import verification
-from stavpr_ros.recognition.verification import GeometricEvidence, GeometricSettings, PlaceVerifier
+from stavpr_ros.method import verification
+from stavpr_ros.method.verification import GeometricEvidence, GeometricSettings, PlaceVerifier
 from stavpr_ros.sources import open_source
 
 METHODS = ['orb', 'sift']

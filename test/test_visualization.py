@@ -21,9 +21,9 @@ from robot import LATCHED
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap
+from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import ImageResult
 from stavpr_ros.pipeline.overlay import draw_match, draw_window
-from stavpr_ros.recognition import Match, Status
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray

@@ -25,10 +25,10 @@ from stavpr_ros.errors import FleetError, InputError, OutputTakenError, Settings
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
+from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method.localizer import EARLY
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.prepare.centering import unit_norm
-from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.recognition.recognizer import EARLY
 
 for package in ('faiss', 'qdrant_client', 'qdrant_edge'):
     pytest.importorskip(package, reason='the extra fleet is not installed')

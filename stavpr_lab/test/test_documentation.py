@@ -81,7 +81,7 @@ def test_readme_python_examples_run(run):
     assert [line.split() for line in run(exec, of_arrays, {}).splitlines()] == answers
 
 
-@pytest.mark.parametrize('page', ['recognition', 'mapping', 'sources'])
+@pytest.mark.parametrize('page', ['method', 'mapping', 'sources'])
 def test_examples_of_the_api_pages_run(run, page):
     text = (ROOT / f'docs/api/{page}.rst').read_text()
     (example,) = re.findall(r'code-block:: python\n\n((?:   .*\n|\n)+)', text)

@@ -17,7 +17,7 @@ from stavpr_lab.evaluation.paper.experiments import (
 )
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map
-from stavpr_ros.recognition import RecognizerSettings
+from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.sources.folder import FolderSource
 
 

@@ -12,7 +12,7 @@ from stavpr_lab.evaluation.metrics import image_matches
 from stavpr_lab.evaluation.records import evaluate_records
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, extract_features, save_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord

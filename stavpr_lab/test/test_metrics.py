@@ -17,7 +17,7 @@ from stavpr_lab.evaluation.metrics import (
 )
 from stavpr_ros.alignment import SequenceMatch
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.method import Match, Status
 
 NONE = Match(Status.WARMING_UP)
 

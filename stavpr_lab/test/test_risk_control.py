@@ -19,8 +19,8 @@ from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_ris
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import ErrorRisks
+from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.prepare import prepared_map
-from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.sources import open_source
 
 PLACES, NAN = 60, float('nan')

@@ -11,7 +11,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import accepted_counts
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import extract_features
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.sources import open_source
 
 SETTINGS = RecognizerSettings(mode='robust')

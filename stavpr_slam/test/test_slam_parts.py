@@ -92,8 +92,8 @@ def test_camera_transform_of_tf_is_looked_up(default_context, monkeypatch):
 
 OPTIMIZED = """
 import importlib, pkgutil, sys
-import stavpr_ros.alignment.cpu, stavpr_ros.filter, stavpr_slam
-for package in (stavpr_ros.alignment.cpu, stavpr_ros.filter, stavpr_slam):
+import stavpr_ros.alignment.cpu, stavpr_ros.method, stavpr_slam
+for package in (stavpr_ros.alignment.cpu, stavpr_ros.method, stavpr_slam):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):
         importlib.import_module(module.name)
 from stavpr_ros.commands.stavpr import main

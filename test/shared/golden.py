@@ -22,11 +22,11 @@ import numpy as np
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, descriptor_map, merge_maps, PlaceMap
+from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.verification import GeometricSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
 from stavpr_ros.pipeline.pipeline import LoadedMap
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.verification import GeometricSettings
 from stavpr_ros.sources.frame import Frame, ImageRecord
 
 FILE = Path(__file__).with_name('golden_streams.json')
