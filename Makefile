@@ -35,7 +35,7 @@ EXECUTABLES := install/stavpr_ros/lib/stavpr_ros
 LAB := install/stavpr_lab/lib/stavpr_lab
 
 .PHONY: help setup build demo animation days repeat evaluate test test-long test-arm coverage crash-test check lint ceilings docs bench bench-quick \
-	accuracy protocol off-map pose-graphs shell clean distclean development
+	accuracy fit protocol off-map pose-graphs shell clean distclean development
 
 help: ## list the targets (the default)
 	@echo 'make TARGET [NAME=VALUE ...]'
@@ -144,6 +144,10 @@ protocol: build ## measure recalls by method, tolerance and sequence length (ARG
 accuracy: override EXTRAS += evaluation
 accuracy: build ## measure the accuracy on the data sets (ARGS=)
 	@$(RUN) python benchmarks/accuracy.py $(ARGS)
+
+fit: override EXTRAS += evaluation
+fit: build ## fit the evidence of mode robust, left out, and its error rates (ARGS=)
+	@OMP_WAIT_POLICY=PASSIVE $(RUN) python benchmarks/fit.py $(ARGS)
 
 off-map: override EXTRAS += evaluation
 off-map: build ## measure mode robust off the map, at night, at other speeds (ARGS=)

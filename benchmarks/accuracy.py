@@ -31,7 +31,7 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import build_map, PlaceMap
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 
 MODES = ('paper', 'robust')

@@ -27,8 +27,8 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map, PlaceMap, save_map
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import unit_norm
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.threads import thread_count
 
@@ -53,6 +53,9 @@ class HalfFeatures(LocalFeatures):
 
     def __post_init__(self) -> None:
         """Accept float16, which features of a map are not."""
+
+    def require_fit(self, *_: Any) -> None:
+        """Accept it for a recognizer as well."""
 
     def __getitem__(self, images: slice | np.ndarray) -> LocalFeatures:
         strips, weights = self.strips[:, images].astype(np.float32), self.weights[:, images]

@@ -34,7 +34,8 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-STRIPS, LENGTH, QUERIES = 7, 20, 40
+STRIPS, LENGTH, QUERIES = 7, 20, 1000
+GRADIENT = 224  # dimensions of features whose cells are compared
 SHOWN = 5  # differences of a stream
 
 
@@ -42,12 +43,13 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
     """Driver of this checkout, see the module's docstring."""
     from stavpr_ros.features import FeatureSettings, LocalFeatures
     from stavpr_ros.mapping import descriptor_map
-    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+    from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
     def features(strips: np.ndarray, weights: np.ndarray) -> LocalFeatures:
         return LocalFeatures(strips, weights, settings)
 
-    settings = FeatureSettings('synthetic', None)
+    kind = 'gradient' if strips.shape[2] == GRADIENT else 'synthetic'
+    settings = FeatureSettings(kind, None)
     place_map = descriptor_map(features(strips, weights))
     limit = {'threshold': 1.0} if mode == 'paper' else {'min_probability': 1e-9}
     recognizer = PlaceRecognizer(
@@ -57,9 +59,10 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
     return lambda strips, weights: recognizer.update(features(strips, weights))
 
 
-def random_strips(n: int, d: int, seed: int) -> np.ndarray:
-    """Draw unit-norm features, shape (W, n, d), float32."""
+def random_strips(n: int, d: int, seed: int, mean: float | np.ndarray = 0.0) -> np.ndarray:
+    """Draw unit-norm features, shape (W, n, d), float32, half of them ``mean``."""
     strips = np.random.default_rng(seed).standard_normal((STRIPS, n, d), np.float32)
+    strips = strips * np.float32(d**-0.5) + mean
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
     return strips
 
@@ -75,9 +78,10 @@ def serve(driver: str) -> None:
         if 'frames' not in request:
             n, d, seed = request['n'], request['d'], request['seed']
             weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
-            places = random_strips(n, d, seed), weights
-            queries = np.split(random_strips(QUERIES, d, seed + 1), QUERIES, axis=1)
-            call, following = make(*places, request['mode'], request['precision']), cycle(queries)
+            strips, count = random_strips(n, d, seed), min(n, QUERIES)
+            drive = random_strips(count, d, seed + 1, strips[:, :count])  # along the map
+            call = make(strips, weights, request['mode'], request['precision'])
+            following = cycle(np.split(drive, count, axis=1))
             request['frames'] = LENGTH
         seconds = []
         for _ in range(request['frames']):
@@ -189,7 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         '--sizes', type=int, nargs='+', default=[2_000, 20_000], metavar='N', help='places'
     )
-    parser.add_argument('--dimensions', type=int, default=512, metavar='D')
+    parser.add_argument('--dimensions', type=int, default=GRADIENT, metavar='D')
     parser.add_argument('--precisions', nargs='+', default=['float32', 'int8'], metavar='DTYPE')
     parser.add_argument('--rounds', type=int, default=15, help='pairs of runs (%(default)s)')
     parser.add_argument('--frames', type=int, default=20, help='frames of each run (%(default)s)')

@@ -172,8 +172,8 @@ def measure_sessions(counts: list[int]) -> list[str]:
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.mapping.reduction import with_principal_components
+    from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
     from stavpr_ros.prepare.centering import normalize
-    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
     from stavpr_ros.sources import open_source
     from stavpr_ros.threads import limit_threads
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of the benchmarks: the folder of data sets, and synthetic maps, queries and windows."""
 
+from dataclasses import replace
 import os
 from pathlib import Path
 import sys
@@ -11,7 +12,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.prepare.centering import normalize
 
-SETTINGS = FeatureSettings('synthetic', None)
+GRADIENT = 224  # dimensions of features whose cells are compared
 
 
 def data_folder() -> Path:
@@ -32,7 +33,17 @@ def make_features(n: int, d: int, W: int, seed: int) -> LocalFeatures:
     for strip in strips:
         rng.standard_normal(out=strip, dtype=np.float32)
         normalize(strip)
-    return LocalFeatures(strips, np.full((W, n), W**-0.5, np.float32), SETTINGS)
+    settings = FeatureSettings('gradient' if d == GRADIENT else 'synthetic', None)
+    return LocalFeatures(strips, np.full((W, n), W**-0.5, np.float32), settings)
+
+
+def along(places: LocalFeatures, images: int, seed: int) -> LocalFeatures:
+    """Return the features of a drive: those of the first places, and as much noise."""
+    strips = places.strips[:, :images].copy()
+    rng, d = np.random.default_rng(seed), places.dimension
+    strips += rng.standard_normal(strips.shape, np.float32) * np.float32(d**-0.5)
+    normalize(strips)
+    return replace(places, strips=strips, weights=places.weights[:, :images])
 
 
 def make_window(l: int, n: int, seed: int) -> np.ndarray:

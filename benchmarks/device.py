@@ -26,10 +26,10 @@ from unittest.mock import patch
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.blocks import rounded
 from stavpr_ros.prepare.centering import MeanCentering
 from stavpr_ros.prepare.prepared_map import PreparedMap
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -101,7 +101,7 @@ def recognizer_of(
         return PreparedMap(used, centering, np.ones((5, len(places)), np.float32))
 
     settings = RecognizerSettings(0.9 if mode == 'paper' else None, mode=mode)
-    with patch('stavpr_ros.recognition.recognizer.prepare_map', prepared):
+    with patch('stavpr_ros.method.localizer.prepare_map', prepared):
         return PlaceRecognizer(descriptor_map(places), settings, backend, precision)
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from stavpr_fleet import FleetRecognizer, open_city_map, upload
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import unit_norm
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 
 ROUTES = {

@@ -5,8 +5,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stavpr_ros.filter.model import FilterSettings
-from stavpr_ros.filter.paths import BLOCK
+import numpy as np
+from stavpr_ros.features.registry import Cells
+from stavpr_ros.method.cells import FEW, SIDE
+from stavpr_ros.method.model import MODEL
 
 ITEM_BYTES = {'float32': 4, 'int8': 1}
 
@@ -15,6 +17,8 @@ ITEM_BYTES = {'float32': 4, 'int8': 1}
 # selects counts once, index arithmetic does not count: fewer operations make a stricter bound.
 SEQUENCE_CELL, SPATIAL_CELL = 8, 9
 BORDER_CELL = 2  # one predecessor: S + x, C + 1
+SPEEDS, STEPS = len(MODEL.speeds), int(np.count_nonzero(MODEL.steps()))  # steps of all speeds
+MIXED = 5  # a change of speed: two products, two sums, and the birth
 
 
 @dataclass(frozen=True)
@@ -102,23 +106,33 @@ def window_push(sizes: Sizes) -> Work:
     return Work(4 * sizes.n, sizes.n)
 
 
-def filter_update(sizes: Sizes, settings: FilterSettings) -> Work:
+def filter_update(sizes: Sizes) -> Work:
     """
-    Advance the filter: states and row are read once; states, origins and sums are written once.
+    Advance the filter: states and row are read once; states, sums and the row are written once.
 
-    Half a byte an origin, a sum for each place. A likelihood takes an exponential (1), a product
-    and a difference. A state mixes levels (2 each) and speeds (9, where it comes from 2), moves
-    (5, 2), is joined by births and weighed (4).
+    A likelihood takes a minimum, a product, a difference and an exponential (1). A state moves (2
+    a step), changes its speed, is weighed, and counts in three sums.
     """
-    K = len(settings.levels)
-    states = K * len(settings.speeds)
-    each = 3 * K + states * (2 * K + 9 + 2 + 5 + 2 + 4)
-    return Work(sizes.n * (8 + states * (4 + 4 + 0.5)), sizes.n * each)
+    each = 4 + 2 * STEPS + SPEEDS * (MIXED + 4)
+    return Work(sizes.n * (12 + 8 * SPEEDS), sizes.n * each)
 
 
-def filter_belief(sizes: Sizes) -> Work:
-    """Read the largest sum of each block; backtracking starts at few places."""
-    return Work(4 * sizes.n / BLOCK, sizes.n / BLOCK)
+def smoothing(sizes: Sizes, columns: int) -> Work:
+    """Advance the states of a region again, and go back; both move, change speed, are weighed."""
+    each = 2 * (2 * STEPS + SPEEDS * (MIXED + 1)) + 3 * SPEEDS  # the belief, and the sum
+    return Work(4 * columns * (SPEEDS + sizes.l), sizes.l * columns * each)
+
+
+def straight_paths(sizes: Sizes, speeds: int) -> Work:
+    """Read the z of a window once; the least of three, a sum for each speed, its minimum."""
+    each = 2 * sizes.l + speeds * (sizes.l + 1)
+    return Work(4 * sizes.l * sizes.n, sizes.n * each)
+
+
+def cells(sizes: Sizes, cells: Cells) -> Work:
+    """Compare the cells of images with those of a competitor's places, all pairs."""
+    C = cells.channels * cells.rows * cells.columns // SIDE
+    return Work(4 * FEW * sizes.W * sizes.d, 2 * FEW * (SIDE * sizes.W) ** 2 * C)
 
 
 def lm_dtw(sizes: Sizes) -> Work:

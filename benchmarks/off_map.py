@@ -43,9 +43,9 @@ from stavpr_ros.alignment.settings import SpatialSettings, STRATEGIES
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, PlaceMap, select_places
+from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.error_rate import least_probability
 from stavpr_ros.sources import open_source
 
 SETTINGS = RecognizerSettings(mode='robust')

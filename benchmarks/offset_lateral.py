@@ -20,9 +20,9 @@ from stavpr_lab.demonstration.repeat import CONDITIONS, Taught, teach, View
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
 from stavpr_lab.demonstration.street.traverses import Conditions, EPOCH
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.ros.messages import matched_pose_message

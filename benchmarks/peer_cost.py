@@ -31,7 +31,7 @@ from stavpr_lab.evaluation.seqslam import (
 )
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.threads import limit_threads
 from timing import measure, timed
 

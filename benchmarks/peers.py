@@ -27,7 +27,7 @@ from stavpr_lab.evaluation.metrics import evaluate_ranking, Ranking
 from stavpr_lab.evaluation.seqslam import match_differences, SeqSlamSettings
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap, select_places
-from stavpr_ros.recognition import RecognizerSettings
+from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.sources import open_source
 import torch
 

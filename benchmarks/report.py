@@ -16,9 +16,10 @@ ROBUST_STAGES = (
     'mean_centering',
     'image_distances',
     'query_znorm',
-    'window_push',
     'filter_update',
-    'filter_belief',
+    'smoothing',
+    'straight_paths',
+    'cells',
 )
 OUTCOME = {True: 'reached', False: '**not reached**', None: 'not measured'}
 CELLS, BOUND = 'cells per second', 'over the lower bound'

@@ -21,7 +21,7 @@ from stavpr_ros.maintenance.same_places import with_last_related
 from stavpr_ros.maintenance.upkeep import update_map
 from stavpr_ros.mapping import build_map, merge_maps, PlaceMap, select_places
 from stavpr_ros.mapping.versions import Version
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.threads import limit_threads
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 import gc
-from itertools import cycle
+from itertools import count, cycle
 from typing import Any
 
 from baselines import accumulated, prange, sample
-from data import free_bytes, make_features, make_window
+from data import along, free_bytes, make_features, make_window
 import lower_bounds as bounds
 from lower_bounds import ITEM_BYTES, Sizes
 import numba as nb
@@ -28,28 +28,30 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.filter.model import MODEL
-from stavpr_ros.filter.place_filter import PlaceFilter
+from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.mapping import descriptor_map, PlaceMap
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.cells import CellAgreement
+from stavpr_ros.method.filter import PlaceFilter
+from stavpr_ros.method.model import APART, MODEL, STRAIGHT
+from stavpr_ros.method.query_window import SequenceBuffer
 from stavpr_ros.pipeline import LoadedMap, Pipeline, PipelineSettings
 from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import MeanCentering, normalize
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.normalization import z_normalized
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.window import SequenceBuffer
 from stavpr_ros.sources.frame import ImageRecord
 from timing import best_seconds, timed
 import torch
 
 MODES = ('robust', 'paper')  # the default first
-SEQUENCE, SPATIAL, FILTER = SequenceSettings(), SpatialSettings(), MODEL
+SEQUENCE, SPATIAL = SequenceSettings(), SpatialSettings()
 NMS_RADIUS = RecognizerSettings.nms_radius
 STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
 LIBROSA_STARTS, ENDS_CHECKED = 500, 3
-PROJECTED, DRIVEN = 64, 1000  # dimensions, and images of the drive, of `process`
+PROJECTED, DRIVEN = 64, 1000  # dimensions of `process`, images of the drives
 SEARCHES = {'faiss': 'faiss', 'usearch': 'bench'}  # package: its requirements
 Call = Callable[[], Any]
 
@@ -68,34 +70,43 @@ def memory_problem(n: int, d: int, device: str, limit: float) -> str:
 def robust_stages(run: Run, n: int, seed: int) -> None:
     """Measure the stages of mode robust that follow the image distances."""
     add = partial(run.measure, size=(n, 0), mode='robust')
-    rows = make_window(SEQUENCE.length, n, seed)
-    buffer = SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k)
-    for row in rows:
-        normalized = z_normalized(row)
-        buffer.push(normalized)
-    sizes = Sizes(n, 0, l=SEQUENCE.length)
+    rows, images = make_window(SEQUENCE.length, n, seed), np.arange(SEQUENCE.length)
+    path = np.minimum(n // 2 + images, n - 1)
+    rows[images, path] = 0.1  # of right places
+    sizes, z = Sizes(n, l=SEQUENCE.length), [z_normalized(row) for row in rows]
     add('query_znorm', call=lambda: z_normalized(rows[-1]), works=[bounds.query_znorm(sizes)])
-    add('window_push', call=lambda: buffer.push(normalized), works=[bounds.window_push(sizes)])
-
-    window = buffer.rows()[:, :n]
+    place_filter = PlaceFilter(n, SEQUENCE.length)
+    for row in z:
+        place_filter.update(row)
+    smooth = partial(place_filter.beliefs, SEQUENCE.length)
+    add('smoothing', call=smooth, works=[bounds.smoothing(sizes, len(smooth().columns))])
     middle = (SEQUENCE.length - 1) // 2
-    lag = SEQUENCE.length - 1 - middle
-    place_filter = PlaceFilter(n, lag, FILTER)
-    speed_weights = np.ones(len(FILTER.speeds))
-    for row in window:
-        place_filter.update(row, FILTER.weight, speed_weights)
-    add(
-        'filter_update',
-        call=partial(place_filter.update, window[-1], FILTER.weight, speed_weights),
-        works=[bounds.filter_update(sizes, FILTER)],
-        cells=n * len(FILTER.levels) * len(FILTER.speeds),
-    )
+    steps = np.rint(np.outer(STRAIGHT, images - middle)).astype(np.int64)
+    near = np.array([[path[middle] - APART, path[middle] + APART + 1]])
+    straight = partial(place_filter.best_straight, steps, slice(0, n), near)
+    add('straight_paths', call=straight, works=[bounds.straight_paths(sizes, len(STRAIGHT))])
+    update, states = partial(place_filter.update, z[-1]), n * len(MODEL.speeds)
+    add('filter_update', call=update, works=[bounds.filter_update(sizes)], cells=states)
 
-    def belief() -> np.ndarray:
-        belief = place_filter.belief(n, lag)
-        return place_filter.path(belief.states[int(np.argmax(belief.weights))], lag)
 
-    add('filter_belief', call=belief, works=[bounds.filter_belief(sizes)])
+def cell_stage(run: Run, places: LocalFeatures, seed: int) -> None:
+    """Measure cells of an image that moves along the map, and whose competitor is another one."""
+    _, cells = evidence_of(places.settings.kind, STRIPS, places.dimension)
+    if cells is None:
+        return
+    n, length = len(places), SEQUENCE.length
+    agreement = CellAgreement(cells, lambda columns: places.strips[:, columns], length)
+    numbers, rng = count(), np.random.default_rng(seed)
+
+    def compare() -> None:
+        path = (next(numbers) + np.arange(length)) % n
+        agreement.push(places.strips[:, path[-1]])
+        agreement.lead(path, (rng.integers(n) + np.arange(length)) % n)
+
+    for place in range(length - 1):
+        agreement.push(places.strips[:, place % n])
+    works = [bounds.cells(Sizes(n, places.dimension), cells)]
+    run.measure('cells', (n, places.dimension), compare, works, mode='robust')
 
 
 # ------------------------------------------------ on windows of distances, mode paper
@@ -108,6 +119,8 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
     padded = np.full((SEQUENCE.length, padded_width(n, SEQUENCE.k)), np.inf, np.float32)
     padded[:, :n] = window
     sizes = Sizes(n, 0, l=SEQUENCE.length, k=SEQUENCE.k)
+    push = partial(SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k).push, window[-1])
+    add('window_push', call=push, works=[bounds.window_push(sizes)])
     kernel = partial(match_padded, padded, n, SEQUENCE.k)
     matches = kernel()
     add(
@@ -173,6 +186,7 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
     sizes, size = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), (n, d)
     centered = partial(MeanCentering(places).next_query, queries.strips[:, 0])
     run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
+    cell_stage(run, places, seed)
     for precision in precisions:
         peers = references(run, places, queries[:1], precision)
         matcher = make_matcher(places, SPATIAL, run.device, precision)
@@ -188,7 +202,7 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
             run.measure('distance_matrix', size, call, works, many, precision)
         del matcher, call
         for mode in MODES:
-            call = frame(places, queries, mode, precision, run.device)
+            call = frame(places, mode, precision, run.device, seed)
             works = frame_works(sizes, mode, precision)
             # of mode paper, the product is the larger part of the work
             beside = peers if mode == 'paper' else map_reading(sizes, precision, run.device)
@@ -207,13 +221,12 @@ def map_reading(sizes: Sizes, precision: str, device: str) -> list[Peer]:
 
 
 def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
-    """Return the work of a whole frame; the trace of one path is too short to matter."""
+    """Return the work of a whole frame; what is done near one path is too short to matter."""
     works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
-    works += [bounds.window_push(sizes)]
     if mode == 'paper':
-        return [*works, bounds.lm_dtw(sizes), bounds.selection(sizes)]
-    filters = [bounds.filter_update(sizes, FILTER), bounds.filter_belief(sizes)]
-    return [bounds.mean_centering(sizes), *works, bounds.query_znorm(sizes), *filters]
+        return [*works, bounds.window_push(sizes), bounds.lm_dtw(sizes), bounds.selection(sizes)]
+    works += [bounds.mean_centering(sizes), bounds.query_znorm(sizes), bounds.filter_update(sizes)]
+    return [*works, bounds.straight_paths(sizes, len(STRAIGHT))]
 
 
 def city_stages(run: Run, n: int, d: int, seed: int) -> None:
@@ -343,12 +356,11 @@ def product(run: Run, places: LocalFeatures, queries: LocalFeatures) -> Peer:
     return Peer('torch float32', timed(forms[form], run.device), note, partial=True)
 
 
-def frame(
-    places: LocalFeatures, queries: LocalFeatures, mode: str, precision: str, device: str
-) -> Call:
-    """Return a call that updates a recognizer, its window full, with the next image."""
+def frame(places: LocalFeatures, mode: str, precision: str, device: str, seed: int) -> Call:
+    """Return a call that updates a recognizer, on the map, its window full, with an image."""
     settings = RecognizerSettings(1.0 if mode == 'paper' else None, mode=mode)
     recognizer = PlaceRecognizer(descriptor_map(places), settings, device, precision)
+    queries = along(places, min(len(places), DRIVEN), seed)
     following = cycle([queries[i : i + 1] for i in range(len(queries))])
     for _ in range(SEQUENCE.length):
         recognizer.update(next(following))

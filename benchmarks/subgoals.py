@@ -18,7 +18,7 @@ from data import data_folder
 import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, extract_features
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 
 DELTA, BEHIND, AHEAD = 5, -2, 10  # of PlaceNav: spread of likelihoods, motion in places an image
