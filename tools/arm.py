@@ -64,7 +64,7 @@ def results(folder: Path, foreign: Path) -> Iterator[tuple[str, np.ndarray]]:
     """
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map, load_map, save_map
-    from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+    from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
     from stavpr_ros.sources.frame import Frame
 
     extractor, rng = FeatureExtractor('gradient'), np.random.default_rng(0)

@@ -29,7 +29,7 @@ ROLES = {'publish': 'publisher', 'subscribe': 'subscriber', 'reply': 'service'}
 STANDARD = re.compile(r'parameter|transition|_states?$|type_description|/(rosout|clock)$')
 PUBLIC = (
     'stavpr_ros.alignment', 'stavpr_ros.errors', 'stavpr_ros.features', 'stavpr_ros.mapping',
-    'stavpr_ros.pipeline', 'stavpr_ros.recognition', 'stavpr_ros.sources',
+    'stavpr_ros.pipeline', 'stavpr_ros.method', 'stavpr_ros.sources',
     'stavpr_ros.sources.frame', 'stavpr_fleet', 'stavpr_slam.pose_graph',
     'stavpr_lab.evaluation.evaluate', 'stavpr_lab.evaluation.ground_truth',
     'stavpr_lab.evaluation.metrics',

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure, SubFigure
 import numpy as np
 from stavpr_lab.evaluation.plots import page, QUIET, show_distances
 from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import evenly
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 COMPARED = 500  # places of the matrix, at most
 SHOWN = 8  # thumbnails

@@ -8,7 +8,7 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.transforms import matrices, to_poses
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_slam.pose_graph import align_maps
 
 

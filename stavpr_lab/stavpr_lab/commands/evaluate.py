@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stavpr_lab.commands.evaluate_sequences import Sequences
     from stavpr_lab.evaluation.evaluate import Evaluation
     from stavpr_lab.evaluation.report import Report
-    from stavpr_ros.recognition import RecognizerSettings
+    from stavpr_ros.method import RecognizerSettings
 
 OUTPUT = 'evaluation_output'
 EXCLUDE_PLACES = default('exclude_places')
@@ -284,7 +284,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         settings_json,
     )
     from stavpr_lab.evaluation.report import Report
-    from stavpr_ros.recognition.sessions import time_note
+    from stavpr_ros.method.sessions import time_note
 
     began = time.perf_counter()
     settings = recognizer_settings(arguments)

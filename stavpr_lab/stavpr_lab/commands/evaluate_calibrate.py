@@ -21,10 +21,10 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import open_map, select_places
 from stavpr_ros.mapping.map_file import save_error_risks
 from stavpr_ros.mapping.place_map import ErrorRisks
+from stavpr_ros.method import PlaceRecognizer
+from stavpr_ros.method.error_rate import ERRORS, least_probability
 from stavpr_ros.output_file import FileVersion, MAP, require_replaceable
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition import PlaceRecognizer
-from stavpr_ros.recognition.error_rate import ERRORS, least_probability
 
 WINDOWS = 2  # of a block: as many images as a block of the bootstrap has
 OTHERS = (

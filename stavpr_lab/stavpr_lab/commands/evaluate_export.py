@@ -16,7 +16,7 @@ from stavpr_ros.output_file import ANY, atomic_output, NPY, require_replaceable,
 if TYPE_CHECKING:
     from stavpr_lab.evaluation.report import Report
     from stavpr_ros.features import LocalFeatures
-    from stavpr_ros.recognition import RecognizerSettings
+    from stavpr_ros.method import RecognizerSettings
 
 FORMATS = {  # their files
     'arrays': ('map.npy', 'query.npy'),
@@ -121,7 +121,7 @@ def _write_matrices(
     report: 'Report', settings: 'RecognizerSettings', folder: Path, force: bool
 ) -> None:
     """Write similarities of single images and the ground truth; rows are places."""
-    from stavpr_ros.recognition import PlaceRecognizer
+    from stavpr_ros.method import PlaceRecognizer
 
     distances = PlaceRecognizer(report.reference, settings).distances(report.query.features)
     _write_npy(folder / 'S.npy', 1 - distances.T, force)

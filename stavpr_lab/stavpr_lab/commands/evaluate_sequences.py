@@ -22,8 +22,8 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import AUTO
 from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
 from stavpr_ros.mapping.builder import fit_value_range
+from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.parameters import default
-from stavpr_ros.recognition import RecognizerSettings
 from stavpr_ros.sources import is_folder, open_source
 from stavpr_ros.sources.bag_path import is_bag
 from stavpr_ros.sources.folder import text_of

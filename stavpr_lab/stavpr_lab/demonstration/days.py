@@ -23,7 +23,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.upkeep import update_map
 from stavpr_ros.mapping import build_map, PlaceMap
 from stavpr_ros.mapping.versions import Version
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
 TOLERANCE = 8.0  # meters from the right position
 DETOUR = -1000.0  # meters, of positions in the detour

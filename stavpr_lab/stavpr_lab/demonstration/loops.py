@@ -15,8 +15,8 @@ from stavpr_lab.evaluation.plots import MatchPair, Outcome
 from stavpr_lab.evaluation.records import IN_WINDOW
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import evenly
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 
 SHOWN = 8  # pairs of images
 LARGEST = 4000  # images of a traverse whose distances are drawn

@@ -14,7 +14,7 @@ from stavpr_lab.evaluation.plots import COLORS, MatchPair, MEANING, Outcome
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
 SHOWN = 6  # pairs of images: two rows of three
 

@@ -39,8 +39,8 @@ from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
 from stavpr_nav.observation import Observation
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
 from tqdm import tqdm

@@ -30,9 +30,9 @@ from stavpr_lab.evaluation.metrics import (
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.progress import Progress
-from stavpr_ros.recognition import Match, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.loop_closer import LoopCloser
 
 MARGIN = 8  # places beside the path of a window whose distances are kept
 MATRIX_SIDE = 900  # cells along a side of the reduced distance matrix
@@ -284,7 +284,7 @@ def evaluate_on_map(
     :param settings: of the recognizer; only the accepted matches depend on its threshold.
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
-    :param backend, precision: see :class:`stavpr_ros.recognition.PlaceRecognizer`.
+    :param backend, precision: see :class:`stavpr_ros.method.PlaceRecognizer`.
     :param odometry: poses of the query's images, (N, 7), compared with the poses of the places.
     :param stamps: of the query's images, ns, (N,), int64, 0 = unknown; None = of all.
     :raises InputError: fewer images than one window, or ground truth of another length.
@@ -327,7 +327,7 @@ def evaluate_loop_closures(
     :param ground_truth: of the same images: the earlier images that are correct.
     :param exclude_places: the latest images that are not part of the map.
     :param late: late matches count for the images that had none.
-    :param precision: see :class:`stavpr_ros.recognition.loop_closer.LoopCloser`.
+    :param precision: see :class:`stavpr_ros.method.loop_closer.LoopCloser`.
 
     The others are as in :func:`evaluate_on_map`.
     """

@@ -17,7 +17,7 @@ import numpy as np
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.alignment import aligned_index
 from stavpr_ros.errors import InputError
-from stavpr_ros.recognition import Match
+from stavpr_ros.method import Match
 
 RANKS = (1, 5, 10, 20)  # k of recall@k
 

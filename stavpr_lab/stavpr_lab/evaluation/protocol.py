@@ -16,8 +16,8 @@ from stavpr_lab.evaluation.metrics import evaluate_ranking, Ranking
 from stavpr_lab.evaluation.seqslam import match_differences, match_lines, SeqSlamSettings
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping import PlaceMap
-from stavpr_ros.recognition import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.recognition.settings import MODES
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.method.settings import MODES
 
 TOLERANCES = (0, 1, 2, 10)  # places
 LENGTHS = (1, 4, 5, 10, 20)  # images
@@ -185,7 +185,7 @@ def evaluate_protocol(
     :param truths: of the N images, by tolerance.
     :param settings: of modes paper and robust, except mode and length.
     :param methods: of :data:`METHODS`; ``centered`` subtracts the mean of each traverse.
-    :param backend: backend and precision of :class:`stavpr_ros.recognition.PlaceRecognizer`.
+    :param backend: backend and precision of :class:`stavpr_ros.method.PlaceRecognizer`.
     :raises InputError: ground truth of another number of images.
     """
     for method in methods:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stavpr_lab.evaluation.metrics import ConfusionCounts, counts_at, image_matches, ImageMatches
 from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.recognition import Match, Status
+from stavpr_ros.method import Match, Status
 
 IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # statuses of images that enter the window
 

@@ -12,7 +12,7 @@ from stavpr_ros.units import SECOND
 RECOGNIZED, PARTLY = 0.8, 0.1  # shares of the images, from which on a drive is called so
 TOLERABLE = 0.05  # share of wrong matches, above which they are the verdict
 GAPS, SHORTEST = 3, 5  # the longest gaps that are listed; images of one at least
-UNLIKELY, DOUBTFUL = 0.05, 0.3  # probabilities of a place that is not matched
+UNLIKELY, DOUBTFUL = 0.001, 0.05  # probabilities of a place that is not matched
 
 
 @dataclass(frozen=True)

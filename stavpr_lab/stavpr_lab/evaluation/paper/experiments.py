@@ -19,8 +19,8 @@ from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
-from stavpr_ros.recognition import RecognizerSettings
-from stavpr_ros.recognition.settings import PAPER, ROBUST, RobustOptions
+from stavpr_ros.method import RecognizerSettings
+from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 import torch
 
 W = 7
