@@ -91,7 +91,7 @@ def two(first):
 
 def test_drive_over_the_route_becomes_a_session(first, rebuilt):
     place_map, version = updated(first, rebuilt)
-    assert version.changes == ('certain of 71% of 200 images', 'added the drive, 200 images')
+    assert version.changes == ('certain of 70% of 200 images', 'added the drive, 200 images')
     assert [session.id for session in place_map.sessions] == ['first', 'drive']
     assert np.bincount(place_map.session_index).tolist() == [200, 200]
     shown = place_map.same_as[200:] < 200
