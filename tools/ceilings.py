@@ -22,7 +22,7 @@ CEILINGS = {
     'lines of the method (prepare, method)': 6_149,
     'lines of all tests': 33_511,
     'lines of benchmarks and tools': 8_829,
-    'lines of docs and README': 4_019,
+    'lines of docs and README': 4_018,
     'parameters of the node': 51,
     'numbers in constants of the method': 145,
 }
