@@ -70,7 +70,7 @@ class Drive:
 
 
 def damaged(image: np.ndarray, damage: str) -> np.ndarray:
-    """Return an image of a darker, covered, rolled or wet camera, or of one that sees less."""
+    """Return an image of a darker, covered, rolled or wet camera, or of a narrower view."""
     h, w = image.shape[:2]
     kind, _, share = damage.partition(' ')
     out: Any = image.astype(np.float32)
@@ -145,12 +145,13 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
         for a, b in ((a, b) for a in half for b in half if a != b):
             sets.negatives.append(('floors', (half[0],), floors[a], floors[b]))
         places[half[0]] = floors[half[0]]
-    ways = {
-        f'{car}/{way}': read(f'both_ways/{car}/{way}')
-        for car in ('car_a', 'car_b') for way in ('forward', 'backward')
+    driven = {
+        f'{car}/{direction}': read(f'both_ways/{car}/{direction}')
+        for car in ('car_a', 'car_b') for direction in ('forward', 'backward')
     }  # fmt: skip
-    for a, b in ((a, b) for a in ways for b in ways if a.partition('/')[2] != b.partition('/')[2]):
-        sets.negatives.append(('reverse', ('reverse',), ways[a], ways[b]))
+    for a, b in ((a, b) for a in driven for b in driven):
+        if a.partition('/')[2] != b.partition('/')[2]:
+            sets.negatives.append(('reverse', ('reverse',), driven[a], driven[b]))
     for a, b in ((a, b) for a in places for b in places if a != b):
         query = select_places(places[b], np.arange(min(100, len(places[b]))))
         sets.negatives.append(('unrelated', (a, b), places[a], query))

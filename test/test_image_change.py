@@ -26,9 +26,9 @@ def plain_change(a, b):
 
 def learned(strips):
     n = strips.shape[1]
-    change, seen = ImageChange(n, 20), PlaceChanges(n, MAX_LAG)
-    seen.add(strips)
-    change.learn(seen.changes)
+    change, changes = ImageChange(n, 20), PlaceChanges(n, MAX_LAG)
+    changes.add(strips)
+    change.learn(changes.changes)
     return change
 
 

@@ -68,7 +68,7 @@ def alike(share, first=0, end=PLACES):
     return (share * KNOWN + (1 - share) * OTHER)[:, first:end]
 
 
-def some(period, count, share=0.0):
+def stretched(period, count, share=0.0):
     """Return images of which so many of a period are of the map's road, others by a share."""
     return np.where(IMAGES % period < count, KNOWN, alike(share))[:, 40:120]
 
@@ -217,11 +217,12 @@ RULES = [
     Rule('EARLY', put(localizer, EARLY=0.5), lambda: matched(alike(0.3, 60, 75), 0.2), 0.65, 0.85),
     Rule('CERTAIN', put(evidence, CERTAIN=9.0), lambda: matched(LOOK_ALIKE, 0.2), 0, 0.005),
     Rule('BELIEF', put(evidence, BELIEF=0.0), lambda: matched(KNOWN[:, 40:60], 5.0), 0.45, 0.1),
-    Rule('UNEVEN_WEIGHT', put(evidence, UNEVEN_WEIGHT=0), lambda: matched(some(6, 4), 1), 0, 0.8),
+    Rule('UNEVEN_WEIGHT', put(evidence, UNEVEN_WEIGHT=0),
+         lambda: matched(stretched(6, 4), 1), 0, 0.8),
     Rule('EVEN', in_kernel(evidence, 'unevenness', EVEN=0.0),
          lambda: matched(STAGE, 8.5), 0.15, 0.08),
     Rule('EVEN_SHARE', in_kernel(evidence, 'unevenness', EVEN_SHARE=0.0),
-         lambda: matched(some(9, 6, 0.2), 0.5), 0.8, 0.05),
+         lambda: matched(stretched(9, 6, 0.2), 0.5), 0.8, 0.05),
     Rule('EXCESS', put(evidence, EXCESS=-0.5), lambda: matched(STAGE, 3.0), 0.93, 0.1),
     Rule('OFFSET', in_kernel(motion, '_excess', OFFSET=1e-9), lambda: matched(
         DENSE[:, 20:120], 0.1, known=DENSE), 0.38, 0.2),

@@ -14,14 +14,14 @@ import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
-    'lines of stavpr_ros': 31_006,
+    'lines of stavpr_ros': 31_003,
     'lines of stavpr_fleet': 1_195,
     'lines of stavpr_slam': 4_378,
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_198,
-    'lines of the method (prepare, method)': 6_149,
-    'lines of all tests': 33_511,
-    'lines of benchmarks and tools': 8_829,
+    'lines of the method (prepare, method)': 6_146,
+    'lines of all tests': 33_512,
+    'lines of benchmarks and tools': 8_830,
     'lines of docs and README': 4_018,
     'parameters of the node': 51,
     'numbers in constants of the method': 145,

@@ -267,7 +267,6 @@ class SequenceRecognizer(ABC):
 
     def _verdict(self, match: WindowMatch, limits: Limits) -> 'Verdict':
         """Decide on what a window showed, by the limits and by odometry."""
-        limits = limits.raised(match.min_probability)
         if match.nearest is None:
             return Verdict(match, limits, Status.NO_MATCH, self.no_places)
         distance, probability = match.nearest.distance, match.probability

@@ -74,7 +74,6 @@ class WindowMatch:
     :param shares: probability of each place of the path and its neighbors, given the sequence,
         (m,); empty in mode paper.
     :param sequences: returns all sequences; valid until the next match of the window.
-    :param min_probability: below which it is no match whatever the limits: of a camera at rest.
     :param images: number of the newest images that are matched; 0 = the whole window.
     :param direction: 1 = along the map, -1 = against it.
     """
@@ -84,7 +83,6 @@ class WindowMatch:
     sequences: Callable[[], WindowSequences] = WindowSequences
     probability: float = math.nan
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
-    min_probability: float = 0.0
     images: int = 0
     direction: int = 1
 

@@ -4,10 +4,11 @@
 The tuned numbers of the method, each with its unit and meaning; numba's kernels contain them.
 
 ``make fit`` fits the weights of the evidence and the constants K, each set left out, and measures
-all others at half and at double of their value, on sets that decide: benchmarks/results/fit.md.
-The numbers of the filter and of the place were chosen on drives of Gardens Point, the walk by
-night, the corridor, Nordland and the office, those of loop closure on the same routes driven twice
-(benchmarks/results/robust_mode.md). Error rates are in :mod:`.error_rate`.
+numbers of the filter, the place and the evidence at half and at double of their value, with
+``gradient``: benchmarks/results/fit.md. They were chosen on drives of Gardens Point, the walk by
+night, the corridor, Nordland and the office. ``ROUTE_IMAGES``, ``CONFIRMED`` and K of a route were
+chosen on these routes driven twice (benchmarks/results/robust_mode.md), on no other ones; they and
+odometry have no half and double. Error rates are in :mod:`.error_rate`.
 """
 
 from dataclasses import dataclass
@@ -73,7 +74,7 @@ class Model:
 MODEL = Model()
 """The model of localization and of loop closure."""
 
-# ------------------------------------------------ image change, over that of neighboring places
+# ------------------------------------------------ image change, over that of neighbors
 
 STANDSTILL = 0.1  # below which the camera is at rest
 MOST_CHANGE, LEAST_CHANGE = 2.0, 0.2  # limits of the weight of an image by its change

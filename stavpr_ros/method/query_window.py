@@ -39,8 +39,9 @@ class SequenceBuffer:
     :param k: places that one start of LM-DTW covers.
     :param row_width: words from row to row for n places and k; the padding that a kernel needs
         behind the places is +inf.
-    :param copies: times that each row is written, l rows apart. 2 = the latest l rows are always
-        one slice of the memory, oldest row first, as LM-DTW takes them; 1 = half the memory.
+
+    Each row is written twice, l rows apart: the latest l rows are always one slice of the memory,
+    oldest row first, as LM-DTW takes them.
     """
 
     def __init__(
@@ -49,9 +50,8 @@ class SequenceBuffer:
         places: int,
         k: int,
         row_width: Callable[[int, int], int] = padded_width,
-        copies: int = 2,
     ) -> None:
-        self.length, self.k, self._copies = int(length), k, copies
+        self.length, self.k = int(length), k
         self._row_width = row_width
         self.first = 0  # index of the first place that is not evicted
         self._order = np.tile(np.arange(self.length), 2)
@@ -61,9 +61,9 @@ class SequenceBuffer:
 
     def _allocate(self, places: int) -> None:
         self.places = places
-        shape = self._copies * self.length, self._row_width(places, self.k)
+        shape = 2 * self.length, self._row_width(places, self.k)
         self.memory: Any = self._filled(shape)
-        copies = self.memory.reshape(self._copies, self.length, -1)
+        copies = self.memory.reshape(2, self.length, -1)
         self._slots = [copies[:, slot, :places] for slot in range(self.length)]
 
     def _filled(self, shape: tuple[int, int]) -> Any:
@@ -105,9 +105,7 @@ class SequenceBuffer:
         self._count += 1
 
     def rows(self) -> np.ndarray:
-        """Return the window, (l, n + padding), float32; padding is +inf. A view of two copies."""
-        if self._copies == 1:
-            return np.roll(self.memory, -self.oldest, axis=0)
+        """Return the window, (l, n + padding), float32; padding is +inf. A view."""
         return self.memory[self.oldest : self.oldest + self.length]
 
     def newest(self) -> np.ndarray:

@@ -109,7 +109,8 @@ class FilterWindow(QueryWindow):
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._shown, self.recent, self.known = None, RecentWindows(), 0
+        self._shown = self._latest = None
+        self.recent, self.known = RecentWindows(), 0
         self._newest = NOT_COMPARED
         self._repeated, self._means = slice(0, 0), PlaceMeans()
         if self.cells is not None:
