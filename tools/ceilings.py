@@ -20,7 +20,7 @@ CEILINGS = {
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_198,
     'lines of the method (prepare, method)': 6_146,
-    'lines of all tests': 33_512,
+    'lines of all tests': 33_517,
     'lines of benchmarks and tools': 8_830,
     'lines of docs and README': 4_018,
     'parameters of the node': 51,

@@ -143,11 +143,16 @@ def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
     options += ['--virtual-time-budget=1500', f'--user-data-dir={tmp_path / "profile"}']
     shot = tmp_path / f'{old}.png'
     outputs = ['--dump-dom'], [f'--screenshot={shot}']
-    shown, _ = (
-        subprocess.check_output([CHROMIUM, *options, *each, page.as_uri()], text=True, timeout=100)
-        for each in outputs
-    )
-    now = re.search(r'<div id="now"[^>]*>[^<]*', shown)[0]
+    for _ in range(3):  # on a busy machine, the events may come after the page's budget of time
+        shown, _ = (
+            subprocess.check_output(
+                [CHROMIUM, *options, *each, page.as_uri()], text=True, timeout=100
+            )
+            for each in outputs
+        )
+        now = re.search(r'<div id="now"[^>]*>[^<]*', shown)[0]
+        if 'no image yet' not in now:
+            break
     assert ('stale' in now, bool(re.search(r'\d+ s ago: place 40', now))) == (old > 0,) * 2, now
     pixels = cv2.imread(str(shot)).astype(int)[:, 530:]  # position on the map, and the right half
     is_green = pixels[..., 1] - pixels[..., [0, 2]].max(axis=-1) > 40
