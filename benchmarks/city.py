@@ -125,7 +125,7 @@ def drive(
         wall.append(time.perf_counter() - before)
         used.append(time.process_time() - cpu)
     length = settings.sequence.length
-    middles = [match.sequence.middle for match in matches[length - 1 :] if match.sequence]
+    middles = [match.path.place for match in matches[length - 1 :] if match.path.place >= 0]
     accepted = np.array([match.accepted for match in matches[length - 1 :]])
     true = true[(length - 1) // 2 :][: len(middles)]
     right = np.abs(np.array(middles) - true) <= tolerance

@@ -221,7 +221,7 @@ def measure_sessions(counts: list[int]) -> list[str]:
                     times[number].append(time.thread_time() - began)
                     if match.accepted:
                         shown = i - len(match.window_stamps) + 1 + match.position
-                        right[number] += abs(match.place_index % places - shown) <= NEAR
+                        right[number] += abs(match.place % places - shown) <= NEAR
             medians.append([1e3 * statistics.median(own) for own in times])
         each = [statistics.median(turns) for turns in zip(*medians[SETTLED_TURNS:], strict=True)]
         one_session = one_session or (each[0], sizes[0])

@@ -118,7 +118,7 @@ def measured(
         began = time.perf_counter()
         match = one.update(image)
         seconds.append(time.perf_counter() - began)
-        middle = match.sequence.middle if match.sequence else -1
+        middle = match.path.place
         answers.append((match.status.name, middle, match.distance))
     quartiles = np.percentile(1e3 * np.array(seconds[WARM:]), [50, 25, 75])
     row['ms'] = [round(float(ms), 4) for ms in quartiles]
@@ -169,9 +169,7 @@ def compared(
     different, difference = 0, 0.0
     for i, (status, middle, distance) in enumerate(answers):
         match = cpu.update(driven[i : i + 1])
-        same = status == match.status.name and (
-            not match.accepted or (match.sequence is not None and match.sequence.middle == middle)
-        )
+        same = status == match.status.name and (not match.accepted or match.path.place == middle)
         different += not same
         if match.sequence is not None:
             difference = max(difference, abs(distance - match.distance))

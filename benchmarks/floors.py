@@ -44,7 +44,7 @@ def drive(
             stamp += SECOND // 10
             result = pipeline.operation.process(ImageRecord.of_image(image, 0), stamp)
             best = int(np.argmax(result.session_probabilities or (0.0,)))
-            session = places.place(result.place_index).session if result.accepted else ''
+            session = places.place(result.match.place).session if result.match.accepted else ''
             found[-1].append((session, places.sessions[best].id if places.sessions else ''))
     return found
 

@@ -262,9 +262,9 @@ def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> in
     for count, match in enumerate(matches, 1):
         window = len(match.window_stamps) or length
         image = count - window + (window - 1) // 2  # the middle of the window
-        if match.accepted and match.sequence is not None and image >= 0:
+        if match.accepted and image >= 0:
             places = np.full(truth.N, -1)
-            places[image] = match.sequence.middle
+            places[image] = match.path.place
             if truth.accepts(places)[image]:
                 return count
     return None

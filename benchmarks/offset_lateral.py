@@ -86,7 +86,7 @@ def pose_row(taught: Taught, seed: int) -> str:
             for k, _, _, truth, image in drive(taught, conditions, left):
                 match = recognizer.update(extractor.extract([image]), EPOCH + k * 10**8)
                 count += 1
-                result = ImageResult.of_match(match)
+                result = ImageResult(match)
                 if message := matched_pose_message(Header(), result, places, 'map'):
                     at, heading = message.pose.pose.position, taught.poses[k, 2]
                     across = np.array([-math.sin(heading), math.cos(heading)])

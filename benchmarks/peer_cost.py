@@ -118,7 +118,7 @@ def methods(places: Drive, query: Drive) -> dict[str, Method]:
             newest = recognizer(mode, precision)
             matches = [newest(i) for i in range(N)]
             # of the middle image of each window
-            middles = [m.sequence.middle if m.sequence else -1 for m in matches]
+            middles = [m.path.place for m in matches]
             return np.array(middles[WINDOW // 2 :] + [-1] * (WINDOW // 2))
 
         return Method(WINDOW, recognizer(mode, precision), all_places)

@@ -146,7 +146,7 @@ def measure(
         times.append(1e3 * (time.thread_time() - began))
         if match.accepted:
             image = i - len(match.window_stamps) + 1 + match.position
-            off = abs(query.position[image] - positions[int(place_map.stamps[match.place_index])])
+            off = abs(query.position[image] - positions[int(place_map.stamps[match.place])])
             counts[int(min(off, route.period - off) > route.tolerance)] += 1
     return counts, float(np.median(times))
 

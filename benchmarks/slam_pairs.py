@@ -84,15 +84,14 @@ def recognize(
     for i, (lap, number) in enumerate(drive.images.tolist()):
         record = ImageRecord.of_image(images[laps[lap] + number], int(drive.stamps[i]))
         result = pipeline.operation.process(record, int(drive.stamps[i]), odometry[i], camera)
-        for each in (result, *result.late):
-            pair = pipeline.operation.matched_pair(each)
-            if pair is None or each.match is None:
+        for match in (result.match, *result.match.late):
+            pair = pipeline.operation.matched_pair(match)
+            if pair is None:
                 continue
-            window = each.match
-            query = image_of[window.window_stamps[window.position]]
-            place = image_of[pair.source.place(each.place_index).stamp]
+            query = image_of[match.window_stamps[match.position]]
+            place = image_of[pair.source.place(match.place).stamp]
             pair = replace(pair, source=route)
-            pairs.append(Matched(i, query, place, pair, window.is_late))
+            pairs.append(Matched(i, query, place, pair, match.is_late))
     return pairs
 
 

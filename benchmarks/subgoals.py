@@ -47,7 +47,7 @@ def ours(recognizer: PlaceRecognizer, queries: object, count: int) -> Iterator[i
     place = -1
     for i in range(count):
         match = recognizer.update(queries[i : i + 1])  # type: ignore[index]
-        place = match.newest_index if match.accepted else place
+        place = match.newest if match.accepted else place
         yield place
 
 

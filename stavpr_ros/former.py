@@ -1,17 +1,52 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Former names of the method, for one release: ``recognition`` and ``filter``."""
+"""Former names, for one release: packages ``recognition`` and ``filter``, fields of results."""
 
 import importlib
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
+from operator import attrgetter
 import sys
 from types import ModuleType
-from typing import Any
+from typing import Any, TYPE_CHECKING
 import warnings
 
 FORMER = {'stavpr_ros.recognition', 'stavpr_ros.filter'}
 METHOD = 'stavpr_ros.method'
+FIELDS: dict[str, dict[str, str]] = {
+    'Path': {'middle': 'place', 'second_best_index': 'second_best'},
+    'Match': {
+        'place_index': 'place',
+        'newest_index': 'newest',
+        'sequence': 'path',
+        'direction': 'path.direction',
+        'min_probability': 'limits.probability',
+        'image_index': 'last_image',
+        'first_image_index': 'first_image',
+    },
+    'ImageResult': {
+        **{name: f'match.{name}' for name in ('status', 'reason', 'threshold', 'accepted')},
+        **{name: f'match.{name}' for name in ('distance', 'probability', 'inliers', 'late')},
+        'path_probabilities': 'match.path_probabilities',
+        'place_index': 'match.place',
+        'newest_index': 'match.newest',
+        'nearest_index': 'match.path.place',
+    },
+}
+
+
+class FormerNames:
+    """Base of results: their former fields, with a warning."""
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            kind = type(self).__name__
+            if name not in FIELDS.get(kind, {}):
+                raise AttributeError(f'{kind} has no attribute {name!r}')
+            field = FIELDS[kind][name]
+            warnings.warn(f'{kind}.{name} is {field} now', DeprecationWarning, stacklevel=2)
+            return attrgetter(field)(self)
 
 
 class _Former(MetaPathFinder, Loader):

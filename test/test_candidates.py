@@ -71,16 +71,16 @@ def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
     one = PlaceRecognizer(small_map, settings)
     assert one.ranked(3) == []
     for i in [*range(10, 20), *range(0, 6)]:
-        nearest = one.update(small_map.features[i : i + 1]).sequence
+        nearest = one.update(small_map.features[i : i + 1]).path
         ranked = one.ranked(4)
-        if nearest is None:
+        if nearest.place < 0:
             assert ranked == []
             continue
-        assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
-        if mode == 'robust' and nearest.second_best_index < 0:  # nowhere else, by the filter
+        assert (ranked[0].place, ranked[0].distance) == (nearest.place, nearest.distance)
+        if mode == 'robust' and nearest.second_best < 0:  # nowhere else, by the filter
             assert len(ranked) == 1
             continue
-        assert ranked[1].place == nearest.second_best_index
+        assert ranked[1].place == nearest.second_best
         assert ranked[1].distance == pytest.approx(nearest.second_best_distance, abs=1e-6)
         assert len(ranked) == 4 or mode == 'robust'  # of other places, nothing is left
     one.reset()

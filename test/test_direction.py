@@ -46,14 +46,14 @@ def test_camera_is_recognized_in_both_directions(against):
     direction = -1 if against else 1
     for i, match in enumerate(matches, LENGTH):
         assert match.direction == direction
-        assert (np.diff(match.path[:, 1]) * direction >= 0).all()
-        assert abs(match.newest_index - (N - 1 - i if against else i)) <= 2
-        path = match.sequence.first, match.sequence.middle, match.sequence.last
+        assert (np.diff(match.path.pairs[:, 1]) * direction >= 0).all()
+        assert abs(match.newest - (N - 1 - i if against else i)) <= 2
+        path = match.path.first, match.path.place, match.path.last
         assert list(path) == sorted(path, reverse=against)
-        assert abs(match.sequence.second_best_index - match.sequence.middle) > 8
+        assert abs(match.path.second_best - match.path.place) > 8
     one = PlaceRecognizer(place_map, BOTH)
     for i in range(30):
-        newest = one.update(query[i : i + 1]).newest_index
+        newest = one.update(query[i : i + 1]).newest
     probabilities = one.place_probabilities()
     assert probabilities.shape == (N,)
     assert abs(probabilities.argmax() - newest) <= 1
@@ -79,12 +79,12 @@ def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
     both = recognize(merge_maps(maps, 'ab'[:sessions]), query, settings)
     for match, expected in zip(both, recognize(twice, query, forward), strict=True):
         assert match.status is expected.status
-        if match.sequence is None:
+        if match.path.place < 0:
             continue
         assert match.probability == pytest.approx(expected.probability, abs=1e-4)
         if match.probability > 0.1:
-            place = expected.sequence.middle
-            assert match.sequence.middle == np.append(same_as, same_as[::-1])[place]
+            place = expected.path.place
+            assert match.path.place == np.append(same_as, same_as[::-1])[place]
             assert match.direction == (-1 if place >= len(same_as) else 1)
     assert {match.direction for match in both if match.accepted} == {1, -1}
 
@@ -100,7 +100,7 @@ def test_map_of_two_cameras_names_the_one_that_saw_the_place(camera, against):
     query = features_of(route_strips(5 if is_rear else 0, N), 0.8, 9)
     for match in recognize(place_map, query[::-1] if against else query)[LENGTH:]:
         assert match.accepted
-        session = place_map.session(match.place_index)
+        session = place_map.session(match.place)
         assert (session.camera, session.yaw) == cameras[is_rear]
         assert match.direction == (-1 if against else 1)
 
@@ -123,9 +123,9 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
     features = FeatureExtractor('gradient').extract(turned[::-1])
     for i, match in list(enumerate(recognize(place_map, features)))[LENGTH:]:
         assert match.accepted
-        assert place_map.session(match.place_index).yaw == pytest.approx(np.pi)
+        assert place_map.session(match.place).yaw == pytest.approx(np.pi)
         assert match.direction == -1
-        assert abs(match.newest_index - (2 * n - 1 - i)) <= 2
+        assert abs(match.newest - (2 * n - 1 - i)) <= 2
     # to the left by a quarter: what was at the left is ahead
     assert build_map.main([*build, back, '--panorama-yaw', '90', '--force']) == 0
     turned = np.roll(panoramas[0], 48, axis=1)
@@ -150,7 +150,7 @@ def test_device_equals_cpu(device):
         assert match.status is expected.status
         if match.accepted:
             assert match.probability == pytest.approx(expected.probability, abs=1e-5)
-            np.testing.assert_array_equal(match.path, expected.path)
+            np.testing.assert_array_equal(match.path.pairs, expected.path.pairs)
     assert match.direction == -1
 
 

@@ -40,7 +40,7 @@ def test_query_at_other_speed_is_matched(recognizer, route, speed):
     places = at_speed(20, 230, speed)
     answers = drive(recognizer, route[:, places])[LENGTH:]
     middles = places[1 + MIDDLE :][: len(answers)]
-    matched = np.array([answer.place_index for answer in answers])
+    matched = np.array([answer.place for answer in answers])
     assert np.mean(matched >= 0) > 0.9
     right = np.abs(matched - middles) <= 2
     assert right[matched >= 0].mean() > 0.95
@@ -51,10 +51,10 @@ def test_camera_that_is_carried_elsewhere_is_matched_by_the_images_since(recogni
     for count, answer in enumerate(drive(recognizer, route[:, images])[60:], 1):
         if answer.accepted:
             shown = len(answer.window_stamps)
-            assert answer.path[-1, 0] == shown - 1 == len(answer.window_changes) - 1
+            assert answer.path.pairs[-1, 0] == shown - 1 == len(answer.window_changes) - 1
             assert shown == LENGTH or answer.probability > EARLY
             image = 60 + count - shown + answer.position
-            assert abs(answer.place_index - images[image]) <= 2
+            assert abs(answer.place - images[image]) <= 2
             since += [count] if image >= 60 else []
     assert since[0] <= MIDDLE + 1
     assert len(since) >= 35
@@ -79,7 +79,7 @@ def test_match_is_path_and_second_best_of_its_window(recognizer, route):
     for answer in answers[: LENGTH - 1]:
         assert answer.status is Status.WARMING_UP or answer.probability > EARLY
     for i, answer in enumerate(answers[LENGTH + 3 :], LENGTH + 3):
-        found, path = answer.sequence, answer.path
+        found, path = answer.path, answer.path.pairs
         assert answer.status is Status.MATCH
         assert path.shape == (LENGTH, 2)
         assert path[:, 0].tolist() == list(range(LENGTH))
@@ -87,14 +87,14 @@ def test_match_is_path_and_second_best_of_its_window(recognizer, route):
         assert path.min() >= 0
         assert path[:, 1].max() < PLACES
         assert (path[0, 1], path[-1, 1]) == (found.first, found.last)
-        assert abs(path[MIDDLE, 1] - found.middle) <= 2
+        assert abs(path[MIDDLE, 1] - found.place) <= 2
         assert np.abs(path[:, 1] - np.arange(20 + i - LENGTH + 1, 20 + i + 1)).max() <= 4
         assert answer.distance == found.distance == 1 - answer.probability
-        assert 0 <= found.distance <= found.second_best_distance or found.second_best_index < 0
-        if found.second_best_index >= 0:
-            assert abs(found.second_best_index - found.middle) > 10
+        assert 0 <= found.distance <= found.second_best_distance or found.second_best < 0
+        if found.second_best >= 0:
+            assert abs(found.second_best - found.place) > 10
         ranked = recognizer.ranked(3)
-        assert [c.place for c in ranked[1:2]] in ([], [answers[-1].sequence.second_best_index])
+        assert [c.place for c in ranked[1:2]] in ([], [answers[-1].path.second_best])
 
 
 def test_window_that_is_not_full_has_no_candidates_without_a_match(recognizer):
@@ -110,9 +110,9 @@ def test_path_follows_images_whose_speed_changes(recognizer, route):
     places = np.flatnonzero(rng.random(PLACES) < 0.6)
     answers = drive(recognizer, route[:, places], noise=0.5)
     off = [
-        np.abs(answer.path[:, 1] - places[i - LENGTH + 1 : i + 1])
+        np.abs(answer.path.pairs[:, 1] - places[i - LENGTH + 1 : i + 1])
         for i, answer in enumerate(answers)
-        if answer.accepted and len(answer.path) == LENGTH
+        if answer.accepted and len(answer.path.pairs) == LENGTH
     ]
     assert len(off) > 0.8 * len(places)
     assert np.mean(np.concatenate(off) <= 2) > 0.98
@@ -125,9 +125,6 @@ def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, rout
         assert answer.path_probabilities.shape == (LENGTH,)
         assert 0 <= answer.path_probabilities.min() <= answer.path_probabilities.max() <= 1
         assert answer.path_probabilities[MIDDLE] == pytest.approx(answer.probability)
-        newest = answer.at(LENGTH - 1)
-        assert newest.probability == pytest.approx(answer.path_probabilities[-1])
-        assert newest.accepted == (newest.probability > 0.5)
 
 
 def test_equal_places_of_the_map_are_one_place_of_the_path(route):
@@ -139,7 +136,7 @@ def test_equal_places_of_the_map_are_one_place_of_the_path(route):
     shares = []
     for i in range(len(query)):
         recognizer.update(query[i : i + 1])
-        shares.append(recognizer._newest.match.shares)
+        shares.append(recognizer._newest.path.shares)
     assert np.min(shares[118:135]) > 0.8
 
 
@@ -151,10 +148,10 @@ def test_standing_camera_changes_no_probability(recognizer, route):
         after = recognizer.update(features[39:40])
         assert after.status is Status.MATCH
     # the middle of the window has caught up with the newest image, nothing else has changed
-    assert after.place_index == pytest.approx(before.newest_index, abs=1)
-    assert after.path[0, 1] == after.path[-1, 1]
+    assert after.place == pytest.approx(before.newest, abs=1)
+    assert after.path.pairs[0, 1] == after.path.pairs[-1, 1]
     again = recognizer.update(features[39:40])
-    assert repr(again.sequence) == repr(after.sequence)  # NaN like NaN
+    assert repr(again.path) == repr(after.path)  # NaN like NaN
 
 
 def test_equal_images_in_dark_stretch_of_map_move_on(route):
@@ -187,7 +184,7 @@ def test_drive_that_leaves_map_and_returns_is_followed(recognizer, route):
     assert (probability[gone:120] < 0.3).all()
     assert not any(answer.accepted for answer in answers[gone:120])
     assert (probability[120 + 2 * LENGTH :] > 0.6).all()
-    middles = np.array([answer.place_index for answer in answers[120 + 2 * LENGTH :]])
+    middles = np.array([answer.place for answer in answers[120 + 2 * LENGTH :]])
     expected = np.arange(120 + 2 * LENGTH, 200) - (LENGTH - 1 - MIDDLE)
     assert (np.abs(middles - expected) <= 2).all()
 
@@ -196,4 +193,4 @@ def test_drive_in_reverse_is_not_matched_wrongly(recognizer, route):
     answers = drive(recognizer, route[:, 200:40:-1])[LENGTH:]
     for i, answer in enumerate(answers, LENGTH):
         there = 200 - i + LENGTH - 1 - MIDDLE
-        assert not answer.accepted or abs(answer.place_index - there) <= LENGTH
+        assert not answer.accepted or abs(answer.place - there) <= LENGTH

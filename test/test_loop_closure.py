@@ -9,10 +9,9 @@ import numpy as np
 from places import features_of
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.lm_dtw import best_match, match_sequence, SequenceMatch
+from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.method.localizer import Verdict
 from stavpr_ros.method.loop_closer import (
     AROUND,
     BAND,
@@ -22,7 +21,7 @@ from stavpr_ros.method.loop_closer import (
     LoopCloser,
     MIN_PLACES,
 )
-from stavpr_ros.method.match import Limits, WindowMatch
+from stavpr_ros.method.match import Limits, Match, Path
 from stavpr_ros.method.model import CLOSE
 from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare import route_features
@@ -70,8 +69,8 @@ def drive(closer, features, stamps=None):
 
 def same(one, other):
     assert (one.status, one.reason) == (other.status, other.reason)
-    assert repr(one.sequence) == repr(other.sequence)  # to the last bit, and NaN like NaN
-    np.testing.assert_array_equal(one.path, other.path)
+    assert repr(one.path) == repr(other.path)  # to the last bit, and NaN like NaN
+    np.testing.assert_array_equal(one.path.pairs, other.path.pairs)
 
 
 class PlainCloser:
@@ -120,22 +119,22 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
         assert closer.first + len(closer) == i + 1
         expected = plain.add(i, closer.first, max(closer.first, i + 1 - exclude))
         if expected is None:
-            assert answer.sequence is None
+            assert answer.path.place < 0
             continue
         answered += 1
-        found = answer.sequence
-        assert (found.first, found.last, found.middle) == (
+        found = answer.path
+        assert (found.first, found.last, found.place) == (
             expected.first,
             expected.last,
             expected.middle,
         )
-        assert found.second_best_index == expected.second_best_index
+        assert found.second_best == expected.second_best_index
         np.testing.assert_array_equal(
             [found.distance, found.second_best_distance],
             [expected.distance, expected.second_best_distance],
         )
-        assert answer.path[:, 1].min() == found.first >= closer.first
-        assert answer.path[-1].tolist() == [sequence.length - 1, found.last]
+        assert answer.path.pairs[:, 1].min() == found.first >= closer.first
+        assert answer.path.pairs[-1].tolist() == [sequence.length - 1, found.last]
         assert found.last < i + 1 - exclude
     assert answered > 270
     assert closer.first > 0
@@ -185,17 +184,17 @@ def test_late_matches_close_what_was_not_certain_at_first():
     middle, closed, late, oldest = (length - 1) // 2, [], {}, 0
     for i in range(len(features)):
         match = closer.update(features[i : i + 1])
-        assert (match.image_index, match.is_late, match.position) == (i, False, match.position)
+        assert (match.last_image, match.is_late, match.position) == (i, False, match.position)
         if match.accepted:
             closed.append(i - (length - 1) + middle)
         assert match.accepted or not match.late
         for found in match.late:
             assert (found.status, found.is_late) == (Status.MATCH, True)
             assert found.position == (0 if found.is_oldest else middle)
-            assert abs(int(found.path[found.position, 1]) - found.place_index) <= CLOSE
-            late[found.first_image_index + found.position] = found.place_index
-            closed.append(found.first_image_index + found.position)
-        newest = [each for each in (*match.late, *closer._waiting) if each.image_index == i]
+            assert abs(int(found.path.pairs[found.position, 1]) - found.place) <= CLOSE
+            late[found.first_image + found.position] = found.place
+            closed.append(found.first_image + found.position)
+        newest = [each for each in (*match.late, *closer._waiting) if each.last_image == i]
         found = newest[0] if newest else match
         if not found.is_oldest:
             continue
@@ -263,23 +262,22 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(
         elif isinstance(event, int):
             place += event
         else:
-            verdict = Verdict(
-                WindowMatch(
-                    SequenceMatch(place, place, place, 0.0, -1, math.nan), np.array([[0, place]])
-                ),
-                Limits(0.5, 0.5),
+            match = Match(
                 Status.NO_MATCH if event == NONE else Status.MATCH,
-                '',
+                limits=Limits(0.5, 0.5),
+                path=Path(np.array([[0, place]]), place),
                 probability=event,
+                window_stamps=(0,),
+                first_image=images,
             )
-            match = closer._confirmed(verdict, [], images)
+            match = closer._confirmed(match, [])
             waits = not match.accepted and event != NONE
             assert match.reason == 'its path is not confirmed yet' * waits
             assert not waits or not match.with_probability(1.0).accepted
             assert all(each.is_late for each in match.late)
             found += [match, *match.late] if match.accepted else []
             images += 1
-    assert [match.image_index for match in found] == closed
+    assert [match.last_image for match in found] == closed
 
 
 def test_exclude_seconds_leaves_young_places_out(laps):
@@ -303,7 +301,7 @@ def test_loop_closer_with_standing_clock_matches_nothing(laps):
     """All places stay young; the limit holds."""
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=80, exclude_seconds=5.0)
     answers = drive(closer, laps, [SECOND] * 300)
-    assert all(answer.sequence is None for answer in answers)
+    assert all(answer.path.place < 0 for answer in answers)
     assert answers[-1].status is Status.NO_MATCH
     assert 'old enough' in answers[-1].reason
     assert len(closer) <= 80
@@ -330,7 +328,7 @@ def test_reset_after_clock_jump_keeps_route(laps):
             assert answer.status is Status.WARMING_UP
         else:
             assert answer.accepted == (i > 104)  # the path is confirmed by two
-            assert not answer.accepted or (i - answer.newest_index) % 60 == 0
+            assert not answer.accepted or (i - answer.newest) % 60 == 0
 
 
 @pytest.mark.parametrize('robust_options', [PAPER, ROBUST, RobustOptions(place_filter=False)])
@@ -338,16 +336,16 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
     closer = LoopCloser(settings_of(robust_options), 12, laps.settings, limit=200)
     assert closer.ranked(5) == []
     for i in range(260):
-        nearest = closer.update(laps[i : i + 1]).sequence
+        nearest = closer.update(laps[i : i + 1]).path
         ranked = closer.ranked(3)
-        if nearest is None:
+        if nearest.place < 0:
             assert ranked == []
             continue
-        assert (ranked[0].place, ranked[0].distance) == (nearest.middle, nearest.distance)
+        assert (ranked[0].place, ranked[0].distance) == (nearest.place, nearest.distance)
         if nearest.distance < 0.99:
-            assert closer.candidates(1)[0] == pytest.approx([nearest.middle], abs=CLOSE)
+            assert closer.candidates(1)[0] == pytest.approx([nearest.place], abs=CLOSE)
         if len(ranked) > 1:
-            assert ranked[1].place == nearest.second_best_index
+            assert ranked[1].place == nearest.second_best
             assert ranked[1].distance == pytest.approx(nearest.second_best_distance, abs=1e-6)
         if i > 220:
             offsets = [i - 2 - c.place for c in ranked[:2] if c.distance < 0.99]
@@ -389,7 +387,7 @@ def test_loop_closer_with_smallest_limit_matches(exclude):
     closer = LoopCloser(settings, exclude, features.settings, limit=least)
     answers = drive(closer, features)
     assert least <= exclude + 2 * SHORT.length + 8
-    assert all(answer.sequence is not None for answer in answers[60:])
+    assert all(answer.path.place >= 0 for answer in answers[60:])
 
 
 def test_loop_closer_of_invalid_settings_is_rejected(laps):
@@ -420,7 +418,7 @@ def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
         assert one.status == other.status
         if other.accepted:
             matched += 1
-            assert one.place_index == pytest.approx(other.place_index, abs=1)
+            assert one.place == pytest.approx(other.place, abs=1)
             assert one.probability == pytest.approx(other.probability, abs=0.05)
     assert matched > 100
     kept = laps[less.first :]

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of matches, field by field, and drawn images; no node that spins."""
 
-from dataclasses import replace
 import math
 
 from builtin_interfaces.msg import Time
@@ -12,10 +11,10 @@ from places import features_of, map_of, route_strips
 import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_msgs.msg import PlaceMatch
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
-from stavpr_ros.method import Match, Status
+from stavpr_ros.method import Match, Path, Status
+from stavpr_ros.method.match import Limits
 from stavpr_ros.pipeline import ImageResult
 from stavpr_ros.relative_pose.pair import matched_pair
 from stavpr_ros.ros.messages import (
@@ -32,19 +31,18 @@ from std_msgs.msg import Header
 
 SECOND = 10**9
 HEADER = Header(stamp=Time(sec=20, nanosec=7), frame_id='camera')
-PATH = np.array([[0, 30], [1, 32], [2, 32], [3, 34], [4, 35]], np.int32)
-NEAREST = SequenceMatch(30, 35, 32, 0.25, 50, 0.5)
+PAIRS = np.array([[0, 30], [1, 32], [2, 32], [3, 34], [4, 35]], np.int32)
 WINDOW = tuple((16 + i) * SECOND + 7 for i in range(5))
 
 
-def result_of(status, reason, path=PATH, inliers=-1, candidates=(), image=None, **fields):
-    fields = {'window_stamps': WINDOW, 'distance': 0.25} | fields
-    result = ImageResult.of_match(Match(status, reason, 0.3, NEAREST, path, **fields))
-    return replace(result, inliers=inliers, candidates=candidates, image=image)
+def result_of(status, reason, pairs=PAIRS, place=32, candidates=(), image=None, **fields):
+    path = Path(pairs, place, 0.25, second_best=50, second_best_distance=0.5)
+    match = Match(status, reason, Limits(0.3), path, window_stamps=WINDOW, **fields)
+    return ImageResult(match, candidates=candidates, image=image)
 
 
-def accepted(path=PATH, **fields):
-    return result_of(Status.MATCH, '', path, **fields)
+def accepted(pairs=PAIRS, place=32, **fields):
+    return result_of(Status.MATCH, '', pairs, place, **fields)
 
 
 def rejected(**fields):
@@ -85,8 +83,8 @@ def test_status_equals_the_constants_of_the_message():
 
 
 def test_loop_closure_message_needs_a_match(places):
-    assert loop_closure_message(HEADER, accepted(), None) is None
-    assert loop_closure_message(HEADER, rejected(image_index=59), places) is None
+    assert loop_closure_message(HEADER, accepted().match, None) is None
+    assert loop_closure_message(HEADER, rejected().match, places) is None
 
 
 def test_matched_pose_message_has_the_spread_of_near_places(places):
@@ -119,11 +117,11 @@ def test_neighbors_of_a_place_are_of_its_session(newest):
     merged = map_of(features_of(route_strips(0, n)), thumbnails=thumbnails, **parts)
     own = np.arange(newest // 5 * 5, newest // 5 * 5 + 5)
     path = np.column_stack([np.arange(5), np.maximum(newest + np.arange(-4, 1), own[0])])
-    match = accepted(path.astype(np.int32))
+    match = accepted(path.astype(np.int32), newest)
     covariance = matched_pose_message(HEADER, match, merged, 'map').pose.covariance
     assert max(covariance[0], covariance[7]) < 5  # along and across the path
     distances = np.abs(np.subtract.outer(path[:, 1], np.arange(n)))
-    pair = matched_pair(match.match, newest, merged, None, poses[:5], lambda at: distances[:, at])
+    pair = matched_pair(match.match, merged, None, poses[:5], lambda at: distances[:, at])
     np.testing.assert_array_equal(pair.poses, poses[own])
 
 

@@ -103,8 +103,8 @@ def places_off(places, noise, whole_path):
     """Return by how many places matches are wrong, of all images of a path or of the middle."""
     images, errors = slice(None) if whole_path else LENGTH // 2 - 1, []
     for i, match in enumerate(drive(KNOWN[:, places], noise)):
-        if match.accepted and len(match.path) == LENGTH:
-            path_off = match.path[:, 1] - places[i + 1 - LENGTH : i + 1]
+        if match.accepted and len(match.path.pairs) == LENGTH:
+            path_off = match.path.pairs[:, 1] - places[i + 1 - LENGTH : i + 1]
             errors.append(np.abs(path_off[images]).mean())
     return np.mean(errors)
 
@@ -149,13 +149,14 @@ def resting(noise, known=KNOWN):
     """Return the share of images at rest that are matched where they are, at place 70."""
     query = features_of(KNOWN[:, 30:71], noise, 1)[np.r_[:40, np.full(60, 40)]]
     matches = recognize_all(recognizer(known), query)[-40:]
-    return np.mean([match.accepted and 68 <= match.place_index <= 73 for match in matches])
+    return np.mean([match.accepted and 68 <= match.place <= 73 for match in matches])
 
 
 def newest_beyond(noise):
     """Return the share of images beyond the map that the window before is accepted for."""
     matches = drive(np.hstack([KNOWN[:, 40:100], OTHER[:, :30]]), noise)[60:]
-    return np.mean([each.accepted and each.at(len(each.path) - 1).accepted for each in matches])
+    newest = [each.path_probabilities[-1] for each in matches if each.accepted]
+    return np.count_nonzero(np.array(newest) > matches[0].limits.probability) / len(matches)
 
 
 def varied():

@@ -18,10 +18,9 @@ import pytest
 from rclpy.qos import qos_profile_services_default
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping.transforms import matrices
-from stavpr_ros.method import Status
-from stavpr_ros.method.match import Match
+from stavpr_ros.method import Match, Status
+from stavpr_ros.method import match as match_module
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.ros.messages import matched_pose_message, pose_message
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
@@ -48,10 +47,8 @@ def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
     poses = np.tile(posed(0, 0, 30), (len(small_map), 1))
     poses[:, 0] = np.arange(len(poses))
     places = replace(small_map, poses=poses)
-    path = np.column_stack([np.arange(4), np.arange(10, 6, -1)])
-    sequence = SequenceMatch(10, 7, 9, 0.1, -1, math.nan)
-    match = Match(Status.MATCH, sequence=sequence, path=path)
-    result = replace(ImageResult.of_match(match), relative_yaw=math.pi)
+    path = match_module.Path(np.column_stack([np.arange(4), np.arange(10, 6, -1)]), 9)
+    result = ImageResult(Match(Status.MATCH, path=path), relative_yaw=math.pi)
     message = matched_pose_message(header(0), result, places, 'map')
     o = message.pose.pose.orientation
     assert message.pose.pose.position.x == 7
@@ -115,7 +112,7 @@ def publishing(map_file, monkeypatch):
             clock.time = i + 1.5
             match = pipeline.operation.process(message(image), (i + 1) * SECOND)
             navigation.publish(header(i), match, pipeline.places, at(i - 10), 'odom')
-            statuses.append(match.accepted)
+            statuses.append(match.match.accepted)
         return statuses
 
     return SimpleNamespace(
@@ -146,7 +143,7 @@ def test_transform_is_repeated_until_the_map_or_the_state_changes(publishing, ro
     assert not publishing.tf  # nothing before the first match
     publishing.show(route[:10])
     _, last = publishing.tf[-1].transforms[0]
-    count, lost = len(publishing.tf), ImageResult(Status.NO_MATCH, 'lost')
+    count, lost = len(publishing.tf), ImageResult(Match(Status.NO_MATCH, 'lost'))
     publishing.navigation.publish(header(30), lost, publishing.pipeline.places, at(0), 'odom')
     for clock.time in (40.0, 40.0, 40.05):  # a paused clock sends no stamp twice
         beat()

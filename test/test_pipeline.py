@@ -37,11 +37,10 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 
 def same_recognition(match, core):
     """Every field that the recognizer fills."""
-    assert match.status is core.status
-    assert match.reason == core.reason
-    np.testing.assert_equal(match.threshold, core.threshold)
-    assert repr(match.match.sequence) == repr(core.sequence)
-    np.testing.assert_array_equal(match.match.path, core.path)
+    assert (match.status, match.reason) == (core.status, core.reason)
+    np.testing.assert_equal(match.limits, core.limits)
+    assert repr(match.path) == repr(core.path)
+    np.testing.assert_array_equal(match.path.pairs, core.path.pairs)
 
 
 @pytest.mark.parametrize(('mode', 'threshold'), [('paper', 0.2), ('robust', None)])
@@ -52,13 +51,15 @@ def test_localization_returns_the_matches_of_the_recognizer(
     images = route[20:32] + route_images(4, seed=9)
     core = PlaceRecognizer(small_map, pipeline.settings.recognition())
     matches = process(pipeline, images)
-    for i, match in enumerate(matches):
-        same_recognition(match, core.update(pipeline.operation.extractor.extract([images[i]])))
-        assert match.match.window_stamps == tuple(
+    for i, result in enumerate(matches):
+        same_recognition(
+            result.match, core.update(pipeline.operation.extractor.extract([images[i]]))
+        )
+        assert result.match.window_stamps == tuple(
             (j + 1) * SECOND for j in range(max(0, i - 4), i + 1)
         )
-        assert (match.image_index, match.match.first_image_index, match.inliers) == (-1, -1, -1)
-        assert set(match.stages) == {'decoding', 'extraction', 'matching', 'verification'}
+        assert (result.image_index, result.match.first_image, result.match.inliers) == (-1, -1, -1)
+        assert set(result.stages) == {'decoding', 'extraction', 'matching', 'verification'}
     assert statuses(matches).count(Status.MATCH) >= 8
     operation = pipeline.operation
     state = operation.map_state, operation.window_fill, operation.missing
@@ -71,13 +72,16 @@ def test_missing_map_or_threshold_is_the_reason(map_file, route):
     state = operation.map_state, operation.places, operation.window_fill
     assert state == ('none', None, 0)
     assert 'map_path' in pipeline.operation.missing
-    (match,) = process(pipeline, route[:1])
-    assert (match.status, match.reason) == (Status.NOT_READY, pipeline.operation.missing)
-    assert match.cause == 'not ready'
+    (result,) = process(pipeline, route[:1])
+    assert (result.match.status, result.match.reason) == (
+        Status.NOT_READY,
+        pipeline.operation.missing,
+    )
+    assert result.cause == 'not ready'
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
     assert (pipeline.operation.map_state, len(pipeline.places)) == ('loaded', 60)
     assert 'threshold' in pipeline.operation.missing
-    assert process(pipeline, route[:1])[0].reason == pipeline.operation.missing
+    assert process(pipeline, route[:1])[0].match.reason == pipeline.operation.missing
     pipeline.change(replace(pipeline.settings, threshold=0.2))
     assert statuses(process(pipeline, route[:LENGTH]))[-1] is Status.MATCH
     pipeline.change(replace(pipeline.settings, threshold=None))
@@ -91,12 +95,12 @@ def test_paper_takes_the_threshold_of_the_map_unless_it_is_set(small_map, route,
     save_map(replace(small_map, threshold=0.2), tmp_path / 'route.stavpr')
     pipeline = localizing(str(tmp_path / 'route.stavpr'), mode='paper')
     assert (pipeline.operation.threshold, pipeline.operation.missing) == (0.2, '')
-    match = process(pipeline, route[20:30])[-1]
-    assert (match.status, match.threshold) == (Status.MATCH, 0.2)
+    result = process(pipeline, route[20:30])[-1]
+    assert (result.match.status, result.match.threshold) == (Status.MATCH, 0.2)
     for threshold in (0.3, None):
         pipeline.change(replace(pipeline.settings, threshold=threshold))
-        (match,) = process(pipeline, route[30:31])
-        assert (match.status, match.threshold) == (Status.MATCH, threshold or 0.2)
+        (result,) = process(pipeline, route[30:31])
+        assert (result.match.status, result.match.threshold) == (Status.MATCH, threshold or 0.2)
     assert localizing(str(tmp_path / 'route.stavpr')).operation.threshold == 1 - MIN_PROBABILITY
 
 
@@ -138,15 +142,15 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
         limit=20000,
         exclude_seconds=exclude_seconds,
     )
-    for i, match in enumerate(process(pipeline, images, poses=True)):
+    for i, result in enumerate(process(pipeline, images, poses=True)):
         features = pipeline.operation.extractor.extract([images[i]])
-        same_recognition(match, core.update(features, (i + 1) * SECOND, at(i)))
-        assert (match.image_index, len(match.match.window_stamps)) == (i, min(i + 1, LENGTH))
-        assert match.match.first_image_index == max(0, i - LENGTH + 1)
-        if match.match.sequence is not None:
-            assert match.match.path[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
+        same_recognition(result.match, core.update(features, (i + 1) * SECOND, at(i)))
+        assert (result.image_index, len(result.match.window_stamps)) == (i, min(i + 1, LENGTH))
+        assert result.match.first_image == max(0, i - LENGTH + 1)
+        if result.match.path.place >= 0:
+            assert result.match.path.pairs[:, 1].max() <= i - max(EXCLUDED, exclude_seconds)
         if i >= 40 + 3 * LENGTH:
-            assert (match.status, match.newest_index) == (Status.MATCH, i - 40)
+            assert (result.match.status, result.match.newest) == (Status.MATCH, i - 40)
     assert (pipeline.operation.map_state, len(pipeline.places)) == ('growing', 80)
 
 
@@ -156,17 +160,17 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
     images = route * 4
     closed, firsts = 0, set()
     for i, image in enumerate(images):
-        (match,) = process(pipeline, [image], first=i, poses=True)
+        (result,) = process(pipeline, [image], first=i, poses=True)
         places = pipeline.places
         firsts.add(places.first)
         assert len(places) <= 100
-        assert (match.image_index, places.first + len(places) - 1) == (i, i)
-        indices = {match.image_index, *(candidate.place for candidate in match.candidates)}
-        if match.status is Status.MATCH:
-            indices |= {int(place) for place in match.match.path[:, 1]}
+        assert (result.image_index, places.first + len(places) - 1) == (i, i)
+        indices = {result.image_index, *(candidate.place for candidate in result.candidates)}
+        if result.match.status is Status.MATCH:
+            indices |= {int(place) for place in result.match.path.pairs[:, 1]}
             assert min(indices) >= places.first
             if i >= 60 + LENGTH:
-                assert match.newest_index == i - 60
+                assert result.match.newest == i - 60
                 closed += 1
         for index in indices:
             place = places.place(index)
@@ -182,23 +186,24 @@ def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkey
     pipeline = recorded(route, operation)
     matches, rows, earlier = [], [], 0
     for i, image in enumerate(route[:30]):
-        (match,) = process(pipeline, [image], first=i, poses=True)
+        (result,) = process(pipeline, [image], first=i, poses=True)
         row = pipeline.operation.recognizer.newest_row()
         rows.append(np.pad(row, (0, 60 - len(row)), constant_values=np.inf))
         if len(rows) < LENGTH:
             continue
         with monkeypatch.context() as patch:
             patch.setattr(SequenceBuffer, 'rows', lambda buffer: pytest.fail('the whole window'))
-            pairs = {one: pipeline.operation.matched_pair(one) for one in (match, *match.late)}
+            pairs = {
+                one: pipeline.operation.matched_pair(one)
+                for one in (result.match, *result.match.late)
+            }
         for one, pair in pairs.items():
             if pair is None:
                 continue
             end = i + 1
             if operation == 'loop_closure':
-                assert (
-                    pair.query_pose[0] == (one.match.first_image_index + one.match.position) % 30
-                )
-                end = one.image_index + 1 - 30
+                assert pair.query_pose[0] == (one.first_image + one.position) % 30
+                end = one.first_image + LENGTH - 30
             if end < LENGTH:  # its window began before the rows
                 continue
             earlier += end <= i
@@ -218,7 +223,7 @@ def test_matched_pair_of_the_newest_images_alone_is_of_these(route):
     lengths = []
     for i in range(35, 44):
         (result,) = process(pipeline, route[i : i + 1], first=i, poses=True)
-        if (pair := pipeline.operation.matched_pair(result)) is not None:
+        if (pair := pipeline.operation.matched_pair(result.match)) is not None:
             stamps = np.array(result.match.window_stamps)
             np.testing.assert_array_equal(pair.query_poses[:, 0], stamps // SECOND - 1)
             assert pair.distances.shape == (len(stamps), len(pair.poses))
@@ -232,9 +237,9 @@ def test_matched_pair_has_thumbnails_of_one_session(small_map, route, tmp_path):
     index = np.repeat(np.array([0, 1], np.int32), [3, 57])
     save_map(replace(small_map, sessions=sessions, session_index=index), path)
     pipeline = localizing(str(path))
-    match = process(pipeline, route[2 : 2 + LENGTH], poses=True)[-1]
-    assert match.place_index == 4
-    assert min(pipeline.operation.matched_pair(match, 'pnp').thumbnails) == 3
+    result = process(pipeline, route[2 : 2 + LENGTH], poses=True)[-1]
+    assert result.match.place == 4
+    assert min(pipeline.operation.matched_pair(result.match, 'pnp').thumbnails) == 3
 
 
 @pytest.mark.parametrize('images', [(6, 0, 6), (6, 6, 6)])
@@ -254,7 +259,7 @@ def test_change_of_operation_keeps_the_places(route, images):
             if name == 'mapping':
                 held = held + new
                 indices = [held.index(stamp) for stamp in new]
-                assert [match.image_index for match in matches] == indices
+                assert [result.image_index for result in matches] == indices
             elif name == 'loop_closure':
                 new_route = new_route + new
             elif not held:
@@ -312,9 +317,9 @@ def test_change_of_operation_that_fails_changes_nothing(map_file, route):
         assert (pipeline.operation.name, pipeline.places) == ('localization', places)
         assert pipeline.operation.window_fill == LENGTH
         assert pipeline.operation.threshold == 1 - MIN_PROBABILITY
-    assert process(pipeline, route[5:6], first=5)[0].newest_index == 5
+    assert process(pipeline, route[5:6], first=5)[0].match.newest == 5
     pipeline.change(operation='localization')  # the current one: the window stays
-    assert process(pipeline, route[6:7], first=6)[0].newest_index == 6
+    assert process(pipeline, route[6:7], first=6)[0].match.newest == 6
 
 
 def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):

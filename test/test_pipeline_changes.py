@@ -3,6 +3,7 @@
 """The pipeline in operation: live settings, keyframes, invalid images, resets, saving."""
 
 from dataclasses import replace
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -37,28 +38,36 @@ CONFIRMED = 11  # images after which its path is confirmed
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_min_probability_and_candidates_change_with_a_full_window(operation, route):
     pipeline = recorded(route, operation, candidates=3)
-    match = process(pipeline, route[:CONFIRMED])[-1]
-    assert (match.status, len(match.candidates)) == (Status.MATCH, 3)
-    assert match.candidates[0].place == match.nearest_index
+    result = process(pipeline, route[:CONFIRMED])[-1]
+    assert (result.match.status, len(result.candidates)) == (Status.MATCH, 3)
+    assert result.candidates[0].place == result.match.path.place
     strict = 1 - 1e-9
     pipeline.change(replace(pipeline.settings, min_probability=strict, candidates=0))
-    match = process(pipeline, route[11:12], first=11)[0]
-    assert (match.status, match.threshold, match.candidates) == (Status.NO_MATCH, 1 - strict, ())
+    result = process(pipeline, route[11:12], first=11)[0]
+    assert (result.match.status, result.match.threshold, result.candidates) == (
+        Status.NO_MATCH,
+        1 - strict,
+        (),
+    )
     pipeline.change(replace(pipeline.settings, min_probability=0.1, candidates=1))
-    match = process(pipeline, route[12:13], first=12)[0]
-    assert (match.status, match.newest_index, match.threshold) == (Status.MATCH, 12, 0.9)
-    assert len(match.candidates) == 1
-    match = pipeline.operation.process(message(route[13]), 14, list_candidates=False)
-    assert match.candidates == ()
+    result = process(pipeline, route[12:13], first=12)[0]
+    assert (result.match.status, result.match.newest, result.match.threshold) == (
+        Status.MATCH,
+        12,
+        0.9,
+    )
+    assert len(result.candidates) == 1
+    result = pipeline.operation.process(message(route[13]), 14, list_candidates=False)
+    assert result.candidates == ()
     pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
-    match = process(pipeline, route[13:14], first=13)[0]
-    assert match.threshold == pytest.approx(0.5)
+    result = process(pipeline, route[13:14], first=13)[0]
+    assert result.match.threshold == pytest.approx(0.5)
 
 
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
     pipeline = localizing(map_file, keyframes=KeyframeSettings(change=0.01))
     matches = process(pipeline, [route[0]] * 3 + route[1:LENGTH], poses=True)
-    skipped = [match.cause == 'not a keyframe' for match in matches]
+    skipped = [result.cause == 'not a keyframe' for result in matches]
     assert skipped == [False, True, True, *[False] * 4]
     assert matches[-1].match.window_stamps == tuple(stamp * SECOND for stamp in (1, 4, 5, 6, 7))
     pipeline.change(replace(pipeline.settings, keyframes=KeyframeSettings(interval=2.0)))
@@ -68,29 +77,36 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
     assert process(pipeline, route[7:8], first=9)[0].cause == 'no odometry'
     # the last keyframe has no pose, so that the next image is one; then it is every third meter
     matches = process(pipeline, route[8:14], first=10, poses=True)
-    assert [match.status is Status.SKIPPED for match in matches] == [False, True, True] * 2
+    assert [result.match.status is Status.SKIPPED for result in matches] == [False, True, True] * 2
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
     pipeline = recorded(route, operation, candidates=2, mode='paper', threshold=1.0)
-    assert {match.inliers for match in process(pipeline, route[:CERTAIN])} == {-1}
+    assert {result.match.inliers for result in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
     # the middle of a window of 5: the images until then came without a check
     process(pipeline, route[7:9], first=7)
     accepted = process(pipeline, route[9:10], first=9)[0]
-    assert (accepted.status, accepted.reason, accepted.place_index) == (Status.MATCH, '', 7)
+    assert (accepted.match.status, accepted.match.reason, accepted.match.place) == (
+        Status.MATCH,
+        '',
+        7,
+    )
     found = PlaceVerifier(check).inliers(thumbnail_of(route[7]), pipeline.places, 7)
-    assert accepted.inliers == found >= 100
+    assert accepted.match.inliers == found >= 100
     pipeline.operation.reset()
     process(pipeline, route[: CERTAIN + 2])  # the same images again
     pipeline.change(replace(pipeline.settings, geometric=replace(check, min_inliers=found + 1)))
-    match = process(pipeline, route[9:10], first=9)[0]
-    assert (match.status, match.inliers, match.place_index) == (Status.NO_MATCH, found, -1)
-    assert f'{found} inliers are fewer than {found + 1}' in match.reason
-    assert (match.match.status, match.match.place_index) == (Status.MATCH, match.nearest_index)
-    assert match.candidates[0].place == match.nearest_index
+    result = process(pipeline, route[9:10], first=9)[0]
+    assert (result.match.status, result.match.inliers, result.match.place) == (
+        Status.NO_MATCH,
+        found,
+        -1,
+    )
+    assert f'{found} inliers are fewer than {found + 1}' in result.match.reason
+    assert result.candidates[0].place == result.match.path.place
     pipeline.change(replace(pipeline.settings, geometric=None))
     assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
 
@@ -102,19 +118,19 @@ def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route,
         cv2.addWeighted(x, 0.75, rng.integers(0, 256, x.shape, np.uint8), 0.25, 0) for x in route
     ]
     plain = process(localizing(map_file, candidates=2), noisy[:LENGTH])[-1]
-    limit = plain.probability  # just not above itself
+    limit = plain.match.probability  # just not above itself
     check = GeometricSettings(min_inliers=least)
     pipeline = localizing(map_file, geometric=check, min_probability=limit, candidates=2)
-    match = process(pipeline, noisy[:LENGTH])[-1]
-    assert 0.1 < plain.probability < 0.99
-    assert match.inliers >= 8
-    expected = GeometricEvidence().updated(plain.probability, least == 8)
-    assert match.probability == pytest.approx(expected)
-    assert match.status is (Status.MATCH if least == 8 else Status.NO_MATCH)
-    assert bool(match.reason) == (least != 8)
-    assert match.distance == match.candidates[0].distance == 1 - match.probability
-    assert match.nearest_index == plain.nearest_index == match.candidates[0].place
-    assert match.match.probability == plain.probability  # as the recognizer made it
+    result = process(pipeline, noisy[:LENGTH])[-1]
+    assert 0.1 < plain.match.probability < 0.99
+    assert result.match.inliers >= 8
+    expected = GeometricEvidence().updated(plain.match.probability, least == 8)
+    assert result.match.probability == pytest.approx(expected)
+    assert result.match.status is (Status.MATCH if least == 8 else Status.NO_MATCH)
+    assert bool(result.match.reason) == (least != 8)
+    assert result.match.distance == result.candidates[0].distance == 1 - result.match.probability
+    assert result.match.path.place == plain.match.path.place == result.candidates[0].place
+    assert result.match.path.probability == plain.match.probability  # by the images alone
 
 
 def test_geometric_check_decides_each_late_match(route, monkeypatch):
@@ -123,28 +139,28 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
 
     def closing(**changes):
         pipeline = recorded(route, 'loop_closure', **changes)
-        (match,) = (each for each in process(pipeline, route[:12], first=30) if each.late)
-        return pipeline.places, match
+        (result,) = (each for each in process(pipeline, route[:12], first=30) if each.match.late)
+        return pipeline.places, result
 
-    places, match = closing(geometric=check)
-    assert match.accepted
-    for each in match.late:
-        query = places.thumbnail(each.match.first_image_index + each.match.position)
-        found = PlaceVerifier(check).inliers(query, places, each.place_index)
+    places, result = closing(geometric=check)
+    assert result.match.accepted
+    for each in result.match.late:
+        query = places.thumbnail(each.first_image + each.position)
+        found = PlaceVerifier(check).inliers(query, places, each.place)
         assert each.inliers == found >= 8
-    rejected = {match.place_index, match.late[0].place_index}
+    rejected = {result.match.place, result.match.late[0].place}
     monkeypatch.setattr(PlaceVerifier, 'inliers', lambda *given: 8 * (given[3] not in rejected))
     _, other = closing(geometric=check)
-    assert not other.accepted
-    left = [each.place_index for each in match.late if each.place_index not in rejected]
-    assert [each.place_index for each in other.late] == left != []
+    assert not other.match.accepted
+    left = [each.place for each in result.match.late if each.place not in rejected]
+    assert [each.place for each in other.match.late] == left != []
 
 
 def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path):
     save_map(replace(small_map, thumbnails=()), tmp_path / 'blind.stavpr')
     pipeline = localizing(str(tmp_path / 'blind.stavpr'), geometric=GeometricSettings())
-    match = process(pipeline, route[:CERTAIN])[-1]
-    assert (match.status, match.inliers) == (Status.MATCH, -1)
+    result = process(pipeline, route[:CERTAIN])[-1]
+    assert (result.match.status, result.match.inliers) == (Status.MATCH, -1)
 
 
 class Failing:
@@ -176,10 +192,10 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     object.__setattr__(cut_off, 'data', cut_off.data[:100])
     for i, image in enumerate(route[:12] if operation != 'mapping' else route[30:42]):
         broken = pipeline.operation.process(cut_off, i)
-        assert (broken.status, broken.cause) == (Status.INVALID_IMAGE, 'invalid: cut off')
+        assert (broken.match.status, broken.cause) == (Status.INVALID_IMAGE, 'invalid: cut off')
         extract.error = ImageError('not finite', kind='features')
         broken = pipeline.operation.process(message(image), i)
-        assert (broken.cause, broken.reason) == ('invalid: features', 'not finite')
+        assert (broken.cause, broken.match.reason) == ('invalid: features', 'not finite')
         extract.error = None
         if operation != 'localization':
             thumbnail.error = InputError('no JPEG')
@@ -190,12 +206,13 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
         good, expected = (
             process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
         )
-        for name in ('status', 'image_index', 'candidates', 'nearest_index', 'distance'):
-            np.testing.assert_equal(getattr(good, name), getattr(expected, name))
+        for name in ('image_index', 'candidates', 'match.status', 'match.distance'):
+            np.testing.assert_equal(attrgetter(name)(good), attrgetter(name)(expected))
+        assert good.match.path.place == expected.match.path.place
         if operation != 'mapping':
             assert good.match.window_stamps == expected.match.window_stamps
     assert stamps_of(pipeline.places) == stamps_of(other.places)
-    assert good.status is not Status.WARMING_UP
+    assert good.match.status is not Status.WARMING_UP
 
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
@@ -214,5 +231,5 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 4
     assert matches[-1].match.window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':
-        assert matches[-1].match.first_image_index == places
-    assert matches[-1].match.path[-1].tolist() == [4, 8]
+        assert matches[-1].match.first_image == places
+    assert matches[-1].match.path.pairs[-1].tolist() == [4, 8]

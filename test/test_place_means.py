@@ -82,7 +82,7 @@ def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(mo
     strips = with_shared_content(seed, 1.6)
     assert probable(drive(strips)) <= 10
     twice = drive(np.concatenate([strips, strips], axis=1))
-    places = [match.sequence.middle for match in twice if match.accepted]
+    places = [match.path.place for match in twice if match.accepted]
     off = np.array(places) - np.arange(len(places))
     assert len(places) > 265
     assert np.mean(np.abs(off - np.median(off)) <= 4) > 0.95

@@ -32,14 +32,14 @@ def test_recognizer_of_its_own_map_matches_every_window(small_map):
     answers = recognize_all(recognizer(small_map), small_map.features)
     for i, answer in enumerate(answers[:4]):
         assert answer.status is Status.WARMING_UP
-        assert answer.place_index == answer.newest_index == -1
+        assert answer.place == answer.newest == -1
         assert f'{i + 1} of 5' in answer.reason
     for i, answer in enumerate(answers[4:], start=4):
         assert answer.status is Status.MATCH
-        assert (answer.place_index, answer.newest_index) == (i - 2, i)
-        assert answer.sequence.distance == pytest.approx(0, abs=1e-5)
-        assert abs(answer.sequence.second_best_index - (i - 2)) > 5
-        assert answer.sequence.second_best_distance > answer.sequence.distance
+        assert (answer.place, answer.newest) == (i - 2, i)
+        assert answer.path.distance == pytest.approx(0, abs=1e-5)
+        assert abs(answer.path.second_best - (i - 2)) > 5
+        assert answer.path.second_best_distance > answer.path.distance
 
 
 @pytest.mark.parametrize('strategy', ['adaptive', 'vanilla', 'sliding_window', 'none'])
@@ -52,15 +52,21 @@ def test_recognizer_by_image_equals_whole_matrix_at_once(small_map, strategy):
     for end in range(4, len(query)):
         window = D[end - 4 : end + 1]
         expected = best_match(match_sequence(window, SHORT), 5)
-        assert answers[end].sequence == expected
+        path = answers[end].path
+        assert (path.first, path.last, path.place) == (
+            *(expected.first, expected.last, expected.middle),
+        )
+        assert (path.distance, path.second_best, path.second_best_distance) == (
+            *(expected.distance, expected.second_best_index, expected.second_best_distance),
+        )
         np.testing.assert_array_equal(
-            answers[end].path, trace_sequence(window, expected.first, SHORT.k)
+            answers[end].path.pairs, trace_sequence(window, expected.first, SHORT.k)
         )
 
 
 def test_recognizer_at_threshold_does_not_match(small_map, route):
     query = small_map.extractor().extract([255 - image for image in route[3:8]])
-    distance = recognize_all(recognizer(small_map), query)[-1].sequence.distance
+    distance = recognize_all(recognizer(small_map), query)[-1].path.distance
     assert distance > 0.01
     for threshold, status in (
         (distance, Status.NO_MATCH),
@@ -75,7 +81,7 @@ def test_recognizer_on_empty_map_never_matches(small_map, mode):
     answers = recognize_all(one, small_map.features[:7])
     assert one.ranked(5) == []
     assert answers[-1].status is Status.NO_MATCH
-    assert answers[-1].place_index == -1
+    assert answers[-1].place == -1
     assert 'empty' in answers[-1].reason
 
 
@@ -85,8 +91,8 @@ def test_recognizer_on_map_shorter_than_window_matches(small_map, places):
     short = PlaceMap(small_map.features[:places], small_map.projection, stamps, ids, None, ())
     answer = recognize_all(recognizer(short, 2.0), small_map.features[:6])[-1]
     assert answer.status is Status.MATCH
-    assert 0 <= answer.place_index < places
-    assert answer.path[:, 1].max() < places
+    assert 0 <= answer.place < places
+    assert answer.path.pairs[:, 1].max() < places
 
 
 @pytest.mark.parametrize('mode', ['paper', 'robust'])

@@ -115,9 +115,7 @@ def test_look_alike_corridors_are_distinguished_by_their_turns():
     assert last.status is Status.NO_MATCH
     assert last.reason.endswith('not above 0.500: odometry disagrees with its path')
     assert last.distance == 1 - last.probability > 0.5
-    assert (
-        last.sequence.middle == by_images[CORNER + LENGTH].sequence.middle
-    )  # the place stays the best
+    assert last.path.place == by_images[CORNER + LENGTH].path.place  # the place stays the best
 
 
 def test_the_same_corridor_is_matched_in_spite_of_drift():
@@ -150,7 +148,7 @@ def test_absence_of_odometry_or_poses_changes_nothing(positions, driven, changes
     settings = replace(settings_of(), **changes)
     expected = drive(PlaceRecognizer(driven_map(places, None), settings), query)
     found = drive(PlaceRecognizer(driven_map(places, positions), settings), query, driven)
-    assert [repr(one.sequence) for one in found] == [repr(one.sequence) for one in expected]
+    assert [repr(one.path) for one in found] == [repr(one.path) for one in expected]
     assert [one.reason for one in found] == [one.reason for one in expected]
 
 
@@ -177,7 +175,9 @@ def test_early_matches_are_compared_since_the_first_of_them():
         driven_map(features_of(route, 0.1, 1), track(count=200)), RecognizerSettings()
     )
     matches = drive(one, features_of(strips, 0.1, 2), driven)
-    assert min(len(match.path) for match in matches[97:105]) < len(matches[-1].path)  # early ones
+    assert min(len(match.path.pairs) for match in matches[97:105]) < len(
+        matches[-1].path.pairs
+    )  # early ones
     assert all(match.accepted for match in matches[98:])
 
 
@@ -202,12 +202,12 @@ def test_pipeline_compares_the_pose_of_each_image(small_map, route, tmp_path):
     save_map(turned, tmp_path / 'turned.stavpr')
     pipeline = localizing(str(tmp_path / 'turned.stavpr'))
     images = route[5:25]
-    assert process(pipeline, images)[-1].accepted
+    assert process(pipeline, images)[-1].match.accepted
     pipeline.operation.reset()
     match = None
     for i, image in enumerate(images):
         pose = poses_of(track(-90, 9, 20, step=2.0))[i]
-        match = pipeline.operation.process(message(image), (i + 1) * 10**9, pose)
+        match = pipeline.operation.process(message(image), (i + 1) * 10**9, pose).match
     assert match.status is Status.NO_MATCH
     assert 'odometry disagrees' in match.reason
 

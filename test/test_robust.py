@@ -149,10 +149,10 @@ def test_recognizer_without_one_option_finds_places(small_map, without, strategy
     )
     one = PlaceRecognizer(small_map, settings)
     answers = recognize_all(one, small_map.features[10:30])
-    middles = [a.sequence.middle for a in answers[4:]]
+    middles = [a.path.place for a in answers[4:]]
     assert np.mean(np.abs(np.array(middles) - np.arange(12, 28)) <= 1) > 0.9
     assert int(np.argmin(one.newest_row())) == 29
     places, distances = one.candidates(7)
-    assert abs(places[0] - answers[-1].sequence.middle) <= CLOSE
+    assert abs(places[0] - answers[-1].path.place) <= CLOSE
     assert len(set(places.tolist())) == len(places) >= 5
     assert (np.diff(distances) >= 0).all()

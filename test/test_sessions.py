@@ -89,14 +89,14 @@ def test_mode_paper_finds_the_sequences_of_each_session_alone(town):
         nearest = min(range(3), key=lambda k: matches[k].distance)
         first = PLACES * nearest
         assert match.distance == matches[nearest].distance
-        assert (match.sequence.first, match.sequence.last) == (
-            matches[nearest].sequence.first + first, matches[nearest].sequence.last + first,
+        assert (match.path.first, match.path.last) == (
+            matches[nearest].path.first + first, matches[nearest].path.last + first,
         )  # fmt: skip
         np.testing.assert_array_equal(
-            match.path, matches[nearest].path + np.array([0, first], np.int32)
+            match.path.pairs, matches[nearest].path.pairs + np.array([0, first], np.int32)
         )
-        costs, middles, _ = together._newest.match.sequences()
-        alone_costs = np.concatenate([one._newest.match.sequences().costs for one in alone])
+        costs, middles, _ = together._sequences()
+        alone_costs = np.concatenate([one._sequences().costs for one in alone])
         assert sorted(costs[np.isfinite(costs)]) == sorted(alone_costs[np.isfinite(alone_costs)])
         assert middles.max() < len(merged)
 
@@ -107,12 +107,12 @@ def test_drive_over_a_border_is_never_one_sequence(town, mode):
     merged = merge_maps([town[0], town[2]], 'ab')
     jump = np.concatenate([route(0)[:, 40:], route(5)[:, :50]], axis=1)
     for match in recognize(merged, features_of(jump, 0.8, 7), mode):
-        if match.sequence is not None:
-            sessions = merged.session_index[match.path[:, 1]]
+        if match.path.place >= 0:
+            sessions = merged.session_index[match.path.pairs[:, 1]]
             assert len(set(sessions.tolist())) == 1
-            assert match.sequence.first <= match.sequence.middle <= match.sequence.last
+            assert match.path.first <= match.path.place <= match.path.last
     assert match.accepted
-    assert merged.session(match.place_index).id == 'b'
+    assert merged.session(match.place).id == 'b'
 
 
 def test_alike_sessions_share_their_probability_once_related(town):
@@ -127,16 +127,16 @@ def test_alike_sessions_share_their_probability_once_related(town):
     assert [match.accepted for match in matches[LENGTH:]] == alone[LENGTH:]
     assert sum(alone) > 70
     for match in matches[LENGTH + 10 :]:
-        second = match.sequence.second_best_index
-        assert second < 0 or abs(second % PLACES - match.sequence.middle % PLACES) > 8
+        second = match.path.second_best
+        assert second < 0 or abs(second % PLACES - match.path.place % PLACES) > 8
 
 
 def test_second_best_is_the_most_probable_place_elsewhere_however_faint(town):
     """Not the first place, where all others cost 1 to the last digit."""
     matches = recognize(with_same_places(merge_maps(town, 'abc')), features_of(route(0), 0.3, 9))
-    accepted = [match.sequence for match in matches if match.accepted]
-    assert sum(one.second_best_index == 0 for one in accepted) < len(accepted) / 2
-    assert all(one.second_best_index != one.middle for one in accepted)
+    accepted = [match.path for match in matches if match.accepted]
+    assert sum(one.second_best == 0 for one in accepted) < len(accepted) / 2
+    assert all(one.second_best != one.place for one in accepted)
 
 
 @pytest.mark.parametrize('around', [0, 6])
@@ -159,7 +159,7 @@ def test_same_place_in_another_session_is_no_candidate_beside(town, mode):
     for i in range(len(query)):
         match = one.update(query[i : i + 1])
     places = [candidate.place for candidate in one.ranked(4)]
-    assert (places[0], *places[1:2]) == (match.sequence.middle, match.sequence.second_best_index)
+    assert (places[0], *places[1:2]) == (match.path.place, match.path.second_best)
     positions = related.same_as[places]
     assert np.abs(positions[1:] - positions[0]).min() > 8
     # in another session, a neighbor by number is no neighbor
@@ -228,4 +228,4 @@ def test_refuted_path_is_not_sought_in_a_session_without_its_states(town, seed):
     strips, other = route(0)[:, ::-1].copy(), np.random.default_rng(seed).random(PLACES) < 0.4
     strips[:, other] = route(5)[:, other]
     matches = recognize(both, features_of(strips, 0.8, seed))
-    assert sum(match.sequence is not None for match in matches) > PLACES // 2
+    assert sum(match.path.place >= 0 for match in matches) > PLACES // 2

@@ -41,7 +41,7 @@ def test_matches_on_a_folder_of_maps_name_the_map(floors, route):
     for images, name in ((route[10:25], 'floor-0'), (UPSTAIRS[5:20], 'floor-1')):
         results = process(pipeline, images)  # from floor to floor without a reset: an elevator
         result = results[-1]
-        assert pipeline.places.place(result.place_index).session == name
+        assert pipeline.places.place(result.match.place).session == name
         probabilities = result.session_probabilities
         assert len(probabilities) == 2
         assert probabilities[int(name[-1])] > 0.8
@@ -96,15 +96,15 @@ def test_session_on_a_map_is_recorded_and_matched(recorded, map_file, route):
     localized = process(localizing(map_file, **SURE_SETTINGS), images, first=100)
     n = len(pipeline.operation.reference)
     assert [each.image_index for each in results] == list(range(n, n + 40))
-    assert {each.status for each in results} == {Status.MATCH, Status.MAPPED}
+    assert {each.match.status for each in results} == {Status.MATCH, Status.MAPPED}
     for result, other in zip(results, localized, strict=True):
-        assert result.accepted == other.accepted
-        assert (result.place_index, result.newest_index) == (other.place_index, other.newest_index)
-        assert result.reason == ''
-    assert results[-1].status is Status.MAPPED
+        assert result.match.accepted == other.match.accepted
+        assert (result.match.place, result.match.newest) == (other.match.place, other.match.newest)
+        assert result.match.reason == ''
+    assert results[-1].match.status is Status.MAPPED
     assert pipeline.operation.relocalize(2).candidates
-    pair = pipeline.operation.matched_pair(results[15])
-    assert (pair.source, pair.place) == (pipeline.operation.reference, results[15].place_index)
+    pair = pipeline.operation.matched_pair(results[15].match)
+    assert (pair.source, pair.place) == (pipeline.operation.reference, results[15].match.place)
 
 
 def test_session_on_a_map_is_related_to_its_places(recorded, map_file, tmp_path):
@@ -117,12 +117,14 @@ def test_session_on_a_map_is_related_to_its_places(recorded, map_file, tmp_path)
     assert both.same_as[:n].tolist() == list(range(n))
     merged = with_same_places(replace(both, same_as=None))
     certain = [
-        each for each in results if each.probability > SURE and len(each.match.path) == LENGTH
+        each
+        for each in results
+        if each.match.probability > SURE and len(each.match.path.pairs) == LENGTH
     ]
     assert certain
     for result in certain:
         middle = result.image_index - LENGTH + 1 + result.match.position
-        assert both.same_as[middle] == result.place_index
+        assert both.same_as[middle] == result.match.place
     differ = np.flatnonzero(both.same_as != merged.same_as)
     assert len(differ) <= 6  # the command has windows of 20 images
     assert both.same_as[n + 25 :].tolist() == list(range(n + 25, n + 40))
@@ -150,14 +152,14 @@ def test_session_that_was_saved_goes_on_after_a_kill(recorded, route):
 
 def test_session_on_a_map_is_recorded_without_a_threshold_of_mode_paper(map_file, tmp_path, route):
     pipeline = extending(map_file, tmp_path / 'a.stavpr', mode='paper', threshold=None)
-    assert {each.status for each in process(pipeline, route[:LENGTH])} == {Status.MAPPED}
+    assert {each.match.status for each in process(pipeline, route[:LENGTH])} == {Status.MAPPED}
     pipeline.close_journals(delete_route=True)
 
 
 def test_full_map_records_no_further_place(map_file, tmp_path, route):
     pipeline = extending(map_file, tmp_path / 'a.stavpr', max_places=62)
     results = process(pipeline, route[:4], first=100)
-    assert [each.status for each in results[2:]] == [Status.NOT_READY] * 2
+    assert [each.match.status for each in results[2:]] == [Status.NOT_READY] * 2
     assert pipeline.operation.map_state == 'full'
-    assert pipeline.operation.process(message(route[4]), SECOND).status is Status.NOT_READY
+    assert pipeline.operation.process(message(route[4]), SECOND).match.status is Status.NOT_READY
     pipeline.close_journals(delete_route=True)

@@ -39,7 +39,7 @@ def matched(recognizer, features):
     """Return the place of each image that has a match, by image."""
     matches = [recognizer.update(features[i : i + 1]) for i in range(len(features))]
     return {
-        i - 10: match.sequence.middle
+        i - 10: match.path.place
         for i, match in enumerate(matches)
         if match.accepted and len(match.window_stamps) == 20
     }
@@ -93,8 +93,8 @@ def test_match_of_a_standing_camera_is_kept():
     matches = recognize_all(PlaceRecognizer(map_of(features_of(known)), settings), query)[-50:]
     assert all(match.accepted for match in matches)
     assert len({match.probability for match in matches}) == 1
-    assert matches[0].path[0, 1] == pytest.approx(79 - 9, abs=2)
-    assert set(matches[-1].path[:, 1]) == {matches[-1].place_index} == {79}
+    assert matches[0].path.pairs[0, 1] == pytest.approx(79 - 9, abs=2)
+    assert set(matches[-1].path.pairs[:, 1]) == {matches[-1].place} == {79}
 
 
 def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():

@@ -54,7 +54,7 @@ def thermal_map(folders):
 
 def matches(place_map, query):
     results = recognize_all(PlaceRecognizer(place_map, RecognizerSettings()), query)
-    return [result.newest_index for result in results if result.status is Status.MATCH]
+    return [match.newest for match in results if match.accepted]
 
 
 def raw(image, big=False):
@@ -141,8 +141,8 @@ def test_pipeline_finds_the_range_before_its_first_place(drives, thermal_map, op
         pipeline.operation.process(raw(image), (i + 1) * 10**9)
         for i, image in enumerate(drives[0])
     ]
-    assert {each.status for each in results[:20]} == {Status.NOT_READY}
-    assert results[4].reason == 'images of 16 bits, 5 of 20 for their range'
+    assert {each.match.status for each in results[:20]} == {Status.NOT_READY}
+    assert results[4].match.reason == 'images of 16 bits, 5 of 20 for their range'
     places = pipeline.places
     assert (len(places), places.settings) == (IMAGES - 20, thermal_map.settings)
     expected = thermal_map.features.strips[:, 20:]

@@ -22,6 +22,7 @@ from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import GrowingMap
 from stavpr_ros.method import Match, Status
+from stavpr_ros.method import match as match_module
 from stavpr_ros.pipeline import ImageResult
 from stavpr_ros.pipeline.overlay import draw_match, draw_window
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
@@ -90,24 +91,25 @@ def test_visualization_without_subscribers_publishes_and_draws_nothing(localized
 
 
 def test_visualization_of_a_match_publishes_routes_and_markers(localized):
-    pipeline, match = localized
+    pipeline, result = localized
+    match = result.match
     assert match.accepted
     views, publishers = views_of('map_path', 'matched_path', 'markers')
     for i in range(2):
-        views.publish(header(i), match, pipeline.operation, 'map')
+        views.publish(header(i), result, pipeline.operation, 'map')
     (route,) = publishers.messages('map_path')  # it has not changed
     assert route.header.frame_id == 'map'
     assert [stamped.pose.position.x for stamped in route.poses] == list(range(60))
     last = publishers.messages('matched_path')[-1].poses
-    place = float(match.newest_index)
+    place = float(match.newest)
     assert [(p.header.stamp.sec, p.pose.position.x) for p in last] == [(1, place), (2, place)]
     assert views.needs_candidates
     clear, ball, *candidates, text = publishers.messages('markers')[-1].markers
     assert clear.action == Marker.DELETEALL
     assert (ball.type, ball.pose.position.x) == (Marker.SPHERE, place)
     assert ball.color == color(match.probability)
-    assert len(candidates) == len(match.candidates)
-    assert text.text == f'place {match.newest_index}, p {match.probability:.2f}'
+    assert len(candidates) == len(result.candidates)
+    assert text.text == f'place {match.newest}, p {match.probability:.2f}'
     shown = [clear, ball, *candidates, text]
     assert len({marker.id for marker in shown}) == len(shown)
 
@@ -115,7 +117,9 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
 def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
     pipeline, _ = localized
     views, publishers = views_of(*TOPICS)
-    views.publish(header(), ImageResult(Status.DROPPED, 'because'), pipeline.operation, 'map')
+    views.publish(
+        header(), ImageResult(Match(Status.DROPPED, 'because')), pipeline.operation, 'map'
+    )
     assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
     assert not publishers.messages('matched_path')
     assert not publishers.messages('match_image/compressed')
@@ -127,11 +131,11 @@ def test_visualization_of_loop_closures_connects_query_and_place(route):
     matches = process(pipeline, route[:30], first=30, poses=True)
     for i, match in enumerate(matches):
         views.publish(header(i), match, pipeline.operation, 'odom')
-    accepted = [match for match in matches if match.accepted]
+    accepted = [result.match for result in matches if result.match.accepted]
     lines = publishers.messages('markers')[-1].markers[1]
     assert lines.type == Marker.LINE_LIST
     assert len(lines.points) == len(lines.colors) == 2 * len(accepted) > 0
-    last = pipeline.places.place(accepted[-1].newest_index).pose[0]
+    last = pipeline.places.place(accepted[-1].newest).pose[0]
     assert lines.points[-1].x == last
     assert all(message.header.frame_id == 'odom' for message in publishers.messages('map_path'))
 
@@ -144,14 +148,14 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
     for i, match in enumerate(matches):
         odometry = np.array([0.1 * i, i, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])
         views.publish(header(i), match, pipeline.operation, 'map', odometry)
-    accepted = [match for match in matches if match.accepted]
+    accepted = [result.match for result in matches if result.match.accepted]
     assert len(accepted) > 2
     lines = publishers.messages('markers')[-1].markers[1]
     assert lines.type == Marker.LINE_LIST
     assert len(lines.points) == len(lines.colors) == 2 * len(accepted) - 2
     assert lines.colors[-1] == color(accepted[-1].probability)
     query, place = lines.points[-2:]
-    pose = pipeline.places.place(accepted[-1].newest_index).pose
+    pose = pipeline.places.place(accepted[-1].newest).pose
     assert place.x == pose[0]
     assert np.hypot(query.x - place.x, query.y - place.y) == pytest.approx(0.1, abs=1e-6)
     views.publish(header(99), matches[0], localizing(map_file).operation, 'map', odometry)
@@ -179,7 +183,7 @@ def test_visualization_of_distances_is_the_newest_row(localized):
     values, numbers = np.frombuffer(row.data, np.float32).reshape(-1, 2).T
     assert numbers.tolist() == list(range(60))
     np.testing.assert_array_equal(values, pipeline.operation.recognizer.newest_row())
-    assert values.argmin() == match.newest_index
+    assert values.argmin() == match.match.newest
     assert len(publishers.messages('window_image')) == 1
     (jpeg,) = publishers.messages('match_image/compressed')
     drawn = cv2.imdecode(np.frombuffer(jpeg.data, np.uint8), cv2.IMREAD_COLOR)
@@ -199,7 +203,7 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     views, publishers = views_of('distances')
     recognizer = SimpleNamespace(window_fill=1, newest_row=lambda: row)
     operation = SimpleNamespace(matched_places=route, recognizer=recognizer)
-    views.publish(header(), ImageResult(Status.NO_MATCH), operation, 'map')
+    views.publish(header(), ImageResult(Match(Status.NO_MATCH)), operation, 'map')
     (message,) = publishers.messages('distances')
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
     assert (message.width, numbers[0]) == (512, 3000)
@@ -211,11 +215,11 @@ def test_draw_window_shows_the_path_over_its_places(places):
     rows = np.ones((5, places), np.float32)
     rows[:, places // 2] = 0
     rows[:, 0] = np.inf
-    path = np.array([[i, places // 2] for i in range(5)], np.int32)
-    sequence = SimpleNamespace(middle=places // 2, distance=0.1)
-    match = Match(Status.MATCH, sequence=sequence, path=path, probability=0.9)
-    drawn = draw_window(rows, 0, ImageResult.of_match(match))
-    without = draw_window(rows, 0, ImageResult(Status.WARMING_UP))
+    pairs = np.array([[i, places // 2] for i in range(5)], np.int32)
+    path = match_module.Path(pairs, places // 2)
+    match = Match(Status.MATCH, path=path, probability=0.9)
+    drawn = draw_window(rows, 0, match)
+    without = draw_window(rows, 0, Match(Status.WARMING_UP))
     assert 200 < drawn.shape[1] < 1400
     assert (drawn == 255).all(axis=2).any()
     if places <= 40:

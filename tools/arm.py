@@ -86,8 +86,8 @@ def results(folder: Path, foreign: Path) -> Iterator[tuple[str, np.ndarray]]:
         if mode == 'paper':
             yield f'{name}: distances of the map', recognizer.distances(place_map.features)
         matches = [recognizer.update(query[i : i + 1]) for i in range(len(query))]
-        yield f'{name}: paths', np.concatenate([match.path for match in matches])
-        yield f'{name}: places', np.array([match.place_index for match in matches])
+        yield f'{name}: paths', np.concatenate([match.path.pairs for match in matches])
+        yield f'{name}: places', np.array([match.place for match in matches])
         yield f'{name}: statuses', np.array([match.status for match in matches])
         windows = 'probabilities' if mode == 'robust' else 'distances of windows'
         yield f'{name}: {windows}', np.array([match.distance for match in matches])

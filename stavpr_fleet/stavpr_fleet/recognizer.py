@@ -203,7 +203,8 @@ class FleetRecognizer(SequenceRecognizer):
         status = Status.WARMING_UP
         if self.window_fill == self._settings.sequence.length:
             status = Status.NO_MATCH
-        return Match(status, self.problem or 'no neighborhood has arrived yet')
+        reason = self.problem or 'no neighborhood has arrived yet'
+        return Match(status, reason, self._limits)
 
     def newest_row(self) -> np.ndarray:
         """See :meth:`SequenceRecognizer.newest_row`; +inf for places that are not loaded."""

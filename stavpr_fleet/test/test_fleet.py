@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps of a fleet: their stores, recognition in neighborhoods, and stores that fail."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 import threading
 import time
 
@@ -25,7 +25,7 @@ from stavpr_ros.errors import FleetError, InputError, OutputTakenError, Settings
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import settings_class
 from stavpr_ros.mapping import descriptor_map, open_map, save_map, select_places, Session
-from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.localizer import EARLY
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.prepare.centering import unit_norm
@@ -160,10 +160,10 @@ def test_recognizer_in_neighborhoods_matches_as_exact_one(store, city, query, tm
     assert len(accepted) > 30
     for i in accepted[5:]:
         assert found[i].accepted
-        assert abs(found[i].sequence.middle - exact[i].sequence.middle) <= 1
+        assert abs(found[i].path.place - exact[i].path.place) <= 1
         assert abs(found[i].probability - exact[i].probability) < 0.01
-        np.testing.assert_allclose(found[i].path[:, 1], exact[i].path[:, 1], atol=2)
-    newest, row = found[-1].sequence.middle, recognizer.newest_row()
+        np.testing.assert_allclose(found[i].path.pairs[:, 1], exact[i].path.pairs[:, 1], atol=2)
+    newest, row = found[-1].path.place, recognizer.newest_row()
     np.testing.assert_array_equal(recognizer.window_columns(np.arange(CITY))[-1], row)
     assert row.shape == (CITY,)
     assert np.isfinite(row).sum() < CITY
@@ -192,9 +192,8 @@ def test_recognizer_after_a_reset_answers_as_a_new_one(city, query):
     drive(one, query)
     one.reset()
     for found, expected in zip(drive(one, query), drive(new, query), strict=True):
-        for field in fields(Match):
-            pair = (getattr(each, field.name) for each in (found, expected))
-            np.testing.assert_array_equal(*pair, err_msg=field.name)
+        values = [vars(each) | {'path': vars(each.path)} for each in (found, expected)]
+        np.testing.assert_equal(*values)
     one._city.store.cut = True
     one.reset()
     assert drive(one, query)[-1].accepted
@@ -230,7 +229,7 @@ def test_recognizer_cut_off_goes_on_in_last_neighborhood_and_recovers(city, quer
     cut = drive(recognizer, query[40:50])
     assert 'cut off' in recognizer.problem
     assert [match.accepted for match in cut] == [True] * 10
-    assert cut[-1].sequence.last == pytest.approx(FIRST + 49, abs=2)
+    assert cut[-1].path.last == pytest.approx(FIRST + 49, abs=2)
     store.cut = False
     drive(recognizer, query[50:])
     end = time.monotonic() + TIMEOUT
@@ -324,8 +323,8 @@ def test_map_upload_command_and_pipeline_localize(route, small_map, tmp_path, ca
         pipeline.operation.process(message(image), (i + 1) * SECOND)
         for i, image in enumerate(route)
     ]
-    assert [match.probability > MIN_PROBABILITY for match in matches[20:]] == [True] * 40
-    assert abs(matches[-1].newest_index - 59) <= 1
+    assert [result.match.probability > MIN_PROBABILITY for result in matches[20:]] == [True] * 40
+    assert abs(matches[-1].match.newest - 59) <= 1
     assert pipeline.places.place(40).identifier == 'place 40'
     assert pipeline.problem == ''
     with pytest.raises(InputError, match='stays where it is'):

@@ -66,11 +66,11 @@ def test_node_on_gardens_point_equals_library(
     np.testing.assert_array_equal(live.places, expected.places)
     np.testing.assert_allclose(live.distances, expected.distances, atol=2e-6)
     for record, core in zip(records, offline, strict=True):
-        assert record['place_index'] == core.place_index
-        assert record['newest_index'] == core.newest_index
-        assert [list(pair.values()) for pair in record['path']] == core.path.tolist()
-        if core.sequence is not None:
-            assert record['second_best_index'] == core.sequence.second_best_index
+        assert record['place_index'] == core.place
+        assert record['newest_index'] == core.newest
+        assert [list(pair.values()) for pair in record['path']] == core.path.pairs.tolist()
+        if core.path.place >= 0:
+            assert record['second_best_index'] == core.path.second_best
     f1 = best_f1(live.distances, live.within(truth, TOLERANCE)).f1
     record_property('f1', f1)
     print(f'Gardens Point day left / day right, {kind}, {mode}: F1 {f1:.4f}')

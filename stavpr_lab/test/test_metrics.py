@@ -15,9 +15,8 @@ from stavpr_lab.evaluation.metrics import (
     Ranking,
     smallest_indices,
 )
-from stavpr_ros.alignment import SequenceMatch
 from stavpr_ros.errors import InputError
-from stavpr_ros.method import Match, Status
+from stavpr_ros.method import Match, Path, Status
 
 NONE = Match(Status.WARMING_UP)
 
@@ -28,9 +27,7 @@ def ranking(places, scores):
 
 
 def window(middle, path, distance):
-    nearest = SequenceMatch(path[0][1], path[-1][1], middle, distance, -1, float('nan'))
-    path = np.array(path, np.int32)
-    return Match(Status.NO_MATCH, sequence=nearest, path=path, distance=distance)
+    return Match(Status.NO_MATCH, path=Path(np.array(path, np.int32), middle, distance))
 
 
 def test_best_f1_on_a_tie_is_that_of_the_lowest_threshold():

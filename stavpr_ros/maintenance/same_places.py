@@ -40,10 +40,10 @@ class SamePlaces:
     def add(self, match: Match, image: int, length: int) -> None:
         """Take the match of the window that ends with an image; only a full one counts."""
         if match.accepted and len(match.window_stamps) == length:
-            window = image - length + 1 + match.path[:, 0]
+            window = image - length + 1 + match.path.pairs[:, 0]
             is_sure = match.path_probabilities > SURE  # beyond an end of the places, it is not
-            self._near[window[is_sure]] = match.path[is_sure, 1]
-            self.middles[window[(len(window) - 1) // 2]] = match.place_index
+            self._near[window[is_sure]] = match.path.pairs[is_sure, 1]
+            self.middles[window[(len(window) - 1) // 2]] = match.place
 
     @property
     def places(self) -> np.ndarray:

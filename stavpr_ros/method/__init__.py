@@ -20,17 +20,17 @@ windows by LM-DTW (:mod:`.lm_dtw_window`).
 >>> recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='robust'))
 >>> for image in range(10, 50):
 ...     match = recognizer.update(features[image : image + 1])
->>> match.status.name, match.place_index, match.newest_index, match.probability > 0.9
+>>> match.status.name, match.place, match.newest, match.probability > 0.9
 ('MATCH', 39, 49, True)
 """
 
 from stavpr_ros.method.filter import Filter, PlaceFilter
 from stavpr_ros.method.localizer import PlaceRecognizer
-from stavpr_ros.method.match import Candidate, Match, Status
+from stavpr_ros.method.match import Candidate, Match, Path, Status
 from stavpr_ros.method.model import Model
 from stavpr_ros.method.settings import RecognizerSettings
 
 __all__ = [
-    'Candidate', 'Filter', 'Match', 'Model', 'PlaceFilter', 'PlaceRecognizer',
+    'Candidate', 'Filter', 'Match', 'Model', 'Path', 'PlaceFilter', 'PlaceRecognizer',
     'RecognizerSettings', 'Status',
 ]  # fmt: skip

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.alignment.device import lm_dtw, nearest_starts
-from stavpr_ros.alignment.lm_dtw import SequenceDistances, SequenceMatch, trace_sequence
+from stavpr_ros.alignment.lm_dtw import SequenceDistances, trace_sequence
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.device_filter import DevicePlaceFilter
-from stavpr_ros.method.match import WindowMatch, WindowSequences
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
 from stavpr_ros.method.sessions import in_places
 from stavpr_ros.method.window import FilterWindow
@@ -173,19 +173,17 @@ class DeviceLmDtwWindow(BufferWindow):
         if not np.isfinite(distance):
             return WindowMatch()
         cells = self._received.numpy[6:].astype(np.float32).reshape(buffer.length, buffer.k)
-        path = trace_sequence(cells, 0, buffer.k)
-        path[:, 1] += start
+        pairs = trace_sequence(cells, 0, buffer.k)
+        pairs[:, 1] += start
         has_second = np.isfinite(second_distance)
-        nearest = SequenceMatch(
-            first=start,
-            last=start + length - 1,
-            middle=(2 * start + length - 1) // 2,
-            distance=distance,
-            second_best_index=(2 * second + second_length - 1) // 2 if has_second else -1,
+        path = Path(
+            pairs,
+            (2 * start + length - 1) // 2,
+            distance,
+            second_best=(2 * second + second_length - 1) // 2 if has_second else -1,
             second_best_distance=second_distance if has_second else float('nan'),
         )
-        match = WindowMatch(nearest, path, self._sequences)
-        return in_places(match, self.layout, nms_radius)
+        return in_places(WindowMatch(path, self._sequences), self.layout, nms_radius)
 
     def _sequences(self) -> WindowSequences:
         """Copy distances and lengths of all starts to the host."""

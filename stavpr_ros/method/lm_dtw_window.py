@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The window whose nearest sequence is found by LM-DTW (section 4 of the paper)."""
 
-from dataclasses import replace
-
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import (
     best_match,
@@ -13,7 +11,7 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.method.columns import ColumnLayout
-from stavpr_ros.method.match import WindowMatch, WindowSequences
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
 from stavpr_ros.method.sessions import in_places
 
@@ -50,17 +48,17 @@ class LmDtwWindow(BufferWindow):
         nearest = best_match(matches, nms_radius)
         if nearest is None:
             return WindowMatch()
-        path = trace_sequence(window[:, :n], nearest.first, k)
-        path[:, 1] += first  # counted from the first place ever, evicted ones included
-        second_best = nearest.second_best_index
-        nearest = replace(
-            nearest,
-            first=nearest.first + first,
-            last=nearest.last + first,
-            middle=nearest.middle + first,
-            second_best_index=second_best + first if second_best >= 0 else -1,
+        pairs = trace_sequence(window[:, :n], nearest.first, k)
+        pairs[:, 1] += first  # counted from the first place ever, evicted ones included
+        second = nearest.second_best_index
+        path = Path(
+            pairs,
+            nearest.middle + first,
+            nearest.distance,
+            second_best=second + first if second >= 0 else -1,
+            second_best_distance=nearest.second_best_distance,
         )
         match = WindowMatch(
-            nearest, path, lambda: WindowSequences(matches.distances, matches.middles + first)
+            path, lambda: WindowSequences(matches.distances, matches.middles + first)
         )
         return in_places(match, self.layout, nms_radius)

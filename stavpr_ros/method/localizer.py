@@ -14,7 +14,7 @@ The chain, image by image (:meth:`PlaceRecognizer.update`).
    (:meth:`.filter.Filter.beliefs`, :func:`.path.centered_place`, :func:`.path.follow`).
 6. **Evidence**: belief, checks of the path, lead, cells, recent windows (:mod:`.evidence`).
 7. **Match**: the limits, odometry, and the newest images alone where the window shows nothing
-   (:meth:`SequenceRecognizer._decide`).
+   (:meth:`SequenceRecognizer._match`).
 
 Steps 3 to 6 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_window` instead.
 """
@@ -22,7 +22,7 @@ Steps 3 to 6 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_
 from abc import ABC, abstractmethod
 from dataclasses import replace
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.checks import require_type
@@ -39,6 +39,7 @@ from stavpr_ros.method.match import (
     distinct_places,
     Limits,
     Match,
+    Path,
     ranked_candidates,
     Status,
     WindowMatch,
@@ -48,6 +49,7 @@ from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.relative_motion import (
     Positions,
     RelativeMotion,
+    Run,
     with_odometry_test,
 )
 from stavpr_ros.method.sessions import time_note
@@ -62,28 +64,8 @@ from stavpr_ros.threads import one_thread
 if TYPE_CHECKING:
     import torch
 
+EMPTY = Match(Status.WARMING_UP), WindowMatch().sequences
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
-
-
-class Verdict(NamedTuple):
-    """
-    What a window showed, and the limits that were applied.
-
-    :param match: by the images alone.
-    :param distance, probability: also by odometry; NaN without a sequence.
-    :param run: of :class:`RelativeMotion` with this match; None = not compared.
-    """
-
-    match: WindowMatch
-    limits: Limits
-    status: Status
-    reason: str
-    distance: float = math.nan
-    probability: float = math.nan
-    run: tuple[int, int, int, int] | None = None
-
-
-EMPTY = Verdict(WindowMatch(), Limits(), Status.WARMING_UP, '')
 
 
 class SequenceRecognizer(ABC):
@@ -117,7 +99,7 @@ class SequenceRecognizer(ABC):
         if not settings.compares_odometry:
             positions = ()
         self._motion = RelativeMotion(settings.sequence.length, settings.odometry_error, positions)
-        self._newest = EMPTY
+        self._newest, self._sequences = EMPTY
 
     @abstractmethod
     def update(
@@ -139,7 +121,7 @@ class SequenceRecognizer(ABC):
         """Drop the images of the window."""
         self._window.reset()
         self._motion.reset()
-        self._newest = EMPTY
+        self._newest, self._sequences = EMPTY
 
     @property
     def window_fill(self) -> int:
@@ -176,7 +158,7 @@ class SequenceRecognizer(ABC):
 
         :returns: places, int64, and the costs of their sequences, at most ``count`` of each.
         """
-        return distinct_places(self._newest.match.sequences(), count)
+        return distinct_places(self._sequences(), count)
 
     def ranked(self, count: int) -> list[Candidate]:
         """
@@ -190,11 +172,11 @@ class SequenceRecognizer(ABC):
         :raises InputError: count below 0.
         """
         newest, nearest = self._newest, None
-        if (sequence := newest.match.nearest) is not None:
-            nearest = Candidate(sequence.middle, newest.distance, newest.probability)
+        if (place := newest.path.place) >= 0:
+            nearest = Candidate(place, newest.distance, newest.probability)
         layout, radius = self._window.layout, self._settings.nms_radius
         where = layout.positions, layout.lap
-        return ranked_candidates(nearest, newest.match.sequences(), count, radius, *where)
+        return ranked_candidates(nearest, self._sequences(), count, radius, *where)
 
     def newest_row(self) -> np.ndarray:
         """
@@ -237,84 +219,76 @@ class SequenceRecognizer(ABC):
 
     def _match(self, odometry_xy: np.ndarray) -> Match:
         """
-        Match the window.
+        Match the window and, where it shows nothing, its newest images.
 
         :param odometry_xy: of the newest image by odometry, (2,); NaN = unknown.
         """
-        return self._built(self._decide(odometry_xy))
-
-    def _decide(self, odometry_xy: np.ndarray) -> 'Verdict':
-        """Decide on the window, and where it has no match, on its newest images."""
-        window, radius = self._window, self._settings.nms_radius
+        window, radius, run = self._window, self._settings.nms_radius, None
         self._motion.trajectory.append(odometry_xy)
-        fill, length = len(window.images), window.length
-        reason = f'{fill} of {length} images in the window'
-        verdict = Verdict(WindowMatch(), self._limits, Status.WARMING_UP, reason)
+        shown = WindowMatch()
         if window.full:
-            verdict = self._verdict(window.match(radius), self._limits)
-        runs = [verdict.run]
-        if verdict.status is not Status.MATCH:
+            shown = window.match(radius)
+            match, run = self._decide(shown.path, self._limits)
+        else:
+            reason = f'{len(window.images)} of {window.length} images in the window'
+            match = self._build(shown.path, self._limits, Status.WARMING_UP, reason)
+        runs = [run]
+        if not match.accepted:
             newest = window.match_newest(radius)
-            if newest.nearest is not None:
-                early = self._verdict(newest, self._limits.raised(EARLY))
-                runs.append(early.run)
-                verdict = early if early.status is Status.MATCH else verdict
+            if newest.path.place >= 0:
+                early, run = self._decide(newest.path, self._limits.raised(EARLY))
+                runs.append(run)
+                match, shown = (early, newest) if early.accepted else (match, shown)
         # of the first match that images accept; the other one is no other image
         runs.sort(key=lambda run: run is None or run[-1] < 0)
         self._motion.run = runs[0] or self._motion.run
-        self._newest = verdict
-        return verdict
+        self._newest, self._sequences = match, shown.sequences
+        return match
 
-    def _verdict(self, match: WindowMatch, limits: Limits) -> 'Verdict':
-        """Decide on what a window showed, by the limits and by odometry."""
-        if match.nearest is None:
-            return Verdict(match, limits, Status.NO_MATCH, self.no_places)
-        distance, probability = match.nearest.distance, match.probability
-        status, reason = limits.decide(distance, probability)
-        run = None
+    def _decide(self, path: Path, limits: Limits) -> tuple[Match, Run | None]:
+        """Decide on a path by the limits and by odometry; return the run with it, if compared."""
+        if path.place < 0:
+            return self._build(path, limits, Status.NO_MATCH, self.no_places), None
+        probability, run = path.probability, None
+        status, reason = limits.decide(path.distance, probability)
         if len(self._motion.positions) and np.isfinite(self._motion.trajectory[-1][0]):
             accepted, layout = status is Status.MATCH, self._window.layout
-            agreed, run = self._motion.agreement(
-                match,
-                (len(match.path) - 1) // 2,
-                accepted,
-                self._window.first,
-                layout.session_of(match.nearest.middle),
-            )
+            session = layout.session_of(path.place)
+            agreed, run = self._motion.agreement(path, accepted, self._window.first, session)
             if agreed < UNUSUAL:
                 probability = with_odometry_test(probability, agreed)
-                distance = 1 - probability
-                status, reason = limits.decide(distance, probability)
+                status, reason = limits.decide(1 - probability, probability)
                 if accepted and status is not Status.MATCH:
                     reason += ': odometry disagrees with its path'
-        return Verdict(match, limits, status, reason, distance, probability, run)
+        return self._build(path, limits, status, reason, probability), run
 
-    def _built(self, verdict: 'Verdict', is_oldest: bool = False, **fields: Any) -> Match:
-        """
-        Build the match of an image.
-
-        :param is_oldest: of the oldest image of the window, not of the middle one.
-        :param fields: of a match in loop closure.
-        """
-        window, match = self._window, verdict.match
-        images = match.images or len(window.images)
-        position = 0 if is_oldest else (images - 1) // 2
+    def _build(
+        self,
+        path: Path,
+        limits: Limits,
+        status: Status,
+        reason: str,
+        probability: float = math.nan,
+        is_oldest: bool = False,
+    ) -> Match:
+        """Build a match of the images of a path, or of the window."""
+        window, count = self._window, len(path.pairs)
+        images = int(path.pairs[-1, 0]) + 1 if count else len(window.images)
         return Match(
-            verdict.status,
-            verdict.reason,
-            verdict.limits.threshold,
-            match.nearest,
-            match.path,
-            verdict.distance,
-            verdict.probability,
-            verdict.limits.probability,
-            match.path_ratios(position),
+            status,
+            reason,
+            limits,
+            path,
+            probability,
             window_stamps=tuple(window.images['stamp'][-images:].tolist()),
             window_changes=window.changes[-images:],
+            first_image=self._first_image(images),
             is_oldest=is_oldest,
-            direction=match.direction,
-            **fields,
         )
+
+    def _first_image(self, images: int) -> int:
+        """Return the place that the first of the newest images has become; -1 = none."""
+        return -1
 
 
 class PlaceRecognizer(SequenceRecognizer):

@@ -13,8 +13,8 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import route_evidence_of
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
-from stavpr_ros.method.localizer import position_of, SequenceRecognizer, Verdict
-from stavpr_ros.method.match import Limits, Match, Status
+from stavpr_ros.method.localizer import position_of, SequenceRecognizer
+from stavpr_ros.method.match import Limits, Match, Status, WindowColumns
 from stavpr_ros.method.model import AROUND, BAND, CONFIRMED, LONGEST_GAP, LONGEST_WAIT
 from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.settings import RecognizerSettings
@@ -125,10 +125,13 @@ class LoopCloser(SequenceRecognizer):
         self._append(features, stamp)
         self._track.append(odometry_xy)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)
-        verdict = self._decide(odometry_xy)
-        return self._confirmed(verdict, self._oldest(verdict), self.first + len(self) - 1)
+        match = self._match(odometry_xy)
+        return self._confirmed(match, self._oldest(match))
 
-    def _confirmed(self, verdict: Verdict, oldest: list[Match], image: int) -> Match:
+    def _first_image(self, images: int) -> int:
+        return self.first + len(self) - images
+
+    def _confirmed(self, match: Match, oldest: list[Match]) -> Match:
         """
         Return the match; mode robust: no match while its path is not confirmed.
 
@@ -137,48 +140,38 @@ class LoopCloser(SequenceRecognizer):
         the match that confirms them. A camera at rest confirms nothing.
 
         :param oldest: the match of the oldest image, or none.
-        :param image: number of the newest one.
         """
-        nearest = verdict.match.nearest
-        if verdict.status is not Status.MATCH or math.isnan(verdict.probability):
-            return self._built(verdict, image_index=image)
-        assert nearest is not None
-        if not self._continues(image, nearest.middle):
+        if not match.accepted or math.isnan(match.probability):
+            return match
+        if not self._continues(match.last_image, match.place):
             self._path.clear()
             self._waiting.clear()
-        self._last = image, nearest.middle
+        self._last = match.last_image, match.place
         self._waiting += oldest
         if not self._window.is_standstill:
-            self._path.append(verdict.probability)
+            self._path.append(match.probability)
         certain = sum(probability > CONFIRMED for probability in self._path)
         length = self._settings.sequence.length
         if certain < length // 2 and len(self._path) < 2 * length:
-            self._waiting.append(self._late(verdict, image))
-            verdict = verdict._replace(
+            self._waiting.append(self._late(match))
+            return replace(
+                match,
                 limits=Limits(0.0, 1.0),
                 status=Status.NO_MATCH,
                 reason='its path is not confirmed yet',
             )
-            return self._built(verdict, image_index=image)
         # places of the others have been evicted
-        late = tuple(each for each in self._waiting if each.path[:, 1].min() >= self.first)
+        late = tuple(each for each in self._waiting if each.path.pairs[:, 1].min() >= self.first)
         self._waiting.clear()
-        return self._built(verdict, image_index=image, late=late)
+        return replace(match, late=late)
 
-    def _late(self, verdict: Verdict, image: int, is_oldest: bool = False) -> Match:
-        """Build a match of the present window with all that is needed of it later."""
-        path = verdict.match.path[:, 1]
-        first = max(int(path.min()) - BAND, self.first)
-        end = min(int(path.max()) + BAND + 1, self.first + len(self))
+    def _late(self, match: Match) -> Match:
+        """Return a match of the present window with all that is needed of it later."""
+        places = match.path.pairs[:, 1]
+        first = max(int(places.min()) - BAND, self.first)
+        end = min(int(places.max()) + BAND + 1, self.first + len(self))
         columns = super().window_columns(np.arange(first, end))
-        return self._built(
-            verdict,
-            is_oldest,
-            image_index=image,
-            is_late=True,
-            first_column=first,
-            columns=columns,
-        )
+        return replace(match, columns=WindowColumns(first, columns))
 
     def _continues(self, image: int, place: int) -> bool:
         """Return whether a match continues the path of the last one."""
@@ -187,7 +180,7 @@ class LoopCloser(SequenceRecognizer):
         images, apart = image - self._last[0], abs(place - self._last[1])
         return images <= LONGEST_GAP and apart <= BAND * images
 
-    def _oldest(self, verdict: Verdict) -> list[Match]:
+    def _oldest(self, match: Match) -> list[Match]:
         """
         Return the match of the oldest image, if it had none as the middle one and is certain now.
 
@@ -195,18 +188,13 @@ class LoopCloser(SequenceRecognizer):
         """
         if not self._window.full:
             return []
-        match = self._window.match_oldest(
-            self._settings.nms_radius, verdict.status is Status.MATCH
-        )
-        if match.nearest is None:
-            return []
-        status, reason = self._limits.decide(match.nearest.distance, match.probability)
+        path = self._window.match_oldest(self._settings.nms_radius, match.accepted).path
+        status, reason = self._limits.decide(path.distance, path.probability)
         if status is not Status.MATCH:
             return []
-        oldest = Verdict(
-            match, self._limits, status, reason, match.nearest.distance, match.probability
-        )
-        return [self._late(oldest, self.first + len(self) - 1, is_oldest=True)]
+        return [
+            self._late(self._build(path, self._limits, status, reason, path.probability, True))
+        ]
 
     def newest_row(self) -> np.ndarray:
         """

@@ -1,18 +1,20 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The match of one image: its status, the nearest sequence of the map, the matched place."""
+"""The match of one image: its status, its path on the map, the matched place."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 import enum
+from functools import cached_property
 import math
 from typing import NamedTuple
 
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import aligned_index, NO_PATH, SequenceMatch
+from stavpr_ros.alignment.lm_dtw import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
+from stavpr_ros.former import FormerNames
 
-NO_SHARES, NO_COLUMNS = np.empty(0), np.empty((0, 0), np.float32)
+NO_SHARES: np.ndarray = np.empty(0)
 MIN_SHARE = 1e-9  # of a place of the path; ratios to it are finite
 
 
@@ -64,33 +66,54 @@ class WindowSequences(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class WindowMatch:
+class Path(FormerNames):
     """
-    The nearest sequence of a window, by the images alone, and all others.
+    The places that the images of a window show, by the images alone; indices are 0-based.
 
-    :param nearest: with the second best; None where no sequence is possible.
-    :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param probability: of the nearest sequence; NaN in mode paper.
+    It is the nearest sequence of the map, accepted or not. Without one, it has no pairs.
+
+    :param pairs: warping path, shape (m, 2), int32: position in the window, place.
+    :param place: of the image that is matched, the middle of the sequence; -1 = none.
+    :param distance: mode paper: q_m of LM-DTW, a mean image distance of this window alone; NaN
+        without a path. Mode robust: 1 - probability.
+    :param probability: that the place is right; NaN in mode paper.
     :param shares: probability of each place of the path and its neighbors, given the sequence,
         (m,); empty in mode paper.
-    :param sequences: returns all sequences; valid until the next match of the window.
-    :param images: number of the newest images that are matched; 0 = the whole window.
-    :param direction: 1 = along the map, -1 = against it.
+    :param second_best: place of the nearest sequence outside the nms_radius; -1 = none.
+    :param second_best_distance: its distance; NaN = none.
+    :param direction: 1 = the camera moves along the map, -1 = against it, as a path that falls.
     """
 
-    nearest: SequenceMatch | None = None
-    path: np.ndarray = field(default_factory=lambda: NO_PATH)
-    sequences: Callable[[], WindowSequences] = WindowSequences
+    pairs: np.ndarray = field(default_factory=lambda: NO_PATH)
+    place: int = -1
+    distance: float = math.nan
     probability: float = math.nan
     shares: np.ndarray = field(default_factory=lambda: NO_SHARES)
-    images: int = 0
+    second_best: int = -1
+    second_best_distance: float = math.nan
     direction: int = 1
 
-    def path_ratios(self, position: int) -> np.ndarray:
-        """Return the shares, divided by the share of the place at a position, (m,)."""
-        if not len(self.shares):
-            return NO_SHARES
-        return self.shares / max(self.shares[position], MIN_SHARE)
+    @property
+    def first(self) -> int:
+        """Return the first place; -1 = none."""
+        return int(self.pairs[0, 1]) if len(self.pairs) else -1
+
+    @property
+    def last(self) -> int:
+        """Return the last place; -1 = none."""
+        return int(self.pairs[-1, 1]) if len(self.pairs) else -1
+
+
+class WindowMatch(NamedTuple):
+    """
+    The nearest sequence of a window, and all others.
+
+    :param path: of the nearest one; empty where no sequence is possible.
+    :param sequences: returns all sequences; valid until the next match of the window.
+    """
+
+    path: Path = Path()
+    sequences: Callable[[], WindowSequences] = WindowSequences
 
 
 class Limits(NamedTuple):
@@ -128,60 +151,73 @@ class Limits(NamedTuple):
         return (Status.MATCH, '') if accepted else (Status.NO_MATCH, reason)
 
 
-@dataclass(frozen=True, eq=False)
-class Match:
+NO_LIMITS = Limits()
+
+
+class WindowColumns(NamedTuple):
     """
-    The match of one image; indices are 0-based places of the map.
+    Image distances of a window to successive places.
+
+    :param first: the first place.
+    :param distances: shape (l, k), float32.
+    """
+
+    first: int
+    distances: np.ndarray
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """
+        Return the distances to places, (l, k).
+
+        :param places: shape (k,), int64, successive ones.
+        :returns: +inf where they are not known.
+        """
+        columns = places - self.first
+        inside = (columns >= 0) & (columns < self.distances.shape[1])
+        rows: np.ndarray = np.full((len(self.distances), len(places)), np.inf, np.float32)
+        rows[:, inside] = self.distances[:, columns[inside]]
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Match(FormerNames):
+    """
+    The match of one image: what its window shows, and the decision; indices are 0-based places.
 
     :param status: only ``MATCH`` names a place.
-    :param reason: why there is no match, one sentence; empty for ``MATCH``.
-    :param threshold: a window is matched below this distance; mode robust: 1 - min_probability.
-        NaN = not set.
-    :param sequence: the nearest sequence of the map by the images alone, accepted or not; None =
-        there is none.
-    :param path: its warping path, shape (m, 2), int32: position in the window, place.
-    :param distance: of the nearest sequence, accepted or not; NaN without one. Mode paper: q_m of
-        LM-DTW, a mean image distance of this window alone. Mode robust: 1 - probability.
-    :param probability: that the nearest sequence is the right place; NaN in mode paper. It has
-        memory: successive values are correlated.
-    :param min_probability: mode robust: a window is matched above this probability.
-    :param path_ratios: probability of each place of the path over the matched place's, (m,);
-        empty in mode paper.
-    :param is_late: it is one of the late matches of another.
-    :param late: loop closure: matches of earlier images that had none until now.
+    :param reason: why there is no match, one sentence; empty for ``MATCH`` and ``MAPPED``.
+    :param limits: that were applied.
+    :param path: by the images alone, accepted or not.
+    :param probability: that the place is right, by odometry and the geometric check as well; NaN
+        in mode paper. It has memory: successive values are correlated.
+    :param inliers: of the geometric check, -1 = not checked.
     :param window_stamps: stamps (ns) of the images in the window, oldest first, this one the last.
     :param window_changes: difference of each of them from the image before it, 0 = equal; empty in
         mode paper.
-    :param image_index: place of a growing map that this image has become, -1 = none.
+    :param first_image: place of the window's first image on a route that grows with every image,
+        -1 = none.
     :param is_oldest: it is the place of the oldest image of the window, not of the middle one.
-    :param direction: 1 = the camera moves along the map, -1 = against it, as a path that falls.
-    :param columns: of a late match: image distances of its window to places from ``first_column``
-        on, (l, k), float32.
+    :param columns: of a late match: image distances of its window to the places around the path.
+    :param late: loop closure: matches of earlier images that had none until now.
     """
 
     status: Status
     reason: str = ''
-    threshold: float = math.nan
-    sequence: SequenceMatch | None = None
-    path: np.ndarray = field(default_factory=lambda: NO_PATH)
-    distance: float = math.nan
+    limits: Limits = NO_LIMITS
+    path: Path = Path()
     probability: float = math.nan
-    min_probability: float = math.nan
-    path_ratios: np.ndarray = field(default_factory=lambda: NO_SHARES)
-    is_late: bool = False
-    late: 'tuple[Match, ...]' = ()
+    inliers: int = -1
     window_stamps: tuple[int, ...] = ()
     window_changes: tuple[float, ...] = ()
-    image_index: int = -1
+    first_image: int = -1
     is_oldest: bool = False
-    direction: int = 1
-    first_column: int = 0
-    columns: np.ndarray = field(default_factory=lambda: NO_COLUMNS)
+    columns: WindowColumns | None = None
+    late: 'tuple[Match, ...]' = ()
 
     def __repr__(self) -> str:
         fields = [self.status.name]
         if self.accepted:
-            fields += [f'place_index={self.place_index}', f'newest_index={self.newest_index}']
+            fields += [f'place={self.place}', f'newest={self.newest}']
         for name in ('probability', 'distance'):
             if not math.isnan(getattr(self, name)):
                 fields.append(f'{name}={getattr(self, name):.4g}')
@@ -193,9 +229,35 @@ class Match:
         return self.status is Status.MATCH
 
     @property
-    def place_index(self) -> int:
-        """Return the matched place, the middle of the matched sequence; -1 unless matched."""
-        return self.sequence.middle if self.sequence and self.accepted else -1
+    def is_late(self) -> bool:
+        """Whether it is one of the late matches of another."""
+        return self.columns is not None
+
+    @property
+    def place(self) -> int:
+        """Return the matched place, of the image at ``position``; -1 unless matched."""
+        return self.path.place if self.accepted else -1
+
+    @cached_property
+    def newest(self) -> int:
+        """Return the place aligned with the newest image; -1 unless matched."""
+        pairs = self.path.pairs
+        return aligned_index(pairs, int(pairs[-1, 0])) if self.accepted else -1
+
+    @property
+    def distance(self) -> float:
+        """Mode robust: 1 - probability; mode paper: of the path. NaN without a path."""
+        return self.path.distance if math.isnan(self.probability) else 1 - self.probability
+
+    @property
+    def threshold(self) -> float:
+        """Distance below which a window is matched, mode robust: 1 - probability; NaN = none."""
+        return self.limits.threshold
+
+    @property
+    def last_image(self) -> int:
+        """Place of the newest image on a route that grows with every image, -1 = none."""
+        return self.first_image + len(self.window_stamps) - 1 if self.first_image >= 0 else -1
 
     @property
     def position(self) -> int:
@@ -203,53 +265,19 @@ class Match:
         return 0 if self.is_oldest else (len(self.window_stamps) - 1) // 2
 
     @property
-    def newest_index(self) -> int:
-        """Return the place aligned with the newest image; -1 unless matched."""
-        return aligned_index(self.path, int(self.path[-1, 0])) if self.accepted else -1
-
-    @property
     def path_probabilities(self) -> np.ndarray:
         """Return the probability of each place of the path, (m,); empty in mode paper."""
-        return np.minimum(self.probability * self.path_ratios, 1)
+        shares = self.path.shares
+        if not len(shares):
+            return NO_SHARES
+        return np.minimum(self.probability * (shares / max(shares[self.position], MIN_SHARE)), 1)
 
-    def columns_of(self, places: np.ndarray) -> np.ndarray:
-        """
-        Return the image distances of the window of a late match, (l, k).
-
-        :param places: shape (k,), int64, successive ones.
-        :returns: +inf where they are not known.
-        """
-        columns = places - self.first_column
-        inside = (columns >= 0) & (columns < self.columns.shape[1])
-        rows: np.ndarray = np.full((len(self.columns), len(places)), np.inf, np.float32)
-        rows[:, inside] = self.columns[:, columns[inside]]
-        return rows
-
-    def at(self, position: int) -> 'Match':
-        """Return this as the match of another image of the window, with its probability."""
-        if not len(self.path_ratios) or self.sequence is None:
-            return self
-        return self.with_probability(float(self.path_probabilities[position]))
-
-    @property
-    def score(self) -> float:
-        """Return the distance; +inf without a sequence, or with a probability of 0."""
-        impossible = self.distance >= 1 and not math.isnan(self.probability)
-        return math.inf if self.sequence is None or impossible else self.distance
-
-    def with_probability(self, probability: float) -> 'Match':
+    def with_probability(self, probability: float, inliers: int = -1) -> 'Match':
         """Return the match of mode robust with another probability, accepted or not by it."""
-        distance = 1 - probability
-        limits = Limits(self.threshold, self.min_probability)
-        status, reason = limits.decide(distance, probability)
+        status, reason = self.limits.decide(1 - probability, probability)
         return replace(
-            self, status=status, reason=reason, distance=distance, probability=probability
+            self, status=status, reason=reason, probability=probability, inliers=inliers
         )
-
-    @property
-    def first_image_index(self) -> int:
-        """Place of the window's first image on a route that grows with every image, -1 = none."""
-        return self.image_index - len(self.window_stamps) + 1 if self.image_index >= 0 else -1
 
 
 def ranked_candidates(

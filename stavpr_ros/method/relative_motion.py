@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from stavpr_ros.method.match import WindowMatch
+from stavpr_ros.method.match import Path
 from stavpr_ros.method.model import ALONG, FARTHEST, LONGEST, UNUSUAL
 
 TURNS = 2  # degrees of freedom of the trajectory's shape; its length has one
@@ -20,6 +20,7 @@ MIN_IMAGES = 3
 MIN_DOUBT = 1e-9  # no probability is 1
 NO_PLACE = -FARTHEST - 1  # no match goes on from it
 Positions = Sequence[np.ndarray] | np.ndarray
+Run = tuple[int, int, int, int]
 
 
 class RelativeMotion:
@@ -52,38 +53,35 @@ class RelativeMotion:
 
     def agreement(
         self,
-        match: WindowMatch,
-        position: int,
+        path: Path,
         accepted: bool,
         first: int,
         session: tuple[int, int],
-    ) -> tuple[float, tuple[int, int, int, int]]:
+    ) -> tuple[float, Run]:
         """
-        Return the p-value of the trajectory, given the path of a match with a sequence.
+        Return the p-value of the trajectory, given the path of a match.
 
         Also ``run`` with this match, for the owner to keep: an image may have several.
 
         The last position of the trajectory, of the match's newest image, is known.
 
-        :param position: of the matched image in the path.
         :param accepted: by the images alone.
         :param first: first place that is not evicted.
         :param session: first place of the match's session, and the first one behind it.
         """
-        assert match.nearest is not None
-        place, newest = match.nearest.middle, int(match.path[-1, 1])
-        length, agreed = len(match.path), 1.0
+        place, newest = path.place, path.last
+        length, agreed = len(path.pairs), 1.0
         since, *last = self.run
-        after = length - 1 - position
+        after = length - 1 - (length - 1) // 2  # images after the middle one
         step = place - last[0] if after == last[1] else newest - last[2]
-        follows = accepted and 0 <= match.direction * step <= FARTHEST
+        follows = accepted and 0 <= path.direction * step <= FARTHEST
         run = since + 1 if follows else length, place, after, newest if accepted else NO_PLACE
         reach = FARTHEST * len(self.trajectory) + 1  # places to either side of the trajectory
         low = max(first, session[0], place - reach)
         high = min(first + len(self.positions), session[1], place + reach)
         track = np.array(self.positions[low - first : high - first])
         ends = place - low, newest - low
-        if match.direction < 0:
+        if path.direction < 0:
             track, ends = track[::-1], (high - 1 - place, high - 1 - newest)
         trajectory = np.array(self.trajectory)
         if ends[1] < ends[0]:  # over the seam of a closed route, where the poses have the drift

@@ -5,7 +5,6 @@
 from dataclasses import replace
 
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
@@ -56,7 +55,8 @@ def in_places(
 
     :param nms_radius: of the second best; None = the one of the match is at another position.
     """
-    if layout.columns is None or match.nearest is None:
+    path = match.path
+    if layout.columns is None or path.place < 0:
         return match
 
     def sequences() -> WindowSequences:
@@ -66,21 +66,24 @@ def in_places(
             probabilities = probabilities[possible]
         return WindowSequences(costs[possible], layout.names_of(columns[possible]), probabilities)
 
-    nearest = match.nearest
-    columns = np.array([nearest.first, nearest.last, nearest.middle, nearest.second_best_index])
-    first, last, middle, second = layout.names_of(columns).tolist()
-    second = second if nearest.second_best_index >= 0 else -1
-    distance = nearest.second_best_distance
+    place, second = layout.names_of(np.array([path.place, path.second_best])).tolist()
+    second, distance = second if path.second_best >= 0 else -1, path.second_best_distance
     if nms_radius is not None:
-        best = Candidate(middle, nearest.distance)
+        best = Candidate(place, path.distance)
         others = ranked_candidates(best, sequences(), 2, nms_radius, layout.positions)[1:]
         second = others[0].place if others else -1
         distance = others[0].distance if others else float('nan')
-    nearest = SequenceMatch(first, last, middle, nearest.distance, second, distance)
-    path = match.path.copy()
-    path[:, 1] = layout.names_of(path[:, 1])
-    direction = layout.direction_of(match.nearest.middle)
-    return replace(match, nearest=nearest, path=path, sequences=sequences, direction=direction)
+    pairs = path.pairs.copy()
+    pairs[:, 1] = layout.names_of(pairs[:, 1])
+    in_places = replace(
+        path,
+        pairs=pairs,
+        place=place,
+        second_best=second,
+        second_best_distance=distance,
+        direction=layout.direction_of(path.place),
+    )
+    return WindowMatch(in_places, sequences)
 
 
 def time_note(place_map: PlaceMap) -> str:

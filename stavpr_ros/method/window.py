@@ -3,19 +3,17 @@
 """The window of mode robust: what the latest images show, by filter, paths and evidence."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.evidence import probability_of, Quantities, RecentWindows, unevenness
 from stavpr_ros.method.filter import Filter, NEGLIGIBLE, PlaceFilter, SPACING
-from stavpr_ros.method.match import WindowMatch, WindowSequences
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.model import APART, CLOSE, MODEL, Model, ON_MAP, ROUTE_IMAGES, STRAIGHT
 from stavpr_ros.method.motion import ImageChange
 from stavpr_ros.method.path import centered_place, close_sums, follow
@@ -208,7 +206,7 @@ class FilterWindow(QueryWindow):
         shown, numbers = self._show(since), self.images['number']
         images = self.images[numbers > numbers[-1] - since]
         middle = int(images['number'][(len(images) - 1) // 2])
-        return replace(self._match(shown, images, middle, nms_radius), images=len(images))
+        return self._match(shown, images, middle, nms_radius)
 
     def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
@@ -284,18 +282,19 @@ class FilterWindow(QueryWindow):
         share = certain / peak if peak > certain else 1.0  # no place is above the match
         second, probability = self._second_best(shown, place, nms_radius)
         probability *= share
-        path = np.empty((len(images), 2), np.int32)
-        path[:, 0], path[:, 1] = np.arange(len(images)), columns + first
-        match = SequenceMatch(
-            first=int(path[0, 1]),
-            last=int(path[-1, 1]),
-            middle=place + first,
-            distance=1 - certain,
-            second_best_index=second + first if probability > 0 else -1,
-            second_best_distance=1 - probability if probability > 0 else float('nan'),
+        pairs = np.empty((len(images), 2), np.int32)
+        pairs[:, 0], pairs[:, 1] = np.arange(len(images)), columns + first
+        path = Path(
+            pairs,
+            place + first,
+            1 - certain,
+            certain,
+            shares,
+            second + first if probability > 0 else -1,
+            1 - probability if probability > 0 else float('nan'),
         )
         sequences = partial(self._sequences, shown, share, self.known, first)
-        return in_places(WindowMatch(match, path, sequences, certain, shares), self.layout)
+        return in_places(WindowMatch(path, sequences), self.layout)
 
     def _second_best(self, shown: Shown, place: int, radius: int) -> tuple[int, float]:
         """Return the most probable column elsewhere, and its probability, 0 if none."""

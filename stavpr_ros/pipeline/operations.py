@@ -4,6 +4,7 @@
 
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 import math
 import os
@@ -20,9 +21,10 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import image_change, KeyframeSelector, small_gray
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.mapping.trajectory import checked_pose
-from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
+from stavpr_ros.method import Candidate, Match, PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.localizer import SequenceRecognizer
 from stavpr_ros.method.loop_closer import LoopCloser
+from stavpr_ros.method.match import Limits
 from stavpr_ros.pipeline.result import GeometricCheck, ImageResult
 from stavpr_ros.pipeline.save_state import SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
@@ -115,8 +117,12 @@ class Operation(ABC):
         """Make the places and their recognizer: all that may fail or takes long."""
 
     @abstractmethod
-    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
-        """Match the window that ends with an image, or make the image a place, or both."""
+    def _update(self, features: LocalFeatures, row: WindowRow) -> tuple[Match, int]:
+        """
+        Match the window that ends with an image, or make the image a place, or both.
+
+        :returns: the match, and the place that the image has become, -1 = none.
+        """
 
     @property
     def matched_places(self) -> PlaceMap | GrowingMap | None:
@@ -205,6 +211,7 @@ class Operation(ABC):
         pose: np.ndarray | None = None,
         camera: Camera | None = None,
         list_candidates: bool = True,
+        yaw: Callable[[], float] | None = None,
     ) -> ImageResult:
         """
         Process one image message, raw or compressed. An invalid image changes nothing.
@@ -213,28 +220,95 @@ class Operation(ABC):
         :param pose: of the camera, from odometry, shape (7,), or None.
         :param camera: None = unknown: in localization, no thumbnail is kept for an edge.
         :param list_candidates: the result has its candidates.
+        :param yaw: returns the yaw of the camera in the base of the robot, radians to the left;
+            None = unknown. Called only where the map states the mounting of its own camera.
         :raises InputError: an invalid pose; nothing is changed then.
         """
-        threshold = math.nan if self.threshold is None else self.threshold
         pose = None if pose is None else checked_pose(pose)
         if self.missing:
-            return ImageResult(Status.NOT_READY, self.missing, threshold, 'not ready')
+            return self.unmatched(Status.NOT_READY, self.missing, 'not ready')
         if reason := self._keyframes.too_soon(stamp, pose):
             blind = pose is None and self.settings.keyframes.needs_poses
-            cause = 'no odometry' if blind else NOT_A_KEYFRAME
-            return ImageResult(Status.SKIPPED, reason, threshold, cause)
+            return self.unmatched(
+                Status.SKIPPED, reason, 'no odometry' if blind else NOT_A_KEYFRAME
+            )
         stages: dict[str, float] = {}
         try:
-            result = self._process(stages, message, WindowRow(stamp, pose), camera)
+            with _Timed(stages, 'decoding'):
+                image = self._decode(message, camera)
+                if refusal := self._refusal(image):
+                    return self.unmatched(*refusal, image=image, stages=stages)
+            match, index = self._process(stages, image, WindowRow(stamp, pose), camera)
         except StavprError as error:
             kind = error.kind if isinstance(error, ImageError) else type(error).__name__
-            result = ImageResult(Status.INVALID_IMAGE, str(error), cause=f'invalid: {kind}')
-        if list_candidates and self.recognizer is not None and result.nearest_index >= 0:
-            result = result.with_candidates(self.recognizer.ranked(self.settings.candidates))
-            result = replace(result, session_probabilities=self._session_probabilities())
-        if math.isnan(result.threshold):  # none has applied
-            result = replace(result, threshold=threshold)
-        return result if result.stages is stages else replace(result, stages=stages)
+            cause = f'invalid: {kind}'
+            return self.unmatched(Status.INVALID_IMAGE, str(error), cause, stages=stages)
+        lists = list_candidates and match.path.place >= 0
+        self._last = ImageResult(
+            match,
+            '',
+            index,
+            self._candidates(match, self.settings.candidates) if lists else (),
+            self._session_probabilities() if lists else (),
+            self._relative_yaw(match, yaw),
+            image,
+            stages,
+        )
+        return self._last
+
+    def unmatched(
+        self, status: Status, reason: str, cause: str = '', **others: Any
+    ) -> ImageResult:
+        """Return the result of an image that is in no window; cause: see :class:`ImageResult`."""
+        threshold = math.nan if self.threshold is None else self.threshold
+        return ImageResult(Match(status, reason, Limits(threshold)), cause, **others)
+
+    def _decode(self, message: Any, camera: Camera | None) -> np.ndarray:
+        """Return the image of a message, RGB, as small as it may be."""
+        assert self.extractor is not None
+        size = self.extractor.needed_size(self._thumbnail_width(camera))
+        self._image = decode_message(message, size, self._to_bytes)
+        return self._image
+
+    def _refusal(self, image: np.ndarray) -> tuple[Status, str, str] | None:
+        """Return status, reason and cause where an image is not for the window, else None."""
+        assert self.extractor is not None
+        if self.extractor.is_new and (reason := self._find_range()):
+            return Status.NOT_READY, reason, 'not ready'
+        if reason := self._keyframes.too_alike(image):
+            return Status.SKIPPED, reason, NOT_A_KEYFRAME
+        if self.map_state == 'full':
+            reason = f'the map is full: parameter max_places = {self.settings.max_places}'
+            return Status.NOT_READY, reason, 'map full'
+        return None
+
+    def _process(
+        self, stages: dict[str, float], image: np.ndarray, row: WindowRow, camera: Camera | None
+    ) -> tuple[Match, int]:
+        """Add an image to the window; return its match, and the place that it has become."""
+        assert self.extractor is not None
+        width = self._thumbnail_width(camera)
+        with _Timed(stages, 'extraction'):
+            features = self.extractor.extract([image])
+        with _Timed(stages, 'matching'):
+            row = row._replace(thumbnail=thumbnail_of(image, width) if width else None)
+            match, index = self._update(features, row)
+        self._window.append(row)
+        self._keyframes.accept(row.stamp, row.pose, image)
+        if isinstance(self.places, GrowingMap):
+            self.places.camera = self.places.camera or camera
+            self.save_state.record(self.places, features)
+        if self.recognizer is not None:
+            with _Timed(stages, 'verification'):
+                match = self._checked(match, index)
+        return match, index
+
+    def _candidates(self, match: Match, count: int) -> tuple[Candidate, ...]:
+        """Return the nearest places; the first one is the match's, with its probability."""
+        assert self.recognizer is not None
+        ranked = self.recognizer.ranked(count)
+        own = [Candidate(each.place, match.distance, match.probability) for each in ranked[:1]]
+        return *own, *ranked[1:]
 
     def _session_probabilities(self) -> tuple[float, ...]:
         """Return the probability of each session of the map, by the newest image."""
@@ -247,36 +321,15 @@ class Operation(ABC):
         sums = np.bincount(places.session_index, by_place, len(places.sessions))
         return tuple(sums.tolist())
 
-    def _process(
-        self, stages: dict[str, float], message: Any, row: WindowRow, camera: Camera | None
-    ) -> ImageResult:
-        assert self.extractor is not None
-        width = self._thumbnail_width(camera)
-        with _Timed(stages, 'decoding'):
-            image = decode_message(message, self.extractor.needed_size(width), self._to_bytes)
-            self._image = image
-            if self.extractor.is_new and (reason := self._find_range()):
-                return ImageResult(Status.NOT_READY, reason, image=image, cause='not ready')
-            if reason := self._keyframes.too_alike(image):
-                return ImageResult(Status.SKIPPED, reason, image=image, cause=NOT_A_KEYFRAME)
-        if self.map_state == 'full':
-            reason = f'the map is full: parameter max_places = {self.settings.max_places}'
-            return ImageResult(Status.NOT_READY, reason, image=image, cause='map full')
-        with _Timed(stages, 'extraction'):
-            features = self.extractor.extract([image])
-        with _Timed(stages, 'matching'):
-            row = row._replace(thumbnail=thumbnail_of(image, width) if width else None)
-            result = replace(self._update(features, row), image=image, stages=stages)
-        self._window.append(row)
-        self._keyframes.accept(row.stamp, row.pose, image)
-        if isinstance(self.places, GrowingMap):
-            self.places.camera = self.places.camera or camera
-            self.save_state.record(self.places, features)
-        if result.match is not None:
-            with _Timed(stages, 'verification'):
-                result = self._checked(result)
-            self._last = result
-        return result
+    def _relative_yaw(self, match: Match, yaw: Callable[[], float] | None) -> float:
+        """Return the yaw by the mountings, where the map states the mounting of its camera."""
+        places = self.matched_places
+        if yaw is None or not (match.accepted and isinstance(places, PlaceMap)):
+            return 0.0
+        session = places.session(match.place)
+        if session is None or session.yaw is None:
+            return 0.0
+        return math.remainder(session.yaw - yaw(), 2 * math.pi)
 
     def _find_range(self) -> str:
         """Find the range of 16 bits by the first images of a new map; return why it lacks one."""
@@ -291,22 +344,25 @@ class Operation(ABC):
                 self._start(None)  # with these settings
         return f'images of 16 bits, {images} of {RANGE_IMAGES} for their range' if images else ''
 
-    def _checked(self, result: ImageResult) -> ImageResult:
-        """Return a result, and its late ones that are matches, after the geometric check."""
-        check, places, late = self._check, self.matched_places, result.late
-        if check is not None and places is not None:
-            is_weighed = self.reference is not None and not math.isnan(result.probability)
-            late = tuple(check.checked(each, places, self._query(each), False) for each in late)
-            result = check.checked(result, places, self._query(result), is_weighed)
-        late = tuple(each for each in late if each.accepted)
-        return replace(result, late=late) if result.late else result
+    def _checked(self, match: Match, index: int) -> Match:
+        """
+        Return a match, and its late ones that are matches, after the geometric check.
 
-    def _query(self, result: ImageResult) -> np.ndarray | None:
+        :param index: place that the image has become, -1 = none.
+        """
+        check, places = self._check, self.matched_places
+        if check is None or places is None:
+            return match
+        is_weighed = self.reference is not None and not math.isnan(match.probability)
+        late = [check.checked(each, places, self._query(each), False) for each in match.late]
+        match = check.checked(match, places, self._query(match), is_weighed)
+        return replace(match, late=tuple(each for each in late if each.accepted))
+
+    def _query(self, match: Match) -> np.ndarray | None:
         """Return the thumbnail of the image that a match is of; None = unknown."""
-        match, places = result.match, self.places
-        assert match is not None
+        places = self.places
         if match.is_late and isinstance(places, GrowingMap):
-            return places.thumbnail(match.first_image_index + match.position)
+            return places.thumbnail(match.first_image + match.position)
         return self._window[match.position - len(match.window_stamps)].thumbnail
 
     def _thumbnail_width(self, camera: Camera | None) -> int:
@@ -324,42 +380,43 @@ class Operation(ABC):
         """
         if self.missing:
             raise InputError(self.missing)
-        recognizer, last = self.recognizer, self._last
-        if recognizer is None:
+        if self.recognizer is None:
             raise InputError(
                 f'operation {self.name} recognizes no places: set_operation localization first'
             )
-        if last is None or last.match is None or last.match.status is Status.WARMING_UP:
-            length = self.settings.sequence.length
+        last, length = self._last, self.settings.sequence.length
+        if last is None or (last.match.path.place < 0 and self.window_fill < length):
             raise InputError(f'{self.window_fill} of {length} images in the window')
-        return last.with_candidates(recognizer.ranked(count))
+        candidates = self._candidates(last.match, count)
+        return ImageResult(last.match, candidates=candidates, relative_yaw=last.relative_yaw)
 
-    def matched_pair(self, result: ImageResult, relative_pose: str = 'auto') -> MatchedPair | None:
+    def matched_pair(
+        self, match: Match, relative_pose: str = 'auto', relative_yaw: float = 0.0
+    ) -> MatchedPair | None:
         """
         Return the pair of the newest match, or of one of its late ones, for its edge.
 
         :param relative_pose: the parameter of this name.
+        :param relative_yaw: see :class:`ImageResult`.
         :returns: None without a match, or where the place of a map can have no edge.
         """
-        match, places, recognizer = result.match, self.matched_places, self.recognizer
-        if not result.accepted or match is None or places is None or recognizer is None:
+        places, recognizer = self.matched_places, self.recognizer
+        if not match.accepted or places is None or recognizer is None:
             return None
-        place = result.place_index
         if isinstance(places, PlaceMap) and (
-            relative_pose == 'none' or places.place(place).pose is None
+            relative_pose == 'none' or places.place(match.place).pose is None
         ):
             return None
         count, distances = len(match.window_stamps), None
         if relative_pose in ('auto', 'aligned'):
             columns = recognizer.window_columns
-            distances = match.columns_of if match.is_late else lambda k: columns(k)[-count:]
+            distances = match.columns.at if match.columns else lambda k: columns(k)[-count:]
         if match.is_late and isinstance(places, GrowingMap):
-            poses = places.poses[match.first_image_index - places.first + np.arange(count)]
+            poses = places.poses[match.first_image - places.first + np.arange(count)]
         else:
             rows, unknown = list(self._window)[-count:], np.full(7, np.nan)
             poses = np.array([unknown if row.pose is None else row.pose for row in rows])
-        query, yaw = self._query(result), result.relative_yaw
-        return matched_pair(match, place, places, query, poses, distances, yaw)
+        return matched_pair(match, places, self._query(match), poses, distances, relative_yaw)
 
 
 class Localizer(Operation):
@@ -379,13 +436,13 @@ class Localizer(Operation):
             self._begin_drive()
         self.recognizer = _map_recognizer(settings, self.name, place_map, self.extractor)
 
-    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+    def _update(self, features: LocalFeatures, row: WindowRow) -> tuple[Match, int]:
         assert self.recognizer is not None
         jpeg = row.jpeg if self.drives else b''
-        result = ImageResult.of_match(self.recognizer.update(features, row.stamp, row.pose))
+        match = self.recognizer.update(features, row.stamp, row.pose)
         if self.drives and sum(map(len, self.drives)) < self.settings.max_places:
             self.drives[-1].add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
-        return result
+        return match, -1
 
     def _thumbnail_width(self, camera: Camera | None) -> int:
         return (
@@ -438,34 +495,31 @@ class Mapper(Operation):
         """Return why no image can be recorded; without a threshold, none is matched."""
         return ''
 
-    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+    def _update(self, features: LocalFeatures, row: WindowRow) -> tuple[Match, int]:
         jpeg, recognizer = row.jpeg, self.recognizer  # first, since it may fail
         if recognizer is None:
-            index = self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
-            return ImageResult(Status.MAPPED, image_index=index)
-        result = ImageResult.of_match(recognizer.update(features, row.stamp, row.pose))
-        index = self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
-        return replace(result, image_index=index)
+            match = self.unmatched(Status.MAPPED, '').match
+        else:
+            match = recognizer.update(features, row.stamp, row.pose)
+        return match, self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
 
-    def _checked(self, result: ImageResult) -> ImageResult:
-        """Return a result after the geometric check; without a match, it is of a place only."""
-        result = super()._checked(result)
-        if not result.accepted:
-            return replace(result, status=Status.MAPPED, reason='')
-        self._relate(result)
-        return result
+    def _checked(self, match: Match, index: int) -> Match:
+        """Return a match after the geometric check; without one, it is of a place only."""
+        match = super()._checked(match, index)
+        if not match.accepted:
+            return replace(match, status=Status.MAPPED, reason='')
+        self._relate(match, index)
+        return match
 
-    def _relate(self, result: ImageResult) -> None:
+    def _relate(self, match: Match, index: int) -> None:
         """Relate the images of a full window that is certain to the places that they show."""
-        match = result.match
-        assert match is not None
         count = len(match.window_stamps)
-        if count < self.settings.sequence.length or not result.probability > SURE:
+        if count < self.settings.sequence.length or not match.probability > SURE:
             return
-        first = result.image_index - count + 1
-        for image, place in match.path.tolist():
+        first = index - count + 1
+        for image, place in match.path.pairs.tolist():
             self.places.relate(first + image, place, replaces=image >= match.position)
-        self.places.relate(first + match.position, result.place_index)
+        self.places.relate(first + match.position, match.place)
 
 
 class RouteCloser(Operation):
@@ -490,12 +544,11 @@ class RouteCloser(Operation):
             held_features=self._closer.features,
         )
 
-    def _update(self, features: LocalFeatures, row: WindowRow) -> ImageResult:
+    def _update(self, features: LocalFeatures, row: WindowRow) -> tuple[Match, int]:
         jpeg = row.jpeg  # first, since it may fail: recognizer and route stay in step
-        result = ImageResult.of_match(self._closer.update(features, row.stamp, row.pose))
+        match = self._closer.update(features, row.stamp, row.pose)
         self.places.forget(self._closer.first - self.places.first)  # it evicts the oldest places
-        self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
-        return result
+        return match, self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
 
 
 CLASSES = {each.name: each for each in (Localizer, Mapper, RouteCloser)}

@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.method import Match
 from stavpr_ros.pipeline.result import ImageResult
 
 RIGHT, NO_MATCH = (46, 125, 80), (200, 150, 40)  # RGB
@@ -22,22 +23,23 @@ def draw_match(result: ImageResult, places: PlaceMap | GrowingMap | None) -> np.
     :returns: RGB, uint8.
     """
     assert result.image is not None
-    place = result.newest_index if result.accepted else result.nearest_index
+    match = result.match
+    place = match.newest if match.accepted else match.path.place
     if place < 0 or places is None:
         return match_image(
-            result.image, None, f'{result.status.label} {result.reason}'.strip(), False
+            result.image, None, f'{match.status.label} {match.reason}'.strip(), False
         )
-    text = f'{result.status.label}: place {place}, '
-    if not math.isnan(result.probability):
-        text += f'p {result.probability:.2f}'
+    text = f'{match.status.label}: place {place}, '
+    if not math.isnan(match.probability):
+        text += f'p {match.probability:.2f}'
     else:
-        text += f'distance {result.distance:.3f}'
-        if not math.isnan(result.threshold):
-            text += f' (threshold {result.threshold:.3f})'
-    if result.inliers >= 0:
-        text += f', {result.inliers} inliers'
+        text += f'distance {match.distance:.3f}'
+        if not math.isnan(match.threshold):
+            text += f' (threshold {match.threshold:.3f})'
+    if match.inliers >= 0:
+        text += f', {match.inliers} inliers'
     return match_image(
-        result.image, places.thumbnail(place), text, result.accepted, f'map place {place}'
+        result.image, places.thumbnail(place), text, match.accepted, f'map place {place}'
     )
 
 
@@ -78,14 +80,14 @@ def match_image(
     return sheet
 
 
-def places_to_draw(result: ImageResult, first: int, count: int) -> np.ndarray:
+def places_to_draw(match: Match, first: int, count: int) -> np.ndarray:
     """Return the places from ``first`` on that are around the nearest sequence, (k,)."""
-    middle = result.nearest_index if result.nearest_index >= 0 else first
+    middle = match.path.place if match.path.place >= 0 else first
     start = min(max(first, middle - NEARBY), max(first, first + count - 2 * NEARBY))
     return np.arange(start, min(start + 2 * NEARBY, first + count))
 
 
-def draw_window(rows: np.ndarray, first: int, result: ImageResult) -> np.ndarray:
+def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
     """
     Draw the distances of a window, one row per image, and the warping path over them.
 
@@ -104,17 +106,17 @@ def draw_window(rows: np.ndarray, first: int, result: ImageResult) -> np.ndarray
     gray = np.nan_to_num((finite - low) / max(high - low, 1e-9), nan=1.0) * 255
     sheet = cv2.applyColorMap(gray.astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
     sheet = np.ascontiguousarray(np.repeat(np.repeat(sheet, down, axis=0), across, axis=1))
-    if result.match is not None and len(result.match.path):
+    if len(match.path.pairs):
         points = [
             ((place - first) * across + across // 2, image * down + down // 2)
-            for image, place in result.match.path.tolist()
+            for image, place in match.path.pairs.tolist()
         ]
-        ink = (255, 255, 255) if result.accepted else NO_MATCH
+        ink = (255, 255, 255) if match.accepted else NO_MATCH
         cv2.polylines(sheet, [np.array(points, np.int32)], False, ink, 2, cv2.LINE_AA)
     bar = np.full((24, sheet.shape[1], 3), _PAPER, np.uint8)
     text = f'images of the window (newest below) x places {first} to {first + width - 1}'
-    if result.nearest_index >= 0 and not math.isnan(result.probability):
-        text += f'; place {result.nearest_index}, p {result.probability:.2f}'
+    if match.path.place >= 0 and not math.isnan(match.probability):
+        text += f'; place {match.path.place}, p {match.probability:.2f}'
     _write(bar, text, 11)
     return np.vstack([sheet, bar])
 

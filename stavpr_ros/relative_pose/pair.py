@@ -110,7 +110,6 @@ class MatchedPair:
 
 def matched_pair(
     match: Match,
-    place: int,
     places: PlaceMap | GrowingMap,
     query: np.ndarray | None,
     query_poses: np.ndarray,
@@ -120,13 +119,13 @@ def matched_pair(
     """
     Copy what the edge of a match needs.
 
-    :param place: that it is of.
     :param query, query_poses, relative_yaw: see :class:`MatchedPair`.
     :param distances_to: returns the distances of the window to places (k,), shape (l, k), +inf =
         not compared; None = not needed. Called only where the pair has both poses.
     """
     start = places.first if isinstance(places, GrowingMap) else 0
-    low, high = int(match.path[:, 1].min()), int(match.path[:, 1].max())
+    place, on_path = match.place, match.path.pairs[:, 1]
+    low, high = int(on_path.min()), int(on_path.max())
     low = max(start, min(low, place) - TRIANGULATION_RADIUS)
     high = min(start + len(places), max(high, place) + TRIANGULATION_RADIUS + 1)
     session = places.place(place).session  # its neighbors in another one were taken elsewhere
@@ -146,7 +145,7 @@ def matched_pair(
             thumbnails[index] = _thumbnail(places, index - start)
     return MatchedPair(
         places, place, query, query_poses, match.position, distances, low, poses, thumbnails,
-        match.direction, relative_yaw,
+        match.path.direction, relative_yaw,
     )  # fmt: skip
 
 

@@ -85,24 +85,27 @@ class EdgePublisher:
         """
         places, edge = operation.matched_places, None
         closures: list[WaitingClosure] = []
-        if not result.accepted:
+        own = result.match
+        if not own.accepted:
             return edge, closures
         # a route has the camera of the query
         place_camera = camera
         if isinstance(places, PlaceMap):  # there, no match is late
-            place_camera = places.camera_of(result.place_index)
-        for each in (result, *result.late):
-            pair = operation.matched_pair(each, self._estimator.method)
-            if each is result:
+            place_camera = places.camera_of(own.place)
+        for match in (own, *own.late):
+            yaw = result.relative_yaw  # of a map, where no match is late
+            pair = operation.matched_pair(match, self._estimator.method, yaw)
+            if match is own:
                 edge = self._immediate(pair, camera, place_camera)
-            if pair is None or each.match is None:
+            if pair is None:
                 continue
             pose = None if np.isnan(pair.query_pose).any() else pair.query_pose
-            if each.match.is_late:  # its window may be an earlier one
-                header = Header(
-                    frame_id=header.frame_id, stamp=time_message(each.match.window_stamps[-1])
-                )
-            message = loop_closure_message(header, each, pair.source, self._robot_id, frames, pose)
+            if match.is_late:  # its window may be an earlier one
+                stamp = time_message(match.window_stamps[-1])
+                header = Header(frame_id=header.frame_id, stamp=stamp)
+            message = loop_closure_message(
+                header, match, pair.source, self._robot_id, frames, pose
+            )
             if message is not None:
                 closures.append(WaitingClosure(message, pair, camera, place_camera))
         return edge, closures

@@ -132,13 +132,14 @@ class LocalizedPublisher:
             return
         position = None if odometry is None else odometry[:3]
         positions, lap = self._route
-        along = int(positions[result.newest_index]) if result.accepted else -1
-        self._state.update(along, result.probability, position, lap)
+        match = result.match
+        along = int(positions[match.newest]) if match.accepted else -1
+        self._state.update(along, match.probability, position, lap)
         if not self.is_localized:
             self._publish(NOWHERE)
-        elif result.accepted:
-            place = places.place(result.newest_index)
-            self._publish(place.identifier or str(result.newest_index))
+        elif match.accepted:
+            place = places.place(match.newest)
+            self._publish(place.identifier or str(match.newest))
 
     def reset(self) -> None:
         """Be not localized: another map, or the window was emptied."""

@@ -36,7 +36,7 @@ from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.mapping.transforms import turned
-from stavpr_ros.method import Status
+from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.sources.frame import ImageRecord
@@ -118,39 +118,38 @@ def match_message(
     :param robot_id: the parameter of this name.
     :param edge: of the middle pair, None = none; frame: of the base.
     """
-    match, is_mapped = result.match, result.status is Status.MAPPED
-    newest_index = result.newest_index
+    match, path = result.match, result.match.path
     message = copy(_NO_MATCH)
     message.header, message.robot_id = header, robot_id
     message.map_id = '' if places is None else places.map_id
-    message.status, message.reason = result.status, result.reason
-    message.place_index = result.place_index
-    message.newest_index = result.image_index if is_mapped else newest_index
-    message.distance, message.threshold = result.distance, result.threshold
-    message.probability, message.inliers = result.probability, result.inliers
+    message.status, message.reason = match.status, match.reason
+    message.place_index = match.place
+    is_mapped = match.status is Status.MAPPED
+    message.newest_index = result.image_index if is_mapped else match.newest
+    message.distance, message.threshold = match.distance, match.threshold
+    message.probability, message.inliers = match.probability, match.inliers
     message.window_first = message.window_middle = message.window_last = header.stamp
-    if match is not None and match.window_stamps:
+    if match.window_stamps:
         stamps = match.window_stamps
         message.window_first = time_message(stamps[0])
         message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
-    if match is not None and match.sequence is not None:
-        sequence = match.sequence
-        message.sequence_first, message.sequence_last = sequence.first, sequence.last
-        message.sequence_middle, message.direction = sequence.middle, match.direction
-        message.path_probabilities = result.path_probabilities.tolist()
-        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in match.path.tolist()]
-        message.second_best_index = sequence.second_best_index
-        message.second_best_distance = sequence.second_best_distance
-    if match is not None and result.accepted and places is not None:
-        place, newest = places.place(message.place_index), places.place(newest_index)
+    if path.place >= 0:
+        message.sequence_first, message.sequence_last = path.first, path.last
+        message.sequence_middle, message.direction = path.place, path.direction
+        message.path_probabilities = match.path_probabilities.tolist()
+        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in path.pairs.tolist()]
+        message.second_best_index = path.second_best
+        message.second_best_distance = path.second_best_distance
+    if match.accepted and places is not None:
+        place, newest = places.place(match.place), places.place(match.newest)
         message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
         message.session, message.relative_yaw = place.session, result.relative_yaw
-        session = places.session(message.place_index) if isinstance(places, PlaceMap) else None
+        session = places.session(match.place) if isinstance(places, PlaceMap) else None
         message.camera = session.camera if session is not None else ''
         message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
         if edge is not None:
             message.has_relative_pose = edge.has_pose
-            first, length = match.first_image_index, len(match.window_stamps)
+            first, length = match.first_image, len(match.window_stamps)
             pair = AlignedPlaces(
                 query_index=first + (length - 1) // 2 if first >= 0 else -1,
                 query_stamp=message.window_middle,
@@ -168,7 +167,7 @@ def candidates_message(
     if not result.candidates or places is None:
         return None
     message = PlaceCandidates(
-        header=header, **origin(robot_id, places), threshold=result.threshold
+        header=header, **origin(robot_id, places), threshold=result.match.threshold
     )
     message.session_probabilities = list(result.session_probabilities)
     for candidate in result.candidates:
@@ -188,7 +187,7 @@ def candidates_message(
 
 def loop_closure_message(
     header: Header,
-    result: ImageResult,
+    match: Match,
     places: PlaceMap | GrowingMap | None,
     robot_id: str = '',
     frames: PoseFrames = NO_FRAMES,
@@ -202,10 +201,9 @@ def loop_closure_message(
     :param query_pose: of the odometry, at the image that matched, shape (7,); for maps only, a
         route has it.
     """
-    match = result.match
-    if match is None or not result.accepted or places is None:
+    if not match.accepted or places is None:
         return None
-    first = match.first_image_index
+    first = match.first_image
     is_route = first >= 0
     stamps = match.window_stamps
     pairs = [
@@ -216,11 +214,11 @@ def loop_closure_message(
             place_stamp=time_message(places.place(m).stamp),
             query_change=match.window_changes[q] if match.window_changes else math.nan,
         )
-        for q, m in match.path.tolist()
+        for q, m in match.path.pairs.tolist()
     ]
     middle = match.position
     query_stamp, query_frame = stamps[middle], frames.odometry
-    place = places.place(result.place_index)
+    place = places.place(match.place)
     if is_route:
         own = places.place(first + middle)
         query_stamp, query_pose, query_frame = own.stamp, own.pose, frames.frame
@@ -232,12 +230,12 @@ def loop_closure_message(
         is_late=match.is_late,
         query_session=robot_id,
         place_session=robot_id if is_route else place.session,
-        place_index=result.place_index,
+        place_index=match.place,
         place_stamp=time_message(place.stamp),
-        distance=result.distance,
-        threshold=result.threshold,
-        probability=result.probability,
-        inliers=result.inliers,
+        distance=match.distance,
+        threshold=match.threshold,
+        probability=match.probability,
+        inliers=match.inliers,
         relative_pose=NO_EDGE,
         pairs=pairs,
     )
@@ -267,7 +265,7 @@ def relative_pose_message(
 
 def newest_pose(result: ImageResult, places: PlaceMap | GrowingMap) -> np.ndarray | None:
     """Return the pose of the robot at the place of the newest image, (7,); None = unknown."""
-    pose = places.place(result.newest_index).pose if result.accepted else None
+    pose = places.place(result.match.newest).pose if result.match.accepted else None
     return None if pose is None else turned(pose, result.relative_yaw)
 
 
@@ -284,9 +282,9 @@ def matched_pose_message(
 
     :param frame: of the poses of the map.
     """
-    if not result.accepted or places is None:
+    if not result.match.accepted or places is None:
         return None
-    newest, pose = result.newest_index, newest_pose(result, places)
+    newest, pose = result.match.newest, newest_pose(result, places)
     if pose is None:
         return None
     first = places.first if isinstance(places, GrowingMap) else 0

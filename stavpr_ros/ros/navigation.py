@@ -85,10 +85,10 @@ class Navigation:
         # a whole window without a match, or a new window
         length = self._settings.pipeline.sequence.length
         is_lost = self._unmatched >= length - 1
-        if result.status is Status.WARMING_UP:
+        if result.match.status is Status.WARMING_UP:
             self._unmatched = length
         else:
-            self._unmatched = 0 if result.accepted else self._unmatched + 1
+            self._unmatched = 0 if result.match.accepted else self._unmatched + 1
         if pose is not None and odometry is not None:
             transform = transform_message(
                 map_to_odometry(pose, odometry), map_frame, odometry_frame

@@ -98,9 +98,9 @@ class Output:
         pose = matched_pose_message(header, result, places, frames.frame)
         candidates = candidates_message(header, result, places, robot_id)
         with until_shutdown(self._node):
-            if result.accepted and self.place_index.get_subscription_count():
+            if result.match.accepted and self.place_index.get_subscription_count():
                 self.place_index.publish(Int32(data=message.place_index))
-            if result.accepted and self.distance.get_subscription_count():
+            if result.match.accepted and self.distance.get_subscription_count():
                 self.distance.publish(Float32(data=message.distance))
             if pose is not None:
                 self.pose.publish(pose)

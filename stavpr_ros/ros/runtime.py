@@ -5,7 +5,6 @@
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
-import math
 from pathlib import Path
 import time
 import traceback
@@ -16,7 +15,7 @@ from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of, yaw_of
-from stavpr_ros.method import Status
+from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import (
@@ -406,8 +405,7 @@ class Runtime:
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
         self._statistics.add_drop(cause)
-        threshold = self.pipeline.operation.threshold
-        result = ImageResult(status, reason, math.nan if threshold is None else threshold)
+        result = self.pipeline.operation.unmatched(status, reason)
         self._output.publish(message.header, result, self.pipeline.places)
 
     def _process(self, item: _Item) -> None:
@@ -420,8 +418,13 @@ class Runtime:
         pose, frames = self._pose_at(nanoseconds(header.stamp))
         camera_input = self.camera  # another thread may unsubscribe
         camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
-        result = self._match(item.message, pose, camera)
-        result = self._with_yaw(result, places, camera_input, frames.child, header.frame_id)
+
+        def yaw() -> float:
+            if camera_input is None:
+                return yaw_of(mount_of(self.settings.camera_transform) or FORWARD)
+            return camera_input.yaw(frames.child, header.frame_id)
+
+        result = self._match(item.message, pose, camera, yaw)
         began = time.monotonic()
         if self._navigation is not None:
             self._navigation.publish(header, result, places, pose, frames.odometry)
@@ -436,34 +439,18 @@ class Runtime:
         if result.cause:
             self._statistics.add_drop(result.cause)
             self._log_cause(result)
-            if result.status is Status.SKIPPED:
+            if result.match.status is Status.SKIPPED:
                 self._log_skips(result, nanoseconds(header.stamp))
             return
         self._skipped_since = None
         self.last_match, self.last_frame = message, frames.frame
         self._statistics.add_match(
-            result.status.name, result.reason, message.newest_index, message.distance, stages
+            result.match.status.name,
+            message.reason,
+            message.newest_index,
+            message.distance,
+            stages,
         )
-
-    def _with_yaw(
-        self,
-        result: ImageResult,
-        places: PlaceMap | GrowingMap | None,
-        camera_input: CameraInput | None,
-        base: str,
-        frame: str,
-    ) -> ImageResult:
-        """Return a result with the yaw by the mountings, where the map states its camera's."""
-        if not (result.accepted and isinstance(places, PlaceMap)):
-            return result
-        session = places.session(result.place_index)
-        if session is None or session.yaw is None:
-            return result
-        if camera_input is None:
-            own = yaw_of(mount_of(self.settings.camera_transform) or FORWARD)
-        else:
-            own = camera_input.yaw(base, frame)
-        return replace(result, relative_yaw=math.remainder(session.yaw - own, 2 * math.pi))
 
     def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
         """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""
@@ -477,22 +464,31 @@ class Runtime:
             frame, odometry.child_frame, odometry.frame
         )
 
-    def _match(self, message: Any, pose: np.ndarray | None, camera: Camera | None) -> ImageResult:
+    def _match(
+        self,
+        message: Any,
+        pose: np.ndarray | None,
+        camera: Camera | None,
+        yaw: Callable[[], float],
+    ) -> ImageResult:
         """Process an image; an internal error is logged, and invalidates this image only."""
         candidates = (
             is_requested(self._node, self._output.candidates) or self._views.needs_candidates
         )
         stamp = nanoseconds(message.header.stamp)
         try:
-            result = self.pipeline.operation.process(message, stamp, pose, camera, candidates)
+            operation = self.pipeline.operation
+            result = operation.process(message, stamp, pose, camera, candidates, yaw)
         except Exception as error:
             self._node.get_logger().error(
                 f'an image could not be processed: {traceback.format_exc()}'
             )
             reason = f'internal error: {type(error).__name__}: {error}'
-            return ImageResult(Status.INVALID_IMAGE, reason, cause='internal error')
-        if result.status is Status.NOT_READY and (path := self._maps.path):
-            return replace(result, reason=f'map {path} is being loaded')
+            return ImageResult(Match(Status.INVALID_IMAGE, reason), 'internal error')
+        if result.match.status is Status.NOT_READY and (path := self._maps.path):
+            return operation.unmatched(
+                Status.NOT_READY, f'map {path} is being loaded', result.cause, image=result.image
+            )
         return result
 
     def _publish_route(self) -> None:
@@ -505,7 +501,7 @@ class Runtime:
 
     def _log_skips(self, result: ImageResult, stamp: int) -> None:
         """Log that a rule of keyframes skips every image, and the remedy."""
-        self._last_reason, now = result.reason, (stamp / SECOND, time.monotonic())
+        self._last_reason, now = result.match.reason, (stamp / SECOND, time.monotonic())
         began = self._skipped_since or now
         began = self._skipped_since = began if 0 <= now[0] - began[0] < STAMP_JUMP else now
         # the stamps count too: a replay may be faster than the camera
@@ -521,20 +517,23 @@ class Runtime:
             names = ' or '.join(f'keyframe_{name}' for name, value in rules if value)
             remedy = f'right for a camera at rest, otherwise lower {names}'
         self._node.get_logger().warning(
-            f'every image is skipped: {result.reason}; {remedy}',
+            f'every image is skipped: {result.match.reason}; {remedy}',
             throttle_duration_sec=SKIP_PERIOD,
         )
 
     def _log_cause(self, result: ImageResult) -> None:
         """Log why an image is in no window: an invalid one once for each cause."""
-        if result.status is Status.INVALID_IMAGE and result.cause not in self._logged_reasons:
+        if (
+            result.match.status is Status.INVALID_IMAGE
+            and result.cause not in self._logged_reasons
+        ):
             self._logged_reasons.add(result.cause)
             self._node.get_logger().warning(
-                f'invalid image: {result.reason} (logged once; /diagnostics counts '
+                f'invalid image: {result.match.reason} (logged once; /diagnostics counts '
                 f'"{result.cause}")'
             )
-        elif result.status is Status.NOT_READY:
+        elif result.match.status is Status.NOT_READY:
             self._node.get_logger().warning(
-                f'images arrive, but cannot be matched: {result.reason}',
+                f'images arrive, but cannot be matched: {result.match.reason}',
                 throttle_duration_sec=REPORT_PERIOD,
             )

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.errors import StavprError
-from stavpr_ros.method import Status
+from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import update_own_map, write_map
@@ -83,7 +83,7 @@ class Services:
             self._faults[name] = response.message
             response.success = False
             if name == 'relocalize':  # indices of -1, where the default 0 would be a place
-                result = ImageResult(Status.NOT_READY, response.message)
+                result = ImageResult(Match(Status.NOT_READY, response.message))
                 response.match = match_message(Header(), result, robot_id=self._robot_id())
             return response
 

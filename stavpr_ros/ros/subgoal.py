@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image of the map further ahead, as the subgoal of a learned policy of navigation."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from rclpy.node import Node
@@ -38,15 +36,15 @@ class SubgoalPublisher:
         self, header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None
     ) -> None:
         """Publish the subgoal of a match on a map; on the worker."""
-        if not (result.accepted and isinstance(places, PlaceMap)):
+        match = result.match
+        if not (match.accepted and isinstance(places, PlaceMap)):
             return
         if not any(is_requested(self._node, each) for each in (self._image, self._place)):
             return
-        direction = result.match.direction if result.match else 1
         distance = self._settings.subgoal_distance
-        index = place_ahead(places, result.newest_index, distance, direction)
-        subgoal = Candidate(index, result.distance, result.probability)
-        only = replace(result, candidates=(subgoal,), session_probabilities=())
+        index = place_ahead(places, match.newest, distance, match.path.direction)
+        subgoal = Candidate(index, match.distance, match.probability)
+        only = ImageResult(match, candidates=(subgoal,))
         message = candidates_message(header, only, places, self._settings.robot_id)
         content = thumbnail_of_width(places, index, self._settings.subgoal_width)
         with until_shutdown(self._node):

@@ -88,7 +88,7 @@ class Visualization:
         self._note(header, result, places, odometry)
         with until_shutdown(self._node):
             self.publish_route(places, frame)
-            if self._is_requested(self._matched) and result.accepted:
+            if self._is_requested(self._matched) and result.match.accepted:
                 own = Header(stamp=header.stamp, frame_id=frame)
                 self._matched.publish(Path(header=own, poses=list(self._poses)))
             if self._is_requested(self._markers):
@@ -139,10 +139,12 @@ class Visualization:
         if not row.size:
             return
         first = places.first if isinstance(places, GrowingMap) else 0
-        near = places_to_draw(result, first, len(row))
+        near = places_to_draw(result.match, first, len(row))
         if self._is_requested(self._window):
             rows = recognizer.window_columns(near)
-            self._window.publish(image_message(header, draw_window(rows, int(near[0]), result)))
+            self._window.publish(
+                image_message(header, draw_window(rows, int(near[0]), result.match))
+            )
         if self._is_requested(self._distances):
             row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]
             numbers = np.arange(first, first + row.size)[None]
@@ -160,25 +162,26 @@ class Visualization:
         On a map, the query is where the odometry leads to from the last match: a long line is a
         jump.
         """
-        if not result.accepted or places is None:
+        match = result.match
+        if not match.accepted or places is None:
             return
-        pose = places.place(result.newest_index).pose
+        pose = places.place(match.newest).pose
         if pose is not None:
             stamped = Header(stamp=header.stamp, frame_id=self.frame)
             self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
         query = None
-        if result.match is not None and result.match.image_index >= 0:
+        if match.first_image >= 0:
             query = places.place(result.image_index).pose
         elif pose is not None and odometry is not None:
             if self._correction is not None:
                 query = to_poses(self._correction @ matrices(odometry))
             self._correction = matrices(pose) @ inverse(matrices(odometry))
         if pose is not None and query is not None:
-            self._lines.append((_point(query), _point(pose), color(result.probability)))
+            self._lines.append((_point(query), _point(pose), color(match.probability)))
 
     def _markers_message(self, header: Header, result: ImageResult, places: Places) -> MarkerArray:
         """Return the lines, the matched place with its text, and the candidates."""
-        own = Header(stamp=header.stamp, frame_id=self.frame)
+        own, match = Header(stamp=header.stamp, frame_id=self.frame), result.match
         markers = [Marker(header=own, action=Marker.DELETEALL)]
 
         def add(kind: int, **fields: Any) -> Marker:
@@ -193,7 +196,7 @@ class Visualization:
             lines.points = [point for a, b, _ in self._lines for point in (a, b)]
             lines.colors = [shade for *_, shade in self._lines for _ in range(2)]
         if places is not None:
-            best = [] if not result.accepted else [(result.newest_index, result.probability, 0.8)]
+            best = [(match.newest, match.probability, 0.8)] if match.accepted else []
             for place, probability, size in best + [
                 (each.place, each.probability, 0.4) for each in result.candidates
             ]:
@@ -201,14 +204,14 @@ class Visualization:
                     ball = add(Marker.SPHERE, color=color(probability))
                     ball.pose.position = _point(pose)
                     ball.scale.x = ball.scale.y = ball.scale.z = size
-            if result.accepted and (pose := places.place(result.newest_index).pose) is not None:
-                text = add(Marker.TEXT_VIEW_FACING, color=color(result.probability))
+            if match.accepted and (pose := places.place(match.newest).pose) is not None:
+                text = add(Marker.TEXT_VIEW_FACING, color=color(match.probability))
                 text.pose.position = _point(pose)
                 text.pose.position.z += 1.0
                 text.scale.z = 0.6
-                text.text = f'place {result.newest_index}'
-                if not math.isnan(result.probability):
-                    text.text += f', p {result.probability:.2f}'
+                text.text = f'place {match.newest}'
+                if not math.isnan(match.probability):
+                    text.text += f', p {match.probability:.2f}'
         return MarkerArray(markers=markers)
 
     def _latched(self, kind: type, topic: str) -> Publisher:

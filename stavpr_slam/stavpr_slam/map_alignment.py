@@ -24,9 +24,9 @@ def align(place_map: PlaceMap, reference: PlaceMap) -> PlaceMap:
     pairs = []
     for i in range(len(place_map)):
         match = recognizer.update(place_map.features[i : i + 1])
-        if match.accepted and len(match.path):
-            position, place = match.path[len(match.path) // 2].tolist()
-            pairs.append((i - int(match.path[-1, 0]) + position, place))
+        if match.accepted and len(path := match.path.pairs):
+            position, place = path[len(path) // 2].tolist()
+            pairs.append((i - int(path[-1, 0]) + position, place))
     found = np.array(pairs, np.int64).reshape(-1, 2)
     print(f'{len(found)} of {len(place_map)} places are recognized on the first map')
     transform = align_maps(reference.poses, place_map.poses, found)

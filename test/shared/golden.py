@@ -259,19 +259,20 @@ def answers(drive: Drive) -> Iterator[Any]:
 
 def row_of(result: ImageResult) -> list[Any]:
     """Return what must not change: status, kind of reason, places, direction, probability."""
-    sequence = result.match.sequence if result.match else None
-    value = result.distance if math.isnan(result.probability) else result.probability
+    match = result.match
+    value = match.distance if math.isnan(match.probability) else match.probability
     return [
-        result.status.name,
-        re.sub(r'[-+\d.e]*\d[-+\d.e]*', '#', result.reason)[:40],
-        result.place_index,
-        result.newest_index,
-        *((sequence.first, sequence.last) if sequence else (-1, -1)),
-        result.match.direction if result.match else 1,
+        match.status.name,
+        re.sub(r'[-+\d.e]*\d[-+\d.e]*', '#', match.reason)[:40],
+        match.place,
+        match.newest,
+        match.path.first,
+        match.path.last,
+        match.path.direction,
         result.image_index,
-        result.inliers >= 20,
+        match.inliers >= 20,
         None if math.isnan(value) else round(value, 5),
-        [[each.place_index, round(each.probability, 5)] for each in result.late],
+        [[each.place, round(each.probability, 5)] for each in match.late],
     ]
 
 

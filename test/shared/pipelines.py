@@ -64,7 +64,7 @@ def save(pipeline, path, overwrite=False):
 
 
 def statuses(matches):
-    return [match.status for match in matches]
+    return [result.match.status for result in matches]
 
 
 def stamps_of(places):

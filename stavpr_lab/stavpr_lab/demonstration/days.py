@@ -73,7 +73,7 @@ def measure(
         match = recognizer.update(drive.features[i : i + 1], int(drive.stamps[i]))
         if match.accepted:
             image = i - len(match.window_stamps) + 1 + match.position
-            stamps = int(drive.stamps[image]), int(place_map.stamps[match.place_index])
+            stamps = int(drive.stamps[image]), int(place_map.stamps[match.place])
             is_right = abs(positions[stamps[0]] - positions[stamps[1]]) <= TOLERANCE
             right, wrong = right + is_right, wrong + (not is_right)
     return right / len(drive), wrong

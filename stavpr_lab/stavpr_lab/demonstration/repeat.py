@@ -195,7 +195,7 @@ class Autopilot:
         """Return what an image shows."""
         features = self._extractor.extract([image])
         match = self._recognizer.update(features, EPOCH + round((stamp + 1e5) * 1e9))
-        place, probability, offset = match.newest_index, match.probability, None
+        place, probability, offset = match.newest, match.probability, None
         if place < 0:
             place, probability = self.follower.expected_place(), math.nan
         if place >= 0:

@@ -248,12 +248,12 @@ def recognize_traverse(
         nearest = smallest_indices(row, ranks)
         if len(nearest):
             single.places[i, : len(nearest)], single.scores[i] = nearest, row[nearest[0]]
-        if match.sequence is not None and is_full(match, length):
+        if match.path.place >= 0 and is_full(match, length):
             image = i - (length - 1) + middle
             places_of_window = np.asarray(online.candidates(ranks)[0])
             candidates[image, : len(places_of_window)] = places_of_window
             if i % interval == 0 or image in shown:
-                windows.append(_window_distances(image, i, length, rows, match.path))
+                windows.append(_window_distances(image, i, length, rows, match.path.pairs))
     matched, published = image_matches(matches, length, late), published_matches(matches, length)
     ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
     sequence, distances = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())

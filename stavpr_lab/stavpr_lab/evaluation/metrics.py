@@ -11,6 +11,7 @@ is in the map is a false negative. Average precision is scikit-learn's, which co
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
+import math
 from typing import Any, Self
 
 import numpy as np
@@ -228,7 +229,13 @@ def _counts(
 
 def is_full(match: Match, length: int) -> bool:
     """Return whether a match is of a full window, by its path; True without a path."""
-    return not len(match.path) or int(match.path[-1, 0]) >= length - 1
+    return not len(match.path.pairs) or int(match.path.pairs[-1, 0]) >= length - 1
+
+
+def score_of(match: Match) -> float:
+    """Return the distance; +inf without a sequence, or with a probability of 0."""
+    impossible = match.distance >= 1 and not math.isnan(match.probability)
+    return math.inf if match.path.place < 0 or impossible else match.distance
 
 
 def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> ImageMatches:
@@ -245,26 +252,28 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     """
     result = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
-    found_at = (end for end, match in enumerate(matches) if match.sequence is not None)
+    found_at = (end for end, match in enumerate(matches) if match.path.place >= 0)
     ends = [end for end in found_at if is_full(matches[end], length)]
 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
         if image >= 0:
-            match = matches[end].at(position)
-            result.places[image], result.distances[image] = place, match.score
+            match = matches[end]
+            if len(match.path.shares):
+                match = match.with_probability(float(match.path_probabilities[position]))
+            result.places[image], result.distances[image] = place, score_of(match)
             result.accepted[image], result.probabilities[image] = match.accepted, match.probability
 
     for end in ends:
-        assign(end, middle, matches[end].sequence.middle)  # type: ignore[union-attr]
+        assign(end, middle, matches[end].path.place)
     if ends:
         for position in range(middle):
-            assign(ends[0], position, aligned_index(matches[ends[0]].path, position))
+            assign(ends[0], position, aligned_index(matches[ends[0]].path.pairs, position))
         for position in range(middle + 1, length):
-            assign(ends[-1], position, aligned_index(matches[ends[-1]].path, position))
+            assign(ends[-1], position, aligned_index(matches[ends[-1]].path.pairs, position))
     for each in chain.from_iterable(match.late for match in matches if late):
-        image = each.first_image_index + each.position
-        result.places[image], result.distances[image] = each.place_index, each.score
+        image = each.first_image + each.position
+        result.places[image], result.distances[image] = each.place, score_of(each)
         result.accepted[image], result.probabilities[image] = True, each.probability
     return result
 
@@ -285,9 +294,9 @@ def published_matches(matches: Sequence[Match], length: int) -> tuple[ImageMatch
         for end, match in enumerate(matches)
         if match.accepted and not is_full(match, length)
     ]
-    newest = [int(match.path[-1, 0]) for _, match in early]
+    newest = [int(match.path.pairs[-1, 0]) for _, match in early]
     images = [end - last + last // 2 for (end, _), last in zip(early, newest, strict=True)]
-    rows = [(each.place_index, each.score, True, each.probability) for _, each in early]
+    rows = [(each.place, score_of(each), True, each.probability) for _, each in early]
     columns = np.array(rows).reshape(-1, 4).T
     published = [
         np.append(getattr(of_images, name), column.astype(getattr(of_images, name).dtype))

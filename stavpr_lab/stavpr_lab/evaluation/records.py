@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 from stavpr_lab.evaluation.metrics import ConfusionCounts, counts_at, image_matches, ImageMatches
-from stavpr_ros.alignment.lm_dtw import SequenceMatch
-from stavpr_ros.method import Match, Status
+from stavpr_ros.method import Match, Path, Status
 
 IN_WINDOW = ('WARMING_UP', 'NO_MATCH', 'MATCH')  # statuses of images that enter the window
 
@@ -72,22 +71,18 @@ class TraverseEvaluation:
 def match_of(record: dict[str, Any]) -> Match:
     """Return the match of a record that the command ``record`` wrote."""
     pairs = [(pair['query_index'], pair['place_index']) for pair in record['path']]
-    path = np.array(pairs, np.int32).reshape(-1, 2)
-    sequence = None
-    if record['sequence_middle'] >= 0:
-        first, last = path[[0, -1], 1].tolist()
-        sequence = SequenceMatch(
-            first, last, record['sequence_middle'], record['distance'], -1, nan
-        )
+    path = Path(
+        np.array(pairs, np.int32).reshape(-1, 2),
+        record['sequence_middle'],
+        nan if record['distance'] is None else record['distance'],
+        shares=np.array(record['path_probabilities'], float),
+    )
     probability = nan if record['probability'] is None else record['probability']
-    of_path = np.array(record['path_probabilities'], float)
     return Match(
         Status[record['status']],
-        sequence=sequence,
         path=path,
-        distance=nan if record['distance'] is None else record['distance'],
         probability=probability,
-        path_ratios=of_path / max(probability, 1e-9) if of_path.size else of_path,
+        window_stamps=(0,) * len(pairs),
     )
 
 
