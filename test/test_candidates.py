@@ -65,8 +65,7 @@ def test_ranked_begins_with_nearest_and_second_best(small_map, mode):
     settings = RecognizerSettings(
         sequence=SHORT,
         nms_radius=5,
-        mode='paper' if mode == 'paper' else 'robust',
-        robust_options=RobustOptions(place_filter=False) if mode == 'dtw' else None,
+        mode=RobustOptions(place_filter=False) if mode == 'dtw' else mode,
     )
     one = PlaceRecognizer(small_map, settings)
     assert one.ranked(3) == []

@@ -88,4 +88,4 @@ def test_settings_that_need_the_cpu_are_rejected(device):
     place_map, _ = drive_map(False)
     options = RobustOptions(place_filter=False)
     with pytest.raises(SettingsError, match='mode paper only'):
-        PlaceRecognizer(place_map, RecognizerSettings(robust_options=options), device)
+        PlaceRecognizer(place_map, RecognizerSettings(mode=options), device)

@@ -45,7 +45,7 @@ def test_camera_is_recognized_in_both_directions(against):
     assert all(match.accepted for match in matches)
     direction = -1 if against else 1
     for i, match in enumerate(matches, LENGTH):
-        assert match.direction == direction
+        assert match.path.direction == direction
         assert (np.diff(match.path.pairs[:, 1]) * direction >= 0).all()
         assert abs(match.newest - (N - 1 - i if against else i)) <= 2
         path = match.path.first, match.path.place, match.path.last
@@ -75,7 +75,7 @@ def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
     query = features_of(strips, 1.0, 9)
     # statistics of other samples
     options = RobustOptions(mean_centering=False, whitening=False)
-    settings, forward = (replace(each, robust_options=options) for each in (BOTH, FORWARD))
+    settings, forward = (replace(each, mode=options) for each in (BOTH, FORWARD))
     both = recognize(merge_maps(maps, 'ab'[:sessions]), query, settings)
     for match, expected in zip(both, recognize(twice, query, forward), strict=True):
         assert match.status is expected.status
@@ -85,8 +85,8 @@ def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
         if match.probability > 0.1:
             place = expected.path.place
             assert match.path.place == np.append(same_as, same_as[::-1])[place]
-            assert match.direction == (-1 if place >= len(same_as) else 1)
-    assert {match.direction for match in both if match.accepted} == {1, -1}
+            assert match.path.direction == (-1 if place >= len(same_as) else 1)
+    assert {match.path.direction for match in both if match.accepted} == {1, -1}
 
 
 @pytest.mark.parametrize('camera', ['front', 'rear'])
@@ -102,7 +102,7 @@ def test_map_of_two_cameras_names_the_one_that_saw_the_place(camera, against):
         assert match.accepted
         session = place_map.session(match.place)
         assert (session.camera, session.yaw) == cameras[is_rear]
-        assert match.direction == (-1 if against else 1)
+        assert match.path.direction == (-1 if against else 1)
 
 
 def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
@@ -124,7 +124,7 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
     for i, match in list(enumerate(recognize(place_map, features)))[LENGTH:]:
         assert match.accepted
         assert place_map.session(match.place).yaw == pytest.approx(np.pi)
-        assert match.direction == -1
+        assert match.path.direction == -1
         assert abs(match.newest - (2 * n - 1 - i)) <= 2
     # to the left by a quarter: what was at the left is ahead
     assert build_map.main([*build, back, '--panorama-yaw', '90', '--force']) == 0
@@ -151,7 +151,7 @@ def test_device_equals_cpu(device):
         if match.accepted:
             assert match.probability == pytest.approx(expected.probability, abs=1e-5)
             np.testing.assert_array_equal(match.path.pairs, expected.path.pairs)
-    assert match.direction == -1
+    assert match.path.direction == -1
 
 
 @pytest.mark.parametrize('turn', [90, -90])

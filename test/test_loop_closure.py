@@ -52,12 +52,12 @@ def laps():
     return laps_of(300, 60)
 
 
-def settings_of(robust_options, **changes):
+def settings_of(mode, **changes):
     return RecognizerSettings(
-        None if robust_options.place_filter else 0.5,
+        None if mode.place_filter else 0.5,
         sequence=SHORT,
         nms_radius=5,
-        robust_options=robust_options,
+        mode=mode,
         **changes,
     )
 
@@ -331,9 +331,9 @@ def test_reset_after_clock_jump_keeps_route(laps):
             assert not answer.accepted or (i - answer.newest) % 60 == 0
 
 
-@pytest.mark.parametrize('robust_options', [PAPER, ROBUST, RobustOptions(place_filter=False)])
-def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
-    closer = LoopCloser(settings_of(robust_options), 12, laps.settings, limit=200)
+@pytest.mark.parametrize('mode', [PAPER, ROBUST, RobustOptions(place_filter=False)])
+def test_ranked_places_are_numbered_from_start_of_route(laps, mode):
+    closer = LoopCloser(settings_of(mode), 12, laps.settings, limit=200)
     assert closer.ranked(5) == []
     for i in range(260):
         nearest = closer.update(laps[i : i + 1]).path
@@ -349,7 +349,7 @@ def test_ranked_places_are_numbered_from_start_of_route(laps, robust_options):
             assert ranked[1].distance == pytest.approx(nearest.second_best_distance, abs=1e-6)
         if i > 220:
             offsets = [i - 2 - c.place for c in ranked[:2] if c.distance < 0.99]
-            near = CLOSE if robust_options.place_filter else 0
+            near = CLOSE if mode.place_filter else 0
             assert all(min(abs(o - lap) for lap in (60, 120, 180)) <= near for o in offsets)
             assert closer.first > 0
 

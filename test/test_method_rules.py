@@ -86,7 +86,7 @@ DENSE = crawling(KNOWN[:, 40:60], 10)
 
 def recognizer(known=KNOWN, **settings):
     places = features_of(known) if isinstance(known, np.ndarray) else known
-    settings = RecognizerSettings(**{'robust_options': PLAIN} | settings)
+    settings = RecognizerSettings(**{'mode': PLAIN} | settings)
     return localizer.PlaceRecognizer(map_of(places), settings)
 
 
@@ -163,7 +163,7 @@ def varied():
     """Return the share of matches where three directions of all images vary most."""
     rng, directions = np.random.default_rng(1), np.random.default_rng(2).normal(size=(7, 3, 24))
     known, strips = KNOWN + 4 * rng.normal(size=(2, 7, PLACES, 3)) @ directions
-    return matched(strips[:, 40:140], 1.0, LENGTH, known=known, robust_options=ROBUST)
+    return matched(strips[:, 40:140], 1.0, LENGTH, known=known, mode=ROBUST)
 
 
 class Rule(NamedTuple):

@@ -44,7 +44,7 @@ def test_choices_are_those_of_library():
     """The table is imported by launch files and names them once more."""
     library = {
         'operation': OPERATIONS,
-        'mode': MODES,
+        'mode': tuple(MODES),
         'geometric_check': ('none', *METHODS),
         'relative_pose': EDGE_METHODS,
         'backend': BACKENDS,

@@ -49,7 +49,7 @@ def test_localization_returns_the_matches_of_the_recognizer(
 ):
     pipeline = localizing(map_file, mode=mode, threshold=threshold)
     images = route[20:32] + route_images(4, seed=9)
-    core = PlaceRecognizer(small_map, pipeline.settings.recognition())
+    core = PlaceRecognizer(small_map, pipeline.settings)
     matches = process(pipeline, images)
     for i, result in enumerate(matches):
         same_recognition(
@@ -136,7 +136,7 @@ def test_loop_closure_returns_the_matches_of_the_loop_closer(route, exclude_seco
     pipeline = Pipeline(settings_of(exclude_seconds=exclude_seconds), 'loop_closure')
     images = route[:40] * 2
     core = LoopCloser(
-        pipeline.settings.recognition(),
+        pipeline.settings,
         EXCLUDED,
         pipeline.operation.extractor.settings,
         limit=20000,

@@ -11,7 +11,7 @@ from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.model import CLOSE
-from stavpr_ros.method.settings import options_of, PAPER, ROBUST, RobustOptions
+from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare.centering import (
     MeanCentering,
     norms_of,
@@ -33,8 +33,8 @@ def robust(place_map, **changes) -> PlaceRecognizer:
 
 
 def test_robust_options_by_name():
-    assert options_of('robust') == ROBUST == RobustOptions()
-    assert options_of('paper') == PAPER
+    assert RecognizerSettings(mode='robust').applied_options == ROBUST == RobustOptions()
+    assert RecognizerSettings(mode='paper').applied_options == PAPER
     with pytest.raises(SettingsError, match='other'):
         RecognizerSettings(0.5, mode='other')
 
@@ -143,10 +143,8 @@ def test_z_normalized_around_subtracts_mean_of_neighbors():
     ],
 )
 def test_recognizer_without_one_option_finds_places(small_map, without, strategy):
-    robust_options = replace(ROBUST, **{without: False}) if without else ROBUST
-    settings = RecognizerSettings(
-        None, SpatialSettings(strategy), SHORT, 5, robust_options=robust_options
-    )
+    mode = replace(ROBUST, **{without: False}) if without else ROBUST
+    settings = RecognizerSettings(None, SpatialSettings(strategy), SHORT, 5, mode)
     one = PlaceRecognizer(small_map, settings)
     answers = recognize_all(one, small_map.features[10:30])
     middles = [a.path.place for a in answers[4:]]

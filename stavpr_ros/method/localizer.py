@@ -364,7 +364,7 @@ class PlaceRecognizer(SequenceRecognizer):
                 )
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time of several sessions
-        notes = prepared.note, settings.error_note, time_note(place_map)
+        notes = prepared.note, settings.calibration_warning, time_note(place_map)
         self.start_notes = '; '.join(filter(None, notes))
 
     def set_limits(

@@ -7,7 +7,7 @@ Everything is causal: only images that have arrived count. The probability of a 
 and successive ones are correlated.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.checks import (
@@ -23,7 +23,7 @@ from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.parameters import default
 
 DIRECTIONS = ('forward', 'both')
-MODES = ('paper', 'robust')
+EVIDENCE_VERSION = 4  # of calibrations: raised where probabilities change
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,7 @@ class RobustOptions:
 
 PAPER = RobustOptions(False, False, False, False)
 ROBUST = RobustOptions()
-
-
-def options_of(mode: str) -> RobustOptions:
-    """
-    Return the options of a mode.
-
-    :raises SettingsError: no such mode.
-    """
-    require_choice('mode', mode, MODES)
-    return ROBUST if mode == 'robust' else PAPER
+MODES = {'paper': PAPER, 'robust': ROBUST}
 
 
 @dataclass(frozen=True)
@@ -76,8 +67,8 @@ class RecognizerSettings:
     :param nms_radius: the second best's midpoint is more than this many places from the nearest
         one's.
     :param mode: ``robust``, with all options of
-        :class:`stavpr_ros.method.settings.RobustOptions`, or ``paper``, LM-DTW as published.
-    :param robust_options: another choice of options than the mode's.
+        :class:`stavpr_ros.method.settings.RobustOptions`, or ``paper``, LM-DTW as published; or
+        a choice of these options.
     :param odometry_error: of a distance by odometry, as a share of it; where query and places have
         poses, the path of a match is compared with them; 0 = never. See
         :mod:`stavpr_ros.method.relative_motion`.
@@ -96,8 +87,7 @@ class RecognizerSettings:
     spatial: SpatialSettings | None = None
     sequence: SequenceSettings = field(default_factory=SequenceSettings)
     nms_radius: int = default('nms_radius')
-    mode: str = default('mode')
-    robust_options: RobustOptions | None = None
+    mode: str | RobustOptions = field(default=default('mode'))
     odometry_error: float = default('odometry_error')
     min_probability: float = default('min_probability')
     max_error: float = default('max_error')
@@ -105,7 +95,8 @@ class RecognizerSettings:
     error_risks: ErrorRisks | None = None
 
     def __post_init__(self) -> None:
-        options_of(self.mode)  # rejects an unknown mode
+        if not isinstance(self.mode, RobustOptions):
+            require_choice('mode', self.mode, tuple(MODES))
         require_number('threshold', 1 if self.threshold is None else self.threshold)
         if self.threshold is not None and not self.threshold > 0:
             raise SettingsError(
@@ -132,7 +123,7 @@ class RecognizerSettings:
     @property
     def applied_options(self) -> RobustOptions:
         """Return the options that are applied."""
-        return options_of(self.mode) if self.robust_options is None else self.robust_options
+        return MODES[self.mode] if isinstance(self.mode, str) else self.mode
 
     @property
     def applied_spatial(self) -> SpatialSettings:
@@ -164,18 +155,15 @@ class RecognizerSettings:
         return max(probability, self.min_probability if is_set else 0)
 
     @property
-    def method(self) -> str:
-        """Return what error risks depend on, as text."""
-        spatial, sequence = self.applied_spatial, self.sequence
-        mode = self.mode if self.robust_options is None else 'own options'
-        return (
-            f'{mode} by evidence, version 4, length {sequence.length}, beta {sequence.beta:g}, '
-            f'{spatial.strategy}, sigma {spatial.sigma:g}, xi {spatial.xi}, '
-            f'vertical {spatial.vertical}' + ', both directions' * self.moves_against
-        )
+    def calibration_key(self) -> str:
+        """Return what error risks depend on: ``name=value``, the evidence by its version."""
+        mode = self.mode if isinstance(self.mode, str) else 'options'
+        values = {'evidence': EVIDENCE_VERSION, 'mode': mode, 'direction': self.direction}
+        values |= asdict(self.sequence) | asdict(self.applied_spatial)
+        return ' '.join(f'{name}={value}' for name, value in values.items())
 
     @property
-    def error_note(self) -> str:
+    def calibration_warning(self) -> str:
         """Return why ``max_error`` is not kept by the error risks; '' = it is, or none is set."""
         if not self.max_error or (risks := self.error_risks) is None:
             return ''
@@ -185,14 +173,14 @@ class RecognizerSettings:
         return (
             f'max_error = {self.max_error:g} is not kept by the calibration of the map '
             f'({risks.units} blocks, {least:.3g} at least, with {risks.method!a}): the built-in '
-            f'table, or stricter, applies (with {self.method!a})'
+            f'table, or stricter, applies (with {self.calibration_key!a})'
         )
 
     @property
     def _own_risks(self) -> ErrorRisks | None:
         """Return the error risks if they are of these settings."""
         risks = self.error_risks
-        return risks if risks is not None and risks.method == self.method else None
+        return risks if risks is not None and risks.method == self.calibration_key else None
 
     @property
     def compares_odometry(self) -> bool:

@@ -563,9 +563,7 @@ def _map_recognizer(
         recognizer = _partial_recognizer(settings, place_map)
     else:
         backend = settings.matching_backend(operation)
-        recognizer = PlaceRecognizer(
-            place_map, settings.recognition(), backend, settings.precision
-        )
+        recognizer = PlaceRecognizer(place_map, settings, backend, settings.precision)
     count, of_map = settings.sequence.length + WARM_IMAGES, None
     images = _noise(extractor.extract([BLANK_IMAGE]), count)
     if isinstance(recognizer, PlaceRecognizer):  # images of the map match it
@@ -583,14 +581,14 @@ def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> Sequ
             'backend auto or cpu, precision auto or float32, and direction forward'
         )
     assert isinstance(place_map, PartialMap)
-    return place_map.recognizer(settings.recognition())
+    return place_map.recognizer(settings)
 
 
 def _loop_closer(
     settings: PipelineSettings, exclude: int, extractor: FeatureExtractor
 ) -> LoopCloser:
     return LoopCloser(
-        settings.recognition(),
+        settings,
         exclude,
         extractor.settings,
         limit=settings.max_places,

@@ -3,8 +3,7 @@
 """Settings of the pipeline and of the node, built from the values of the parameters."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, fields
 import os
 from pathlib import Path
 from typing import Any
@@ -28,16 +27,12 @@ OPERATIONS = BY_NAME['operation'].choices
 
 
 @dataclass(frozen=True)
-class PipelineSettings:
+class PipelineSettings(RecognizerSettings):
     """
-    Settings of the pipeline.
+    Settings of the pipeline: those of its recognizer, and these.
 
     Fields that are not explained here are parameters (:mod:`stavpr_ros.parameters`).
 
-    :param threshold: mode paper: a window is matched when its distance is below it; None = not
-        set.
-    :param min_probability, max_error: mode robust, see
-        :class:`stavpr_ros.method.RecognizerSettings`.
     :param features: kind of the features of a route that starts without a map, or ``auto``.
     :param feature_settings: settings of that kind as a JSON object, '' = its defaults.
     :param candidates: nearest places that every match lists.
@@ -45,13 +40,6 @@ class PipelineSettings:
     :raises SettingsError: a value out of range, or values that exclude each other.
     """
 
-    threshold: float | None = None
-    min_probability: float = default('min_probability')
-    max_error: float = default('max_error')
-    sequence: SequenceSettings = field(default_factory=SequenceSettings)
-    nms_radius: int = default('nms_radius')
-    odometry_error: float = default('odometry_error')
-    mode: str = default('mode')
     backend: str = default('backend')
     precision: str = default('precision')
     model_path: str = default('model_path')
@@ -64,7 +52,6 @@ class PipelineSettings:
     candidates: int = default('candidates')
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     geometric: GeometricSettings | None = None
-    direction: str = default('direction')
     update_map: bool = default('update_map')
 
     def __post_init__(self) -> None:
@@ -72,16 +59,7 @@ class PipelineSettings:
             settings_from_json(self.features, self.feature_settings, self.model_path)
         elif self.features != AUTO:
             settings_class(self.features)  # rejects an unknown kind
-        self.recognition()
-
-    @cached_property
-    def applied_threshold(self) -> float | None:
-        """Return the distance below which a window is matched, None = not set."""
-        return self.recognition().applied_threshold
-
-    def recognition(self) -> RecognizerSettings:
-        """Return the settings of the recognizer."""
-        return RecognizerSettings(**_of_same_name(RecognizerSettings, vars(self)))
+        super().__post_init__()
 
     def require_operation(self, operation: str) -> None:
         """
@@ -239,12 +217,12 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
             values['keyframe_change'],
         ),
         geometric=None if method == 'none' else GeometricSettings(method, values['min_inliers']),
-        **_of_same_name(PipelineSettings, values),
+        **_parameters_of(PipelineSettings, values),
     )
     choose_backend(pipeline.backend)
-    return NodeSettings(pipeline=pipeline, **_of_same_name(NodeSettings, values))
+    return NodeSettings(pipeline=pipeline, **_parameters_of(NodeSettings, values))
 
 
-def _of_same_name(settings: type, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of parameters that are fields of the same name."""
-    return {name: value for name, value in values.items() if name in settings.__annotations__}
+def _parameters_of(settings: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of the parameters that are fields of these settings."""
+    return {each.name: values[each.name] for each in fields(settings) if each.name in values}

@@ -252,7 +252,7 @@ class Runtime:
     def _update_odometry(self) -> None:
         """Subscribe to odometry while it is needed."""
         places, settings = self.pipeline.places, self.settings
-        is_compared = settings.pipeline.recognition().compares_odometry
+        is_compared = settings.pipeline.compares_odometry
         needs_odometry = settings.needs_odometry or (  # edges to places of a map, and their paths
             (settings.relative_pose in ('auto', 'aligned') or is_compared)
             and isinstance(places, PlaceMap)

@@ -293,8 +293,8 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         settings = replace(settings, error_risks=sequences.reference.error_risks)
         if note := time_note(sequences.reference):
             print(note)
-    if settings.error_note:
-        print(settings.error_note)
+    if settings.calibration_warning:
+        print(settings.calibration_warning)
     truth = sequences.drive.truth.kind
     loaded = time.perf_counter()
     evaluation = _evaluate(arguments, sequences, settings)

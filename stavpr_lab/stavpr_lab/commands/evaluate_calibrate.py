@@ -56,10 +56,10 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     reference, features = sequences.reference, sequences.query.features
     assert reference is not None  # without --loop-closure
     before = reference.error_risks if arguments.calibrate == 'add' else None
-    if arguments.calibrate == 'add' and (before is None or before.method != settings.method):
+    key = settings.calibration_key
+    if arguments.calibrate == 'add' and (before is None or before.method != key):
         raise SettingsError(
-            f'--calibrate add: {path} has no calibration of these settings ({settings.method}): '
-            'leave add out'
+            f'--calibrate add: {path} has no calibration of these settings ({key}): leave add out'
         )
     recording = hashlib.sha256(np.ascontiguousarray(features.strips).data).hexdigest()[:16]
     if before is not None and recording in before.recordings:
@@ -72,7 +72,7 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         recognizer = PlaceRecognizer(places, settings, arguments.backend, arguments.precision)
         matches = recognize_all(recognizer, features[drive.images])
         driven.append((drive, *published_matches(matches, settings.sequence.length)))
-    risks = measured_risks(driven, block, settings.method)
+    risks = measured_risks(driven, block, key)
     risks = replace(risks, recordings=(recording,))
     say(
         f'{sequences.title}: {risks.units} blocks of {block} images, as recorded, at other speeds '

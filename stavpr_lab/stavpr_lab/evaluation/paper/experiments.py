@@ -20,7 +20,7 @@ from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class
 from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
 from stavpr_ros.method import RecognizerSettings
-from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
+from stavpr_ros.method.settings import ROBUST, RobustOptions
 import torch
 
 W = 7
@@ -37,7 +37,7 @@ class Configuration:
     :param temporal: sequences; False = single images.
     :param strips: W.
     :param projection: dimensions of a random projection, None without.
-    :param robust_options: of the recognizer; None = the options of the mode.
+    :param mode: of the recognizer; None = as the command has it.
     :param baseline: run that instead: ``seqslam``, with the length of the sequence settings;
         ``ssm_vpr``, with two layers of the network; ``descriptors``, single images by the arrays
         of this name.
@@ -50,7 +50,7 @@ class Configuration:
     temporal: bool = True
     strips: int = W
     projection: int | None = None
-    robust_options: RobustOptions | None = None
+    mode: str | RobustOptions | None = None
     baseline: str = ''
 
 
@@ -89,17 +89,17 @@ PRESETS: dict[str, tuple[Configuration, ...]] = {
     'field': (
         Configuration('no_alignment', 'single image', NO_ALIGNMENT, temporal=False),
         Configuration('spatial', 'aligned image', temporal=False),
-        replace(STA_VPR, title='mode paper', robust_options=PAPER),
-        Configuration('robust', 'mode robust', robust_options=ROBUST),
+        replace(STA_VPR, title='mode paper', mode='paper'),
+        Configuration('robust', 'mode robust', mode='robust'),
     ),
     'robust_options': (
-        replace(STA_VPR, robust_options=PAPER),
-        Configuration('robust', 'robust', robust_options=ROBUST),
+        replace(STA_VPR, mode='paper'),
+        Configuration('robust', 'robust', mode='robust'),
         *(
             Configuration(
                 f'without_{option.name}',
                 f'without {option.name}',
-                robust_options=replace(ROBUST, **{option.name: False}),
+                mode=replace(ROBUST, **{option.name: False}),
             )
             for option in fields(RobustOptions)
             if getattr(ROBUST, option.name)
@@ -197,8 +197,7 @@ class DatasetExperiment:
         settings = RecognizerSettings(
             spatial=configuration.spatial,
             sequence=configuration.sequence,
-            mode=self._mode,
-            robust_options=configuration.robust_options,
+            mode=configuration.mode or self._mode,
         )
         evaluation = evaluate_on_map(
             reference, query.features, self._dataset.ground_truth, settings
