@@ -90,7 +90,7 @@ def test_recognizer_keeps_the_error_rate_by_its_map_or_gives_the_reason(
     place_map = replace(small_map, error_risks=error_risks(method=settings.calibration_key))
     recognizer = PlaceRecognizer(place_map, replace(settings, **changes))
     match = recognizer.update(small_map.features[:1])
-    assert (match.min_probability, match.threshold) == pytest.approx(
+    assert (match.limits.probability, match.threshold) == pytest.approx(
         (probability, 1 - probability)
     )
     assert recognizer.threshold == match.threshold

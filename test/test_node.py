@@ -33,9 +33,9 @@ def recognize(place_map, images):
 def same_match(message, core):
     """Features may differ in the last bits."""
     assert message.status == core.status
-    assert (message.place_index, message.newest_index) == (core.place_index, core.newest_index)
+    assert (message.place_index, message.newest_index) == (core.place, core.newest)
     path = [(pair.query_index, pair.place_index) for pair in message.path]
-    assert path == [tuple(cell) for cell in core.path.tolist()]
+    assert path == [tuple(cell) for cell in core.path.pairs.tolist()]
     assert message.distance == pytest.approx(core.distance, abs=1e-4, nan_ok=True)
 
 
@@ -54,7 +54,7 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
         bgr = image_message(image, encoding='bgr8')
         message = robot.show(bgr, SECOND + 7)
         same_match(message, core)
-        if core.sequence is not None:
+        if core.path.place >= 0:
             windows.append(message)
         if message.status == PlaceMatch.MATCH:
             matches.append(message)

@@ -74,7 +74,7 @@ def test_node_without_save_path_continues_its_recording_at_the_next_start(make, 
     node = make(operation='localization')  # recognizes what was recorded
     record(node, route[:12], first=20)
     assert len(node.runtime.pipeline.places) == 14
-    assert node.runtime.pipeline.operation._last.newest_index == 11
+    assert node.runtime.pipeline.operation._last.match.newest == 11
 
 
 def test_localization_on_another_map_names_the_journal_and_leaves_it(

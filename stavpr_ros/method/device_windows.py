@@ -12,9 +12,8 @@ from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.device_filter import DevicePlaceFilter
-from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
+from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
 from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
-from stavpr_ros.method.sessions import in_places
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 import torch

@@ -11,9 +11,8 @@ from stavpr_ros.alignment.lm_dtw import (
 )
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.method.columns import ColumnLayout
-from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
+from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
 from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
-from stavpr_ros.method.sessions import in_places
 
 
 class LmDtwWindow(BufferWindow):

@@ -160,7 +160,7 @@ class SequenceRecognizer(ABC):
         """
         return distinct_places(self._sequences(), count)
 
-    def ranked(self, count: int) -> list[Candidate]:
+    def ranked(self, count: int, match: Match | None = None) -> list[Candidate]:
         """
         Rank places for the newest window, no two of them neighbors, nearest first.
 
@@ -168,12 +168,13 @@ class SequenceRecognizer(ABC):
         its second best.
 
         :param count: most candidates, at least 0.
+        :param match: of the newest window, after a check of it; None = as it was returned.
         :returns: empty while the window has no match and is not full.
         :raises InputError: count below 0.
         """
-        newest, nearest = self._newest, None
-        if (place := newest.path.place) >= 0:
-            nearest = Candidate(place, newest.distance, newest.probability)
+        match, nearest = match or self._newest, None
+        if (place := match.path.place) >= 0:
+            nearest = Candidate(place, match.distance, match.probability)
         layout, radius = self._window.layout, self._settings.nms_radius
         where = layout.positions, layout.lap
         return ranked_candidates(nearest, self._sequences(), count, radius, *where)
@@ -225,12 +226,12 @@ class SequenceRecognizer(ABC):
         """
         window, radius, run = self._window, self._settings.nms_radius, None
         self._motion.trajectory.append(odometry_xy)
-        shown = WindowMatch()
-        if window.full:
+        fill, shown = len(window.images), WindowMatch()
+        if fill == window.length:
             shown = window.match(radius)
             match, run = self._decide(shown.path, self._limits)
         else:
-            reason = f'{len(window.images)} of {window.length} images in the window'
+            reason = f'{fill} of {window.length} images in the window'
             match = self._build(shown.path, self._limits, Status.WARMING_UP, reason)
         runs = [run]
         if not match.accepted:
@@ -357,11 +358,10 @@ class PlaceRecognizer(SequenceRecognizer):
                 place_map.settings.kind, place_map.settings.strips, self._dimension
             )
             if cells is not None:
-                self._window.cells = CellAgreement(
-                    cells,
-                    lambda columns: self._matcher.strips_of(layout.names_of(columns)),
-                    settings.sequence.length,
-                )
+                of_places, names_of = self._matcher.strips_of, layout.names_of
+                is_plain = layout.columns is None  # columns are places
+                strips_of = of_places if is_plain else lambda each: of_places(names_of(each))
+                self._window.cells = CellAgreement(cells, strips_of, settings.sequence.length)
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time of several sessions
         notes = prepared.note, settings.calibration_warning, time_note(place_map)

@@ -7,12 +7,15 @@ from dataclasses import dataclass, field, replace
 import enum
 from functools import cached_property
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import aligned_index, NO_PATH
 from stavpr_ros.errors import InputError
 from stavpr_ros.former import FormerNames
+
+if TYPE_CHECKING:
+    from stavpr_ros.method.columns import ColumnLayout
 
 NO_SHARES: np.ndarray = np.empty(0)
 MIN_SHARE = 1e-9  # of a place of the path; ratios to it are finite
@@ -320,6 +323,45 @@ def ranked_candidates(
         probability = math.nan if probabilities is None else float(probabilities[best])
         ranked.append(Candidate(int(places[best]), float(costs[best]), probability))
     return ranked
+
+
+def in_places(
+    match: WindowMatch, layout: 'ColumnLayout', nms_radius: int | None = None
+) -> WindowMatch:
+    """
+    Return a match whose columns have become places.
+
+    :param nms_radius: of the second best; None = the one of the match is at another position.
+    """
+    path = match.path
+    if layout.columns is None or path.place < 0:
+        return match
+
+    def sequences() -> WindowSequences:
+        costs, columns, probabilities = match.sequences()
+        possible = np.isfinite(costs)
+        if probabilities is not None:
+            probabilities = probabilities[possible]
+        return WindowSequences(costs[possible], layout.names_of(columns[possible]), probabilities)
+
+    place, second = layout.names_of(np.array([path.place, path.second_best])).tolist()
+    second, distance = second if path.second_best >= 0 else -1, path.second_best_distance
+    if nms_radius is not None:
+        best = Candidate(place, path.distance)
+        others = ranked_candidates(best, sequences(), 2, nms_radius, layout.positions)[1:]
+        second = others[0].place if others else -1
+        distance = others[0].distance if others else float('nan')
+    pairs = path.pairs.copy()
+    pairs[:, 1] = layout.names_of(pairs[:, 1])
+    in_places = replace(
+        path,
+        pairs=pairs,
+        place=place,
+        second_best=second,
+        second_best_distance=distance,
+        direction=layout.direction_of(path.place),
+    )
+    return WindowMatch(in_places, sequences)
 
 
 def distinct_places(sequences: WindowSequences, count: int) -> tuple[np.ndarray, np.ndarray]:

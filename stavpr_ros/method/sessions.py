@@ -1,13 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The map's sessions as columns of a window, and matches in columns as matches of places."""
-
-from dataclasses import replace
+"""The map's sessions as columns of a window, and what they cost."""
 
 import numpy as np
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.method.columns import ColumnLayout
-from stavpr_ros.method.match import Candidate, ranked_candidates, WindowMatch, WindowSequences
 from stavpr_ros.method.model import Model
 from stavpr_ros.prepare.blocks import MAX_LAG
 from stavpr_ros.prepare.normalization import ONE_SESSION
@@ -45,45 +42,6 @@ def session_gap(nms_radius: int, model: Model) -> int:
     """Return the number of columns between two sessions: no place is near to another session."""
     farthest = int(np.ceil(max(model.speeds))) + 1  # places from image to image
     return max(farthest, nms_radius) + 1
-
-
-def in_places(
-    match: WindowMatch, layout: ColumnLayout, nms_radius: int | None = None
-) -> WindowMatch:
-    """
-    Return a match whose columns have become places.
-
-    :param nms_radius: of the second best; None = the one of the match is at another position.
-    """
-    path = match.path
-    if layout.columns is None or path.place < 0:
-        return match
-
-    def sequences() -> WindowSequences:
-        costs, columns, probabilities = match.sequences()
-        possible = np.isfinite(costs)
-        if probabilities is not None:
-            probabilities = probabilities[possible]
-        return WindowSequences(costs[possible], layout.names_of(columns[possible]), probabilities)
-
-    place, second = layout.names_of(np.array([path.place, path.second_best])).tolist()
-    second, distance = second if path.second_best >= 0 else -1, path.second_best_distance
-    if nms_radius is not None:
-        best = Candidate(place, path.distance)
-        others = ranked_candidates(best, sequences(), 2, nms_radius, layout.positions)[1:]
-        second = others[0].place if others else -1
-        distance = others[0].distance if others else float('nan')
-    pairs = path.pairs.copy()
-    pairs[:, 1] = layout.names_of(pairs[:, 1])
-    in_places = replace(
-        path,
-        pairs=pairs,
-        place=place,
-        second_best=second,
-        second_best_distance=distance,
-        direction=layout.direction_of(path.place),
-    )
-    return WindowMatch(in_places, sequences)
 
 
 def time_note(place_map: PlaceMap) -> str:

@@ -13,13 +13,12 @@ from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.evidence import probability_of, Quantities, RecentWindows, unevenness
 from stavpr_ros.method.filter import Filter, NEGLIGIBLE, PlaceFilter, SPACING
-from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
+from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
 from stavpr_ros.method.model import APART, CLOSE, MODEL, Model, ON_MAP, ROUTE_IMAGES, STRAIGHT
 from stavpr_ros.method.motion import ImageChange
 from stavpr_ros.method.path import centered_place, close_sums, follow
 from stavpr_ros.method.place_means import PlaceMeans
 from stavpr_ros.method.query_window import QueryWindow
-from stavpr_ros.method.sessions import in_places
 
 MIN_IMAGES = 2  # of a match by the newest images alone
 LEAST = 1e-9  # probability that shares are relative to

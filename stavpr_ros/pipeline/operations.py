@@ -243,13 +243,17 @@ class Operation(ABC):
             kind = error.kind if isinstance(error, ImageError) else type(error).__name__
             cause = f'invalid: {kind}'
             return self.unmatched(Status.INVALID_IMAGE, str(error), cause, stages=stages)
-        lists = list_candidates and match.path.place >= 0
+        candidates: list[Candidate] = []
+        sessions: tuple[float, ...] = ()
+        if list_candidates and self.recognizer is not None and match.path.place >= 0:
+            candidates = self.recognizer.ranked(self.settings.candidates, match)
+            sessions = self._session_probabilities()
         self._last = ImageResult(
             match,
             '',
             index,
-            self._candidates(match, self.settings.candidates) if lists else (),
-            self._session_probabilities() if lists else (),
+            tuple(candidates),
+            sessions,
             self._relative_yaw(match, yaw),
             image,
             stages,
@@ -302,13 +306,6 @@ class Operation(ABC):
             with _Timed(stages, 'verification'):
                 match = self._checked(match, index)
         return match, index
-
-    def _candidates(self, match: Match, count: int) -> tuple[Candidate, ...]:
-        """Return the nearest places; the first one is the match's, with its probability."""
-        assert self.recognizer is not None
-        ranked = self.recognizer.ranked(count)
-        own = [Candidate(each.place, match.distance, match.probability) for each in ranked[:1]]
-        return *own, *ranked[1:]
 
     def _session_probabilities(self) -> tuple[float, ...]:
         """Return the probability of each session of the map, by the newest image."""
@@ -387,7 +384,7 @@ class Operation(ABC):
         last, length = self._last, self.settings.sequence.length
         if last is None or (last.match.path.place < 0 and self.window_fill < length):
             raise InputError(f'{self.window_fill} of {length} images in the window')
-        candidates = self._candidates(last.match, count)
+        candidates = tuple(self.recognizer.ranked(count, last.match))
         return ImageResult(last.match, candidates=candidates, relative_yaw=last.relative_yaw)
 
     def matched_pair(
