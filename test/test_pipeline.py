@@ -52,9 +52,8 @@ def test_localization_returns_the_matches_of_the_recognizer(
     core = PlaceRecognizer(small_map, pipeline.settings)
     matches = process(pipeline, images)
     for i, result in enumerate(matches):
-        same_recognition(
-            result.match, core.update(pipeline.operation.extractor.extract([images[i]]))
-        )
+        features = pipeline.operation.extractor.extract([images[i]])
+        same_recognition(result.match, core.update(features))
         assert result.match.window_stamps == tuple(
             (j + 1) * SECOND for j in range(max(0, i - 4), i + 1)
         )
@@ -73,11 +72,8 @@ def test_missing_map_or_threshold_is_the_reason(map_file, route):
     assert state == ('none', None, 0)
     assert 'map_path' in pipeline.operation.missing
     (result,) = process(pipeline, route[:1])
-    assert (result.match.status, result.match.reason) == (
-        Status.NOT_READY,
-        pipeline.operation.missing,
-    )
-    assert result.cause == 'not ready'
+    assert (result.match.reason, result.cause) == (pipeline.operation.missing, 'not ready')
+    assert result.match.status is Status.NOT_READY
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
     assert (pipeline.operation.map_state, len(pipeline.places)) == ('loaded', 60)
     assert 'threshold' in pipeline.operation.missing
@@ -193,10 +189,8 @@ def test_matched_pair_copies_only_columns_of_the_window(operation, route, monkey
             continue
         with monkeypatch.context() as patch:
             patch.setattr(SequenceBuffer, 'rows', lambda buffer: pytest.fail('the whole window'))
-            pairs = {
-                one: pipeline.operation.matched_pair(one)
-                for one in (result.match, *result.match.late)
-            }
+            matches_now = (result.match, *result.match.late)
+            pairs = {one: pipeline.operation.matched_pair(one) for one in matches_now}
         for one, pair in pairs.items():
             if pair is None:
                 continue

@@ -3,7 +3,6 @@
 """The pipeline in operation: live settings, keyframes, invalid images, resets, saving."""
 
 from dataclasses import replace
-from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -44,18 +43,11 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     strict = 1 - 1e-9
     pipeline.change(replace(pipeline.settings, min_probability=strict, candidates=0))
     result = process(pipeline, route[11:12], first=11)[0]
-    assert (result.match.status, result.match.threshold, result.candidates) == (
-        Status.NO_MATCH,
-        1 - strict,
-        (),
-    )
+    assert (result.match.status, result.candidates) == (Status.NO_MATCH, ())
+    assert result.match.threshold == 1 - strict
     pipeline.change(replace(pipeline.settings, min_probability=0.1, candidates=1))
     result = process(pipeline, route[12:13], first=12)[0]
-    assert (result.match.status, result.match.newest, result.match.threshold) == (
-        Status.MATCH,
-        12,
-        0.9,
-    )
+    assert (result.match.newest, result.match.threshold) == (12, 0.9)
     assert len(result.candidates) == 1
     result = pipeline.operation.process(message(route[13]), 14, list_candidates=False)
     assert result.candidates == ()
@@ -88,25 +80,18 @@ def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
     pipeline.change(replace(pipeline.settings, geometric=check))
     # the middle of a window of 5: the images until then came without a check
     process(pipeline, route[7:9], first=7)
-    accepted = process(pipeline, route[9:10], first=9)[0]
-    assert (accepted.match.status, accepted.match.reason, accepted.match.place) == (
-        Status.MATCH,
-        '',
-        7,
-    )
+    accepted = process(pipeline, route[9:10], first=9)[0].match
+    assert (accepted.status, accepted.reason, accepted.place) == (Status.MATCH, '', 7)
     found = PlaceVerifier(check).inliers(thumbnail_of(route[7]), pipeline.places, 7)
-    assert accepted.match.inliers == found >= 100
+    assert accepted.inliers == found >= 100
     pipeline.operation.reset()
     process(pipeline, route[: CERTAIN + 2])  # the same images again
     pipeline.change(replace(pipeline.settings, geometric=replace(check, min_inliers=found + 1)))
     result = process(pipeline, route[9:10], first=9)[0]
-    assert (result.match.status, result.match.inliers, result.match.place) == (
-        Status.NO_MATCH,
-        found,
-        -1,
-    )
-    assert f'{found} inliers are fewer than {found + 1}' in result.match.reason
-    assert result.candidates[0].place == result.match.path.place
+    match = result.match
+    assert (match.status, match.inliers, match.place) == (Status.NO_MATCH, found, -1)
+    assert f'{found} inliers are fewer than {found + 1}' in match.reason
+    assert result.candidates[0].place == match.path.place
     pipeline.change(replace(pipeline.settings, geometric=None))
     assert statuses(process(pipeline, route[10:11], first=10)) == [Status.MATCH]
 
@@ -206,9 +191,9 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
         good, expected = (
             process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
         )
-        for name in ('image_index', 'candidates', 'match.status', 'match.distance'):
-            np.testing.assert_equal(attrgetter(name)(good), attrgetter(name)(expected))
-        assert good.match.path.place == expected.match.path.place
+        for name in ('image_index', 'candidates'):
+            assert getattr(good, name) == getattr(expected, name)
+        assert repr(good.match) == repr(expected.match)
         if operation != 'mapping':
             assert good.match.window_stamps == expected.match.window_stamps
     assert stamps_of(pipeline.places) == stamps_of(other.places)

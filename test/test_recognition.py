@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recognizer image by image: equal to the whole matrix at once, never a false place 0."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 from places import recognize_all
@@ -53,12 +53,8 @@ def test_recognizer_by_image_equals_whole_matrix_at_once(small_map, strategy):
         window = D[end - 4 : end + 1]
         expected = best_match(match_sequence(window, SHORT), 5)
         path = answers[end].path
-        assert (path.first, path.last, path.place) == (
-            *(expected.first, expected.last, expected.middle),
-        )
-        assert (path.distance, path.second_best, path.second_best_distance) == (
-            *(expected.distance, expected.second_best_index, expected.second_best_distance),
-        )
+        second = path.second_best, path.second_best_distance
+        assert (path.first, path.last, path.place, path.distance, *second) == astuple(expected)
         np.testing.assert_array_equal(
             answers[end].path.pairs, trace_sequence(window, expected.first, SHORT.k)
         )

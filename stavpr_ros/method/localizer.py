@@ -214,8 +214,8 @@ class SequenceRecognizer(ABC):
             )
             require_type('features', features, LocalFeatures, expected)
         features.require_fit(self._feature_settings, where, dimension)
-        if len(features) != 1:
-            raise InputError(f'features of {len(features)} images: expected one image')
+        if (count := features.strips.shape[1]) != 1:
+            raise InputError(f'features of {count} images: expected one image')
         require_finite(features, 'the image')
 
     def _match(self, odometry_xy: np.ndarray) -> Match:
@@ -234,7 +234,7 @@ class SequenceRecognizer(ABC):
             reason = f'{fill} of {window.length} images in the window'
             match = self._build(shown.path, self._limits, Status.WARMING_UP, reason)
         runs = [run]
-        if not match.accepted:
+        if match.status is not Status.MATCH:
             newest = window.match_newest(radius)
             if newest.path.place >= 0:
                 early, run = self._decide(newest.path, self._limits.raised(EARLY))
