@@ -171,7 +171,7 @@ def compared(
         match = cpu.update(driven[i : i + 1])
         same = status == match.status.name and (not match.accepted or match.path.place == middle)
         different += not same
-        if match.sequence is not None:
+        if match.path.place >= 0:
             difference = max(difference, abs(distance - match.distance))
     return {'different_answers': different, 'largest_difference': difference}
 

@@ -86,11 +86,12 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         return log_odds(q.belief), q.uneven, q.excess, lead, cells, nothing
 
     def noted(result: Any, is_early: bool) -> Any:
-        if result.nearest is not None:
-            l = result.images or len(window.images)
+        path = result.path
+        if path.place >= 0:
+            l = len(path.pairs)
             image = state['image'] - (l - 1) + (l - 1) // 2
             middle = int(window.images['number'][(l - 1) // 2])
-            rest, place = not is_early and middle == window.filter.count - 1, result.nearest.middle
+            rest, place = not is_early and middle == window.filter.count - 1, path.place
             about = image, place, float(is_early)
             if rest and any(
                 window._shown is each for each in shown
@@ -98,7 +99,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
                 rows.append((-1, *about, NEW, *quantities(window._shown), 0.0))
             which = window._latest if rest else shown[-1] if shown else window._shown
             kind = REST if rest else NEW if shown else REPEATED
-            rows.append((state['image'], *about, kind, *quantities(which), result.probability))
+            rows.append((state['image'], *about, kind, *quantities(which), path.probability))
         return result
 
     def matched(radius: int) -> Any:

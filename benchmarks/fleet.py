@@ -75,8 +75,7 @@ def accepted(
         began = time.perf_counter()
         match = recognizer.update(query[i : i + 1])
         times.append((time.perf_counter() - began) * 1e3)
-        nearest = match.sequence
-        places.append(nearest.middle if match.accepted and nearest is not None else -1)
+        places.append(match.place)
     return places[SETTINGS.sequence.length - 1 :]
 
 

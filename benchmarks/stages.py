@@ -281,7 +281,7 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
         i = next(following)
         result = pipeline.operation.process(ImageRecord.of_image(images[i], 0), i, poses[i])
         pipeline.operation.matched_pair(result)
-        accepted[min_probability] += result.accepted
+        accepted[min_probability] += result.match.accepted
 
     for _ in range(2 * SEQUENCE.length):
         process(0.5)
