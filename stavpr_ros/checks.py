@@ -121,16 +121,6 @@ def float32_vector(name: str, values: np.ndarray, shortest: int, longest: int) -
     return array.astype(np.float32, copy=False)
 
 
-def relative_weights(count: int, *weights: np.ndarray) -> list[np.ndarray]:
-    """Return relative probabilities, float64, (count,); raise InputError for others."""
-    arrays = [np.asarray(each) for each in weights]
-    for array in arrays:
-        numbers = array.tolist() if array.shape == (count,) and array.dtype.kind in 'fiu' else ()
-        if not (numbers and 0 < sum(numbers) < math.inf and min(numbers) >= 0):
-            raise InputError(f'weights {array}: expected {count} numbers, at least 0, not all 0')
-    return [np.ascontiguousarray(array, np.float64) for array in arrays]
-
-
 def require_indices(name: str, values: Any, end: int) -> None:
     """Raise InputError if not all are whole numbers of at least 0 and below ``end``."""
     array = np.asarray(values)
