@@ -8,13 +8,14 @@ place that looks alike has matches as well; one geometry explains few of them.
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice, require_shape
 from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.method.match import Match, Status
 
 METHODS = ('orb', 'sift')
 # These belong together: more keypoints, a ratio nearer to 1 and more pixels let more matches of
@@ -197,6 +198,53 @@ class GeometricEvidence:
             factor = min((1 - right) / (1 - wrong), 1.0)
         odds = probability / (1 - probability) * factor
         return odds / (1 + odds)
+
+
+class GeometricCheck:
+    """Checks matches; it learns from those since the last reset how often right ones pass."""
+
+    def __init__(self, settings: GeometricSettings) -> None:
+        self.settings = settings
+        self._verifier = PlaceVerifier(settings)
+        self._evidence = GeometricEvidence()
+
+    def reset(self) -> None:
+        """Forget the passes of earlier matches."""
+        self._evidence = GeometricEvidence()
+
+    def checked(
+        self,
+        match: Match,
+        places: PlaceMap | GrowingMap,
+        query: np.ndarray | None,
+        is_weighed: bool,
+    ) -> Match:
+        """
+        Return a match after the check; without thumbnails, as it is.
+
+        Matches with too few inliers are rejected.
+
+        :param query: thumbnail of its image, RGB (h, w, 3) uint8; None = unknown.
+        :param is_weighed: the result changes the probability instead (:class:`GeometricEvidence`),
+            where the match is doubtful.
+        """
+        if match.path.place < 0 or query is None:
+            return match
+        if not (self._evidence.wants(match.probability) if is_weighed else match.accepted):
+            return match
+        inliers = self._verifier.inliers(query, places, match.path.place)
+        if inliers is None:
+            return match
+        least = self.settings.min_inliers
+        if is_weighed:
+            probability = self._evidence.updated(match.probability, inliers >= least)
+            return match.with_probability(probability, inliers)
+        if inliers >= least:
+            return replace(match, inliers=inliers)
+        reason = (
+            f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
+        )
+        return replace(match, inliers=inliers, status=Status.NO_MATCH, reason=reason)
 
 
 def _detector(method: str) -> Any:

@@ -25,7 +25,8 @@ from stavpr_ros.method import Candidate, Match, PlaceRecognizer, RecognizerSetti
 from stavpr_ros.method.localizer import SequenceRecognizer
 from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.method.match import Limits
-from stavpr_ros.pipeline.result import GeometricCheck, ImageResult
+from stavpr_ros.method.verification import GeometricCheck
+from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.save_state import SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 from stavpr_ros.relative_pose.pair import matched_pair, MatchedPair

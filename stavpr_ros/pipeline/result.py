@@ -1,23 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The result for one image: its match, and what the pipeline adds to it.
-
-The geometric check compares the thumbnails of query and place, by keypoints.
-"""
+"""The result for one image: its match, and what the pipeline adds to it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.former import FormerNames
-from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.method import Candidate, Match, Status
-from stavpr_ros.method.verification import (
-    GeometricEvidence,
-    GeometricSettings,
-    PlaceVerifier,
-)
+from stavpr_ros.method import Candidate, Match
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,50 +36,3 @@ class ImageResult(FormerNames):
     relative_yaw: float = 0.0
     image: np.ndarray | None = None
     stages: Mapping[str, float] = field(default_factory=dict)
-
-
-class GeometricCheck:
-    """Checks matches; it learns from those since the last reset how often right ones pass."""
-
-    def __init__(self, settings: GeometricSettings) -> None:
-        self.settings = settings
-        self._verifier = PlaceVerifier(settings)
-        self._evidence = GeometricEvidence()
-
-    def reset(self) -> None:
-        """Forget the passes of earlier matches."""
-        self._evidence = GeometricEvidence()
-
-    def checked(
-        self,
-        match: Match,
-        places: PlaceMap | GrowingMap,
-        query: np.ndarray | None,
-        is_weighed: bool,
-    ) -> Match:
-        """
-        Return a match after the check; without thumbnails, as it is.
-
-        Matches with too few inliers are rejected.
-
-        :param query: thumbnail of its image, RGB (h, w, 3) uint8; None = unknown.
-        :param is_weighed: the result changes the probability instead (:class:`GeometricEvidence`),
-            where the match is doubtful.
-        """
-        if match.path.place < 0 or query is None:
-            return match
-        if not (self._evidence.wants(match.probability) if is_weighed else match.accepted):
-            return match
-        inliers = self._verifier.inliers(query, places, match.path.place)
-        if inliers is None:
-            return match
-        least = self.settings.min_inliers
-        if is_weighed:
-            probability = self._evidence.updated(match.probability, inliers >= least)
-            return match.with_probability(probability, inliers)
-        if inliers >= least:
-            return replace(match, inliers=inliers)
-        reason = (
-            f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
-        )
-        return replace(match, inliers=inliers, status=Status.NO_MATCH, reason=reason)
