@@ -60,8 +60,8 @@ def answers(place_map, precision):
     found = []
     for i in range(40):
         match = recognizer.update(place_map.features[i + 100 : i + 101])
-        found += [recognizer.newest_row().tobytes(), match.probability, match.path.tobytes()]
-        found.append(match.sequence)
+        found += [recognizer.newest_row().tobytes(), match.probability, match.path.pairs.tobytes()]
+        found.append(match.path)
     return repr(found), recognizer.start_notes
 
 
@@ -202,7 +202,9 @@ def test_answers_of_codes_are_those_of_features_bit_for_bit(place_map, tmp_path,
     query = place_map.features
     for one in (recognizer, PlaceRecognizer(open_map(files[0]), SETTINGS, 'cpu', 'int8')):
         matches = [one.update(query[i : i + 1]) for i in range(130, 160)]
-        found.append([one.newest_row().tobytes(), [(m.probability, m.sequence) for m in matches]])
+        found.append(
+            [one.newest_row().tobytes(), [(m.probability, repr(m.path)) for m in matches]]
+        )
     assert found[0] == found[1]
     # other precisions take the features
     assert answers(opened, 'float32') == answers(open_map(files[0]), 'float32')

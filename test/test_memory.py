@@ -50,7 +50,7 @@ def test_recognizer_on_an_opened_map_matches_as_on_a_loaded_one(path, mode, prec
     features = load_map(path).features
     for i in range(25):
         image = features[i : i + 1]
-        assert repr(opened.update(image).sequence) == repr(loaded.update(image).sequence)
+        assert repr(opened.update(image).path) == repr(loaded.update(image).path)
 
 
 @pytest.mark.parametrize('change', ['replace', 'delete'])
