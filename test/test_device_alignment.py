@@ -97,7 +97,7 @@ def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned):
             np.testing.assert_array_equal(middles, SequenceDistances(q, m).middles)
             assert best_match(SequenceDistances(q, m), radius).first == answer.start
     window.reset()
-    assert len(window.buffer) == 0
+    assert len(window.images) == 0
 
 
 def test_starts_of_default_window_equal_oracle(device):
