@@ -437,7 +437,7 @@ def advance(states, z, slope, offset, most, steps, change, entering, scale, new,
     for part in nb.prange(parts):
         first = part * PART
         m = min(PART, width - first)
-        moved = np.zeros((V, m), F)
+        moved = _moved(states, steps, first, m)
         likelihoods, valid = np.empty(m, F), np.empty(m, F)
         for i in range(m):
             value = z[first + i]
@@ -446,17 +446,6 @@ def advance(states, z, slope, offset, most, steps, change, entering, scale, new,
             likelihoods[i] = valid[i] * power(slope * min(value, most) - offset)
         own, came, arrived, total = sums[first : first + m], np.zeros(m, F), 0.0, 0.0
         own[:] = 0
-        for v in range(V):
-            for s in range(steps.shape[1]):
-                share, step = steps[v, s], s - 1
-                if share > 0:
-                    low, end = max(first, step), min(first + m, width + step)
-                    to, since = (
-                        moved[v, low - first : end - first],
-                        states[v, low - step : end - step],
-                    )
-                    for i in range(len(to)):
-                        to[i] += share * since[i]
         for v in range(V):
             same, below, above = moved[v], moved[max(v - 1, 0)], moved[min(v + 1, V - 1)]
             out = new[v, first : first + m]
@@ -512,15 +501,15 @@ def _mixed(states, change):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _moved(states, steps):  # type: ignore[no-untyped-def]
-    """Return states (V, m) advanced by their speeds."""
-    (V, m), moved = states.shape, np.zeros_like(states)
+def _moved(states, steps, first, m):  # type: ignore[no-untyped-def]
+    """Return what states (V, width) become by their speeds, at m columns from ``first`` on."""
+    (V, width), moved = states.shape, np.zeros((len(states), m), states.dtype)
     for v in range(V):
         for s in range(steps.shape[1]):
             share, step = steps[v, s], s - 1
-            low, end = max(0, step), min(m, m + step)
+            low, end = max(first, step), min(first + m, width + step)
             if share > 0 and low < end:
-                to, since = moved[v, low:end], states[v, low - step : end - step]
+                to, since = moved[v, low - first : end - first], states[v, low - step : end - step]
                 for i in range(len(to)):
                     to[i] += share * since[i]
     return moved
@@ -563,7 +552,7 @@ def _forward(states, z, numbers, level, most, steps, change, images):  # type: i
         for y in range(m):
             factor = scale if z[image, y] < np.inf else 0.0
             likelihoods[image, y] = power(slope * min(z[image, y], most) - offset, 8) * factor
-        states = _mixed(_moved(states, steps), change)
+        states = _mixed(_moved(states, steps, 0, m), change)
         for v in range(V):
             for y in range(m):
                 states[v, y] = (states[v, y] + entering) * likelihoods[image, y]
