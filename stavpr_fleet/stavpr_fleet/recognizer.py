@@ -55,7 +55,7 @@ class CityLayout(ColumnLayout):
     def __init__(
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
     ) -> None:
-        super().__init__(firsts, same_as, session_gap(nms_radius, MODEL))
+        super().__init__(firsts, same_as, session_gap(nms_radius))
         self.loaded = places
 
     def names_of(self, columns: np.ndarray) -> np.ndarray:
