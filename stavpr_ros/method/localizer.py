@@ -274,13 +274,8 @@ class SequenceRecognizer(ABC):
         run = None
         if len(self._motion.positions) and np.isfinite(self._motion.trajectory[-1][0]):
             accepted, layout = status is Status.MATCH, self._window.layout
-            agreed, run = self._motion.agreement(
-                match,
-                (len(match.path) - 1) // 2,
-                accepted,
-                self._window.first,
-                layout.session_of(match.nearest.middle),
-            )
+            session = layout.session_of(match.nearest.middle)
+            agreed, run = self._motion.agreement(match, accepted, self._window.first, session)
             if agreed < UNUSUAL:
                 probability = with_odometry_test(probability, agreed)
                 distance = 1 - probability

@@ -53,7 +53,6 @@ class RelativeMotion:
     def agreement(
         self,
         match: WindowMatch,
-        position: int,
         accepted: bool,
         first: int,
         session: tuple[int, int],
@@ -65,7 +64,6 @@ class RelativeMotion:
 
         The last position of the trajectory, of the match's newest image, is known.
 
-        :param position: of the matched image in the path.
         :param accepted: by the images alone.
         :param first: first place that is not evicted.
         :param session: first place of the match's session, and the first one behind it.
@@ -74,7 +72,7 @@ class RelativeMotion:
         place, newest = match.nearest.middle, int(match.path[-1, 1])
         length, agreed = len(match.path), 1.0
         since, *last = self.run
-        after = length - 1 - position
+        after = length - 1 - (length - 1) // 2
         step = place - last[0] if after == last[1] else newest - last[2]
         follows = accepted and 0 <= match.direction * step <= FARTHEST
         run = since + 1 if follows else length, place, after, newest if accepted else NO_PLACE
