@@ -131,16 +131,6 @@ class ImageChange:
         decay = float(-np.log(np.clip(similarity[1], MIN_SIMILARITY, 1)))
         self._extended = np.append(self.curve, further), decay
 
-    def expected_change(self, places: float) -> float:
-        """
-        Return the change of images so many places apart, by the curve of the map.
-
-        The curve is known at whole places. Below one place, the similarity decays exponentially.
-
-        :param places: at least 0.
-        """
-        return _expected_change(float(places), *self._extended)
-
     def _find_equal(self) -> None:
         self.equal = self._from_before < self.standstill
         self._distinct = None
@@ -219,8 +209,12 @@ class ImageChange:
 
 
 @kernel
-def _expected_change(places, curve, decay):  # type: ignore[no-untyped-def]
-    """Return the change of :meth:`ImageChange.expected_change`."""
+def expected_change(places, curve, decay):  # type: ignore[no-untyped-def]
+    """
+    Return the change of images so many places apart, at least 0, by the curve of the map.
+
+    The curve is known at whole places. Below one place, the similarity decays exponentially.
+    """
     if places < 1:
         return -math.expm1(-decay * places)
     whole = min(int(places), len(curve) - 2)
@@ -238,7 +232,7 @@ def _excess(speed, changes, curve, decay):  # type: ignore[no-untyped-def]
         for row in range(len(changes)):
             means[i] += changes[row, i]
         means[i] = min(means[i] / len(changes), 1.0)
-        expected[i] = min(_expected_change(speed * (i + 1), curve, decay), 1.0)
+        expected[i] = min(expected_change(speed * (i + 1), curve, decay), 1.0)
     noise = (1 - means[0]) / max(1 - expected[0], MIN_SIMILARITY)
     noise, total = min(max(noise, MIN_SIMILARITY_RATIO), 1.0), 0.0
     for i in range(1, COMPARED):
