@@ -231,7 +231,7 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 
 def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     """Measure the image distances of a map in int8, on a CPU."""
-    from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+    from stavpr_ros.prepare.matcher import CpuMatcher
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):

@@ -27,7 +27,7 @@ from stavpr_ros.method.sessions import session_gap
 from stavpr_ros.method.settings import ROBUST
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
-from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.matcher import CpuMatcher
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.threads import call_on_thread
 

@@ -21,6 +21,7 @@ Steps 3 to 6 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -54,14 +55,15 @@ from stavpr_ros.method.sessions import time_note
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.method.windows import window_of
-from stavpr_ros.prepare.blocks import blocks
-from stavpr_ros.prepare.matcher import make_matcher, precision_of
+from stavpr_ros.prepare.blocks import converted_blocks
+from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.threads import one_thread
 
 if TYPE_CHECKING:
     import torch
 
+INT8_PLACES = 2_000  # from which on `auto` is int8: faster, a quarter of the memory
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
 
 
@@ -355,13 +357,13 @@ class PlaceRecognizer(SequenceRecognizer):
         )
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
             features.require_fit(place_map.settings, 'the map', features.dimension)
-            for _, block in blocks(features):
-                require_finite(block, 'the map')
+            for _ in converted_blocks(features, partial(require_finite, where='the map')):
+                pass
         self._dimension = features.dimension
         is_vertical = settings.applied_spatial.vertical  # cells are made of float32 strips
-        rounds = settings.has_probability and backend == 'cpu' and not is_vertical
-        precision = precision_of(precision, len(features), rounds)
-        precision = 'float32' if is_vertical else precision
+        if precision == 'auto' and settings.has_probability and backend == 'cpu':
+            precision = 'int8' if len(features) >= INT8_PLACES else 'float32'
+        precision = 'float32' if is_vertical or precision == 'auto' else precision
         prepared = prepare_map(
             features, precision, options.mean_centering, options.whitening, options.place_filter
         )

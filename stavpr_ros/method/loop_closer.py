@@ -19,8 +19,7 @@ from stavpr_ros.method.model import AROUND, BAND, CONFIRMED, LONGEST_GAP, LONGES
 from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
-from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
-from stavpr_ros.prepare.matcher import precision_of, PRECISIONS
+from stavpr_ros.prepare.matcher import CpuRouteMatcher, PRECISIONS
 from stavpr_ros.prepare.route_features import RouteFeatures
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
@@ -66,8 +65,7 @@ class LoopCloser(SequenceRecognizer):
     ) -> None:
         settings = replace(settings, spatial=settings.spatial or SpatialSettings())
         _require_fitting(settings, exclude, limit, exclude_seconds)
-        precision = precision_of(precision, 0, False)
-        require_choice('precision', precision, PRECISIONS)
+        require_choice('precision', precision, ('auto', *PRECISIONS))
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
         window = _route_window(settings, feature_settings.kind)
         super().__init__(settings, feature_settings, window, self._track)
@@ -76,7 +74,7 @@ class LoopCloser(SequenceRecognizer):
         self._matcher = CpuRouteMatcher(W, settings.applied_spatial)
         options = settings.applied_options
         self._route = RouteFeatures(
-            feature_settings, options.mean_centering, options.whitening, limit, precision
+            feature_settings, options.mean_centering, options.whitening, limit, precision == 'int8'
         )
         # stamps of the latest places, not yet old enough in seconds
         self._recent_stamps: deque[int] = deque()

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numba as nb
 import numpy as np
@@ -25,6 +26,7 @@ PIECE = 256  # places read or centered at a time
 MAX_LAG = 5  # places apart up to which the changes of a map are learned
 LARGE_CHANGE = 0.97  # quantile of changes from place to place
 REST, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a slow one
+Block = TypeVar('Block')
 
 
 @dataclass(frozen=True)
@@ -44,22 +46,17 @@ class Int8Features:
         return self.strips.shape[1]
 
 
-def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
-    """Yield the features of each block of places."""
-    for places in _slices(features):
-        yield places, features[places]
-
-
 def converted_blocks(
-    features: LocalFeatures, convert: Callable[[LocalFeatures], np.ndarray]
-) -> Iterator[tuple[slice, np.ndarray]]:
+    features: LocalFeatures, convert: Callable[[LocalFeatures], Block]
+) -> Iterator[tuple[slice, Block]]:
     """Yield the converted blocks, in their order."""
-    slices, threads = _slices(features), thread_count()
+    n, threads = len(features), thread_count()
+    slices = [slice(low, min(low + PIECE, n)) for low in range(0, n, PIECE)]
     if threads == 1 or len(slices) <= 1:
         for places in slices:
             yield places, convert(features[places])
         return
-    pending: deque[tuple[slice, Future[np.ndarray]]] = deque()
+    pending: deque[tuple[slice, Future[Block]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         for places in slices:
             future = pool.submit(lambda places: convert(features[places]), places)
@@ -104,11 +101,6 @@ def rounded(
         visit(block)
         strips.write(places.start, np.ascontiguousarray(block))
     return Int8Features(strips, features.weights, features.settings, features.cells)
-
-
-def _slices(features: LocalFeatures) -> list[slice]:
-    n = len(features)
-    return [slice(low, min(low + PIECE, n)) for low in range(0, n, PIECE)]
 
 
 class PlaceChanges:

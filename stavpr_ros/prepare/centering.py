@@ -16,13 +16,7 @@ from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.stored_features import MapStatistics
-from stavpr_ros.prepare.blocks import (
-    blocks,
-    change_weights,
-    converted,
-    converted_blocks,
-    PlaceChanges,
-)
+from stavpr_ros.prepare.blocks import change_weights, converted, converted_blocks, PlaceChanges
 
 PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most
@@ -124,8 +118,9 @@ class MeanCentering:
             changes.add(strips)
             total += strips.sum(axis=1, dtype=np.float64)
         weights = change_weights(changes.changes[0])
-        for places, block in blocks(features) if weights.min(initial=1) < 1 else ():
-            total -= (block.strips * (1 - weights[places])[:, None]).sum(axis=1)
+        if weights.min(initial=1) < 1:
+            for places, strips in converted_blocks(features, lambda block: block.strips):
+                total -= (strips * (1 - weights[places])[:, None]).sum(axis=1)
         mean = total / max(weights.sum(), 1) * self._centering
         self.mean = mean.astype(np.float32)  # (W, d)
         if whitening and len(features):

@@ -35,7 +35,7 @@ class RouteFeatures:
     :param mean_centering: subtract the mean.
     :param whitening: whiten; learned again from time to time while the route is short.
     :param limit: most places there will be; None = no limit.
-    :param precision: of the features once the route is settled, see the module.
+    :param rounds: to int8 once the route is settled, see the module.
 
     ``latest`` are the features of the newest ``LATEST`` places, oldest first, (W, m, d); ``mean``
     the mean that is subtracted, (W, d), float32, zeros without centering.
@@ -47,9 +47,9 @@ class RouteFeatures:
         mean_centering: bool,
         whitening: bool,
         limit: int | None,
-        precision: str = 'float32',
+        rounds: bool = False,
     ) -> None:
-        self.count, self._precision = 0, precision
+        self.count, self._rounds = 0, rounds
         none = np.empty((settings.strips, 0), np.float32)
         self.strips: RouteStrips = none[..., None]  # centered, (W, room, d)
         self._is_settled, self._since_mean = False, 0  # images since the mean was taken
@@ -123,7 +123,7 @@ class RouteFeatures:
                 self._learn(0)
             return grows
         is_full = self.count == min(SETTLED, self._limit or SETTLED)
-        settles = is_full and self._precision != 'float32'
+        settles = is_full and self._rounds
         if (self._centering or self._whitens) and (self.count >= self._next_mean or settles):
             self._learn(0)
             self._next_mean = int(self.count * GROWTH) + 1
