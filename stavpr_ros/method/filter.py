@@ -156,9 +156,9 @@ class Kept(NamedTuple):
     number: int
 
 
-class StateFilter(Filter):
+class PlaceFilter(Filter):
     """
-    What the filters of the CPU and of other devices share: all but the advance of the states.
+    The filter of the module, on the CPU; a filter of a device overrides what advances its states.
 
     States, sums and z are arrays of NumPy, or tensors, on whose slices the same operators work.
 
@@ -184,25 +184,18 @@ class StateFilter(Filter):
         self._allocate(columns)
         self.reset()
 
-    @abstractmethod
     def _zeros(self, shape: tuple[int, ...]) -> Any:
         """Return zeros, float32, an array or a tensor."""
+        return aligned_zeros(shape)
 
-    @abstractmethod
     def _on_host(self, values: Any) -> np.ndarray:
         """Return values of the device as an array."""
+        array: np.ndarray = values
+        return array
 
-    @abstractmethod
     def _vector(self, z: Any) -> Any:
         """Return z as float32 vector; raise InputError where it does not fit."""
-
-    @abstractmethod
-    def _advance(self, z: Any, image: Image, scale: float) -> None:
-        """
-        Add z to the ring and advance all states; :meth:`_read` follows sooner or later.
-
-        :param image: without its scale and its blocks; scale: of the states before it.
-        """
+        return checks.float32_vector('z', z, int(self._gaps.max(initial=-1)) + 1, self._width)
 
     def _read(self) -> None:
         """Wait for what the newest image gave, if need be."""
@@ -236,6 +229,29 @@ class StateFilter(Filter):
             entering, scale = s.enter * self._off / states, self._images[-1].scale
         self._advance(z, Image(weight * s.weight, entering, 0.0, states, NO_PLACES), scale)
         self.count += 1
+
+    def _advance(self, z: Any, image: Image, scale: float) -> None:
+        """
+        Add z to the ring and advance all states; :meth:`_read` follows sooner or later.
+
+        :param image: without its scale and its blocks; scale: of the states before it.
+        """
+        s, alpha, n, before = self.model, image.weight, len(z), self._now
+        row = self._z[self.count % self._rows]
+        row[:n], row[n:] = z, np.inf
+        row[self._gaps] = np.inf
+        self._now = self._free.pop()
+        arrived, on_map = advance(
+            before, row, alpha * s.level, alpha * s.level**2 / 2, s.most, self._steps, s.change,
+            image.entering, scale, self._now, self._sums,
+        )  # fmt: skip
+        if self.count % SPACING == 1:
+            self._keep(before, scale)
+        else:
+            self._free.append(before)
+        scale = self._normalize(arrived, on_map)
+        blocks = probable_blocks(self._sums[:n], scale)
+        self._images.append(image._replace(scale=scale, blocks=blocks))
 
     def _keep(self, states: Any, scale: float) -> None:
         """Keep the states after the newest image."""
@@ -313,11 +329,13 @@ class StateFilter(Filter):
         arrays = np.ascontiguousarray(steps), np.ascontiguousarray(excluded)
         return self._best_straight(self._ring(steps.shape[1]), low, end, *arrays)
 
-    @abstractmethod
     def _best_straight(
         self, rows: np.ndarray, low: int, end: int, steps: np.ndarray, excluded: np.ndarray
     ) -> tuple[float, np.ndarray]:
         """See :func:`best_straight`."""
+        with one_thread(end - low <= PART):
+            score, path = best_straight(self._z, rows, low, end, steps, excluded)
+        return score, path
 
     def move_back(self, columns: slice, count: int) -> None:
         """See :meth:`Filter.move_back`."""
@@ -336,44 +354,6 @@ class StateFilter(Filter):
             moved = starts[(starts < end) & (ends > first)] - count
             blocks = np.concatenate([stay, np.maximum(moved, 0)])
             self._images[i] = image._replace(blocks=blocks)
-
-
-class PlaceFilter(StateFilter):
-    """The filter of the module, on the CPU: see :class:`StateFilter`."""
-
-    def _zeros(self, shape: tuple[int, ...]) -> np.ndarray:
-        return aligned_zeros(shape)
-
-    def _on_host(self, values: np.ndarray) -> np.ndarray:
-        return values
-
-    def _vector(self, z: np.ndarray) -> np.ndarray:
-        return checks.float32_vector('z', z, int(self._gaps.max(initial=-1)) + 1, self._width)
-
-    def _advance(self, z: np.ndarray, image: Image, scale: float) -> None:
-        s, alpha, n, before = self.model, image.weight, len(z), self._now
-        row = self._z[self.count % self._rows]
-        row[:n], row[n:] = z, np.inf
-        row[self._gaps] = np.inf
-        self._now = self._free.pop()
-        arrived, on_map = advance(
-            before, row, alpha * s.level, alpha * s.level**2 / 2, s.most, self._steps, s.change,
-            image.entering, scale, self._now, self._sums,
-        )  # fmt: skip
-        if self.count % SPACING == 1:
-            self._keep(before, scale)
-        else:
-            self._free.append(before)
-        scale = self._normalize(arrived, on_map)
-        blocks = probable_blocks(self._sums[:n], scale)
-        self._images.append(image._replace(scale=scale, blocks=blocks))
-
-    def _best_straight(
-        self, rows: np.ndarray, low: int, end: int, steps: np.ndarray, excluded: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        with one_thread(end - low <= PART):
-            score, path = best_straight(self._z, rows, low, end, steps, excluded)
-        return score, path
 
     def grow(self, columns: int) -> None:
         """See :meth:`Filter.grow`."""
