@@ -10,6 +10,7 @@ They are an array (W, room, d), float32, or of the class below, int8. Both retur
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.memory import aligned_empty
+from stavpr_ros.simd import LANES
 
 PIECE = 256  # places rounded at a time
 
@@ -26,14 +27,10 @@ class Int8Route(Int8Strips):
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
-        for values, reciprocals in zip(
-            self.values.view(np.int32)[..., 0], self.reciprocals, strict=True
-        ):
-            groups, quads, lanes = values.shape
-            by_place = values.transpose(0, 2, 1).reshape(groups * lanes, quads)
-            by_place[:-count] = by_place[count:].copy()
-            values[:] = by_place.reshape(groups, lanes, quads).transpose(0, 2, 1)
-            reciprocals[:-count] = reciprocals[count:].copy()
+        source, to = np.arange(count, self.shape[1]), np.arange(self.shape[1] - count)
+        for values in self.values.view(np.int32)[..., 0]:  # of a strip
+            values[to // LANES, :, to % LANES] = values[source // LANES, :, source % LANES]
+        self.reciprocals[:, to] = self.reciprocals[:, source]
 
 
 RouteStrips = np.ndarray | Int8Route
