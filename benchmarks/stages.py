@@ -236,7 +236,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
         block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, seed + low)
-        rounded.write(low, block.strips)
+        rounded[:, low:] = block.strips
     query = make_features(1, d, STRIPS, seed)
     weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
     places = Int8Features(rounded, weights, query.settings)

@@ -130,7 +130,7 @@ def expected_row(reference, query, i, settings, precision):
         whole, lengths = rounded_queries(query.strips)
         x = whole[i].astype(float) * lengths[i, :, None]
         held = Int8Strips(*y.shape)
-        held.write(0, reference.strips)
+        held[:, :] = reference.strips
         y = held[:, :].astype(float)
     products = np.einsum('id,jnd->ijn', x, y)
     if settings.strategy == 'none':
@@ -170,7 +170,7 @@ def test_strip_distances_of_int8_are_those_of_cpu_bit_for_bit(device):
     reference, query = features(9, strips=7), features(2, seed=1, strips=7)
     matcher = make_matcher(reference, SpatialSettings(), device, 'int8')
     held = Int8Strips(*reference.strips.shape)
-    held.write(0, reference.strips)
+    held[:, :] = reference.strips
     whole, lengths = rounded_queries(query.strips)
     for i in range(2):
         matcher.distances(query.strips[:, i], query.weights[:, i])

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numba as nb
 import numpy as np
@@ -70,37 +70,23 @@ def converted_blocks(
 
 def converted(
     features: LocalFeatures,
-    convert: Callable[[np.ndarray], np.ndarray],
+    convert: Callable[[np.ndarray], np.ndarray] = lambda strips: strips,
     visit: Callable[[np.ndarray], None] = lambda strips: None,
-) -> LocalFeatures:
+    rounds: bool = False,
+) -> Any:
     """
     Return new features, converted block by block.
 
-    :param visit: called with the strips of each converted block.
+    :param visit: called with the strips of each converted block, before they are rounded.
+    :param rounds: return :class:`Int8Features` instead of :class:`LocalFeatures`.
     """
-    strips = aligned_empty((*features.weights.shape, features.dimension))
+    shape = *features.weights.shape, features.dimension
+    strips: Any = Int8Strips(*shape) if rounds else aligned_empty(shape)
     for places, block in converted_blocks(features, lambda block: convert(block.strips)):
         visit(block)
         strips[:, places] = block
-    return LocalFeatures(strips, features.weights, features.settings, features.cells)
-
-
-def rounded(
-    features: LocalFeatures,
-    convert: Callable[[LocalFeatures], LocalFeatures],
-    visit: Callable[[np.ndarray], None] = lambda strips: None,
-) -> Int8Features:
-    """
-    Return features, converted and rounded to int8 block by block.
-
-    :param visit: called with the strips of each block, before they are rounded.
-    """
-    W, n = features.weights.shape
-    strips = Int8Strips(W, n, features.dimension)
-    for places, block in converted_blocks(features, lambda block: convert(block).strips):
-        visit(block)
-        strips.write(places.start, np.ascontiguousarray(block))
-    return Int8Features(strips, features.weights, features.settings, features.cells)
+    kind = Int8Features if rounds else LocalFeatures
+    return kind(strips, features.weights, features.settings, features.cells)
 
 
 class PlaceChanges:

@@ -10,6 +10,8 @@ distinguishes no places.
 """
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 from stavpr_ros.checks import require_shape
@@ -137,13 +139,15 @@ class MeanCentering:
         self,
         features: LocalFeatures,
         visit: Callable[[np.ndarray], None] = lambda strips: None,
-    ) -> LocalFeatures:
+        rounds: bool = False,
+    ) -> Any:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
 
-        :param visit: called with the strips of each block.
+        :param visit, rounds: see :func:`stavpr_ros.prepare.blocks.converted`.
         """
-        return converted(features, lambda strips: self._converted(strips, self.mean), visit)
+        convert = partial(self._converted, mean=self.mean)
+        return converted(features, convert, visit, rounds)
 
     def _converted(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
         if strips.shape[1] == 1:

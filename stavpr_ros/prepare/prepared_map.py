@@ -16,11 +16,11 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.prepare.blocks import (
+    converted,
     converted_blocks,
     Int8Features,
     MAX_LAG,
     PlaceChanges,
-    rounded,
 )
 from stavpr_ros.prepare.centering import MeanCentering, RANK, SAMPLE, STRENGTH
 
@@ -68,16 +68,16 @@ def prepare_map(
         centering = MeanCentering(features, centers, whitens, statistics)
     learns = learns_changes and statistics is None
     changes = PlaceChanges(len(features) if learns else 0, MAX_LAG)
-    prepared: LocalFeatures | Int8Features
-    if (
-        statistics is not None
-        and precision == 'int8'
-        and isinstance(features, StoredFeatures)
-        and features.has_codes
-    ):
-        prepared = _of_codes(features)
-    else:
-        prepared = _converted(features, centering, precision, changes)
+    rounds = precision == 'int8'
+    if rounds and statistics and isinstance(features, StoredFeatures) and features.has_codes:
+        prepared: LocalFeatures | Int8Features = _of_codes(features)
+    elif centering is not None:
+        prepared = centering.places(features, changes.add, rounds)
+    elif rounds:
+        prepared = converted(features, visit=changes.add, rounds=True)
+    else:  # those of a map in memory are not copied
+        prepared = whole = features[:]
+        changes.add(whole.strips)
     learned = statistics.changes if statistics else changes.changes
     return PreparedMap(prepared, centering, learned, note)
 
@@ -92,20 +92,6 @@ def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
         return statistics, ''
     path = features.file.path
     return None, f'the statistics in {path} {why}: learned again; map compact renews them'
-
-
-def _converted(
-    features: LocalFeatures, centering: MeanCentering | None, precision: str, changes: PlaceChanges
-) -> LocalFeatures | Int8Features:
-    """Return the features for the matcher, and add them to the changes; a map's are not copied."""
-    if precision == 'int8':
-        convert = centering.places if centering else lambda block: block
-        return rounded(features, convert, changes.add)
-    if centering is not None:
-        return centering.places(features, changes.add)
-    whole = features[:]
-    changes.add(whole.strips)
-    return whole
 
 
 def _of_codes(features: StoredFeatures) -> Int8Features:
@@ -128,7 +114,7 @@ def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> 
     """Add the features, rounded for precision int8; see :func:`statistics_of_map`."""
     features = _AsStored(place_map.features, storage)
     centering = MeanCentering(features, statistics=statistics)
-    return replace(statistics, codes=rounded(features, centering.places).strips.rounded())
+    return replace(statistics, codes=centering.places(features, rounds=True).strips.rounded())
 
 
 def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:

@@ -20,8 +20,8 @@ GROWTH = 1.125  # the mean is updated when the route is so much longer
 SAMPLE = 128  # places that whitening is learned from
 SETTLED = 2000  # places from which on it is not learned again; a full route is settled as well
 LATEST = MAX_LAG + 1  # places that the newest one is compared with, itself included
-AT_ONCE = 64  # places whitened at a time
-PIECE = 512  # places centered at a time: the intermediate results stay in the cache
+AT_ONCE = 64  # places centered or whitened at a time: what is between stays in the cache
+PIECE = 512  # places that are summed at a time
 
 
 class RouteFeatures:
@@ -101,15 +101,11 @@ class RouteFeatures:
             self._grow(strips.shape[2])
             self._cells = features.cells
         newest = self._whitened(strips)
-        norms: np.ndarray = np.asarray(strips[:, 0].any(axis=1), np.float32)
+        norms: np.ndarray = np.asarray(strips.any(axis=2), np.float32)
         if self._centering or self._whitens:
-            change = -self._whitened(self.mean[:, None])[:, 0]
-            moved = [_moved(newest[j], norms[j : j + 1], change[j]) for j in range(len(strips))]
-            newest = np.stack([unit for unit, _ in moved])
-            norms = np.concatenate([length for _, length in moved])
-        newest = np.ascontiguousarray(newest)
-        self._write(self.count, newest)
-        self._norms[:, self.count] = norms
+            newest, norms = _moved(newest, norms, -self._whitened(self.mean[:, None]))
+        here = slice(self.count, self.count + 1)
+        self.strips[:, here], self._norms[:, here] = newest, norms
         self.latest = np.concatenate([self.latest[:, 1 - LATEST :], newest], axis=1)
         self._weights[:, self.count] = features.weights[:, 0]
         before, self._newest = self._newest, strips[:, 0]
@@ -128,16 +124,9 @@ class RouteFeatures:
             self._learn(0)
             self._next_mean = int(self.count * GROWTH) + 1
         if settles:
-            self.strips = rounded_strips(self._floats, self.count)
+            self.strips = rounded_strips(self.strips, self.count)
             self._is_settled, self._since_mean = True, 0
         return grows
-
-    def _write(self, first: int, strips: np.ndarray) -> None:
-        """Write strips (W, m, d) of the places from ``first`` on."""
-        if isinstance(self.strips, np.ndarray):
-            self.strips[:, first : first + strips.shape[1]] = strips
-        else:
-            self.strips.write(first, strips)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the mean is of the others until the next eviction."""
@@ -164,12 +153,6 @@ class RouteFeatures:
         """Return features less the mean, not whitened, of their own norm, (W, m, d)."""
         strips = self.strips[:, places] * self._norms[:, places, None]
         return self._whitening.inverse(strips) if self._whitening else strips
-
-    @property
-    def _floats(self) -> np.ndarray:
-        """Return the strips before they are rounded."""
-        assert isinstance(self.strips, np.ndarray)
-        return self.strips
 
     def _grow(self, d: int) -> None:
         """Double the room; memory that is not used yet is not touched."""
@@ -213,7 +196,7 @@ class RouteFeatures:
         """Take the mean and, until the route is settled, whitening; ``first`` becomes place 0."""
         weights = change_weights(self._changes[: self.count])
         mean = self._weighted_mean(first, weights) if self._centering else self.mean
-        self._shift(first, self._whitened((self.mean - mean)[:, None])[:, 0])
+        self._shift(first, self._whitened((self.mean - mean)[:, None]))
         self.mean, self._since_mean = mean, 0
         if self._whitens and self.count <= SETTLED and not self._is_settled:
             sample = evenly_weighted(weights, SAMPLE)
@@ -222,7 +205,7 @@ class RouteFeatures:
                 places = slice(low, min(low + AT_ONCE, self.count))
                 strips, norms = whitening(self._centered(places)), self._norms[:, places]
                 norms[:] = norms_of(strips).clip(1e-12) * (norms > 0)
-                self._floats[:, places] = unit_norm(strips)
+                self.strips[:, places] = unit_norm(strips)
             self._whitening = whitening
         last = slice(max(0, self.count - LATEST), self.count)
         self.latest = self.strips[:, last].copy()
@@ -232,29 +215,27 @@ class RouteFeatures:
         Add to features, and make them unit norm again; zero features stay zero.
 
         :param first: place from which on; it becomes place 0, the last one the last of ``count``.
-        :param change: shape (W, d).
+        :param change: shape (W, 1, d).
         """
-        for low in range(0, self.count, PIECE):
-            piece = slice(low, min(low + PIECE, self.count))
-            source = slice(piece.start + first, piece.stop + first)
-            strips, norms = self.strips[:, source], self._norms[:, source]
-            moved = [_moved(*each) for each in zip(strips, norms, change, strict=True)]
-            self._write(low, np.stack([unit for unit, _ in moved]))
-            self._norms[:, piece] = np.stack([lengths for _, lengths in moved])
+        for low in range(0, self.count, AT_ONCE):
+            places = slice(low, min(low + AT_ONCE, self.count))
+            source = slice(places.start + first, places.stop + first)
+            moved = _moved(self.strips[:, source], self._norms[:, source], change)
+            self.strips[:, places], self._norms[:, places] = moved
 
 
 def _moved(
     strips: np.ndarray, norms: np.ndarray, change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Add to features (m, d) of norms (m,), and make them unit norm; zero features stay zero.
+    Add to features (W, m, d) of norms (W, m), and make them unit norm; zero features stay zero.
 
     :returns: the features, and their norms.
     """
-    alive = norms[:, None] > 0
-    moved = strips * norms[:, None]
+    alive = norms[..., None] > 0
+    moved = strips * norms[..., None]
     moved += change
     moved *= alive
-    length = norms_of(moved)[:, None].clip(1e-12)
+    length = norms_of(moved)[..., None].clip(1e-12)
     moved /= length
-    return moved, (length * alive)[:, 0]
+    return moved, (length * alive)[..., 0]

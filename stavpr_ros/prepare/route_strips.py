@@ -51,9 +51,10 @@ def move_up(values: np.ndarray, count: int, last: int) -> None:
         values[:, first - count : end - count] = values[:, first:end]
 
 
-def rounded_strips(strips: np.ndarray, count: int) -> Int8Route:
+def rounded_strips(strips: RouteStrips, count: int) -> Int8Route:
     """Return float32 strips (W, room, d), of which ``count`` places are known, in int8."""
     rounded = Int8Route(*strips.shape)
     for low in range(0, count, PIECE):
-        rounded.write(low, np.ascontiguousarray(strips[:, low : min(low + PIECE, count)]))
+        places = slice(low, min(low + PIECE, count))
+        rounded[:, places] = strips[:, places]
     return rounded
