@@ -23,6 +23,7 @@ from stavpr_ros.prepare.matcher import CpuRouteMatcher, PRECISIONS
 from stavpr_ros.prepare.route_features import RouteFeatures
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
+NO_MATCH = -LONGEST_GAP - 1, 0  # image and place that no match continues
 MIN_PLACES = 5  # fewer distances have no meaningful mean and deviation
 
 
@@ -81,7 +82,7 @@ class LoopCloser(SequenceRecognizer):
         self._places = 0  # the newest image may be matched with so many of the oldest places
         length = settings.sequence.length
         # of the latest path: image and place of its last match; probabilities; waiting matches
-        self._last: tuple[int, int] | None = None
+        self._last = NO_MATCH
         self._path: deque[float] = deque(maxlen=2 * length)
         self._waiting: deque[Match] = deque(maxlen=LONGEST_WAIT * length)
 
@@ -107,7 +108,7 @@ class LoopCloser(SequenceRecognizer):
         """
         super().reset()
         self._recent_stamps.clear()
-        self._last = None
+        self._last = NO_MATCH
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -141,7 +142,8 @@ class LoopCloser(SequenceRecognizer):
         if verdict.status is not Status.MATCH or math.isnan(verdict.probability):
             return self._built(verdict, image_index=image)
         assert nearest is not None
-        if not self._continues(image, nearest.middle):
+        images, apart = image - self._last[0], abs(nearest.middle - self._last[1])
+        if images > LONGEST_GAP or apart > BAND * images:  # another path begins
             self._path.clear()
             self._waiting.clear()
         self._last = image, nearest.middle
@@ -177,13 +179,6 @@ class LoopCloser(SequenceRecognizer):
             first_column=first,
             columns=columns,
         )
-
-    def _continues(self, image: int, place: int) -> bool:
-        """Return whether a match continues the path of the last one."""
-        if self._last is None:
-            return False
-        images, apart = image - self._last[0], abs(place - self._last[1])
-        return images <= LONGEST_GAP and apart <= BAND * images
 
     def _oldest(self, verdict: Verdict) -> list[Match]:
         """
