@@ -347,12 +347,14 @@ class PlaceRecognizer(SequenceRecognizer):
         backend = choose_backend(backend)
         settings = replace(settings, error_risks=place_map.error_risks)
         features, options = place_map.features, settings.applied_options
+        kind, strips = place_map.settings.kind, place_map.settings.strips
+        constant, cells = evidence_of(kind, strips, features.dimension)
         self._suggested = place_map.threshold
         poses = place_map.poses if place_map.has_poses else None
         super().__init__(
             settings,
             place_map.settings,
-            window_of(place_map, settings, backend),
+            window_of(place_map, settings, backend, constant),
             () if poses is None else poses[:, :2],
         )
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
@@ -371,14 +373,11 @@ class PlaceRecognizer(SequenceRecognizer):
         self._matcher = make_matcher(
             prepared.features, settings.applied_spatial, backend, precision
         )
-        numbers = place_map.settings.strips * len(features) * self._dimension
+        numbers = strips * len(features) * self._dimension
         self._is_small = numbers * (1 if precision == 'int8' else 4) < SMALL_MAP
         if isinstance(self._window, FilterWindow):
             layout = self._window.layout
             self._window.change.learn(layout.changes_of_passes(prepared.changes), layout.firsts)
-            _, cells = evidence_of(
-                place_map.settings.kind, place_map.settings.strips, self._dimension
-            )
             if cells is not None:
                 self._window.cells = CellAgreement(
                     cells,

@@ -68,19 +68,24 @@ class LoopCloser(SequenceRecognizer):
         _require_fitting(settings, exclude, limit, exclude_seconds)
         require_choice('precision', precision, ('auto', *PRECISIONS))
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
-        window = _route_window(settings, feature_settings.kind)
+        options, sequence = settings.applied_options, settings.sequence
+        window: QueryWindow
+        if options.place_filter:
+            constant = route_evidence_of(feature_settings.kind)
+            window = FilterWindow(sequence, 0, None, True, AROUND, True, constant=constant)
+        else:
+            window = LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
         super().__init__(settings, feature_settings, window, self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._matcher = CpuRouteMatcher(W, settings.applied_spatial)
-        options = settings.applied_options
         self._route = RouteFeatures(
             feature_settings, options.mean_centering, options.whitening, limit, precision == 'int8'
         )
         # stamps of the latest places, not yet old enough in seconds
         self._recent_stamps: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
-        length = settings.sequence.length
+        length = sequence.length
         # of the latest path: image and place of its last match; probabilities; waiting matches
         self._last = NO_MATCH
         self._path: deque[float] = deque(maxlen=2 * length)
@@ -240,15 +245,6 @@ class LoopCloser(SequenceRecognizer):
         if self._places < MIN_PLACES:
             return np.empty(0, np.float32)
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
-
-
-def _route_window(settings: RecognizerSettings, kind: str) -> QueryWindow:
-    """Return an empty window for a route without places."""
-    options, sequence = settings.applied_options, settings.sequence
-    if not options.place_filter:
-        return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
-    constant = route_evidence_of(kind)
-    return FilterWindow(sequence, 0, None, True, AROUND, True, constant=constant)
 
 
 def least_limit(exclude: int, length: int) -> int:

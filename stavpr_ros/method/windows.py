@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.filter import SPACING
@@ -24,24 +23,26 @@ if TYPE_CHECKING:
 
 
 def window_of(
-    place_map: PlaceMap, settings: RecognizerSettings, backend: 'str | torch.device'
+    place_map: PlaceMap,
+    settings: RecognizerSettings,
+    backend: 'str | torch.device',
+    constant: float,
 ) -> QueryWindow:
-    """Return an empty window for a map."""
+    """
+    Return an empty window for a map.
+
+    :param constant: of the evidence of its features.
+    """
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
     length = sequence.length + SPACING if options.place_filter else 0
     layout = layout_of(place_map, settings.nms_radius, settings.moves_against, length)
     if options.place_filter:
-        window: FilterWindow
         arguments = sequence, n, layout, True
-        W = place_map.settings.strips
-        constant, _ = evidence_of(place_map.settings.kind, W, place_map.features.dimension)
         if isinstance(backend, str):
-            window = FilterWindow(*arguments, constant=constant)
-        else:
-            from stavpr_ros.method.device_windows import DeviceFilterWindow
+            return FilterWindow(*arguments, constant=constant)
+        from stavpr_ros.method.device_windows import DeviceFilterWindow
 
-            window = DeviceFilterWindow(*arguments, constant=constant, device=backend)
-        return window
+        return DeviceFilterWindow(*arguments, constant=constant, device=backend)
     if isinstance(backend, str):
         return LmDtwWindow(sequence, n, layout, options.query_znorm)
     if options != PAPER:

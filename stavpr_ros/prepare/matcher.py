@@ -16,7 +16,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty, is_aligned
 from stavpr_ros.prepare.blocks import converted, Int8Features
 from stavpr_ros.prepare.centering import normalize
-from stavpr_ros.prepare.route_strips import RouteStrips
+from stavpr_ros.prepare.route_features import RouteStrips
 
 if TYPE_CHECKING:
     from stavpr_ros.prepare.device_matcher import DeviceMatcher

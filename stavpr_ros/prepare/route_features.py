@@ -10,10 +10,12 @@ are places, so that a place is seldom rounded again.
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.memory import aligned_empty
 from stavpr_ros.prepare.blocks import change_weights, MAX_LAG
 from stavpr_ros.prepare.centering import evenly_weighted, norms_of, unit_norm, Whitening
-from stavpr_ros.prepare.route_strips import grown, move_up, rounded_strips, RouteStrips
+from stavpr_ros.simd import LANES
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
@@ -22,6 +24,27 @@ SETTLED = 2000  # places from which on it is not learned again; a full route is 
 LATEST = MAX_LAG + 1  # places that the newest one is compared with, itself included
 AT_ONCE = 64  # places centered or whitened at a time: what is between stays in the cache
 PIECE = 512  # places that are summed at a time
+
+
+class Int8Route(Int8Strips):
+    """Strips of a route in int8; see :class:`stavpr_ros.alignment.cpu.int8`."""
+
+    def grow(self, room: int) -> None:
+        """Make room for more places."""
+        values, reciprocals = self.values, self.reciprocals
+        super().__init__(self.shape[0], room, self.shape[2])
+        self.values[:, : values.shape[1]] = values
+        self.reciprocals[:, : reciprocals.shape[1]] = reciprocals
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        source, to = np.arange(count, self.shape[1]), np.arange(self.shape[1] - count)
+        for values in self.values.view(np.int32)[..., 0]:  # of a strip
+            values[to // LANES, :, to % LANES] = values[source // LANES, :, source % LANES]
+        self.reciprocals[:, to] = self.reciprocals[:, source]
+
+
+RouteStrips = np.ndarray | Int8Route  # of a route, (W, room, d), float32 or int8
 
 
 class RouteFeatures:
@@ -239,3 +262,27 @@ def _moved(
     length = norms_of(moved)[..., None].clip(1e-12)
     moved /= length
     return moved, (length * alive)[..., 0]
+
+
+def grown(values: np.ndarray, room: int) -> np.ndarray:
+    """Return (W, n, ...) with room for more places; memory that is not used is not touched."""
+    W, n, *rest = values.shape
+    out = aligned_empty((W, room, *rest), values.dtype)
+    out[:, :n] = values
+    return out
+
+
+def move_up(values: np.ndarray, count: int, last: int) -> None:
+    """Move places ``count`` to ``last`` of (W, n, ...) up by ``count``."""
+    for first in range(count, last, count):
+        end = min(first + count, last)
+        values[:, first - count : end - count] = values[:, first:end]
+
+
+def rounded_strips(strips: RouteStrips, count: int) -> Int8Route:
+    """Return float32 strips (W, room, d), of which ``count`` places are known, in int8."""
+    rounded = Int8Route(*strips.shape)
+    for low in range(0, count, AT_ONCE):
+        places = slice(low, min(low + AT_ONCE, count))
+        rounded[:, places] = strips[:, places]
+    return rounded
