@@ -10,7 +10,6 @@ computed by one thread, several blocks at the same time.
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numba as nb
@@ -18,7 +17,7 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.threads import thread_count
 
@@ -29,21 +28,12 @@ REST, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a sl
 Block = TypeVar('Block')
 
 
-@dataclass(frozen=True)
-class Int8Features:
-    """
-    Features of a map in int8, one byte a value: :class:`stavpr_ros.features.LocalFeatures`.
+class Int8Features(LocalFeatures):
+    """Features of a map in int8, one byte a value: ``strips`` are rounded."""
 
-    :param strips: the features, rounded.
-    """
+    strips: Int8Strips  # type: ignore[assignment]
 
-    strips: Int8Strips
-    weights: np.ndarray
-    settings: FeatureSettings
-    cells: tuple[int, int] | None = None
-
-    def __len__(self) -> int:
-        return self.strips.shape[1]
+    def __post_init__(self) -> None: ...
 
 
 def converted_blocks(
@@ -73,12 +63,12 @@ def converted(
     convert: Callable[[np.ndarray], np.ndarray] = lambda strips: strips,
     visit: Callable[[np.ndarray], None] = lambda strips: None,
     rounds: bool = False,
-) -> Any:
+) -> LocalFeatures:
     """
     Return new features, converted block by block.
 
     :param visit: called with the strips of each converted block, before they are rounded.
-    :param rounds: return :class:`Int8Features` instead of :class:`LocalFeatures`.
+    :param rounds: return :class:`Int8Features`.
     """
     shape = *features.weights.shape, features.dimension
     strips: Any = Int8Strips(*shape) if rounds else aligned_empty(shape)

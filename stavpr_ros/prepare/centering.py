@@ -11,7 +11,6 @@ distinguishes no places.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 from stavpr_ros.checks import require_shape
@@ -140,7 +139,7 @@ class MeanCentering:
         features: LocalFeatures,
         visit: Callable[[np.ndarray], None] = lambda strips: None,
         rounds: bool = False,
-    ) -> Any:
+    ) -> LocalFeatures:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
 

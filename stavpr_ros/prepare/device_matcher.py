@@ -26,7 +26,7 @@ class DeviceMatcher:
 
     def __init__(
         self,
-        features: LocalFeatures | Int8Features,
+        features: LocalFeatures,
         spatial: SpatialSettings,
         device: torch.device,
     ) -> None:

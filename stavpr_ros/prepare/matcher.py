@@ -26,7 +26,7 @@ PRECISIONS = ('float32', 'int8')
 
 
 def make_matcher(
-    features: LocalFeatures | Int8Features,
+    features: LocalFeatures,
     spatial: SpatialSettings,
     backend: 'str | torch.device',
     precision: str,
@@ -55,7 +55,7 @@ def make_matcher(
         raise SettingsError(f"backend '{backend}' has no vertical alignment: take 'cpu'")
     if precision == 'int8' and spatial.vertical:
         raise SettingsError("precision 'int8' has no vertical alignment: take float32")
-    if precision == 'int8' and isinstance(features, LocalFeatures):
+    if precision == 'int8' and not isinstance(features, Int8Features):
         features = converted(features, rounds=True)
     device = choose_backend(backend)
     if isinstance(device, str):
@@ -96,7 +96,7 @@ class CpuMatcher:
 
     def __init__(
         self,
-        features: LocalFeatures | Int8Features,
+        features: LocalFeatures,
         spatial: SpatialSettings,
     ) -> None:
         W, _, d = features.strips.shape

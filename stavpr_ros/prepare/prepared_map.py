@@ -41,7 +41,7 @@ class PreparedMap:
         there are none.
     """
 
-    features: LocalFeatures | Int8Features
+    features: LocalFeatures
     centering: MeanCentering | None
     changes: np.ndarray
     note: str = ''
@@ -70,7 +70,7 @@ def prepare_map(
     changes = PlaceChanges(len(features) if learns else 0, MAX_LAG)
     rounds = precision == 'int8'
     if rounds and statistics and isinstance(features, StoredFeatures) and features.has_codes:
-        prepared: LocalFeatures | Int8Features = _of_codes(features)
+        prepared = _of_codes(features)
     elif centering is not None:
         prepared = centering.places(features, changes.add, rounds)
     elif rounds:
@@ -94,14 +94,14 @@ def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
     return None, f'the statistics in {path} {why}: learned again; map compact renews them'
 
 
-def _of_codes(features: StoredFeatures) -> Int8Features:
+def _of_codes(features: StoredFeatures) -> LocalFeatures:
     """
     Return the features that are kept as codes in the map's file.
 
     :raises MapFileError: they are longer than codes can be.
     """
     W, n = features.weights.shape
-    strips = Int8Strips(W, n, features.dimension)
+    strips: Any = Int8Strips(W, n, features.dimension)
     with errors_of(features.file.path):
         for j in range(W):
             for first in range(0, n, CODES_AT_ONCE):
@@ -113,8 +113,9 @@ def _of_codes(features: StoredFeatures) -> Int8Features:
 def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> MapStatistics:
     """Add the features, rounded for precision int8; see :func:`statistics_of_map`."""
     features = _AsStored(place_map.features, storage)
-    centering = MeanCentering(features, statistics=statistics)
-    return replace(statistics, codes=centering.places(features, rounds=True).strips.rounded())
+    rounded = MeanCentering(features, statistics=statistics).places(features, rounds=True)
+    assert isinstance(rounded, Int8Features)
+    return replace(statistics, codes=rounded.strips.rounded())
 
 
 def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:
