@@ -68,8 +68,8 @@ class ColumnLayout:
         n = len(same_as)
         self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         self.lap = n - int(same_as[-1]) - 1 if repeated else 0
-        again = np.arange(n, n + repeated) - self.lap
-        self._places = np.append(np.arange(n), again)  # of each pass
+        seam_places = np.arange(n, n + repeated) - self.lap
+        self._places = np.append(np.arange(n), seam_places)  # of each pass
         self._along = len(self._places)
         if against:
             self._places = np.append(self._places, n - 1 - self._places)
@@ -84,8 +84,8 @@ class ColumnLayout:
         self._shared = np.arange(self._width)  # column where the position's probability is summed
         self._positions = self._shared[self.columns] = self.columns[same_as[self._places]]
         self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
-        self._of_columns = np.full(self._width, n)  # place of each column, n in a gap
-        self._of_columns[self.columns] = self._places
+        self._place_of_column = np.full(self._width, n)  # n in a gap
+        self._place_of_column[self.columns] = self._places
 
     def passes(self, places: int) -> int:
         """Return the number of passes of so many places."""
@@ -116,7 +116,7 @@ class ColumnLayout:
         """Return distances to places (n,) as distances to columns, +inf in gaps."""
         if self.columns is None:
             return row
-        out: np.ndarray = np.append(row, row.dtype.type(np.inf)).take(self._of_columns)
+        out: np.ndarray = np.append(row, row.dtype.type(np.inf)).take(self._place_of_column)
         return out
 
     def to_places(self, values: np.ndarray) -> np.ndarray:
@@ -151,8 +151,7 @@ class ColumnLayout:
 
     def direction_of(self, column: int) -> int:
         """Return 1 of a pass along the map, -1 of one against it."""
-        is_along = self.columns is None or column <= self.columns[self._along - 1]
-        return 1 if is_along else -1
+        return 1 if self.columns is None or column <= self.columns[self._along - 1] else -1
 
     def repeated(self, path: np.ndarray) -> slice:
         """
