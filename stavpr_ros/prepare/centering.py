@@ -149,22 +149,18 @@ class MeanCentering:
         return converted(features, convert, visit, rounds)
 
     def _converted(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        if strips.shape[1] == 1:
-            return self._converted_image(strips[:, 0], mean)[:, None]
+        W, m, d = strips.shape
+        if m == 1:
+            directions, change = np.empty((W, 0, d), np.float32), np.empty((W, 1, 0), np.float32)
+            if self.whitening is not None:
+                directions, change = self.whitening.directions, self.whitening.change
+            arguments, out = (strips[:, 0], mean, directions, change[:, 0]), np.empty_like(mean)
+            _convert_image(*map(np.ascontiguousarray, arguments), out)
+            return out[:, None]
         centered = strips - mean[:, None]
         centered[~strips.any(axis=2)] = 0
         normalize(centered)
         return centered if self.whitening is None else normalize(self.whitening(centered))
-
-    def _converted_image(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        W, d = strips.shape
-        directions, change = np.empty((W, 0, d), np.float32), np.empty((W, 1, 0), np.float32)
-        if self.whitening is not None:
-            directions, change = self.whitening.directions, self.whitening.change
-        out: np.ndarray = np.empty((W, d), np.float32)
-        arguments = strips, mean, directions, change[:, 0]
-        _convert_image(*map(np.ascontiguousarray, arguments), out)
-        return out
 
     def next_query(self, strips: np.ndarray) -> np.ndarray:
         """

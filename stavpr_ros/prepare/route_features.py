@@ -155,7 +155,8 @@ class RouteFeatures:
         """Drop the oldest places; the mean is of the others until the next eviction."""
         remaining = self.count - count
         self._weights[:, :remaining] = self._weights[:, count : self.count].copy()
-        self._sum -= self._total(np.ones(count))
+        if self._centering:
+            self._sum -= self._total(np.ones(count))
         self._changes[:remaining] = self._changes[count : self.count].copy()
         if (self._centering or self._whitens) and not self._is_settled:
             self.count = remaining
@@ -195,8 +196,6 @@ class RouteFeatures:
     def _total(self, weights: np.ndarray) -> np.ndarray:
         """Return the weighted sum of the original features of the oldest places, (W, d)."""
         total: np.ndarray = np.zeros_like(self._sum)
-        if not self._centering:
-            return total
         for low in range(0, len(weights), PIECE):
             piece = slice(low, min(low + PIECE, len(weights)))
             if not weights[piece].any():
@@ -209,16 +208,13 @@ class RouteFeatures:
             total += of_piece[:, 0] + (alive * of_place).sum(axis=1, keepdims=True) * self.mean
         return total
 
-    def _weighted_mean(self, first: int, weights: np.ndarray) -> np.ndarray:
-        """Return the mean of the places from ``first`` on, of these weights."""
-        less = np.append(np.zeros(first), 1 - weights)
-        total = self._sum - self._total(less) if less.any() else self._sum
-        return (total / weights.sum()).astype(np.float32)
-
     def _learn(self, first: int) -> None:
         """Take the mean and, until the route is settled, whitening; ``first`` becomes place 0."""
-        weights = change_weights(self._changes[: self.count])
-        mean = self._weighted_mean(first, weights) if self._centering else self.mean
+        weights, mean = change_weights(self._changes[: self.count]), self.mean
+        if self._centering:
+            less = np.append(np.zeros(first), 1 - weights)
+            total = self._sum - self._total(less) if less.any() else self._sum
+            mean = (total / weights.sum()).astype(np.float32)
         self._shift(first, self._whitened((self.mean - mean)[:, None]))
         self.mean, self._since_mean = mean, 0
         if self._whitens and self.count <= SETTLED and not self._is_settled:
