@@ -73,7 +73,5 @@ def layout_of(
     if length and seam is not None:
         repeated = min(n - 1 - 2 * seam, int(length * max(MODEL.speeds)))
         repeated = repeated if repeated > MAX_LAG else 0
-    if (index is None and not against and not repeated) or not n:
-        return ColumnLayout()
-    gap = session_gap(nms_radius)
-    return ColumnLayout(firsts, same_as.astype(np.int64), gap, against, repeated)
+    gap, same_as = session_gap(nms_radius), same_as.astype(np.int64)
+    return ColumnLayout(firsts, same_as, gap, against, repeated) if n else ColumnLayout()
