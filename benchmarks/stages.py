@@ -33,8 +33,8 @@ from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.filter import PlaceFilter
+from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.model import APART, MODEL, STRAIGHT
-from stavpr_ros.method.query_window import SequenceBuffer
 from stavpr_ros.pipeline import LoadedMap, Pipeline, PipelineSettings
 from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import MeanCentering, normalize
@@ -119,7 +119,7 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
     padded = np.full((SEQUENCE.length, padded_width(n, SEQUENCE.k)), np.inf, np.float32)
     padded[:, :n] = window
     sizes = Sizes(n, 0, l=SEQUENCE.length, k=SEQUENCE.k)
-    push = partial(SequenceBuffer(SEQUENCE.length, n, SEQUENCE.k).push, window[-1])
+    push = partial(LmDtwWindow(SEQUENCE, n).push, window[-1], window, 0)
     add('window_push', call=push, works=[bounds.window_push(sizes)])
     kernel = partial(match_padded, padded, n, SEQUENCE.k)
     matches = kernel()
@@ -231,12 +231,12 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
 
 def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     """Measure the image distances of a map in int8, on a CPU."""
-    from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+    from stavpr_ros.prepare.matcher import CpuMatcher
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
         block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, seed + low)
-        rounded.write(low, block.strips)
+        rounded[:, low:] = block.strips
     query = make_features(1, d, STRIPS, seed)
     weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
     places = Int8Features(rounded, weights, query.settings)

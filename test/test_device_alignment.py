@@ -93,7 +93,7 @@ def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned):
             np.testing.assert_array_equal(middles, SequenceDistances(q, m).middles)
             assert best_match(SequenceDistances(q, m), radius).first == answer.start
     window.reset()
-    assert len(window.buffer) == 0
+    assert len(window.images) == 0
 
 
 def test_starts_of_default_window_equal_oracle(device):
@@ -126,7 +126,7 @@ def expected_row(reference, query, i, settings, precision):
         whole, lengths = rounded_queries(query.strips)
         x = whole[i].astype(float) * lengths[i, :, None]
         held = Int8Strips(*y.shape)
-        held.write(0, reference.strips)
+        held[:, :] = reference.strips
         y = held[:, :].astype(float)
     products = np.einsum('id,jnd->ijn', x, y)
     if settings.strategy == 'none':
@@ -166,7 +166,7 @@ def test_strip_distances_of_int8_are_those_of_cpu_bit_for_bit(device):
     reference, query = features(9, strips=7), features(2, seed=1, strips=7)
     matcher = make_matcher(reference, SpatialSettings(), device, 'int8')
     held = Int8Strips(*reference.strips.shape)
-    held.write(0, reference.strips)
+    held[:, :] = reference.strips
     whole, lengths = rounded_queries(query.strips)
     for i in range(2):
         matcher.distances(query.strips[:, i], query.weights[:, i])

@@ -22,8 +22,7 @@ from stavpr_ros.alignment import (
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare import prepare_map, z_normalized
-from stavpr_ros.prepare.cpu_matcher import CpuMatcher
-from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
+from stavpr_ros.prepare.matcher import CpuMatcher, make_matcher, PRECISIONS
 from stavpr_ros.threads import limit_threads
 
 ADAPTIVE = SpatialSettings()

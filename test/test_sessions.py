@@ -23,8 +23,7 @@ from stavpr_ros.mapping import (
 from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.method.model import MODEL
-from stavpr_ros.method.sessions import layout_of
+from stavpr_ros.method.windows import layout_of
 from stavpr_ros.prepare.normalization import z_normalized
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -56,7 +55,7 @@ def recognize(place_map, query, mode='robust'):
 
 def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
-    assert {layout_of(each, 20, MODEL).columns for each in (town[0], one)} == {None}
+    assert {layout_of(each, 20).columns for each in (town[0], one)} == {None}
     query = features_of(route(0), 1.0, 9)[10:50]
     for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
         assert repr(found) == repr(expected)

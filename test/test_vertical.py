@@ -10,8 +10,7 @@ from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.prepare.cpu_matcher import CpuMatcher, cut_cells
-from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.matcher import CpuMatcher, cut_cells, make_matcher
 
 SETTINGS = FeatureSettings('gradient', GradientSettings(), 5)
 

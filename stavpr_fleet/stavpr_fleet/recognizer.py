@@ -27,7 +27,7 @@ from stavpr_ros.method.sessions import session_gap
 from stavpr_ros.method.settings import ROBUST
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
-from stavpr_ros.prepare.cpu_matcher import CpuMatcher
+from stavpr_ros.prepare.matcher import CpuMatcher
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.threads import call_on_thread
 
@@ -55,7 +55,7 @@ class CityLayout(ColumnLayout):
     def __init__(
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
     ) -> None:
-        super().__init__(firsts, same_as, session_gap(nms_radius, MODEL))
+        super().__init__(firsts, same_as, session_gap(nms_radius))
         self.loaded = places
 
     def names_of(self, columns: np.ndarray) -> np.ndarray:

@@ -204,7 +204,7 @@ def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, 
     assert (tmp_path / 'map.stavpr').exists() is (code == 0)
 
 
-@pytest.mark.parametrize('where', ['mapping.save_map', 'method.threshold.suggest_threshold'])
+@pytest.mark.parametrize('where', ['mapping.save_map', 'maintenance.threshold.suggest_threshold'])
 def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatch, where):
     monkeypatch.setattr(f'stavpr_ros.{where}', interrupt)
     result = run(build_map, '--input', traverse, '--output', tmp_path / 'map')

@@ -279,7 +279,7 @@ def _source_of(arguments: argparse.Namespace) -> str:
 def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float | None':
     """Return the threshold of mode paper for a map, None = unknown; print the reason."""
     from stavpr_ros.errors import InputError
-    from stavpr_ros.method.threshold import suggest_threshold
+    from stavpr_ros.maintenance.threshold import suggest_threshold
 
     if len(place_map) > MAX_SUGGESTED:
         return None  # it would take the whole map into memory

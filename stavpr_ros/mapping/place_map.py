@@ -127,7 +127,7 @@ class PlaceMap:
         closed route, that shows the same, shape (n,), int32; None = unknown. By
         :mod:`stavpr_ros.maintenance.same_places`.
     :param threshold: distance below which mode paper matches where its own is not set, above 0; as
-        :func:`stavpr_ros.method.threshold.suggest_threshold` returns it; None = unknown.
+        :func:`stavpr_ros.maintenance.threshold.suggest_threshold` returns it; None = unknown.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
         read from a file.
     :param error_risks: of drives on this map, which ``max_error`` is kept by; None = unknown.

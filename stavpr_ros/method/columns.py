@@ -68,8 +68,8 @@ class ColumnLayout:
         n = len(same_as)
         self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         self.lap = n - int(same_as[-1]) - 1 if repeated else 0
-        again = np.arange(n, n + repeated) - self.lap
-        self._places = np.append(np.arange(n), again)  # of each pass
+        seam_places = np.arange(n, n + repeated) - self.lap
+        self._places = np.append(np.arange(n), seam_places)  # of each pass
         self._along = len(self._places)
         if against:
             self._places = np.append(self._places, n - 1 - self._places)
@@ -82,12 +82,10 @@ class ColumnLayout:
         self._width = int(self.columns[-1]) + 1
         self._same_as = same_as
         self._shared = np.arange(self._width)  # column where the position's probability is summed
-        self._shared[self.columns] = self.columns[same_as[self._places]]
-        by_position = self.columns[np.argsort(self._shared[self.columns], kind='stable')]
-        self._sorted = by_position, self._shared[by_position]  # columns, and their positions
+        self._positions = self._shared[self.columns] = self.columns[same_as[self._places]]
         self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
-        self._of_columns = np.full(self._width, n)  # place of each column, n in a gap
-        self._of_columns[self.columns] = self._places
+        self._place_of_column = np.full(self._width, n)  # n in a gap
+        self._place_of_column[self.columns] = self._places
 
     def passes(self, places: int) -> int:
         """Return the number of passes of so many places."""
@@ -118,7 +116,7 @@ class ColumnLayout:
         """Return distances to places (n,) as distances to columns, +inf in gaps."""
         if self.columns is None:
             return row
-        out: np.ndarray = np.append(row, row.dtype.type(np.inf)).take(self._of_columns)
+        out: np.ndarray = np.append(row, row.dtype.type(np.inf)).take(self._place_of_column)
         return out
 
     def to_places(self, values: np.ndarray) -> np.ndarray:
@@ -153,15 +151,7 @@ class ColumnLayout:
 
     def direction_of(self, column: int) -> int:
         """Return 1 of a pass along the map, -1 of one against it."""
-        is_along = self.columns is None or column <= self.columns[self._along - 1]
-        return 1 if is_along else -1
-
-    def first_column(self, column: int) -> int:
-        """Return the first column of a column's session."""
-        if self.columns is None:
-            return 0
-        firsts = self.columns[self.firsts]
-        return int(firsts[np.searchsorted(firsts, column, 'right') - 1])
+        return 1 if self.columns is None or column <= self.columns[self._along - 1] else -1
 
     def repeated(self, path: np.ndarray) -> slice:
         """
@@ -170,11 +160,11 @@ class ColumnLayout:
         :param path: columns, ascending, (l,).
         :returns: an empty slice where it is not.
         """
-        if not self.lap:
+        if self.columns is None or not self.lap:
             return slice(0, 0)
-        first = self.first_column(path[0])
-        start, stop = first + len(self._same_as), first + self._along
-        return slice(start, stop) if path[0] >= start else slice(0, 0)
+        firsts, n = self.columns[self.firsts], len(self._same_as)
+        first = int(firsts[np.searchsorted(firsts, path[0], 'right') - 1])  # of its direction
+        return slice(first + n, first + self._along) if path[0] >= first + n else slice(0, 0)
 
     def session_of(self, place: int) -> tuple[int, int]:
         """Return the first place of a place's session, and the first one behind it."""
@@ -191,10 +181,15 @@ class ColumnLayout:
         """Return the columns of positions near a column's, as first ones and ends, (m, 2)."""
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
-        own = self._shared[self.columns[int(self.pass_before(np.array(column)))]]
-        near = _columns_near(*self._sorted, np.array([own]), radius, self.lap)
+        own = self._positions[self.pass_before(np.array(column))]
+        near = self.columns[self._apart(self._positions, own) <= radius]
         ends = np.flatnonzero(np.diff(near) > 1)
         return np.stack([near[np.append(0, ends + 1)], near[np.append(ends, -1)] + 1], axis=1)
+
+    def _apart(self, positions: np.ndarray, position: int) -> np.ndarray:
+        """Return how far positions are from one, also over the seam of a closed route."""
+        apart = np.abs(positions - position)
+        return np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
 
     def merged(self, columns: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, int]:
         """
@@ -214,8 +209,7 @@ class ColumnLayout:
         sums = np.empty(len(around))
         sums[order] = sums_near(around[order], np.tile(probabilities, len(shifts))[order])
         sums = sums[len(columns) * (len(shifts) // 2) :][: len(columns)]
-        apart = np.abs(positions - positions[np.argmax(sums)])
-        apart = np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
+        apart = self._apart(positions, positions[np.argmax(sums)])
         best = int(np.argmax(np.where(apart <= CLOSE, own, -1)))
         return np.minimum(sums, 1), int(columns[best])
 
@@ -235,22 +229,3 @@ def sums_near(positions: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
             sums[i] += probabilities[j]
             j += 1
     return sums
-
-
-@kernel
-def _columns_near(
-    by_position: np.ndarray, positions: np.ndarray, sought: np.ndarray, radius: int, lap: int
-) -> np.ndarray:
-    """
-    Return the columns of positions near any of those sought, ascending.
-
-    :param by_position, positions: columns by position, and their positions, (m,).
-    :param lap: of a closed route, else 0.
-    """
-    is_near = np.zeros(len(positions), np.bool_)
-    for position in sought:
-        for shifted in range(-1, 2) if lap else range(1):
-            low = np.searchsorted(positions, position + shifted * lap - radius)
-            end = np.searchsorted(positions, position + shifted * lap + radius, 'right')
-            is_near[low:end] = True
-    return np.sort(by_position[is_near])

@@ -13,12 +13,10 @@ from stavpr_ros.method.filter import (
     BLOCKS,
     Image,
     NEGLIGIBLE,
-    NO_PLACES,
+    PlaceFilter,
     SPACING,
-    StateFilter,
     STEEPEST,
 )
-from stavpr_ros.method.model import MODEL, Model
 from stavpr_ros.method.straight import FAR
 import torch
 from torch.nn.functional import conv1d, max_pool1d, pad
@@ -26,30 +24,22 @@ from torch.nn.functional import conv1d, max_pool1d, pad
 PLACES_AT_ONCE = 1 << 17  # columns of straight paths
 
 
-class DevicePlaceFilter(StateFilter):
+class DevicePlaceFilter(PlaceFilter):
     """
-    A :class:`stavpr_ros.method.filter.PlaceFilter` on a device of torch.
+    A :class:`stavpr_ros.method.filter.PlaceFilter` whose states are on a device of torch.
 
     Probabilities differ from those of the CPU in the last digits: sums are formed in another
     order. Only the first question about an image waits for the device. Values of z that are
     tensors are not checked, which would wait for it.
 
-    :param device: of torch; other parameters: see
-        :class:`stavpr_ros.method.filter.StateFilter`.
+    :param device: of torch; others: see :class:`stavpr_ros.method.filter.PlaceFilter`.
     """
 
-    def __init__(
-        self,
-        columns: int,
-        length: int,
-        model: Model = MODEL,
-        gaps: np.ndarray = NO_PLACES,
-        device: torch.device | str = 'cuda',
-    ) -> None:
+    def __init__(self, *arguments: Any, device: torch.device | str, **options: Any) -> None:
         self._device = torch.device(device)
         self._graph = DeviceGraph(self._device, self._compute)
         self._image: Image | None = None  # the newest one, until its results were read
-        super().__init__(columns, length, model, gaps)
+        super().__init__(*arguments, **options)
 
     def _zeros(self, shape: tuple[int, ...]) -> torch.Tensor:
         return torch.zeros(shape, device=self._device)
@@ -77,10 +67,10 @@ class DevicePlaceFilter(StateFilter):
         return values.cpu().numpy()
 
     def _vector(self, z: Any) -> torch.Tensor:
-        least = int(self._gaps.max(initial=-1)) + 1
         if not isinstance(z, torch.Tensor):
-            return torch.from_numpy(checks.float32_vector('z', z, least, self._width))
+            return torch.from_numpy(super()._vector(z))
         checks.require_shape('z', z, 'n')
+        least = int(self._gaps.max(initial=-1)) + 1
         if not (z.is_floating_point() and least <= len(z) <= self._width):
             expected = f'expected {least} to {self._width}, floating-point'
             raise InputError(f'z of {len(z)} places, {z.dtype}: {expected}')

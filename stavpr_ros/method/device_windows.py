@@ -13,7 +13,7 @@ from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.device_filter import DevicePlaceFilter
 from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
-from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
+from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 import torch
@@ -26,30 +26,6 @@ def z_normalized_on_device(row: torch.Tensor, counted: torch.Tensor) -> torch.Te
     off = row - torch.where(known, row, 0).sum(dtype=torch.float64) / count
     variance = torch.where(known, off, 0).square().sum() / count
     return (off / variance.sqrt().clamp(min=MIN_DEVIATION)).float()
-
-
-class DeviceBuffer(SequenceBuffer):
-    """A :class:`SequenceBuffer` on a device; rows are not checked, which would wait for it."""
-
-    def __init__(self, *arguments: Any, device: torch.device, **options: Any) -> None:
-        self._device = device
-        super().__init__(*arguments, **options)
-
-    def _filled(self, shape: tuple[int, int]) -> torch.Tensor:
-        return torch.full(shape, torch.inf, device=self._device)
-
-    def push(self, row: torch.Tensor) -> None:  # type: ignore[override]
-        """See :meth:`SequenceBuffer.push`; the row is on the device."""
-        self._add(row)
-
-    def newest(self) -> np.ndarray:
-        """Return the row of the newest image, (n,), copied from the device."""
-        return self._slots[self.oldest - 1][0].cpu().numpy()
-
-    def at(self, columns: np.ndarray, images: int | None = None) -> np.ndarray:
-        """See :meth:`SequenceBuffer.at`; copied from the device."""
-        flat = torch.from_numpy(self._ring(images)[:, None] * self.memory.shape[1] + columns)
-        return self.memory.take(flat.to(self._device)).cpu().numpy()
 
 
 class RowColumns:
@@ -114,9 +90,9 @@ class DeviceFilterWindow(FilterWindow):
         return self._row_columns(row)
 
 
-class DeviceLmDtwWindow(BufferWindow):
+class DeviceLmDtwWindow(QueryWindow):
     """
-    LM-DTW on a device; only a match waits for it.
+    LM-DTW on a device; only a match waits for it. Rows are not checked, which would, too.
 
     :param sequence: l and k.
     :param places: number of places n.
@@ -130,11 +106,11 @@ class DeviceLmDtwWindow(BufferWindow):
         layout: ColumnLayout,
         device: torch.device,
     ) -> None:
+        super().__init__(sequence.length, layout)
         n, l, k = layout.width(places), sequence.length, sequence.k
-        buffer = DeviceBuffer(l, n, k, lambda n, k: n + k - 1, device=device)
-        super().__init__(buffer, layout)
+        self._k, self._width = k, n
         self._row_columns = RowColumns(None, layout, places, device)
-        self._window = torch.full((l, n + k - 1), torch.inf, device=device)
+        self._rows = torch.full((l, n + k - 1), torch.inf, device=device)  # oldest image first
         self._distances = torch.full((n,), torch.inf, device=device)
         self._lengths = torch.zeros(n, dtype=torch.int64, device=device)
         self._radius = torch.zeros((), dtype=torch.int64, device=device)
@@ -143,27 +119,42 @@ class DeviceLmDtwWindow(BufferWindow):
         self._received = HostCopy(self._out)
         self._graph = DeviceGraph(device, self._compute)
 
-    def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
-        return self._row_columns(row)
+    def push(self, row: torch.Tensor, strips: np.ndarray, stamp: int) -> None:
+        """See :meth:`QueryWindow.push`; the row is on the device."""
+        self._rows.copy_(self._rows.roll(-1, 0))
+        self._rows[-1, : self._width] = self._row_columns(row)
+        self._append(stamp)
+
+    def newest_row(self) -> np.ndarray:
+        """See :meth:`QueryWindow.newest_row`; copied from the device."""
+        return self._rows[-1, : self._width].cpu().numpy()
+
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`QueryWindow.at`; copied from the device."""
+        rows = self._rows[self.length - len(self.images) :]
+        return rows[:, torch.from_numpy(columns).to(rows.device)].cpu().numpy()
+
+    def reset(self) -> None:
+        """Drop all images."""
+        super().reset()
+        self._rows.fill_(torch.inf)
 
     def _compute(self) -> None:
-        k = self.buffer.k
-        distances, lengths = lm_dtw(self._window, k)
+        k = self._k
+        distances, lengths = lm_dtw(self._rows, k)
         self._distances.copy_(distances)
         self._lengths.copy_(lengths)
         starts, nearest = nearest_starts(distances, lengths, self._radius)
         columns = starts[:1] + torch.arange(k, device=starts.device)
-        cells = self._window.index_select(1, columns).view(-1)
+        cells = self._rows.index_select(1, columns).view(-1)
         parts = starts, lengths.index_select(0, starts), nearest, cells
         torch.cat([part.double() for part in parts], out=self._out)
 
     def match(self, nms_radius: int) -> WindowMatch:
         """Find the nearest start and its second best on the device; trace the path on the host."""
-        buffer = self.buffer
-        if not buffer.places:
+        if not self._width:
             return WindowMatch()
-        self._radius.fill_(min(nms_radius, buffer.places))  # no two midpoints are farther apart
-        self._window.copy_(buffer.memory[buffer.oldest : buffer.oldest + buffer.length])
+        self._radius.fill_(min(nms_radius, self._width))  # no two midpoints are farther apart
         self._graph()
         self._received.receive()
         self._received.wait()
@@ -171,8 +162,8 @@ class DeviceLmDtwWindow(BufferWindow):
         distance, second_distance = self._received.numpy[4:6].tolist()
         if not np.isfinite(distance):
             return WindowMatch()
-        cells = self._received.numpy[6:].astype(np.float32).reshape(buffer.length, buffer.k)
-        pairs = trace_sequence(cells, 0, buffer.k)
+        cells = self._received.numpy[6:].astype(np.float32).reshape(self.length, self._k)
+        pairs = trace_sequence(cells, 0, self._k)
         pairs[:, 1] += start
         has_second = np.isfinite(second_distance)
         path = Path(

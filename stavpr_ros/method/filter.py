@@ -156,9 +156,9 @@ class Kept(NamedTuple):
     number: int
 
 
-class StateFilter(Filter):
+class PlaceFilter(Filter):
     """
-    What the filters of the CPU and of other devices share: all but the advance of the states.
+    The filter of the module, on the CPU; a filter of a device overrides what advances its states.
 
     States, sums and z are arrays of NumPy, or tensors, on whose slices the same operators work.
 
@@ -184,25 +184,18 @@ class StateFilter(Filter):
         self._allocate(columns)
         self.reset()
 
-    @abstractmethod
     def _zeros(self, shape: tuple[int, ...]) -> Any:
         """Return zeros, float32, an array or a tensor."""
+        return aligned_zeros(shape)
 
-    @abstractmethod
     def _on_host(self, values: Any) -> np.ndarray:
         """Return values of the device as an array."""
+        array: np.ndarray = values
+        return array
 
-    @abstractmethod
     def _vector(self, z: Any) -> Any:
         """Return z as float32 vector; raise InputError where it does not fit."""
-
-    @abstractmethod
-    def _advance(self, z: Any, image: Image, scale: float) -> None:
-        """
-        Add z to the ring and advance all states; :meth:`_read` follows sooner or later.
-
-        :param image: without its scale and its blocks; scale: of the states before it.
-        """
+        return checks.float32_vector('z', z, int(self._gaps.max(initial=-1)) + 1, self._width)
 
     def _read(self) -> None:
         """Wait for what the newest image gave, if need be."""
@@ -236,6 +229,29 @@ class StateFilter(Filter):
             entering, scale = s.enter * self._off / states, self._images[-1].scale
         self._advance(z, Image(weight * s.weight, entering, 0.0, states, NO_PLACES), scale)
         self.count += 1
+
+    def _advance(self, z: Any, image: Image, scale: float) -> None:
+        """
+        Add z to the ring and advance all states; :meth:`_read` follows sooner or later.
+
+        :param image: without its scale and its blocks; scale: of the states before it.
+        """
+        s, alpha, n, before = self.model, image.weight, len(z), self._now
+        row = self._z[self.count % self._rows]
+        row[:n], row[n:] = z, np.inf
+        row[self._gaps] = np.inf
+        self._now = self._free.pop()
+        arrived, on_map = advance(
+            before, row, alpha * s.level, alpha * s.level**2 / 2, s.most, self._steps, s.change,
+            image.entering, scale, self._now, self._sums,
+        )  # fmt: skip
+        if self.count % SPACING == 1:
+            self._keep(before, scale)
+        else:
+            self._free.append(before)
+        scale = self._normalize(arrived, on_map)
+        blocks = probable_blocks(self._sums[:n], scale)
+        self._images.append(image._replace(scale=scale, blocks=blocks))
 
     def _keep(self, states: Any, scale: float) -> None:
         """Keep the states after the newest image."""
@@ -313,11 +329,13 @@ class StateFilter(Filter):
         arrays = np.ascontiguousarray(steps), np.ascontiguousarray(excluded)
         return self._best_straight(self._ring(steps.shape[1]), low, end, *arrays)
 
-    @abstractmethod
     def _best_straight(
         self, rows: np.ndarray, low: int, end: int, steps: np.ndarray, excluded: np.ndarray
     ) -> tuple[float, np.ndarray]:
         """See :func:`best_straight`."""
+        with one_thread(end - low <= PART):
+            score, path = best_straight(self._z, rows, low, end, steps, excluded)
+        return score, path
 
     def move_back(self, columns: slice, count: int) -> None:
         """See :meth:`Filter.move_back`."""
@@ -336,44 +354,6 @@ class StateFilter(Filter):
             moved = starts[(starts < end) & (ends > first)] - count
             blocks = np.concatenate([stay, np.maximum(moved, 0)])
             self._images[i] = image._replace(blocks=blocks)
-
-
-class PlaceFilter(StateFilter):
-    """The filter of the module, on the CPU: see :class:`StateFilter`."""
-
-    def _zeros(self, shape: tuple[int, ...]) -> np.ndarray:
-        return aligned_zeros(shape)
-
-    def _on_host(self, values: np.ndarray) -> np.ndarray:
-        return values
-
-    def _vector(self, z: np.ndarray) -> np.ndarray:
-        return checks.float32_vector('z', z, int(self._gaps.max(initial=-1)) + 1, self._width)
-
-    def _advance(self, z: np.ndarray, image: Image, scale: float) -> None:
-        s, alpha, n, before = self.model, image.weight, len(z), self._now
-        row = self._z[self.count % self._rows]
-        row[:n], row[n:] = z, np.inf
-        row[self._gaps] = np.inf
-        self._now = self._free.pop()
-        arrived, on_map = advance(
-            before, row, alpha * s.level, alpha * s.level**2 / 2, s.most, self._steps, s.change,
-            image.entering, scale, self._now, self._sums,
-        )  # fmt: skip
-        if self.count % SPACING == 1:
-            self._keep(before, scale)
-        else:
-            self._free.append(before)
-        scale = self._normalize(arrived, on_map)
-        blocks = probable_blocks(self._sums[:n], scale)
-        self._images.append(image._replace(scale=scale, blocks=blocks))
-
-    def _best_straight(
-        self, rows: np.ndarray, low: int, end: int, steps: np.ndarray, excluded: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        with one_thread(end - low <= PART):
-            score, path = best_straight(self._z, rows, low, end, steps, excluded)
-        return score, path
 
     def grow(self, columns: int) -> None:
         """See :meth:`Filter.grow`."""
@@ -437,7 +417,7 @@ def advance(states, z, slope, offset, most, steps, change, entering, scale, new,
     for part in nb.prange(parts):
         first = part * PART
         m = min(PART, width - first)
-        moved = np.zeros((V, m), F)
+        moved = _moved(states, steps, first, m)
         likelihoods, valid = np.empty(m, F), np.empty(m, F)
         for i in range(m):
             value = z[first + i]
@@ -446,17 +426,6 @@ def advance(states, z, slope, offset, most, steps, change, entering, scale, new,
             likelihoods[i] = valid[i] * power(slope * min(value, most) - offset)
         own, came, arrived, total = sums[first : first + m], np.zeros(m, F), 0.0, 0.0
         own[:] = 0
-        for v in range(V):
-            for s in range(steps.shape[1]):
-                share, step = steps[v, s], s - 1
-                if share > 0:
-                    low, end = max(first, step), min(first + m, width + step)
-                    to, since = (
-                        moved[v, low - first : end - first],
-                        states[v, low - step : end - step],
-                    )
-                    for i in range(len(to)):
-                        to[i] += share * since[i]
         for v in range(V):
             same, below, above = moved[v], moved[max(v - 1, 0)], moved[min(v + 1, V - 1)]
             out = new[v, first : first + m]
@@ -512,15 +481,15 @@ def _mixed(states, change):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _moved(states, steps):  # type: ignore[no-untyped-def]
-    """Return states (V, m) advanced by their speeds."""
-    (V, m), moved = states.shape, np.zeros_like(states)
+def _moved(states, steps, first, m):  # type: ignore[no-untyped-def]
+    """Return what states (V, width) become by their speeds, at m columns from ``first`` on."""
+    (V, width), moved = states.shape, np.zeros((len(states), m), states.dtype)
     for v in range(V):
         for s in range(steps.shape[1]):
             share, step = steps[v, s], s - 1
-            low, end = max(0, step), min(m, m + step)
+            low, end = max(first, step), min(first + m, width + step)
             if share > 0 and low < end:
-                to, since = moved[v, low:end], states[v, low - step : end - step]
+                to, since = moved[v, low - first : end - first], states[v, low - step : end - step]
                 for i in range(len(to)):
                     to[i] += share * since[i]
     return moved
@@ -563,7 +532,7 @@ def _forward(states, z, numbers, level, most, steps, change, images):  # type: i
         for y in range(m):
             factor = scale if z[image, y] < np.inf else 0.0
             likelihoods[image, y] = power(slope * min(z[image, y], most) - offset, 8) * factor
-        states = _mixed(_moved(states, steps), change)
+        states = _mixed(_moved(states, steps, 0, m), change)
         for v in range(V):
             for y in range(m):
                 states[v, y] = (states[v, y] + entering) * likelihoods[image, y]

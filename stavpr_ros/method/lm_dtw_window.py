@@ -10,14 +10,19 @@ from stavpr_ros.alignment.lm_dtw import (
     trace_sequence,
 )
 from stavpr_ros.alignment.settings import SequenceSettings
+from stavpr_ros.checks import no_nan
+from stavpr_ros.memory import aligned_empty
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
-from stavpr_ros.method.query_window import BufferWindow, SequenceBuffer
+from stavpr_ros.method.query_window import QueryWindow
 
 
-class LmDtwWindow(BufferWindow):
+class LmDtwWindow(QueryWindow):
     """
     LM-DTW on the CPU; its twin is in :mod:`stavpr_ros.method.device_windows`.
+
+    The distances are one row behind the other, as the images, so that those of the window are one
+    slice, oldest image first, as LM-DTW takes them.
 
     :param sequence: l and k.
     :param places: number of places n.
@@ -33,16 +38,65 @@ class LmDtwWindow(BufferWindow):
         normalizes: bool = False,
         around: int = 0,
     ) -> None:
-        layout = layout or ColumnLayout()
-        buffer = SequenceBuffer(sequence.length, layout.width(places), sequence.k)
-        super().__init__(buffer, layout, normalizes, around)
+        super().__init__(sequence.length, layout or ColumnLayout(), normalizes, around)
+        self._k, self._width = sequence.k, 0  # columns
+        self._rows: np.ndarray = np.empty((2 * self.length, 0), np.float32)
+        self.grow(self.layout.width(places))
+
+    def push(self, row: np.ndarray, strips: np.ndarray, stamp: int) -> None:
+        """
+        See :meth:`QueryWindow.push`.
+
+        :raises InputError: NaN or -inf in the row; the window is unchanged.
+        """
+        row = self._as_columns(row)
+        if not row.sum() > -np.inf:
+            no_nan(row, 'image distances')
+        self._append(stamp)
+        newest, m = self._rows[self._end - 1], len(row)
+        newest[:m], newest[m : self._width] = row, np.inf
+        self.known = max(self.known, m)
+
+    def _move_to_front(self, count: int) -> None:
+        self._rows[:count] = self._rows[self._end - count :]
+        super()._move_to_front(count)
+
+    def newest_row(self) -> np.ndarray:
+        """See :meth:`QueryWindow.newest_row`."""
+        return self._rows[self._end - 1, : self._width]
+
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """See :meth:`QueryWindow.at`."""
+        return self._rows[self._end - len(self.images) : self._end, columns]
+
+    def reset(self) -> None:
+        """Drop all images."""
+        super().reset()
+        self._rows[:], self.known = np.inf, 0
+
+    def grow(self, places: int) -> None:
+        """Make room for more places; in the rows of the window they are +inf."""
+        rows, before = self._rows, self._width
+        self._width = places
+        # with the padding that the kernel needs behind the places
+        self._rows = aligned_empty((2 * self.length, padded_width(places, self._k)))
+        self._rows[:] = np.inf
+        self._rows[:, :before] = rows[:, :before]
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        super().evict(count)
+        remaining = self._width - count
+        self._rows[:, :remaining] = self._rows[:, count : self._width].copy()
+        self._rows[:, remaining : self._width] = np.inf
+        self.known = max(0, self.known - count)
 
     def match(self, nms_radius: int) -> WindowMatch:
         """See :meth:`QueryWindow.match`."""
-        buffer = self.buffer
-        n, k, first = buffer.known, buffer.k, buffer.first
+        n, k, first = self.known, self._k, self.first
         # columns behind the known ones are +inf, as the padding that the kernel needs
-        window = np.ascontiguousarray(buffer.rows()[:, : padded_width(n, k)])
+        rows = self._rows[self._end - self.length : self._end, : padded_width(n, k)]
+        window = np.ascontiguousarray(rows)
         matches = match_padded(window, n, k)
         nearest = best_match(matches, nms_radius)
         if nearest is None:

@@ -21,6 +21,7 @@ Steps 3 to 6 are in :class:`.window.FilterWindow`; mode paper has :mod:`.lm_dtw_
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any, TYPE_CHECKING
 
@@ -56,8 +57,8 @@ from stavpr_ros.method.sessions import time_note
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.method.windows import window_of
-from stavpr_ros.prepare.blocks import blocks
-from stavpr_ros.prepare.matcher import make_matcher, precision_of
+from stavpr_ros.prepare.blocks import converted_blocks
+from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.threads import one_thread
 
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
     import torch
 
 EMPTY = Match(Status.WARMING_UP), WindowMatch().sequences
+INT8_PLACES = 2_000  # from which on `auto` is int8: faster, a quarter of the memory
 SMALL_MAP = 2**24  # bytes of features, below which a second thread takes as much as it saves
 
 
@@ -325,23 +327,25 @@ class PlaceRecognizer(SequenceRecognizer):
         backend = choose_backend(backend)
         settings = replace(settings, error_risks=place_map.error_risks)
         features, options = place_map.features, settings.applied_options
+        kind, strips = place_map.settings.kind, place_map.settings.strips
+        constant, cells = evidence_of(kind, strips, features.dimension)
         self._suggested = place_map.threshold
         poses = place_map.poses if place_map.has_poses else None
         super().__init__(
             settings,
             place_map.settings,
-            window_of(place_map, settings, backend),
+            window_of(place_map, settings, backend, constant),
             () if poses is None else poses[:, :2],
         )
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
             features.require_fit(place_map.settings, 'the map', features.dimension)
-            for _, block in blocks(features):
-                require_finite(block, 'the map')
+            for _ in converted_blocks(features, partial(require_finite, where='the map')):
+                pass
         self._dimension = features.dimension
         is_vertical = settings.applied_spatial.vertical  # cells are made of float32 strips
-        rounds = settings.has_probability and backend == 'cpu' and not is_vertical
-        precision = precision_of(precision, len(features), rounds)
-        precision = 'float32' if is_vertical else precision
+        if precision == 'auto' and settings.has_probability and backend == 'cpu':
+            precision = 'int8' if len(features) >= INT8_PLACES else 'float32'
+        precision = 'float32' if is_vertical or precision == 'auto' else precision
         prepared = prepare_map(
             features, precision, options.mean_centering, options.whitening, options.place_filter
         )
@@ -349,14 +353,11 @@ class PlaceRecognizer(SequenceRecognizer):
         self._matcher = make_matcher(
             prepared.features, settings.applied_spatial, backend, precision
         )
-        numbers = place_map.settings.strips * len(features) * self._dimension
+        numbers = strips * len(features) * self._dimension
         self._is_small = numbers * (1 if precision == 'int8' else 4) < SMALL_MAP
         if isinstance(self._window, FilterWindow):
             layout = self._window.layout
             self._window.change.learn(layout.changes_of_passes(prepared.changes), layout.firsts)
-            _, cells = evidence_of(
-                place_map.settings.kind, place_map.settings.strips, self._dimension
-            )
             if cells is not None:
                 of_places, names_of = self._matcher.strips_of, layout.names_of
                 is_plain = layout.columns is None  # columns are places

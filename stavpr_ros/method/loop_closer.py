@@ -19,11 +19,11 @@ from stavpr_ros.method.model import AROUND, BAND, CONFIRMED, LONGEST_GAP, LONGES
 from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
-from stavpr_ros.prepare.cpu_matcher import CpuRouteMatcher
-from stavpr_ros.prepare.matcher import precision_of, PRECISIONS
+from stavpr_ros.prepare.matcher import CpuRouteMatcher, PRECISIONS
 from stavpr_ros.prepare.route_features import RouteFeatures
 
 EVICTED = 8  # the oldest one in so many is evicted at a time
+NO_MATCH = -LONGEST_GAP - 1, 0  # image and place that no match continues
 MIN_PLACES = 5  # fewer distances have no meaningful mean and deviation
 
 
@@ -66,24 +66,28 @@ class LoopCloser(SequenceRecognizer):
     ) -> None:
         settings = replace(settings, spatial=settings.spatial or SpatialSettings())
         _require_fitting(settings, exclude, limit, exclude_seconds)
-        precision = precision_of(precision, 0, False)
-        require_choice('precision', precision, PRECISIONS)
+        require_choice('precision', precision, ('auto', *PRECISIONS))
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
-        window = _route_window(settings, feature_settings.kind)
+        options, sequence = settings.applied_options, settings.sequence
+        window: QueryWindow
+        if options.place_filter:
+            constant = route_evidence_of(feature_settings.kind)
+            window = FilterWindow(sequence, 0, None, True, AROUND, True, constant=constant)
+        else:
+            window = LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
         super().__init__(settings, feature_settings, window, self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
         self._matcher = CpuRouteMatcher(W, settings.applied_spatial)
-        options = settings.applied_options
         self._route = RouteFeatures(
-            feature_settings, options.mean_centering, options.whitening, limit, precision
+            feature_settings, options.mean_centering, options.whitening, limit, precision == 'int8'
         )
         # stamps of the latest places, not yet old enough in seconds
         self._recent_stamps: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
-        length = settings.sequence.length
+        length = sequence.length
         # of the latest path: image and place of its last match; probabilities; waiting matches
-        self._last: tuple[int, int] | None = None
+        self._last = NO_MATCH
         self._path: deque[float] = deque(maxlen=2 * length)
         self._waiting: deque[Match] = deque(maxlen=LONGEST_WAIT * length)
 
@@ -109,7 +113,7 @@ class LoopCloser(SequenceRecognizer):
         """
         super().reset()
         self._recent_stamps.clear()
-        self._last = None
+        self._last = NO_MATCH
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -143,7 +147,8 @@ class LoopCloser(SequenceRecognizer):
         """
         if not match.accepted or math.isnan(match.probability):
             return match
-        if not self._continues(match.last_image, match.place):
+        images, apart = match.last_image - self._last[0], abs(match.place - self._last[1])
+        if images > LONGEST_GAP or apart > BAND * images:  # another path begins
             self._path.clear()
             self._waiting.clear()
         self._last = match.last_image, match.place
@@ -172,13 +177,6 @@ class LoopCloser(SequenceRecognizer):
         end = min(int(places.max()) + BAND + 1, self.first + len(self))
         columns = super().window_columns(np.arange(first, end))
         return replace(match, columns=WindowColumns(first, columns))
-
-    def _continues(self, image: int, place: int) -> bool:
-        """Return whether a match continues the path of the last one."""
-        if self._last is None:
-            return False
-        images, apart = image - self._last[0], abs(place - self._last[1])
-        return images <= LONGEST_GAP and apart <= BAND * images
 
     def _oldest(self, match: Match) -> list[Match]:
         """
@@ -235,15 +233,6 @@ class LoopCloser(SequenceRecognizer):
         if self._places < MIN_PLACES:
             return np.empty(0, np.float32)
         return self._matcher.to_oldest(self._route.strips, self._route.newest, self._places)
-
-
-def _route_window(settings: RecognizerSettings, kind: str) -> QueryWindow:
-    """Return an empty window for a route without places."""
-    options, sequence = settings.applied_options, settings.sequence
-    if not options.place_filter:
-        return LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
-    constant = route_evidence_of(kind)
-    return FilterWindow(sequence, 0, None, True, AROUND, True, constant=constant)
 
 
 def least_limit(exclude: int, length: int) -> int:

@@ -39,8 +39,7 @@ class ImageChange:
     Changes of a map from place to place, and of a query from image to image.
 
     ``curve`` is the mean change of places 0, 1, ... ``MAX_LAG`` apart while the camera moves, 1
-    where none is known; ``standstill`` the change below which a camera is at rest; ``equal`` which
-    places equal the one before up to noise.
+    where none is known; ``standstill`` the change below which a camera is at rest.
 
     :param places: places that there is room for.
     :param length: images in the window of the query.
@@ -48,7 +47,6 @@ class ImageChange:
 
     def __init__(self, places: int, length: int) -> None:
         self._length = length
-        self._distinct: np.ndarray | None = None  # kept until the map changes
         self._sums, self._counts = np.zeros(MAX_LAG + 1), np.zeros(MAX_LAG + 1)
         self._from_before = np.ones(places, np.float32)  # change of each place from the one before
         self._update_curve()
@@ -90,8 +88,6 @@ class ImageChange:
             for apart in range(1, min(MAX_LAG, last) + 1)
         ]
         self._from_before[n - 1] = changes[0] if changes else 1
-        self.equal[n - 1] = self._from_before[n - 1] < self.standstill
-        self._distinct = None
         if changes and not changes[0] < self.standstill:
             self._sums[1 : len(changes) + 1] += changes
             self._counts[1 : len(changes) + 1] += 1
@@ -111,39 +107,22 @@ class ImageChange:
         """Make room for more places."""
         more = np.ones(places - len(self._from_before), np.float32)
         self._from_before = np.append(self._from_before, more)
-        self._find_equal()
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         self._from_before = np.append(self._from_before[count:], np.ones(count, np.float32))
-        self._find_equal()
 
     def _update_curve(self) -> None:
         measured = self._counts > 0
         self.curve = np.where(measured, self._sums / np.maximum(self._counts, 1), 1)
         self.curve[0] = 0
         self.standstill = STANDSTILL * self.curve[1]
-        self._find_equal()
         # the similarity shrinks in one ratio further
         similarity = np.maximum(1 - self.curve, 0)
         ratio = min(similarity[-1] / similarity[-2], 1) if similarity[-2] > 0 else 0.0
         further = self.curve[-1] + similarity[-1] * (1 - ratio ** np.arange(1, FURTHER))
         decay = float(-np.log(np.clip(similarity[1], MIN_SIMILARITY, 1)))
         self._extended = np.append(self.curve, further), decay
-
-    def expected_change(self, places: float) -> float:
-        """
-        Return the change of images so many places apart, by the curve of the map.
-
-        The curve is known at whole places. Below one place, the similarity decays exponentially.
-
-        :param places: at least 0.
-        """
-        return _expected_change(float(places), *self._extended)
-
-    def _find_equal(self) -> None:
-        self.equal = self._from_before < self.standstill
-        self._distinct = None
 
     def is_dark_stretch(self, by_place: np.ndarray) -> bool:
         """
@@ -190,11 +169,9 @@ class ImageChange:
 
     def distinct(self, n: int) -> np.ndarray:
         """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
-        if self._distinct is None or len(self._distinct) != n:
-            distinct = ~self.equal[:n]
-            has_few = np.count_nonzero(distinct) < MIN_DISTINCT
-            self._distinct = np.ones(n, bool) if has_few else distinct
-        return self._distinct
+        distinct = ~(self._from_before[:n] < self.standstill)
+        has_few = np.count_nonzero(distinct) < MIN_DISTINCT
+        return np.ones(n, bool) if has_few else distinct
 
     def weight(self, change: float) -> float:
         """Return the weight of an image by its change: equal images add nothing."""
@@ -219,8 +196,12 @@ class ImageChange:
 
 
 @kernel
-def _expected_change(places, curve, decay):  # type: ignore[no-untyped-def]
-    """Return the change of :meth:`ImageChange.expected_change`."""
+def expected_change(places, curve, decay):  # type: ignore[no-untyped-def]
+    """
+    Return the change of images so many places apart, at least 0, by the curve of the map.
+
+    The curve is known at whole places. Below one place, the similarity decays exponentially.
+    """
     if places < 1:
         return -math.expm1(-decay * places)
     whole = min(int(places), len(curve) - 2)
@@ -238,7 +219,7 @@ def _excess(speed, changes, curve, decay):  # type: ignore[no-untyped-def]
         for row in range(len(changes)):
             means[i] += changes[row, i]
         means[i] = min(means[i] / len(changes), 1.0)
-        expected[i] = min(_expected_change(speed * (i + 1), curve, decay), 1.0)
+        expected[i] = min(expected_change(speed * (i + 1), curve, decay), 1.0)
     noise = (1 - means[0]) / max(1 - expected[0], MIN_SIMILARITY)
     noise, total = min(max(noise, MIN_SIMILARITY_RATIO), 1.0), 0.0
     for i in range(1, COMPARED):

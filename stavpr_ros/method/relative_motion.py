@@ -95,12 +95,10 @@ class RelativeMotion:
 
 def with_odometry_test(probability: float, agreed: float) -> float:
     """
-    Return the probability of a match whose trajectory has this p-value.
+    Return the probability of a match whose trajectory has this p-value, below ``UNUSUAL``.
 
     Agreement is no evidence: other places have a track of that shape as well.
     """
-    if agreed >= UNUSUAL:
-        return probability
     odds = probability / max(1 - probability, MIN_DOUBT) * agreed / UNUSUAL
     return odds / (1 + odds)
 

@@ -73,7 +73,10 @@ class PlaceVerifier:
     """
 
     def __init__(self, settings: GeometricSettings) -> None:
-        self._detector = _detector(settings.method)
+        library: Any = cv2  # its types leave these out
+        self._detector = library.ORB_create(FEATURES, fastThreshold=7)
+        if settings.method == 'sift':
+            self._detector = library.SIFT_create(FEATURES)
         self._query: tuple[np.ndarray, Keypoints] | None = None  # small and gray; its keypoints
         self._places: PlaceMap | GrowingMap | None = None
         self._known: OrderedDict[int, Keypoints] = OrderedDict()
@@ -108,8 +111,6 @@ class PlaceVerifier:
         return self._query[1]
 
     def _common(self, query: Keypoints, place: Keypoints) -> int:
-        if min(len(query.points), len(place.points)) < MIN_MATCHES:
-            return 0
         mine, theirs = mutual_matches(query.descriptors, place.descriptors, RATIO)
         if len(mine) < MIN_MATCHES:
             return 0
@@ -245,13 +246,6 @@ class GeometricCheck:
             f'geometric check: {inliers} inliers are fewer than {least} (parameter min_inliers)'
         )
         return replace(match, inliers=inliers, status=Status.NO_MATCH, reason=reason)
-
-
-def _detector(method: str) -> Any:
-    library: Any = cv2  # its types leave these out
-    if method == 'sift':
-        return library.SIFT_create(FEATURES)
-    return library.ORB_create(FEATURES, fastThreshold=7)
 
 
 def _explained(points: np.ndarray, others: np.ndarray) -> int:

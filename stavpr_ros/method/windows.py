@@ -1,43 +1,48 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The window of a map, by mode and backend."""
+"""The window of a map, by mode and backend, and the columns of its places."""
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.filter import SPACING
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.model import MODEL
 from stavpr_ros.method.query_window import QueryWindow
-from stavpr_ros.method.sessions import layout_of
+from stavpr_ros.method.sessions import session_gap
 from stavpr_ros.method.settings import PAPER, RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
+from stavpr_ros.prepare.blocks import MAX_LAG
+from stavpr_ros.prepare.normalization import ONE_SESSION
 
 if TYPE_CHECKING:
     import torch
 
 
 def window_of(
-    place_map: PlaceMap, settings: RecognizerSettings, backend: 'str | torch.device'
+    place_map: PlaceMap,
+    settings: RecognizerSettings,
+    backend: 'str | torch.device',
+    constant: float,
 ) -> QueryWindow:
-    """Return an empty window for a map."""
+    """
+    Return an empty window for a map.
+
+    :param constant: of the evidence of its features.
+    """
     options, n, sequence = settings.applied_options, len(place_map), settings.sequence
     length = sequence.length + SPACING if options.place_filter else 0
-    layout = layout_of(place_map, settings.nms_radius, MODEL, settings.moves_against, length)
+    layout = layout_of(place_map, settings.nms_radius, settings.moves_against, length)
     if options.place_filter:
-        window: FilterWindow
         arguments = sequence, n, layout, True
-        W = place_map.settings.strips
-        constant, _ = evidence_of(place_map.settings.kind, W, place_map.features.dimension)
         if isinstance(backend, str):
-            window = FilterWindow(*arguments, constant=constant)
-        else:
-            from stavpr_ros.method.device_windows import DeviceFilterWindow
+            return FilterWindow(*arguments, constant=constant)
+        from stavpr_ros.method.device_windows import DeviceFilterWindow
 
-            window = DeviceFilterWindow(*arguments, constant=constant, device=backend)
-        return window
+        return DeviceFilterWindow(*arguments, constant=constant, device=backend)
     if isinstance(backend, str):
         return LmDtwWindow(sequence, n, layout, options.query_znorm)
     if options != PAPER:
@@ -48,3 +53,25 @@ def window_of(
     from stavpr_ros.method.device_windows import DeviceLmDtwWindow
 
     return DeviceLmDtwWindow(sequence, n, layout, backend)
+
+
+def layout_of(
+    place_map: PlaceMap, nms_radius: int, against: bool = False, length: int = 0
+) -> ColumnLayout:
+    """
+    Return the layout of a map.
+
+    :param against: the camera may move against the map.
+    :param length: l, of a window that goes on over the seam of a closed route.
+    """
+    index, n = place_map.session_index, len(place_map)
+    same_as = place_map.same_as
+    if same_as is None:
+        same_as = np.arange(n)
+    firsts = ONE_SESSION if index is None else np.flatnonzero(np.diff(index, prepend=-1))
+    repeated, seam = 0, place_map.seam
+    if length and seam is not None:
+        repeated = min(n - 1 - 2 * seam, int(length * max(MODEL.speeds)))
+        repeated = repeated if repeated > MAX_LAG else 0
+    gap, same_as = session_gap(nms_radius), same_as.astype(np.int64)
+    return ColumnLayout(firsts, same_as, gap, against, repeated) if n else ColumnLayout()

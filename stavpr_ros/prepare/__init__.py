@@ -11,7 +11,7 @@ alignment of :mod:`stavpr_ros.alignment` makes one distance of the W x W strip d
 2. whitening: the directions in which places vary most are shrunk (:mod:`.centering`);
 3. after the alignment, z-normalization over all places (:mod:`.normalization`).
 
-A matcher has the prepared places in its memory (:mod:`.matcher`; on the CPU :mod:`.cpu_matcher`),
+A matcher has the prepared places in its memory (:mod:`.matcher`),
 in float32 or int8 (:class:`.blocks.Int8Features`), or the places of a route that grows
 (:mod:`.route_features`). Passes over a map go block by block (:mod:`.blocks`), since it may
 exceed the memory:
@@ -32,8 +32,8 @@ exceed the memory:
 (20, True)
 """
 
-from stavpr_ros.prepare.matcher import make_matcher, Matcher
+from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.prepare.prepared_map import prepare_map, PreparedMap
 
-__all__ = ['Matcher', 'PreparedMap', 'make_matcher', 'prepare_map', 'z_normalized']
+__all__ = ['PreparedMap', 'make_matcher', 'prepare_map', 'z_normalized']

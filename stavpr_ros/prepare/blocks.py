@@ -10,14 +10,14 @@ computed by one thread, several blocks at the same time.
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numba as nb
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.compilation import parallel_kernel
-from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.threads import thread_count
 
@@ -25,41 +25,28 @@ PIECE = 256  # places read or centered at a time
 MAX_LAG = 5  # places apart up to which the changes of a map are learned
 LARGE_CHANGE = 0.97  # quantile of changes from place to place
 REST, SLOW = 0.02, 0.1  # shares of it: of a camera at rest at most, and of a slow one
+Block = TypeVar('Block')
 
 
-@dataclass(frozen=True)
-class Int8Features:
-    """
-    Features of a map in int8, one byte a value: :class:`stavpr_ros.features.LocalFeatures`.
+class Int8Features(LocalFeatures):
+    """Features of a map in int8, one byte a value: ``strips`` are rounded."""
 
-    :param strips: the features, rounded.
-    """
+    strips: Int8Strips  # type: ignore[assignment]
 
-    strips: Int8Strips
-    weights: np.ndarray
-    settings: FeatureSettings
-    cells: tuple[int, int] | None = None
-
-    def __len__(self) -> int:
-        return self.strips.shape[1]
-
-
-def blocks(features: LocalFeatures) -> Iterator[tuple[slice, LocalFeatures]]:
-    """Yield the features of each block of places."""
-    for places in _slices(features):
-        yield places, features[places]
+    def __post_init__(self) -> None: ...
 
 
 def converted_blocks(
-    features: LocalFeatures, convert: Callable[[LocalFeatures], np.ndarray]
-) -> Iterator[tuple[slice, np.ndarray]]:
+    features: LocalFeatures, convert: Callable[[LocalFeatures], Block]
+) -> Iterator[tuple[slice, Block]]:
     """Yield the converted blocks, in their order."""
-    slices, threads = _slices(features), thread_count()
+    n, threads = len(features), thread_count()
+    slices = [slice(low, min(low + PIECE, n)) for low in range(0, n, PIECE)]
     if threads == 1 or len(slices) <= 1:
         for places in slices:
             yield places, convert(features[places])
         return
-    pending: deque[tuple[slice, Future[np.ndarray]]] = deque()
+    pending: deque[tuple[slice, Future[Block]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         for places in slices:
             future = pool.submit(lambda places: convert(features[places]), places)
@@ -73,42 +60,23 @@ def converted_blocks(
 
 def converted(
     features: LocalFeatures,
-    convert: Callable[[np.ndarray], np.ndarray],
+    convert: Callable[[np.ndarray], np.ndarray] = lambda strips: strips,
     visit: Callable[[np.ndarray], None] = lambda strips: None,
+    rounds: bool = False,
 ) -> LocalFeatures:
     """
     Return new features, converted block by block.
 
-    :param visit: called with the strips of each converted block.
+    :param visit: called with the strips of each converted block, before they are rounded.
+    :param rounds: return :class:`Int8Features`.
     """
-    strips = aligned_empty((*features.weights.shape, features.dimension))
+    shape = *features.weights.shape, features.dimension
+    strips: Any = Int8Strips(*shape) if rounds else aligned_empty(shape)
     for places, block in converted_blocks(features, lambda block: convert(block.strips)):
         visit(block)
         strips[:, places] = block
-    return LocalFeatures(strips, features.weights, features.settings, features.cells)
-
-
-def rounded(
-    features: LocalFeatures,
-    convert: Callable[[LocalFeatures], LocalFeatures],
-    visit: Callable[[np.ndarray], None] = lambda strips: None,
-) -> Int8Features:
-    """
-    Return features, converted and rounded to int8 block by block.
-
-    :param visit: called with the strips of each block, before they are rounded.
-    """
-    W, n = features.weights.shape
-    strips = Int8Strips(W, n, features.dimension)
-    for places, block in converted_blocks(features, lambda block: convert(block).strips):
-        visit(block)
-        strips.write(places.start, np.ascontiguousarray(block))
-    return Int8Features(strips, features.weights, features.settings, features.cells)
-
-
-def _slices(features: LocalFeatures) -> list[slice]:
-    n = len(features)
-    return [slice(low, min(low + PIECE, n)) for low in range(0, n, PIECE)]
+    kind = Int8Features if rounds else LocalFeatures
+    return kind(strips, features.weights, features.settings, features.cells)
 
 
 class PlaceChanges:

@@ -10,19 +10,14 @@ distinguishes no places.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.stored_features import MapStatistics
-from stavpr_ros.prepare.blocks import (
-    blocks,
-    change_weights,
-    converted,
-    converted_blocks,
-    PlaceChanges,
-)
+from stavpr_ros.prepare.blocks import change_weights, converted, converted_blocks, PlaceChanges
 
 PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most
@@ -124,8 +119,9 @@ class MeanCentering:
             changes.add(strips)
             total += strips.sum(axis=1, dtype=np.float64)
         weights = change_weights(changes.changes[0])
-        for places, block in blocks(features) if weights.min(initial=1) < 1 else ():
-            total -= (block.strips * (1 - weights[places])[:, None]).sum(axis=1)
+        if weights.min(initial=1) < 1:
+            for places, strips in converted_blocks(features, lambda block: block.strips):
+                total -= (strips * (1 - weights[places])[:, None]).sum(axis=1)
         mean = total / max(weights.sum(), 1) * self._centering
         self.mean = mean.astype(np.float32)  # (W, d)
         if whitening and len(features):
@@ -142,31 +138,29 @@ class MeanCentering:
         self,
         features: LocalFeatures,
         visit: Callable[[np.ndarray], None] = lambda strips: None,
+        rounds: bool = False,
     ) -> LocalFeatures:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
 
-        :param visit: called with the strips of each block.
+        :param visit, rounds: see :func:`stavpr_ros.prepare.blocks.converted`.
         """
-        return converted(features, lambda strips: self._converted(strips, self.mean), visit)
+        convert = partial(self._converted, mean=self.mean)
+        return converted(features, convert, visit, rounds)
 
     def _converted(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        if strips.shape[1] == 1:
-            return self._converted_image(strips[:, 0], mean)[:, None]
+        W, m, d = strips.shape
+        if m == 1:
+            directions, change = np.empty((W, 0, d), np.float32), np.empty((W, 1, 0), np.float32)
+            if self.whitening is not None:
+                directions, change = self.whitening.directions, self.whitening.change
+            arguments, out = (strips[:, 0], mean, directions, change[:, 0]), np.empty_like(mean)
+            _convert_image(*map(np.ascontiguousarray, arguments), out)
+            return out[:, None]
         centered = strips - mean[:, None]
         centered[~strips.any(axis=2)] = 0
         normalize(centered)
         return centered if self.whitening is None else normalize(self.whitening(centered))
-
-    def _converted_image(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
-        W, d = strips.shape
-        directions, change = np.empty((W, 0, d), np.float32), np.empty((W, 1, 0), np.float32)
-        if self.whitening is not None:
-            directions, change = self.whitening.directions, self.whitening.change
-        out: np.ndarray = np.empty((W, d), np.float32)
-        arguments = strips, mean, directions, change[:, 0]
-        _convert_image(*map(np.ascontiguousarray, arguments), out)
-        return out
 
     def next_query(self, strips: np.ndarray) -> np.ndarray:
         """

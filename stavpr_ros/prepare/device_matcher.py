@@ -16,7 +16,7 @@ WIDENED = 2**23  # most int8 values that are float32 at a time: 32 MiB, which fi
 
 class DeviceMatcher:
     """
-    See :class:`stavpr_ros.prepare.matcher.Matcher`; distances are tensors on the device.
+    Twin of :class:`stavpr_ros.prepare.matcher.CpuMatcher`; distances are tensors on the device.
 
     :param features: those of the map; unit norm, strips (W, n, d), weights (W, n). If they are
         int8, queries are rounded as well; strip distances are those of the CPU, bit for bit.
@@ -26,7 +26,7 @@ class DeviceMatcher:
 
     def __init__(
         self,
-        features: LocalFeatures | Int8Features,
+        features: LocalFeatures,
         spatial: SpatialSettings,
         device: torch.device,
     ) -> None:

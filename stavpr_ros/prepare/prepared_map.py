@@ -16,11 +16,11 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.prepare.blocks import (
+    converted,
     converted_blocks,
     Int8Features,
     MAX_LAG,
     PlaceChanges,
-    rounded,
 )
 from stavpr_ros.prepare.centering import MeanCentering, RANK, SAMPLE, STRENGTH
 
@@ -41,7 +41,7 @@ class PreparedMap:
         there are none.
     """
 
-    features: LocalFeatures | Int8Features
+    features: LocalFeatures
     centering: MeanCentering | None
     changes: np.ndarray
     note: str = ''
@@ -68,16 +68,16 @@ def prepare_map(
         centering = MeanCentering(features, centers, whitens, statistics)
     learns = learns_changes and statistics is None
     changes = PlaceChanges(len(features) if learns else 0, MAX_LAG)
-    prepared: LocalFeatures | Int8Features
-    if (
-        statistics is not None
-        and precision == 'int8'
-        and isinstance(features, StoredFeatures)
-        and features.has_codes
-    ):
+    rounds = precision == 'int8'
+    if rounds and statistics and isinstance(features, StoredFeatures) and features.has_codes:
         prepared = _of_codes(features)
-    else:
-        prepared = _converted(features, centering, precision, changes)
+    elif centering is not None:
+        prepared = centering.places(features, changes.add, rounds)
+    elif rounds:
+        prepared = converted(features, visit=changes.add, rounds=True)
+    else:  # those of a map in memory are not copied
+        prepared = whole = features[:]
+        changes.add(whole.strips)
     learned = statistics.changes if statistics else changes.changes
     return PreparedMap(prepared, centering, learned, note)
 
@@ -94,28 +94,14 @@ def _usable(features: StoredFeatures) -> tuple[MapStatistics | None, str]:
     return None, f'the statistics in {path} {why}: learned again; map compact renews them'
 
 
-def _converted(
-    features: LocalFeatures, centering: MeanCentering | None, precision: str, changes: PlaceChanges
-) -> LocalFeatures | Int8Features:
-    """Return the features for the matcher, and add them to the changes; a map's are not copied."""
-    if precision == 'int8':
-        convert = centering.places if centering else lambda block: block
-        return rounded(features, convert, changes.add)
-    if centering is not None:
-        return centering.places(features, changes.add)
-    whole = features[:]
-    changes.add(whole.strips)
-    return whole
-
-
-def _of_codes(features: StoredFeatures) -> Int8Features:
+def _of_codes(features: StoredFeatures) -> LocalFeatures:
     """
     Return the features that are kept as codes in the map's file.
 
     :raises MapFileError: they are longer than codes can be.
     """
     W, n = features.weights.shape
-    strips = Int8Strips(W, n, features.dimension)
+    strips: Any = Int8Strips(W, n, features.dimension)
     with errors_of(features.file.path):
         for j in range(W):
             for first in range(0, n, CODES_AT_ONCE):
@@ -127,8 +113,9 @@ def _of_codes(features: StoredFeatures) -> Int8Features:
 def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> MapStatistics:
     """Add the features, rounded for precision int8; see :func:`statistics_of_map`."""
     features = _AsStored(place_map.features, storage)
-    centering = MeanCentering(features, statistics=statistics)
-    return replace(statistics, codes=rounded(features, centering.places).strips.rounded())
+    rounded = MeanCentering(features, statistics=statistics).places(features, rounds=True)
+    assert isinstance(rounded, Int8Features)
+    return replace(statistics, codes=rounded.strips.rounded())
 
 
 def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:

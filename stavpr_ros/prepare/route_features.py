@@ -10,18 +10,41 @@ are places, so that a place is seldom rounded again.
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
+from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.memory import aligned_empty
 from stavpr_ros.prepare.blocks import change_weights, MAX_LAG
 from stavpr_ros.prepare.centering import evenly_weighted, norms_of, unit_norm, Whitening
-from stavpr_ros.prepare.route_strips import grown, move_up, rounded_strips, RouteStrips
+from stavpr_ros.simd import LANES
 
 ROOM = 256  # places that there is room for at first; doubled when they are full
 GROWTH = 1.125  # the mean is updated when the route is so much longer
 SAMPLE = 128  # places that whitening is learned from
 SETTLED = 2000  # places from which on it is not learned again; a full route is settled as well
 LATEST = MAX_LAG + 1  # places that the newest one is compared with, itself included
-AT_ONCE = 64  # places whitened at a time
-PIECE = 512  # places centered at a time: the intermediate results stay in the cache
+AT_ONCE = 64  # places centered or whitened at a time: what is between stays in the cache
+PIECE = 512  # places that are summed at a time
+
+
+class Int8Route(Int8Strips):
+    """Strips of a route in int8; see :class:`stavpr_ros.alignment.cpu.int8`."""
+
+    def grow(self, room: int) -> None:
+        """Make room for more places."""
+        values, reciprocals = self.values, self.reciprocals
+        super().__init__(self.shape[0], room, self.shape[2])
+        self.values[:, : values.shape[1]] = values
+        self.reciprocals[:, : reciprocals.shape[1]] = reciprocals
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        source, to = np.arange(count, self.shape[1]), np.arange(self.shape[1] - count)
+        for values in self.values.view(np.int32)[..., 0]:  # of a strip
+            values[to // LANES, :, to % LANES] = values[source // LANES, :, source % LANES]
+        self.reciprocals[:, to] = self.reciprocals[:, source]
+
+
+RouteStrips = np.ndarray | Int8Route  # of a route, (W, room, d), float32 or int8
 
 
 class RouteFeatures:
@@ -35,7 +58,7 @@ class RouteFeatures:
     :param mean_centering: subtract the mean.
     :param whitening: whiten; learned again from time to time while the route is short.
     :param limit: most places there will be; None = no limit.
-    :param precision: of the features once the route is settled, see the module.
+    :param rounds: to int8 once the route is settled, see the module.
 
     ``latest`` are the features of the newest ``LATEST`` places, oldest first, (W, m, d); ``mean``
     the mean that is subtracted, (W, d), float32, zeros without centering.
@@ -47,9 +70,9 @@ class RouteFeatures:
         mean_centering: bool,
         whitening: bool,
         limit: int | None,
-        precision: str = 'float32',
+        rounds: bool = False,
     ) -> None:
-        self.count, self._precision = 0, precision
+        self.count, self._rounds = 0, rounds
         none = np.empty((settings.strips, 0), np.float32)
         self.strips: RouteStrips = none[..., None]  # centered, (W, room, d)
         self._is_settled, self._since_mean = False, 0  # images since the mean was taken
@@ -101,15 +124,11 @@ class RouteFeatures:
             self._grow(strips.shape[2])
             self._cells = features.cells
         newest = self._whitened(strips)
-        norms: np.ndarray = np.asarray(strips[:, 0].any(axis=1), np.float32)
+        norms: np.ndarray = np.asarray(strips.any(axis=2), np.float32)
         if self._centering or self._whitens:
-            change = -self._whitened(self.mean[:, None])[:, 0]
-            moved = [_moved(newest[j], norms[j : j + 1], change[j]) for j in range(len(strips))]
-            newest = np.stack([unit for unit, _ in moved])
-            norms = np.concatenate([length for _, length in moved])
-        newest = np.ascontiguousarray(newest)
-        self._write(self.count, newest)
-        self._norms[:, self.count] = norms
+            newest, norms = _moved(newest, norms, -self._whitened(self.mean[:, None]))
+        here = slice(self.count, self.count + 1)
+        self.strips[:, here], self._norms[:, here] = newest, norms
         self.latest = np.concatenate([self.latest[:, 1 - LATEST :], newest], axis=1)
         self._weights[:, self.count] = features.weights[:, 0]
         before, self._newest = self._newest, strips[:, 0]
@@ -123,27 +142,21 @@ class RouteFeatures:
                 self._learn(0)
             return grows
         is_full = self.count == min(SETTLED, self._limit or SETTLED)
-        settles = is_full and self._precision != 'float32'
+        settles = is_full and self._rounds
         if (self._centering or self._whitens) and (self.count >= self._next_mean or settles):
             self._learn(0)
             self._next_mean = int(self.count * GROWTH) + 1
         if settles:
-            self.strips = rounded_strips(self._floats, self.count)
+            self.strips = rounded_strips(self.strips, self.count)
             self._is_settled, self._since_mean = True, 0
         return grows
-
-    def _write(self, first: int, strips: np.ndarray) -> None:
-        """Write strips (W, m, d) of the places from ``first`` on."""
-        if isinstance(self.strips, np.ndarray):
-            self.strips[:, first : first + strips.shape[1]] = strips
-        else:
-            self.strips.write(first, strips)
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the mean is of the others until the next eviction."""
         remaining = self.count - count
         self._weights[:, :remaining] = self._weights[:, count : self.count].copy()
-        self._sum -= self._total(np.ones(count))
+        if self._centering:
+            self._sum -= self._total(np.ones(count))
         self._changes[:remaining] = self._changes[count : self.count].copy()
         if (self._centering or self._whitens) and not self._is_settled:
             self.count = remaining
@@ -165,12 +178,6 @@ class RouteFeatures:
         strips = self.strips[:, places] * self._norms[:, places, None]
         return self._whitening.inverse(strips) if self._whitening else strips
 
-    @property
-    def _floats(self) -> np.ndarray:
-        """Return the strips before they are rounded."""
-        assert isinstance(self.strips, np.ndarray)
-        return self.strips
-
     def _grow(self, d: int) -> None:
         """Double the room; memory that is not used yet is not touched."""
         n, W = self.count, self._settings.strips
@@ -189,8 +196,6 @@ class RouteFeatures:
     def _total(self, weights: np.ndarray) -> np.ndarray:
         """Return the weighted sum of the original features of the oldest places, (W, d)."""
         total: np.ndarray = np.zeros_like(self._sum)
-        if not self._centering:
-            return total
         for low in range(0, len(weights), PIECE):
             piece = slice(low, min(low + PIECE, len(weights)))
             if not weights[piece].any():
@@ -203,17 +208,14 @@ class RouteFeatures:
             total += of_piece[:, 0] + (alive * of_place).sum(axis=1, keepdims=True) * self.mean
         return total
 
-    def _weighted_mean(self, first: int, weights: np.ndarray) -> np.ndarray:
-        """Return the mean of the places from ``first`` on, of these weights."""
-        less = np.append(np.zeros(first), 1 - weights)
-        total = self._sum - self._total(less) if less.any() else self._sum
-        return (total / weights.sum()).astype(np.float32)
-
     def _learn(self, first: int) -> None:
         """Take the mean and, until the route is settled, whitening; ``first`` becomes place 0."""
-        weights = change_weights(self._changes[: self.count])
-        mean = self._weighted_mean(first, weights) if self._centering else self.mean
-        self._shift(first, self._whitened((self.mean - mean)[:, None])[:, 0])
+        weights, mean = change_weights(self._changes[: self.count]), self.mean
+        if self._centering:
+            less = np.append(np.zeros(first), 1 - weights)
+            total = self._sum - self._total(less) if less.any() else self._sum
+            mean = (total / weights.sum()).astype(np.float32)
+        self._shift(first, self._whitened((self.mean - mean)[:, None]))
         self.mean, self._since_mean = mean, 0
         if self._whitens and self.count <= SETTLED and not self._is_settled:
             sample = evenly_weighted(weights, SAMPLE)
@@ -222,7 +224,7 @@ class RouteFeatures:
                 places = slice(low, min(low + AT_ONCE, self.count))
                 strips, norms = whitening(self._centered(places)), self._norms[:, places]
                 norms[:] = norms_of(strips).clip(1e-12) * (norms > 0)
-                self._floats[:, places] = unit_norm(strips)
+                self.strips[:, places] = unit_norm(strips)
             self._whitening = whitening
         last = slice(max(0, self.count - LATEST), self.count)
         self.latest = self.strips[:, last].copy()
@@ -232,29 +234,51 @@ class RouteFeatures:
         Add to features, and make them unit norm again; zero features stay zero.
 
         :param first: place from which on; it becomes place 0, the last one the last of ``count``.
-        :param change: shape (W, d).
+        :param change: shape (W, 1, d).
         """
-        for low in range(0, self.count, PIECE):
-            piece = slice(low, min(low + PIECE, self.count))
-            source = slice(piece.start + first, piece.stop + first)
-            strips, norms = self.strips[:, source], self._norms[:, source]
-            moved = [_moved(*each) for each in zip(strips, norms, change, strict=True)]
-            self._write(low, np.stack([unit for unit, _ in moved]))
-            self._norms[:, piece] = np.stack([lengths for _, lengths in moved])
+        for low in range(0, self.count, AT_ONCE):
+            places = slice(low, min(low + AT_ONCE, self.count))
+            source = slice(places.start + first, places.stop + first)
+            moved = _moved(self.strips[:, source], self._norms[:, source], change)
+            self.strips[:, places], self._norms[:, places] = moved
 
 
 def _moved(
     strips: np.ndarray, norms: np.ndarray, change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Add to features (m, d) of norms (m,), and make them unit norm; zero features stay zero.
+    Add to features (W, m, d) of norms (W, m), and make them unit norm; zero features stay zero.
 
     :returns: the features, and their norms.
     """
-    alive = norms[:, None] > 0
-    moved = strips * norms[:, None]
+    alive = norms[..., None] > 0
+    moved = strips * norms[..., None]
     moved += change
     moved *= alive
-    length = norms_of(moved)[:, None].clip(1e-12)
+    length = norms_of(moved)[..., None].clip(1e-12)
     moved /= length
-    return moved, (length * alive)[:, 0]
+    return moved, (length * alive)[..., 0]
+
+
+def grown(values: np.ndarray, room: int) -> np.ndarray:
+    """Return (W, n, ...) with room for more places; memory that is not used is not touched."""
+    W, n, *rest = values.shape
+    out = aligned_empty((W, room, *rest), values.dtype)
+    out[:, :n] = values
+    return out
+
+
+def move_up(values: np.ndarray, count: int, last: int) -> None:
+    """Move places ``count`` to ``last`` of (W, n, ...) up by ``count``."""
+    for first in range(count, last, count):
+        end = min(first + count, last)
+        values[:, first - count : end - count] = values[:, first:end]
+
+
+def rounded_strips(strips: RouteStrips, count: int) -> Int8Route:
+    """Return float32 strips (W, room, d), of which ``count`` places are known, in int8."""
+    rounded = Int8Route(*strips.shape)
+    for low in range(0, count, AT_ONCE):
+        places = slice(low, min(low + AT_ONCE, count))
+        rounded[:, places] = strips[:, places]
+    return rounded

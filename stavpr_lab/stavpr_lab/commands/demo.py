@@ -239,7 +239,7 @@ def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, 
 
 def _threshold(place_map: 'PlaceMap', arguments: argparse.Namespace) -> float:
     """Return the distance below which a window is matched."""
-    from stavpr_ros.method.threshold import suggest_threshold
+    from stavpr_ros.maintenance.threshold import suggest_threshold
 
     if arguments.mode == 'robust':
         return 1 - arguments.min_probability

@@ -244,12 +244,11 @@ class Int8Strips:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def write(self, first: int, strips: np.ndarray) -> None:
-        """Round strips (W, m, d), float32, and keep them as the places from ``first`` on."""
-        d = self.shape[2]
-        _round_places(
-            strips, _longest(d), np.float32(MAP_PEAK), first, self.values, self.reciprocals
-        )
+    def __setitem__(self, index: tuple[slice, slice], strips: np.ndarray) -> None:
+        """Round strips (W, m, d), float32, and keep them as the places [:, places]."""
+        first, longest = index[1].start or 0, _longest(self.shape[2])
+        strips = np.ascontiguousarray(strips)
+        _round_places(strips, longest, np.float32(MAP_PEAK), first, self.values, self.reciprocals)
 
     def copy(self, j: int, first: int, codes: np.ndarray) -> None:
         """
