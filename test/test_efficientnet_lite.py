@@ -9,7 +9,7 @@ import io
 import subprocess
 import sys
 
-from evaluation_commands import runner, write_images
+from evaluation_commands import write_images
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
@@ -194,14 +194,14 @@ def test_hybrid_is_not_pooled(network):
 @pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
 def test_map_recognizes_its_images_and_finds_its_network(
-    network, folders, tmp_path, monkeypatch, capsys, kind, precision
+    network, folders, tmp_path, runner, kind, precision
 ):
     """The map states the hash: a file of another name in the models folder is found by it."""
     images = list(np.random.default_rng(2).integers(0, 256, (12, 60, 80, 3), np.uint8))
     write_images(tmp_path / 'drive', images)
     options = '--features', kind, f'--{kind}-model', network
     path = tmp_path / 'route.stavpr'
-    run = runner(build_map, monkeypatch, capsys)
+    run = runner(build_map)
     assert run('--input', tmp_path / 'drive', '--output', path, *options)[0] == 0
     places = open_map(path)
     with pytest.raises(UnavailableError, match='is not in'):

@@ -3,6 +3,8 @@
 """What each package installs, the dependencies it declares, and the command ``stavpr``."""
 
 import ast
+from contextlib import chdir
+import distutils.core  # of setuptools
 from functools import partial
 from importlib import import_module
 import os
@@ -50,14 +52,10 @@ ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 each_package = pytest.mark.parametrize('package', PACKAGES)
 
 
-def setup_arguments(package: str, monkeypatch) -> dict:
+def distribution(package: str) -> setuptools.Distribution:
     """Return what setup.py passes to setuptools."""
-    passed: dict = {}
-    monkeypatch.setattr(setuptools, 'setup', passed.update)
-    monkeypatch.chdir(PACKAGES[package])
-    source = Path('setup.py').read_text(encoding='utf-8')
-    exec(compile(source, 'setup.py', 'exec'), {'__name__': 'setup'})
-    return passed
+    with chdir(PACKAGES[package]):
+        return distutils.core.run_setup('setup.py', stop_after='init')
 
 
 def imported(folder: Path) -> set[str]:
@@ -87,10 +85,10 @@ def imports_of(package: str) -> set[str]:
 
 
 @each_package
-def test_every_imported_distribution_is_required(package, monkeypatch):
-    arguments = setup_arguments(package, monkeypatch)
-    extras = arguments.get('extras_require', {})
-    lines = sum((extras.get(extra, []) for extra in EXTRAS), arguments['install_requires'])
+def test_every_imported_distribution_is_required(package):
+    stated = distribution(package)
+    extras = stated.extras_require
+    lines = sum((extras.get(extra, []) for extra in EXTRAS), [*stated.install_requires])
     required = {re.match(r'[\w-]+', line).group().lower() for line in lines}
     needed = {name for name in imports_of(package) if not ROS.fullmatch(name)}
     needed -= {'stavpr_slam', 'stavpr_nav'}
@@ -109,11 +107,11 @@ def test_every_imported_ros_package_is_dependency(package):
     assert tests - declared(package, 'exec_depend', 'depend', 'test_depend') == set()
 
 
-def test_versions_agree(monkeypatch):
+def test_versions_agree():
     versions = [manifest(folder).findtext('version') for folder in FOLDERS]
     citation = (ROOT / 'CITATION.cff').read_text(encoding='utf-8')
     versions.append(re.search(r'^version: (.+)$', citation, re.MULTILINE).group(1))
-    versions += [setup_arguments(package, monkeypatch)['version'] for package in PACKAGES]
+    versions += [distribution(package).metadata.version for package in PACKAGES]
     assert set(versions) == {stavpr_ros.__version__}
     for folder in FOLDERS:
         changelog = get_changelog_from_path(folder)

@@ -7,7 +7,7 @@ import os
 import re
 
 import cv2
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import read_json, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
@@ -40,8 +40,8 @@ def folders(tmp_path_factory):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    return runner(evaluate, monkeypatch, capsys)
+def run(runner):
+    return runner(evaluate)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@
 from glob import glob
 import os
 
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import read_json, write_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import evaluate
@@ -14,11 +14,11 @@ N = 24
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path, route):
+def run(runner, tmp_path, route):
     """Run evaluate on the same images as map and query with an export; return the outcome."""
     for name in ('map', 'query'):
         write_images(tmp_path / name, route[:N])
-    command = runner(evaluate, monkeypatch, capsys)
+    command = runner(evaluate)
     folders = ['--map', tmp_path / 'map', '--query', tmp_path / 'query', '--sequence-length', 5]
 
     def run(name, *options):

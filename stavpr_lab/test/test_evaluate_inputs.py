@@ -4,7 +4,7 @@
 
 import json
 
-from evaluation_commands import runner, write_images
+from evaluation_commands import write_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import build_descriptor_map, evaluate
@@ -23,8 +23,8 @@ def vectors():
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    return runner(evaluate, monkeypatch, capsys)
+def run(runner):
+    return runner(evaluate)
 
 
 @pytest.fixture
@@ -92,10 +92,8 @@ def test_evaluate_of_descriptors_rejects_options_of_images(run, pair, options, w
     assert (code, word in errors) == (2, True)
 
 
-def test_map_of_descriptors_takes_descriptors_only(
-    run, pair, route, tmp_path, monkeypatch, capsys
-):
-    build = runner(build_descriptor_map, monkeypatch, capsys)
+def test_map_of_descriptors_takes_descriptors_only(run, pair, route, tmp_path, runner):
+    build = runner(build_descriptor_map)
     saved = tmp_path / 'route.stavpr'
     source = ['--descriptors-source', 'netvlad']
     poses = tmp_path / 'poses.csv'
@@ -115,13 +113,11 @@ def test_map_of_descriptors_takes_descriptors_only(
     assert (code, 'not from images' in errors) == (1, True)
 
 
-def test_map_of_bits_takes_bits_without_the_option(
-    run, pair, vectors, tmp_path, monkeypatch, capsys
-):
+def test_map_of_bits_takes_bits_without_the_option(run, pair, vectors, tmp_path, runner):
     """The map has the setting; a query of numbers is rejected."""
     path, saved = tmp_path / 'bits.npy', tmp_path / 'bits.stavpr'
     np.save(path, np.packbits(vectors > 0, axis=1))
-    build = runner(build_descriptor_map, monkeypatch, capsys)
+    build = runner(build_descriptor_map)
     code, _, errors = build('--input', path, '--output', saved)
     assert (code, 'with --descriptors-bits true' in errors) == (1, True)
     code, output, _ = build('--input', path, '--output', saved, '--descriptors-bits', 'true')

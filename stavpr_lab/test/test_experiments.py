@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's experiments: configurations, published numbers, and the command."""
 
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import read_json, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ from stavpr_ros.sources.folder import FolderSource
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    return runner(experiments, monkeypatch, capsys)
+def run(runner):
+    return runner(experiments)
 
 
 @pytest.fixture

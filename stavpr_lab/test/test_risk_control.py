@@ -7,7 +7,7 @@ import stat
 from unittest.mock import patch
 
 import cv2
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import read_json, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
@@ -129,9 +129,9 @@ def traverses(tmp_path_factory):
 
 
 @pytest.fixture
-def command(traverses, tmp_path, monkeypatch, capsys):
+def command(traverses, tmp_path, monkeypatch, runner):
     """Return the path of a copy of the map, and a function that evaluates the query on it."""
-    path, run = tmp_path / 'route.stavpr', runner(evaluate, monkeypatch, capsys)
+    path, run = tmp_path / 'route.stavpr', runner(evaluate)
     path.write_bytes((traverses / 'route.stavpr').read_bytes())
     pair = ['--map', path, '--query', traverses / 'query', '--truth', 'identity']
     monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)

@@ -72,7 +72,8 @@ def test_camera_transform_of_tf_is_looked_up(default_context, monkeypatch):
     node = rclpy.create_node('camera_test', context=default_context)
     camera = CameraInput(node, '')
     k = [300.0, 0.0, 159.5, 0.0, 300.0, 119.5, 0.0, 0.0, 1.0]
-    camera._on_info(CameraInfo(width=320, height=240, k=k))
+    (subscription,) = node.subscriptions
+    subscription.callback(CameraInfo(width=320, height=240, k=k))
     assert camera.camera('base', 'optical') is None
     assert "no transform from 'optical' to 'base' on tf" in camera.problem
     Buffer.known = True

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from stavpr_ros.sources.bag import COMPRESSED, ODOMETRY, RAW
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.frame import ImageRecord
@@ -31,6 +31,10 @@ class Bag:
     def make(self, kind: str, *fields: object, **named: object):
         """Return a message, its fields in the order of their definition."""
         return self._store.types[kind](*fields, **named)
+
+    def define(self, name: str, text: str) -> None:
+        """Add a type of message."""
+        self._store.register(get_types_from_msg(text, name))
 
     def header(self, stamp: int, frame_id: str = 'camera'):
         time = self.make('builtin_interfaces/msg/Time', *divmod(stamp, SECOND))

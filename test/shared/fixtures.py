@@ -126,6 +126,24 @@ def device(request):
 
 
 @pytest.fixture
+def runner(monkeypatch, capsys):
+    """Make functions that run a command in this process: exit code, output, errors."""
+    monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
+
+    def make(command):
+        def run(*arguments):
+            try:
+                code = command.main([str(argument) for argument in arguments])
+            except SystemExit as error:  # argparse
+                code = error.code
+            return code, *capsys.readouterr()
+
+        return run
+
+    return make
+
+
+@pytest.fixture
 def context():
     """Yield an initialized ROS context."""
     import rclpy
