@@ -14,7 +14,7 @@ import cv2
 from evaluation_commands import write_images
 from fixtures import route_images
 import numpy as np
-from processes import DOMAIN, executable, Process, TIMEOUT
+from processes import executable, Process, TIMEOUT
 import pytest
 from stavpr_lab.commands import demo
 from stavpr_ros.commands import build_map, node, record, replay, stavpr
@@ -38,7 +38,6 @@ def run(monkeypatch, capfd):
     """Run the ``main`` of a command's module in this process, which keeps its signal handlers."""
     monkeypatch.setattr('signal.signal', lambda *_: None)
     monkeypatch.setattr('stavpr_ros.commands.replay.prepare_transport', lambda: None)
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
 
     def run_main(command, *arguments):
         try:

@@ -3,10 +3,12 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 from collections import OrderedDict
+from contextlib import contextmanager
 from functools import cache
 import os
 from pathlib import Path
 import re
+import resource
 from types import SimpleNamespace
 
 from domain import DOMAIN
@@ -123,6 +125,17 @@ def device(request):
     import torch
 
     return torch.device(request.param)
+
+
+@contextmanager
+def disk_of(size: int):
+    """Let no file of this process be larger, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture
