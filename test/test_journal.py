@@ -10,13 +10,12 @@ import struct
 import subprocess
 import sys
 import time
-from unittest.mock import Mock
 import zlib
 
 from fixtures import disk_of
 from map_files import changed
 import numpy as np
-from pipelines import process, save, settings_of
+from pipelines import Log, process, save, settings_of
 import pytest
 from stavpr_ros.errors import JournalError, OutputTakenError
 from stavpr_ros.mapping import journal_writer, load_map, save_map
@@ -220,7 +219,7 @@ def scaled(place, **factors):
     ],
 )
 def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target, damage):
-    content, log = written.read_bytes(), Mock()
+    content, log = written.read_bytes(), Log()
     with JournalReader(written) as reader:
         ends = [reader.end, *(reader.end for _ in reader.places())]
     record = damage(content[ends[30] : ends[31]], list(places_of(small_map))[30])
@@ -229,8 +228,7 @@ def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, targ
     assert recover_maps(target, log) == str(target)
     assert stamps(target) == seconds(*range(1, 31), *range(32, 61))
     kept = target.with_name(f'{written.name}.damaged')
-    assert log.method_calls[1][0] == 'error'
-    assert f'{kept} is kept' in log.method_calls[1].args[0]
+    assert f'{kept} is kept' in log.of('error')
     assert set(os.listdir(target.parent)) == {target.name, kept.name}
     assert recover_maps(target, log) == ''  # the next start
 
@@ -325,7 +323,7 @@ def header_with(**changes):
     ],
 )
 def test_file_with_an_invalid_header_stops_no_start_and_is_kept(content, text, target):
-    path, log = journal_of(target), Mock()
+    path, log = journal_of(target), Log()
     path.write_bytes(content)
     with pytest.raises(JournalError, match=f'is no journal, or its header is damaged.*{text}'):
         recover(path)
@@ -426,11 +424,10 @@ def test_recover_without_the_map_that_was_continued_keeps_the_places(
         base.unlink()
     else:
         base.write_bytes(b'PK')
-    log = Mock()
+    log = Log()
     assert recover_maps(target, log) == str(target)
     assert len(load_map(target)) == 4
-    assert log.method_calls[1][0] == 'error'
-    assert 'base.stavpr' in log.method_calls[1].args[0]
+    assert 'base.stavpr' in log.of('error')
 
 
 def test_recover_beside_another_map_takes_a_numbered_name(start, small_map, route, target):
@@ -449,9 +446,9 @@ def test_journal_of_a_second_recording_takes_a_numbered_name(start, route, targe
     names = [path.name for path in journals(target)]
     assert sorted(names) == ['route-2.stavpr.journal', 'route.stavpr.journal']
     killed(first)
-    log = Mock()
+    log = Log()
     assert recover_maps(target, log) == str(target)  # and that of the living one stays
-    assert 'written by a running program' in log.method_calls[1].args[0]
+    assert 'written by a running program' in log.lines[1][1]
     assert [path.name for path in journals(target)] == ['route-2.stavpr.journal']
 
 
@@ -510,7 +507,7 @@ def test_removed_journal_is_reported_and_written_anew(start, route, tmp_path, ca
 
 FULL = """
 import resource, signal, sys
-from pipelines import process, settings_of
+from pipelines import Log, process, settings_of
 from fixtures import route_images
 from stavpr_ros.mapping.journal_map import recover
 from stavpr_ros.mapping.journal_writer import JournalWriter

@@ -9,15 +9,15 @@ import numpy as np
 from pipelines import settings_of
 import pytest
 from raw_images import compressed, encoded, padded, raw
-from stavpr_ros.commands.build_map import _Images
+from stavpr_ros.commands import build_map as command
 from stavpr_ros.errors import ImageError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map
+from stavpr_ros.mapping import build_map, load_map
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.encodings import decode_message
-from stavpr_ros.sources.files import decode_file, reduction
+from stavpr_ros.sources.files import reduction
 
 MIN_SIZE = (224, 224)
 
@@ -120,15 +120,16 @@ def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes,
     assert pipeline.operation.process(message_of(image), 1).image.shape[0] == rows
 
 
-@pytest.mark.parametrize('images', [lambda source: source, lambda source: _Images(source, 1)])
-def test_map_of_large_files_has_the_features_that_a_node_computes(image, images, tmp_path):
-    cv2.imwrite(str(tmp_path / 'large.jpg'), image[..., ::-1])
-    extractor = FeatureExtractor('gradient')
-    place_map = build_map(images(open_source(tmp_path)), extractor, progress=False)
-    reduced = decode_file(
-        (tmp_path / 'large.jpg').read_bytes(), None, extractor.needed_size(THUMBNAIL_WIDTH)
-    )
+def test_map_of_large_files_has_the_features_that_a_node_computes(image, tmp_path):
+    """Of the library and of the command."""
+    path, folder, extractor = tmp_path / 'map', tmp_path / 'images', FeatureExtractor('gradient')
+    folder.mkdir()
+    (folder / 'large.jpg').write_bytes(encoded('.jpg', image))
+    options = ['--input', str(folder), '--output', str(path), '--features', 'gradient']
+    assert command.main(options) == 0
+    least = extractor.needed_size(THUMBNAIL_WIDTH)
+    reduced = decode_message(compressed(encoded('.jpg', image)), least)
     assert reduced.shape == (270, 480, 3)
-    np.testing.assert_array_equal(
-        place_map.features.strips, extractor.extract([reduced]).strips, strict=True
-    )
+    expected = extractor.extract([reduced]).strips
+    for places in (build_map(open_source(folder), extractor, progress=False), load_map(path)):
+        np.testing.assert_array_equal(places.features.strips, expected, strict=True)

@@ -11,7 +11,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import decision
 from stavpr_slam.pose_graph import graph as graph_module
-from stavpr_slam.pose_graph.g2o import _reversed, g2o_text, graph_of, read_edges
+from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges, reversed_edge
 from test_pose_graph import error
 
 SIDE, LAPS = 12, 3
@@ -135,7 +135,9 @@ def test_vertices_with_gaps_and_edges_to_the_one_before(tmp_path, freedom):
     """As RTAB-Map exports its nodes."""
     edges = read_edges(write(tmp_path / 'a.g2o', freedom, 0.3))
     expected = graph_of(edges).update(final=True)
-    changed = [_reversed(*edge) if number % 3 == 0 else edge for number, edge in enumerate(edges)]
+    changed = [
+        reversed_edge(*edge) if number % 3 == 0 else edge for number, edge in enumerate(edges)
+    ]
     numbers = np.cumsum(1 + np.arange(COUNT) % 4)
     renamed = [(int(numbers[i]), int(numbers[j]), *rest) for i, j, *rest in changed]
     found = graph_of(renamed).update(final=True)
