@@ -393,7 +393,8 @@ HAND_MADE = [  # parts, a change of the manifest, and what the error names; the 
     ({}, cameras(intrinsics={'width': 640}), "lacks '"),
     ({}, cameras(4), 'section cameras has 4 of them: expected 2'),
 ]
-STATISTICS = [  # the same, of a file that has some
+STATISTICS = [  # the same, of a file that has some, and a projection
+    ({'projection': np.full((32, 16), np.nan, np.float32)}, None, 'projection is not finite'),
     ({'statistics__mean': None}, None, 'part statistics/mean is missing'),
     ({'statistics__changes': None}, None, 'part statistics/changes is missing'),
     ({'statistics__mean': np.zeros((2, 31), np.float32)}, None, 'expected 16 for d'),
