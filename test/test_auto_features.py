@@ -18,10 +18,8 @@ WHEEL, RUNTIME = efficientnet_lite_file.WHEEL, 'onnxruntime'
 
 
 @pytest.fixture(params=['hybrid', RUNTIME, WHEEL, 'room'])
-def kind(request, tmp_path, monkeypatch):
+def kind(request, model_folders, monkeypatch):
     """Return what auto is on a machine that has all, or lacks a package or a cache."""
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
-    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
     if request.param == RUNTIME:
         monkeypatch.setitem(sys.modules, RUNTIME, None)
     elif request.param == WHEEL:

@@ -127,6 +127,14 @@ def device(request):
     return torch.device(request.param)
 
 
+@pytest.fixture
+def model_folders(tmp_path, monkeypatch):
+    """Set the folders of models and of downloads, and return both."""
+    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    return tmp_path / 'models', tmp_path / 'cache' / 'stavpr_ros'
+
+
 @contextmanager
 def disk_of(size: int):
     """Let no file of this process be larger, as on a full disk."""
