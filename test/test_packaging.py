@@ -175,8 +175,13 @@ def test_wheel_has_every_file_of_the_packages_and_their_entry_points(sources, tm
             assert line in entries
 
 
-def test_stavpr_without_a_package_names_it(monkeypatch, capsys):
+@pytest.fixture
+def no_plugins(monkeypatch):
+    """Hide the entry points of all packages."""
     monkeypatch.setattr(plugins, 'load', lambda group: {})
+
+
+def test_stavpr_without_a_package_names_it(no_plugins, capsys):
     assert stavpr.main(['evaluate']) == 2
     assert 'in the package stavpr_lab' in capsys.readouterr().err
     assert stavpr.main([]) == stavpr.main(['evaluat']) == 2
@@ -313,8 +318,7 @@ def test_unknown_scheme_lists_known_ones():
 
 
 @pytest.mark.parametrize('address', ['faiss:FILE', 'qdrant:FOLDER', 'qdrant+https://HOST:1/NAME'])
-def test_address_without_stavpr_fleet_names_it(monkeypatch, address):
-    monkeypatch.setattr(plugins, 'load', lambda group: {})
+def test_address_without_stavpr_fleet_names_it(no_plugins, address):
     assert is_address(address)
     with pytest.raises(UnavailableError, match=r"the package stavpr_fleet.*install '\.\[fleet\]'"):
         store_of(address)
@@ -326,8 +330,7 @@ def test_kind_of_features_of_another_package_is_listed_and_loaded(plugged):
     assert backbone_class('plain').__name__ == 'Gradient'
 
 
-def test_kind_of_a_missing_package_names_it(monkeypatch):
-    monkeypatch.setattr(plugins, 'load', lambda group: {})
+def test_kind_of_a_missing_package_names_it(no_plugins):
     with pytest.raises(SettingsError, match='in the package stavpr_lab'):
         settings_class('vgg16')
     with pytest.raises(SettingsError, match=r"'teleport'.*take one of gradient"):
