@@ -169,8 +169,7 @@ def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run
         (['--gradient-cell', 32], '--gradient-cell'),
         (['--crop-map', 0.3], '--crop-map'),
     ):
-        code, _, errors = run('--map', saved, '--query', query, *wrong)
-        assert (code, word in errors) == (2, True)
+        run.fails(2, word, '--map', saved, '--query', query, *wrong)
 
 
 def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers, run):
@@ -184,8 +183,7 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     options = ['--dataset', f'nordland={tmp_path}', '--features', 'gradient']
     options += ['--projection', 32, '--unknown', saved]
     assert numbers(*options)['unknown_images'] == 24
-    code, _, errors = run(*options, '--seed', 1)
-    assert (code, 'those of the first sequence' in errors) == (1, True)
+    run.fails(1, 'those of the first sequence', *options, '--seed', 1)
 
 
 def test_evaluate_with_a_ground_truth_file_has_tolerance_zero(folders, numbers, tmp_path):
@@ -216,8 +214,7 @@ def test_evaluate_with_poses_accepts_near_places(folders, numbers, run, tmp_path
         ([*options, '--map-poses', tmp_path / 'short.csv'], 1, '1 poses for 60 images'),
         ([*pair(folders), '--odometry', tmp_path / 'short.csv'], 1, '1 poses for 60 images'),
     ):
-        found, _, errors = run(*wrong)
-        assert (found, word in errors) == (code, True), errors
+        run.fails(code, word, *wrong)
 
 
 def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
@@ -395,8 +392,7 @@ LOOP, PAIR = '--query x --loop-closure --truth y', '--map x --query y'
     ],
 )
 def test_evaluate_with_invalid_options_fails_before_the_work(run, options, code, word):
-    found, _, errors = run(*options.split())
-    assert (found, word in errors) == (code, True)
+    run.fails(code, word, *options.split())
 
 
 def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
@@ -408,8 +404,7 @@ def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
         (['--speed', 4], 1, 'at least l = 20'),
         (['--window', 3, '--output', folder], 2, '9 .. 49'),
     ):
-        found, _, errors = run(*pair(folders), *options)
-        assert (found, word in errors) == (code, True), errors
+        run.fails(code, word, *pair(folders), *options)
     assert not folder.exists()
 
 
@@ -458,11 +453,9 @@ def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):
     (folder / 'report.html').write_text('<!doctype html>\n')
     out.write_text('{}')
     for option, path in (('--json', out), ('--output', folder)):
-        code, _, errors = run(*pair(folders), option, path)
-        assert (code, 'exists already' in errors) == (1, True), errors
+        run.fails(1, 'exists already', *pair(folders), option, path)
     out.write_text('my notes')
-    code, _, errors = run(*pair(folders), '--json', out, '--force')
-    assert (code, 'is no JSON file: it is never replaced' in errors) == (1, True), errors
+    run.fails(1, 'is no JSON file: it is never replaced', *pair(folders), '--json', out, '--force')
 
 
 CHROMIUM = shutil.which('chromium')

@@ -47,8 +47,7 @@ def test_evaluate_of_descriptors_and_of_exported_ones_are_equal(run, pair, tmp_p
     numbers = [json.loads(path.read_text()) for path in (first, second)]
     assert numbers[0]['sequence']['f1'] == pytest.approx(numbers[1]['sequence']['f1'])
     assert numbers[0]['single']['recall_at_1'] > 0.9
-    code, _, errors = run(*pair, '--json', tmp_path / '3.json', '--export', exported)
-    assert (code, 'exists already' in errors) == (1, True)
+    run.fails(1, 'exists already', *pair, '--json', tmp_path / '3.json', '--export', exported)
 
 
 def test_evaluate_names_a_result_that_cannot_be_wrong(run, pair, tmp_path):
@@ -90,8 +89,7 @@ def test_evaluate_exports_strips_of_images(run, route, tmp_path):
     ],
 )
 def test_evaluate_of_descriptors_rejects_options_of_images(run, pair, options, word):
-    code, _, errors = run(*pair, *options)
-    assert (code, word in errors) == (2, True)
+    run.fails(2, word, *pair, *options)
 
 
 def test_map_of_descriptors_takes_descriptors_only(run, pair, route, tmp_path, runner):
@@ -108,11 +106,9 @@ def test_map_of_descriptors_takes_descriptors_only(run, pair, route, tmp_path, r
         place_map.extractor()
     query = ['--query', *pair[3:], '--json', tmp_path / 'a.json', '--force']
     assert run('--map', saved, *query)[0] == 0
-    code, _, errors = run('--map', saved, *query, '--descriptors-source', 'megaloc')
-    assert (code, 'megaloc' in errors) == (1, True)
+    run.fails(1, 'megaloc', '--map', saved, *query, '--descriptors-source', 'megaloc')
     images = write_images(tmp_path / 'images', route[:24])
-    code, _, errors = run('--map', saved, '--query', images)
-    assert (code, 'not from images' in errors) == (1, True)
+    run.fails(1, 'not from images', '--map', saved, '--query', images)
 
 
 def test_map_of_bits_takes_bits_without_the_option(run, pair, vectors, tmp_path, runner):
@@ -120,14 +116,12 @@ def test_map_of_bits_takes_bits_without_the_option(run, pair, vectors, tmp_path,
     path, saved = tmp_path / 'bits.npy', tmp_path / 'bits.stavpr'
     np.save(path, np.packbits(vectors > 0, axis=1))
     build = runner(build_descriptor_map)
-    code, _, errors = build('--input', path, '--output', saved)
-    assert (code, 'with --descriptors-bits true' in errors) == (1, True)
+    build.fails(1, 'with --descriptors-bits true', '--input', path, '--output', saved)
     code, output, _ = build('--input', path, '--output', saved, '--descriptors-bits', 'true')
     assert (code, '1 strips of 24 dimensions' in output) == (0, True)
     options = ['--map', saved, *pair[4:], '--json', tmp_path / 'a.json', '--force', '--query']
     assert run(*options, path)[0] == 0
-    code, _, errors = run(*options, pair[3])
-    assert (code, 'expected uint8 for bits' in errors) == (1, True)
+    run.fails(1, 'expected uint8 for bits', *options, pair[3])
 
 
 @pytest.mark.long

@@ -159,6 +159,11 @@ def runner(monkeypatch, capsys):
                 code = error.code
             return code, *capsys.readouterr()
 
+        def fails(code, words, *arguments):
+            found, _, errors = run(*arguments)
+            assert (found, words in errors) == (code, True), errors
+
+        run.fails = fails  # expects an exit code, and words in the errors
         return run
 
     return make
