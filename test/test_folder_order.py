@@ -7,7 +7,7 @@ import random
 import numpy as np
 from PIL import Image
 import pytest
-from stavpr_ros.sources.order import in_order
+from stavpr_ros.sources.order import in_order, natural_key
 
 
 def counter(first, span, count=24, width=0, zero=0):
@@ -30,6 +30,18 @@ GUESSED = {
     'steps': counter(9900, 10000, 240, width=4)[::10],
     '16 bits': counter(65530, 2**16),
 }
+
+
+def test_natural_key_sorts_numbers():
+    names = ['10.jpg', 'a2b10.png', '2.jpg', '1.jpg', 'a2b9.png', 'A1.png', '01.jpg', 'a.png']
+    expected = ['01.jpg', '1.jpg', '2.jpg', '10.jpg', 'a.png', 'A1.png', 'a2b9.png', 'a2b10.png']
+    assert sorted(names, key=natural_key) == expected
+
+
+@pytest.mark.parametrize('mark', [' (1)', '(0)', '-1', '_2', ' copy'])
+def test_natural_key_sorts_numbered_copies_behind_their_name(mark):
+    expected = ['IMG_9.jpg', f'IMG_9{mark}.jpg', 'IMG_10.jpg', f'IMG_10{mark}.JPG']
+    assert sorted({*expected}, key=natural_key) == expected
 
 
 @pytest.mark.parametrize(

@@ -53,36 +53,44 @@ def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path
     assert ids(tmp_path / 'maps') == ids(built)
 
 
-def test_run_jobs_failed_job_does_not_stop_others(monkeypatch, capfd):
-    def run(command, **_):
-        return subprocess.CompletedProcess(command, int(command[-1]), f'{command[-1]}\n')
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """Write a module that jobs run; return its file."""
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path), prepend=':')
 
-    monkeypatch.setattr(subprocess, 'run', run)
-    assert run_jobs([Job(f'job{i}', BUILD_MAP, (str(i),)) for i in (1, 2, 0)], 1, None) == 2
+    def write(text):
+        (tmp_path / 'program.py').write_text(f'import os, sys\n{text}\n')
+        return tmp_path / 'program.py'
+
+    return write
+
+
+def test_run_jobs_failed_job_does_not_stop_others(program, capfd):
+    program('print(sys.argv[1], flush=True); sys.exit(int(sys.argv[1]))')
+    assert run_jobs([Job(f'job{i}', 'program', (str(i),)) for i in (1, 2, 0)], 1, None) == 2
     text = capfd.readouterr().out
     for part in ('job1: failed, exit code 1\n1\n', 'job0: done\n0', 'job2: failed, exit code 2'):
         assert f'--- {part}' in text
 
 
 @pytest.mark.parametrize(
-    ('codes', 'is_new', 'forced', 'shown'),
+    ('killed', 'is_new', 'forced', 'shown'),
     [
-        ([-9, 0], False, [False, False], 'done\nout\n'),
-        ([-9, 0], True, [False, True], 'done\nout\n'),
-        ([-9] * 4, False, [False] * 4, 'failed, exit code 1\nout\nkilled by signal 9\n'),
+        (1, False, [False, False], 'done\nout\n'),
+        (1, True, [False, True], 'done\nout\n'),
+        (4, False, [False] * 4, 'failed, exit code 1\nout\nkilled by signal 9\n'),
     ],
 )
-def test_run_jobs_killed_job_is_run_again(codes, is_new, forced, shown, monkeypatch, capfd):
+def test_run_jobs_killed_job_is_run_again(killed, is_new, forced, shown, program, capfd):
     """It may have written its output before: another try replaces what was not there at first."""
-    runs = []
-
-    def run(command, **_):
-        runs.append('--force' in command)
-        return subprocess.CompletedProcess(command, codes[len(runs) - 1], 'out\n')
-
-    monkeypatch.setattr(subprocess, 'run', run)
-    assert run_jobs([Job('a', BUILD_MAP, (), is_new)], 1, None) == (codes[-1] < 0)
-    assert (runs, capfd.readouterr().out) == (forced, f'--- a: {shown}')
+    runs = program(
+        "print('out', flush=True); runs = open(__file__ + '.runs', 'a+')\n"
+        "print('--force' in sys.argv, file=runs, flush=True); runs.seek(0)\n"
+        f'if len(runs.readlines()) <= {killed}: os.kill(os.getpid(), 9)'
+    ).with_suffix('.py.runs')
+    assert run_jobs([Job('a', 'program', (), is_new)], 1, None) == (killed == len(forced))
+    assert runs.read_text().split() == list(map(str, forced))
+    assert capfd.readouterr().out == f'--- a: {shown}'
 
 
 def test_job_names_and_arguments():

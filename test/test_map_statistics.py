@@ -136,31 +136,6 @@ def test_statistics_of_a_later_version_of_the_section_are_not_looked_at(place_ma
     assert answers(opened, 'float32') == answers(load_map(path), 'float32')
 
 
-@pytest.mark.parametrize(
-    ('change', 'parts', 'text'),
-    [
-        (None, {'mean': None}, 'part statistics/mean is missing'),
-        (None, {'changes': None}, 'part statistics/changes is missing'),
-        (None, {'mean': np.zeros((2, 31), np.float32)}, 'expected 32 for d'),
-        (None, {'mean': np.zeros((2, 32))}, 'part statistics/mean is F64'),
-        (None, {'mean': np.full((2, 32), np.nan, np.float32)}, 'mean is not between'),
-        (None, {'gains': np.zeros((2, 64))}, 'gains is not between|expected'),
-        (None, {'directions': np.full((2, 64, 32), np.inf, np.float32)}, 'directions is not'),
-        (None, {'directions': np.zeros((2, 2**10, 32), np.float32)}, 'for r'),
-        (None, {'changes': np.zeros((4, 600), np.float32)}, 'expected 5 for 5'),
-        (None, {'changes': np.full((5, 600), -9, np.float32)}, 'changes is not between'),
-        (lambda section: section.update(data=None), {}, 'section statistics is'),
-        (lambda section: section['data'].update(features='x'), {}, 'features is'),
-        (lambda section: section['data'].update(method='m' * 999), {}, 'at most 128'),
-    ],
-)
-def test_hand_made_statistics_are_rejected_by_name(place_map, tmp_path, change, parts, text):
-    path = save(place_map, tmp_path / 'map')
-    change_file(path, change or (lambda section: None), **parts)
-    with pytest.raises(MapFileError, match=text):
-        open_map(path)
-
-
 def test_reader_written_from_the_documentation_finds_the_statistics(place_map, tmp_path):
     from map_reader import read
 

@@ -158,7 +158,7 @@ def test_map_of_vectors_localizes_in_the_pipeline(saved, route, tmp_path):
     noise = np.random.default_rng(0).normal(0, 10, (20, *route[0].shape))
     images = np.clip(route[20:40] + noise, 0, 255).astype(np.uint8)
     last = process(localizing(str(path), model_path=str(network)), images)[-1]
-    assert (last.status, last.place_index) == (Status.MATCH, 37)
+    assert (last.match.status, last.match.place) == (Status.MATCH, 37)
 
 
 MEAN = helper.make_node('ReduceMean', ['y'], ['m'], axes=[0, 2, 3], keepdims=1)

@@ -5,12 +5,12 @@
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 import os
-import resource
 import stat
 import subprocess
 import sys
 import threading
 
+from fixtures import disk_of
 import pytest
 from stavpr_ros.errors import OutputError, OutputTakenError
 from stavpr_ros.output_file import (
@@ -168,16 +168,10 @@ def test_atomic_output_killed_writer_leaves_what_the_next_one_sweeps(writer, tmp
 
 
 def test_write_output_on_a_full_disk_leaves_what_was_there(tmp_path):
-    """A limit of this process stands for the disk."""
-    path = tmp_path / 'a.json'
+    path, match = tmp_path / 'a.json', r'written .File too large.; what was there is untouched'
     path.write_text('{}')
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
-    try:
-        with pytest.raises(OutputError, match=r'written .File too large.; what was there is unt'):
-            write_output(path, '[' + ' ' * 100_000, JSON, force=True)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.raises(OutputError, match=match), disk_of(10_000):
+        write_output(path, '[' + ' ' * 100_000, JSON, force=True)
     assert (path.read_text(), names(tmp_path)) == ('{}', ['a.json'])
 
 

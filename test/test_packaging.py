@@ -1,8 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What each package installs, the dependencies it declares, and the command ``stavpr``."""
+"""What each package installs and depends on, its entry points, and the command stavpr."""
 
 import ast
+from contextlib import chdir
 from functools import partial
 from importlib import import_module
 import os
@@ -22,8 +23,10 @@ import stavpr_ros
 from stavpr_ros import plugins
 from stavpr_ros.commands import program, stavpr
 from stavpr_ros.compilation import CACHE
-from stavpr_ros.errors import UnavailableError
+from stavpr_ros.errors import SettingsError, UnavailableError
+from stavpr_ros.features.registry import backbone_class, kinds, settings_class
 from stavpr_ros.mapping import save_map
+from stavpr_ros.mapping.stores import is_address, store_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SIBLINGS = ('stavpr_fleet', 'stavpr_slam', 'stavpr_nav', 'stavpr_lab')
@@ -50,14 +53,12 @@ ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules of another name
 each_package = pytest.mark.parametrize('package', PACKAGES)
 
 
-def setup_arguments(package: str, monkeypatch) -> dict:
+def distribution(package: str) -> setuptools.Distribution:
     """Return what setup.py passes to setuptools."""
-    passed: dict = {}
-    monkeypatch.setattr(setuptools, 'setup', passed.update)
-    monkeypatch.chdir(PACKAGES[package])
-    source = Path('setup.py').read_text(encoding='utf-8')
-    exec(compile(source, 'setup.py', 'exec'), {'__name__': 'setup'})
-    return passed
+    import distutils.core  # of setuptools, which is imported above
+
+    with chdir(PACKAGES[package]):
+        return distutils.core.run_setup('setup.py', stop_after='init')
 
 
 def imported(folder: Path) -> set[str]:
@@ -87,10 +88,10 @@ def imports_of(package: str) -> set[str]:
 
 
 @each_package
-def test_every_imported_distribution_is_required(package, monkeypatch):
-    arguments = setup_arguments(package, monkeypatch)
-    extras = arguments.get('extras_require', {})
-    lines = sum((extras.get(extra, []) for extra in EXTRAS), arguments['install_requires'])
+def test_every_imported_distribution_is_required(package):
+    stated = distribution(package)
+    extras = stated.extras_require
+    lines = sum((extras.get(extra, []) for extra in EXTRAS), [*stated.install_requires])
     required = {re.match(r'[\w-]+', line).group().lower() for line in lines}
     needed = {name for name in imports_of(package) if not ROS.fullmatch(name)}
     needed -= {'stavpr_slam', 'stavpr_nav'}
@@ -109,11 +110,11 @@ def test_every_imported_ros_package_is_dependency(package):
     assert tests - declared(package, 'exec_depend', 'depend', 'test_depend') == set()
 
 
-def test_versions_agree(monkeypatch):
+def test_versions_agree():
     versions = [manifest(folder).findtext('version') for folder in FOLDERS]
     citation = (ROOT / 'CITATION.cff').read_text(encoding='utf-8')
     versions.append(re.search(r'^version: (.+)$', citation, re.MULTILINE).group(1))
-    versions += [setup_arguments(package, monkeypatch)['version'] for package in PACKAGES]
+    versions += [distribution(package).metadata.version for package in PACKAGES]
     assert set(versions) == {stavpr_ros.__version__}
     for folder in FOLDERS:
         changelog = get_changelog_from_path(folder)
@@ -174,8 +175,13 @@ def test_wheel_has_every_file_of_the_packages_and_their_entry_points(sources, tm
             assert line in entries
 
 
-def test_stavpr_without_a_package_names_it(monkeypatch, capsys):
+@pytest.fixture
+def no_plugins(monkeypatch):
+    """Hide the entry points of all packages."""
     monkeypatch.setattr(plugins, 'load', lambda group: {})
+
+
+def test_stavpr_without_a_package_names_it(no_plugins, capsys):
     assert stavpr.main(['evaluate']) == 2
     assert 'in the package stavpr_lab' in capsys.readouterr().err
     assert stavpr.main([]) == stavpr.main(['evaluat']) == 2
@@ -245,3 +251,87 @@ def test_command_without_docstrings_and_letters_explains_itself(name):
         command = [sys.executable, '-OO', '-c', f'{code}{words}]))']
         done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
         assert (done.returncode, 'Traceback' in done.stderr) == (expected, False), done.stderr
+
+
+MODULE = """
+from stavpr_ros.commands import Command
+from stavpr_ros.features.registry import GradientSettings, Kind
+from stavpr_ros.mapping.stores import Store
+
+COMMANDS = {'hello': Command('plugged', 'greet'), 'node': Command('plugged', 'not this one')}
+KIND = Kind(GradientSettings, 'stavpr_ros.features.gradient:Gradient')
+STORE = Store(open_map=lambda address: address, upload=lambda *_: None)
+main = lambda arguments: len(arguments)
+"""
+ENTRY_POINTS = """
+[stavpr.commands]
+plugged = plugged:COMMANDS
+broken = plugged:MISSING
+
+[stavpr.features]
+plain = plugged:KIND
+
+[stavpr.stores]
+drawer = plugged:STORE
+"""
+
+
+@pytest.fixture
+def plugged(tmp_path, monkeypatch):
+    """Install a package with entry points."""
+    (tmp_path / 'plugged.py').write_text(MODULE)
+    info = tmp_path / 'plugged-1.0.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: plugged\nVersion: 1.0\n')
+    (info / 'entry_points.txt').write_text(ENTRY_POINTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins.load.cache_clear()
+    yield
+    plugins.load.cache_clear()
+
+
+def test_command_of_another_package_runs(plugged, capsys):
+    assert stavpr.main(['hello', 'a', 'b']) == 2
+    stavpr.main(['--help'])
+    assert 'greet' in capsys.readouterr().out
+
+
+def test_command_of_this_package_is_not_replaced(plugged):
+    assert stavpr.all_commands()['node'].module == 'stavpr_ros.commands.node'
+
+
+def test_broken_plugin_is_named_and_skipped(plugged, caplog):
+    assert 'plugged' in plugins.load(plugins.COMMANDS)
+    assert 'broken' not in plugins.load(plugins.COMMANDS)
+    assert 'plug-in broken of plugged (plugged:MISSING): AttributeError' in caplog.text
+
+
+def test_store_of_another_package_opens_its_scheme(plugged):
+    assert is_address('drawer:socks')
+    assert store_of('drawer:socks').open_map('drawer:socks') == 'drawer:socks'
+
+
+def test_unknown_scheme_lists_known_ones():
+    assert not is_address('drawer:socks')
+    with pytest.raises(SettingsError, match=r'drawer:socks is no address.*faiss:, qdrant:'):
+        store_of('drawer:socks')
+
+
+@pytest.mark.parametrize('address', ['faiss:FILE', 'qdrant:FOLDER', 'qdrant+https://HOST:1/NAME'])
+def test_address_without_stavpr_fleet_names_it(no_plugins, address):
+    assert is_address(address)
+    with pytest.raises(UnavailableError, match=r"the package stavpr_fleet.*install '\.\[fleet\]'"):
+        store_of(address)
+
+
+def test_kind_of_features_of_another_package_is_listed_and_loaded(plugged):
+    assert 'plain' in kinds()
+    assert settings_class('plain').__name__ == 'GradientSettings'
+    assert backbone_class('plain').__name__ == 'Gradient'
+
+
+def test_kind_of_a_missing_package_names_it(no_plugins):
+    with pytest.raises(SettingsError, match='in the package stavpr_lab'):
+        settings_class('vgg16')
+    with pytest.raises(SettingsError, match=r"'teleport'.*take one of gradient"):
+        settings_class('teleport')

@@ -2,9 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded map is saved at the end, and no file of another map is overwritten."""
 
-from unittest.mock import Mock
-
-from pipelines import localizing, process, save, settings_of
+from pipelines import localizing, Log, process, save, settings_of
 import pytest
 from stavpr_ros.mapping import load_map, open_map, save_map
 from stavpr_ros.output_file import FileVersion
@@ -21,9 +19,9 @@ def mapping(route):
 
 
 def at_the_end(pipeline, path, on_worker=lambda function: function()):
-    log = Mock()
+    log = Log()
     save_recorded_map(pipeline, on_worker, str(path), log)
-    return [(level, text) for level, (text,), _ in log.method_calls]
+    return log.lines
 
 
 def test_save_recorded_map_writes_unsaved_places_once(mapping, route, tmp_path):

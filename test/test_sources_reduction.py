@@ -2,22 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Large images are reduced while they are decoded; results stay those of whole images."""
 
-from types import SimpleNamespace
+from functools import partial
 
 import cv2
 import numpy as np
 from pipelines import settings_of
 import pytest
-from raw_images import padded
-from stavpr_ros.commands.build_map import _Images
+from raw_images import compressed, encoded, padded, raw
+from stavpr_ros.commands import build_map as command
 from stavpr_ros.errors import ImageError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map
+from stavpr_ros.mapping import build_map, load_map
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.sources import open_source
-from stavpr_ros.sources.encodings import decode_image, decode_message
-from stavpr_ros.sources.files import decode_file, reduction
+from stavpr_ros.sources.encodings import decode_message
+from stavpr_ros.sources.files import reduction
 
 MIN_SIZE = (224, 224)
 
@@ -50,18 +50,11 @@ def block_means(image, divisor):
     return image.reshape(height, divisor, width, divisor, 3).mean((1, 3))
 
 
-def raw(image, encoding='rgb8', padding=0):
+def message_of(image, encoding='rgb8', padding=0):
     """Return the message of an image with padded rows."""
     rows = np.ascontiguousarray(ENCODERS[encoding](image))
     step, data = padded(rows.reshape(len(rows), -1).view(np.uint8), padding)
-    height, width = image.shape[:2]
-    fields = {'height': height, 'width': width, 'encoding': encoding, 'is_bigendian': 0}
-    return SimpleNamespace(**fields, step=step, data=data)
-
-
-def compressed(image, suffix):
-    data = cv2.imencode(suffix, image[..., ::-1])[1].reshape(-1)
-    return SimpleNamespace(format='rgb8; jpeg compressed bgr8', data=data)
+    return raw(encoding, *image.shape[:2], step, data)
 
 
 @pytest.mark.parametrize(
@@ -85,40 +78,32 @@ def test_reduction_keeps_needed_size_and_whole_pixels(size, least, divisor):
     assert reduction(*size, least) == divisor
 
 
-@pytest.mark.parametrize(
-    ('encoding', 'padding'), [*zip(ENCODERS, [0, 7, 7, 7, 7], strict=True), ('nv12', 0)]
-)
-def test_decode_of_large_raw_image_averages_blocks(image, encoding, padding):
-    reduced = decode_message(raw(image, encoding, padding), MIN_SIZE)
-    whole = decode_message(raw(image, encoding, padding))
+@pytest.mark.parametrize(('make', 'tolerance'), [
+    *((partial(message_of, encoding=name, padding=7 * (name != 'rgb8')), 1) for name in ENCODERS),
+    (partial(message_of, encoding='nv12'), 1),
+    (lambda image: compressed(encoded('.png', image)), 1),
+    (lambda image: compressed(encoded('.jpg', image)), 4),
+])  # fmt: skip
+def test_decode_of_large_image_averages_blocks(image, make, tolerance):
+    """To within what is rounded twice, and what a JPEG rounds."""
+    reduced, whole = decode_message(make(image), MIN_SIZE), decode_message(make(image))
     assert (whole.shape, reduced.shape) == ((1080, 1920, 3), (270, 480, 3))
-    assert np.abs(reduced - block_means(whole, 4)).max() <= 1  # rounded twice
-    assert reduced.flags.c_contiguous
-
-
-@pytest.mark.parametrize(('suffix', 'tolerance'), [('.png', 1), ('.jpg', 4)])
-def test_decode_of_large_compressed_image_averages_blocks(image, suffix, tolerance):
-    reduced = decode_message(compressed(image, suffix), MIN_SIZE)
-    whole = decode_message(compressed(image, suffix))
-    assert reduced.shape == (270, 480, 3)
     assert np.abs(reduced - block_means(whole, 4)).max() <= tolerance
+    assert reduced.flags.c_contiguous
 
 
 def test_decode_of_small_image_is_unchanged(image):
     small = image[:768, :1024]
-    for message in (raw(small), compressed(small, '.jpg')):
+    for message in (message_of(small), compressed(encoded('.jpg', small))):
         np.testing.assert_array_equal(decode_message(message, MIN_SIZE), decode_message(message))
-    assert not np.shares_memory(decode_message(raw(small), MIN_SIZE), small)
+    assert not np.shares_memory(decode_message(message_of(small), MIN_SIZE), small)
 
 
 def test_decode_of_large_image_cut_off_is_rejected(image):
-    message = raw(image)
-    with pytest.raises(ImageError, match='cut off'):
-        decode_image(1080, 1920, 'rgb8', False, 5760, message.data[:-1], MIN_SIZE)
-    message = compressed(image, '.jpg')
-    message.data = message.data[:-30]
-    with pytest.raises(ImageError, match='cut off'):
-        decode_message(message, MIN_SIZE)
+    for message, missing in ((message_of(image), 1), (compressed(encoded('.jpg', image)), 30)):
+        message.data = message.data[:-missing]
+        with pytest.raises(ImageError, match='cut off'):
+            decode_message(message, MIN_SIZE)
 
 
 @pytest.mark.parametrize(
@@ -132,18 +117,19 @@ def test_decode_of_large_image_cut_off_is_rejected(image):
 def test_pipeline_reduces_large_images_to_what_is_needed(image, resize, changes, rows):
     settings = settings_of(feature_settings=f'{{"resize": "{resize}"}}', **changes)
     pipeline = Pipeline(settings, 'mapping')
-    assert pipeline.operation.process(raw(image), 1).image.shape[0] == rows
+    assert pipeline.operation.process(message_of(image), 1).image.shape[0] == rows
 
 
-@pytest.mark.parametrize('images', [lambda source: source, lambda source: _Images(source, 1)])
-def test_map_of_large_files_has_the_features_that_a_node_computes(image, images, tmp_path):
-    cv2.imwrite(str(tmp_path / 'large.jpg'), image[..., ::-1])
-    extractor = FeatureExtractor('gradient')
-    place_map = build_map(images(open_source(tmp_path)), extractor, progress=False)
-    reduced = decode_file(
-        (tmp_path / 'large.jpg').read_bytes(), None, extractor.needed_size(THUMBNAIL_WIDTH)
-    )
+def test_map_of_large_files_has_the_features_that_a_node_computes(image, tmp_path):
+    """Of the library and of the command."""
+    path, folder, extractor = tmp_path / 'map', tmp_path / 'images', FeatureExtractor('gradient')
+    folder.mkdir()
+    (folder / 'large.jpg').write_bytes(encoded('.jpg', image))
+    options = ['--input', str(folder), '--output', str(path), '--features', 'gradient']
+    assert command.main(options) == 0
+    least = extractor.needed_size(THUMBNAIL_WIDTH)
+    reduced = decode_message(compressed(encoded('.jpg', image)), least)
     assert reduced.shape == (270, 480, 3)
-    np.testing.assert_array_equal(
-        place_map.features.strips, extractor.extract([reduced]).strips, strict=True
-    )
+    expected = extractor.extract([reduced]).strips
+    for places in (build_map(open_source(folder), extractor, progress=False), load_map(path)):
+        np.testing.assert_array_equal(places.features.strips, expected, strict=True)

@@ -1,15 +1,17 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Vertical strips, their norms, and the distances between them, against the oracle."""
+"""Strips of an image: cut, pooled, weighted, projected at random, and one vector an image."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import oracle
 import pytest
-from stavpr_ros.alignment import strip_distances
-from stavpr_ros.errors import InputError
+from stavpr_ros.alignment import SpatialSettings, strip_distances
+from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.features.extractor import cut_strips, normalize
+from stavpr_ros.prepare.matcher import make_matcher
 
 TOLERANCE = 1e-5
 
@@ -123,3 +125,107 @@ def test_strip_distances_of_other_dtype_are_rejected():
     for pair in ((query.astype(np.float64), reference), (query, reference.astype(np.float64))):
         with pytest.raises(InputError, match='float64'):
             strip_distances(*pair)
+
+
+def test_projection_identity_follows_matrix():
+    one, two = Projection.gaussian(40, 16, seed=3), Projection.gaussian(40, 16, seed=3)
+    np.testing.assert_array_equal(one.matrix, two.matrix)
+    assert one.matrix.dtype == np.float32
+    assert Projection(one.matrix.copy(), one.name).identity == two.identity  # of a loaded map
+    two.matrix[3, 5] = np.nextafter(two.matrix[3, 5], np.float32(9))
+    assert Projection(two.matrix, one.name).identity != one.identity
+    others = [(40, 16, 0), (40, 16, 1), (40, 17, 0), (41, 16, 0)]
+    assert len({Projection.gaussian(*other).identity for other in others}) == 4
+
+
+def test_apply_equals_matrix_product():
+    projection = Projection.gaussian(6, 4, seed=1)
+    strips = np.random.default_rng(0).standard_normal((3, 5, 6)).astype(np.float32)
+    strips[1, 2] = 0
+    result = projection.apply(strips)
+    assert result.dtype == np.float32
+    np.testing.assert_allclose(
+        result, np.einsum('ind,dm->inm', strips.astype(float), projection.matrix), atol=1e-5
+    )
+    assert not result[1, 2].any()
+
+
+def test_gaussian_entries_are_normal_with_mean_zero():
+    matrix = Projection.gaussian(1000, 512).matrix
+    spread = matrix.std()
+    assert spread == pytest.approx(512**-0.5, rel=0.01)  # norms are kept on average
+    # 512,000 entries: the mean deviates by spread / 715, the share within one sigma by .0007
+    assert abs(matrix.mean()) < 5 * spread / 715
+    assert np.mean(np.abs(matrix) < spread) == pytest.approx(0.6827, abs=0.004)
+
+
+def test_apply_of_other_dimension_is_rejected():
+    with pytest.raises(InputError, match=r'shape \(7, 2, 5\) float32, expected \(W, n, 6\)'):
+        Projection.gaussian(6, 4).apply(np.zeros((7, 2, 5), np.float32))
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [((0, 4), 'features = 0'), ((6, 0), '= 0'), ((6, -3), '= -3'), ((6, 4, -1), 'seed .* = -1')],
+)
+def test_gaussian_out_of_range_is_rejected(arguments, text):
+    with pytest.raises(SettingsError, match=text):
+        Projection.gaussian(*arguments)
+
+
+@pytest.mark.parametrize('pooling', ['mean', 'gem'])
+def test_cut_strips_pooled_equals_plain_loops(pooling):
+    """A map of 5 rows and 8 columns in three strips: columns 1-2, 3-4, 5-6."""
+    maps = np.random.default_rng(0).standard_normal((2, 3, 5, 8)).astype(np.float32)
+    strips = cut_strips(maps, 3, pooling)
+    assert strips.shape == (3, 2, 3)
+    for w in range(3):
+        for n in range(2):
+            for c in range(3):
+                cells = [float(maps[n, c, y, 1 + 2 * w + x]) for y in range(5) for x in range(2)]
+                expected = sum(cells) / 10
+                if pooling == 'gem':
+                    expected = (sum(max(v, 1e-6) ** 3 for v in cells) / 10) ** (1 / 3)
+                assert float(strips[w, n, c]) == pytest.approx(expected, abs=1e-6)
+
+
+def vectors(n, d, seed=0):
+    """Return unit-norm vectors along a random curve; the first is zero."""
+    steps = np.random.default_rng(seed).standard_normal((n, d))
+    curve = np.cumsum(steps, axis=0) * 0.5 + steps
+    curve /= np.linalg.norm(curve, axis=1, keepdims=True)
+    curve[0] = 0
+    weights = (np.linalg.norm(curve, axis=1) > 0).astype(np.float32)
+    return LocalFeatures(
+        (curve[None].astype(np.float32)),
+        weights[None],
+        FeatureSettings('gradient', None, 1),
+        (1, 1),
+    )
+
+
+@pytest.mark.parametrize(
+    ('strategy', 'precision', 'error'),
+    [
+        ('adaptive', 'float32', 1e-5),
+        ('vanilla', 'float32', 1e-5),
+        ('none', 'float32', 1e-5),
+        ('vertical', 'float32', 1e-5),
+        ('adaptive', 'int8', 0.02),
+    ],
+)
+def test_alignment_of_one_strip_is_the_cosine_distance(strategy, precision, error):
+    vertical = strategy == 'vertical'
+    spatial = SpatialSettings('adaptive' if vertical else strategy, vertical=vertical)
+    features, queries = vectors(131, 515), vectors(3, 515, seed=1)
+    matcher = make_matcher(features, spatial, 'cpu', precision)
+    matrix = matcher.distance_matrix(queries.strips, queries.weights)
+    expected = 1 - queries.strips[0] @ features.strips[0].T
+    np.testing.assert_allclose(matrix, expected, rtol=0, atol=error)
+    row = matcher.distances(queries.strips[:, 1], queries.weights[:, 1])
+    assert np.array_equal(row, matrix[1])
+
+
+def test_sliding_window_over_one_strip_is_rejected_with_the_map():
+    with pytest.raises(InputError, match='W = 1 strips: the sliding window'):
+        make_matcher(vectors(5, 4), SpatialSettings('sliding_window'), 'cpu', 'float32')

@@ -13,7 +13,6 @@ from bags import SECOND, writing
 from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
-from rosbags.typesys import get_types_from_msg
 from sensor_msgs.msg import CompressedImage
 from stavpr_ros.errors import ImageError, SourceError
 from stavpr_ros.pipeline.statistics import Statistics
@@ -153,7 +152,7 @@ def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded
     text = ROS1_FFMPEG if is_ros1 else DEFINITIONS[name] + (NEWER if kind == 'newer' else '')
     path = tmp_path / ('drive.bag' if is_ros1 else 'drive')
     with writing(path, is_ros1) as bag:
-        bag._store.register(get_types_from_msg(text, name))
+        bag.define(name, text)
         for i, packet in enumerate(encoded):
             if i == 7:
                 continue
@@ -212,7 +211,7 @@ def test_node_decodes_video_in_compressed_images(
 def test_topics_of_other_transports_have_a_remedy(tmp_path):
     kind = 'theora_image_transport/msg/Packet'
     with writing(tmp_path / 'drive') as bag:
-        bag._store.register(get_types_from_msg('uint8[] data\n', kind))
+        bag.define(kind, 'uint8[] data\n')
         bag.write('/camera/theora', kind, SECOND, np.zeros(9, np.uint8))
     with pytest.raises(SourceError, match='republish TRANSPORT raw'):
         BagSource(tmp_path / 'drive')
@@ -220,7 +219,7 @@ def test_topics_of_other_transports_have_a_remedy(tmp_path):
 
 def test_damaged_foxglove_message_of_a_bag_is_an_error_of_its_image(tmp_path):
     with writing(tmp_path / 'drive') as bag:
-        bag._store.register(get_types_from_msg(DEFINITIONS[FOXGLOVE], FOXGLOVE))
+        bag.define(FOXGLOVE, DEFINITIONS[FOXGLOVE])
         for content in (b'', b'\0\1\0\0', b'\0\1\0\0' + 40 * b'\xff'):
             bag.write_bytes('/video', FOXGLOVE, SECOND, content)
     errors = []

@@ -188,13 +188,14 @@ def test_probabilities_are_those_of_the_same_map_on_a_robot(kind):
 
 def test_recognizer_after_a_reset_answers_as_a_new_one(city, query):
     """Also one whose store fails, by the chunks of before."""
-    one, new = (FleetRecognizer(CityMap.of(Faulty(city)), SETTINGS, timeout=60) for _ in 'ab')
+    stores = Faulty(city), Faulty(city)
+    one, new = (FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60) for store in stores)
     drive(one, query)
     one.reset()
     for found, expected in zip(drive(one, query), drive(new, query), strict=True):
         values = [vars(each) | {'path': vars(each.path)} for each in (found, expected)]
         np.testing.assert_equal(*values)
-    one._city.store.cut = True
+    stores[0].cut = True
     one.reset()
     assert drive(one, query)[-1].accepted
 

@@ -1,7 +1,7 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Damaged files for every reader but that of maps: read, or rejected by our own error.
+Damaged files for every reader: read, or rejected by our own error.
 
 Each within a second, and within ``ROOM`` and three times its size in memory. It is run as a
 process of its own, since decoders may end it: ``python3 reader_fuzz.py FILES SEED [READER ...]``,
@@ -14,13 +14,14 @@ from pathlib import Path
 import random
 import resource
 import shutil
-import struct
 import sys
 import tempfile
 import time
 
 from bags import write_odometry
 import cv2
+from map_examples import example_files
+from map_fuzz import hand_made, mutated, use_file
 import numpy as np
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import StavprError
@@ -34,33 +35,6 @@ from stavpr_slam.colmap import read_closures
 ROOM = 64 * 2**20  # bytes
 SECONDS = 1.0  # processor time of one file
 SECOND = 10**9
-PIECES = (
-    b'',
-    bytes(8),
-    b'\xff' * 8,
-    b'1e999',
-    b'-1',
-    b'nan',
-    b'[' * 3000,
-    b'9' * 400,
-    b',\n"',
-    b'\0',
-)
-NUMBERS = ('<B', '<H', '<I', '<Q', '>I')
-
-
-def mutated(content: bytes, rng: random.Random) -> bytes:
-    """Return a file with damage: bytes removed, replaced, copied, or a number of any size."""
-    data = bytearray(content)
-    for _ in range(rng.choice((1, 1, 2, 5))):
-        at = int(len(data) * rng.random() ** rng.choice((1, 4)))
-        other = rng.randrange(len(data) + 1)
-        number = rng.choice(NUMBERS)
-        value = rng.randrange(2 ** (8 * struct.calcsize(number) - rng.randrange(7)))
-        removed = rng.choice((0, 1, 8, struct.calcsize(number), rng.randrange(40), len(data)))
-        drawn = rng.choice((struct.pack(number, value), data[other : other + 64], *PIECES))
-        data[at : at + removed] = drawn
-    return bytes(data)
 
 
 def _truth(path: Path) -> None:
@@ -96,6 +70,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     'bag': _bag,
     'odometry': _odometry,
     'onnx': _onnx,
+    'map': use_file,
+    'hand-made map': use_file,
 }
 
 
@@ -122,6 +98,8 @@ def originals(reader: str, folder: Path) -> Iterator[Path]:
         write_odometry(folder / 'odometry.bag', stamps, ros1=True, images=images_of(stamps))
         made = write_odometry(folder / 'made', stamps, images=images_of(stamps))
         shutil.move(next(made.glob('*.db3')), folder / 'odometry.db3')
+    elif 'map' in reader:
+        example_files(folder)
     else:
         onnx_model(folder / 'network.onnx')
     yield from sorted(path for path in folder.iterdir() if path.is_file())
@@ -153,6 +131,7 @@ def onnx_model(path: Path) -> None:
 def attack(reader: str, files: int, seed: int) -> None:
     """Read many damaged files; the first that fails is kept in the working directory."""
     rng, read = random.Random(seed), READERS[reader]
+    change = hand_made if reader == 'hand-made map' else mutated
     with tempfile.TemporaryDirectory() as temporary:
         made, tried = Path(temporary, 'made'), Path(temporary, 'tried')
         made.mkdir()
@@ -168,7 +147,7 @@ def attack(reader: str, files: int, seed: int) -> None:
         for i in range(files):
             suffix, content = contents[i % len(contents)]
             path = tried / f'file{suffix}'
-            path.write_bytes(mutated(content, rng))
+            path.write_bytes(change(content, rng))
             limit = before + ROOM + 3 * path.stat().st_size
             resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
             began = time.process_time()

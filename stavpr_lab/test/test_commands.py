@@ -14,7 +14,7 @@ import cv2
 from evaluation_commands import write_images
 from fixtures import route_images
 import numpy as np
-from processes import DOMAIN, executable, Process, TIMEOUT
+from processes import executable, Process, TIMEOUT
 import pytest
 from stavpr_lab.commands import demo
 from stavpr_ros.commands import build_map, node, record, replay, stavpr
@@ -38,7 +38,6 @@ def run(monkeypatch, capfd):
     """Run the ``main`` of a command's module in this process, which keeps its signal handlers."""
     monkeypatch.setattr('signal.signal', lambda *_: None)
     monkeypatch.setattr('stavpr_ros.commands.replay.prepare_transport', lambda: None)
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
 
     def run_main(command, *arguments):
         try:
@@ -86,21 +85,6 @@ def test_command_help_lists_exit_codes(name, run):
     assert 'exit codes' in result.out
 
 
-@pytest.mark.parametrize(
-    ('command', 'arguments', 'words'),
-    [
-        (build_map, ['--inptu', 'x', '--output', 'y'], 'did you mean --input?'),
-        (stavpr, ['bild_map'], 'did you mean build_map?'),
-        (stavpr, ['map', 'ifno', 'x'], 'did you mean info?'),
-        (stavpr, ['map', 'info', 'x', '--plto', 'y'], 'did you mean --plot?'),
-    ],
-)
-def test_command_with_a_misspelled_word_suggests_another(run, command, arguments, words):
-    result = run(command, *arguments)
-    assert (result.code, words in result.err) == (2, True), result.err
-    assert len(result.err.splitlines()) < 5
-
-
 def test_build_map_continues_after_a_bad_image_with_the_option_that_skips_it(
     run, tmp_path, monkeypatch
 ):
@@ -136,6 +120,7 @@ def test_demo_removes_the_files_of_an_earlier_one_and_no_others(run, tmp_path):
 def test_build_map_with_options_writes_map(run, traverse, poses, tmp_path):
     output = tmp_path / 'map.stavpr'
     options = ['--every', 2, '--poses', poses, '--projection', 32, '--strips', 5]
+    options += ['--features', 'gradient', '--gradient-cell', 7]
     result = run(build_map, '--input', traverse, '--output', output, *options)
     assert result.code == 0, result.err
     assert '12 places, 5 strips of 32 dimensions' in result.out
@@ -179,31 +164,6 @@ def test_build_map_with_odometry_sets_poses(run, tmp_path):
     assert 'expected one of /odom' in result.err
 
 
-@pytest.mark.parametrize(
-    ('options', 'code', 'word'),
-    [
-        (['--every', '0'], 2, '--every'),
-        (['--onnx-layer', 'fire'], 2, '--features onnx'),
-        (['--strips', '99'], 1, 'Wf = 14'),
-        (['--gradient-cell', '7'], 0, ''),
-        (['--gradient-cell', '9'], 2, 'multiple'),
-        (['--poses', '/missing.csv'], 1, '/missing.csv'),
-        (['--keyframe-distance', '1'], 2, 'need --odometry or --poses'),
-        (['--keyframe-interval', '1'], 2, 'have no stamps'),
-        (['--odometry', '/odom'], 2, 'is no bag'),
-        (['--fps', '5'], 2, 'no input is a video'),
-        (['--odometry', '/odom', '--poses', 'x.csv'], 2, 'give one'),
-        (['--no-thumbnails', '--thumbnail-width', '9'], 2, 'give one'),
-    ],
-)
-def test_build_map_with_wrong_option_names_it(run, traverse, tmp_path, options, code, word):
-    options = ['--features', 'gradient', *options]
-    result = run(build_map, '--input', traverse, '--output', tmp_path / 'map.stavpr', *options)
-    assert result.code == code
-    assert word in result.err
-    assert (tmp_path / 'map.stavpr').exists() is (code == 0)
-
-
 @pytest.mark.parametrize('where', ['mapping.save_map', 'maintenance.threshold.suggest_threshold'])
 def test_build_map_interrupted_reports_state(run, traverse, tmp_path, monkeypatch, where):
     monkeypatch.setattr(f'stavpr_ros.{where}', interrupt)
@@ -225,47 +185,55 @@ def test_build_map_of_video_takes_images_at_the_rate(run, tmp_path):
     assert 'stamps     1.0 s to 3.2 s\n' in result.out
 
 
-@pytest.mark.parametrize(
-    ('command', 'arguments', 'code', 'words'),
-    [
-        (node, ['-p', 'max_error:=2.0'], 1, 'max_error'),
-        (node, ['-p', 'threshold:=low'], 1, 'threshold'),
-        (node, ['--params-file', '/missing.yaml'], 1, '--ros-args'),
-        (record, ['--output', '{folder}/x', '--ros-args', '-r'], 2, '--ros-args'),
-        (replay, ['no/such.bag'], 1, 'no/such.bag does not exist'),
-        (replay, [], 2, 'BAG'),
-        (replay, ['.', '--rate', '0'], 2, '0: expected a number above 0'),
-        (replay, ['.', '--rate', '2', '--lossless'], 2, 'not allowed with'),
-        (replay, ['{folder}/bag', '--ros-args', '-r', 'image:=im%age'], 2, 'im%age'),
-        (replay, ['{folder}/bag', '--ros-args', '-r'], 2, 'remap'),
-        (replay, ['{folder}/bag', '--topic', '/other'], 1, 'expected one of /camera'),
-    ],
-)
-def test_command_with_wrong_arguments_names_them(run, tmp_path, command, arguments, code, words):
+BUILD = '--input {images} --output {output}'
+WRONG = [
+    (build_map, '--inptu x --output y', 2, 'did you mean --input?'),
+    (stavpr, 'bild_map', 2, 'did you mean build_map?'),
+    (stavpr, 'map ifno x', 2, 'did you mean info?'),
+    (stavpr, 'map info x --plto y', 2, 'did you mean --plot?'),
+    (build_map, f'{BUILD} --every 0', 2, '--every'),
+    (build_map, f'{BUILD} --features gradient --onnx-layer fire', 2, '--features onnx'),
+    (build_map, f'{BUILD} --features gradient --strips 99', 1, 'Wf = 14'),
+    (build_map, f'{BUILD} --features gradient --gradient-cell 9', 2, 'multiple'),
+    (build_map, f'{BUILD} --poses /missing.csv', 1, '/missing.csv'),
+    (build_map, f'{BUILD} --keyframe-distance 1', 2, 'need --odometry or --poses'),
+    (build_map, f'{BUILD} --keyframe-interval 1', 2, 'have no stamps'),
+    (build_map, f'{BUILD} --odometry /odom', 2, 'is no bag'),
+    (build_map, f'{BUILD} --fps 5', 2, 'no input is a video'),
+    (build_map, f'{BUILD} --odometry /odom --poses x.csv', 2, 'give one'),
+    (build_map, f'{BUILD} --no-thumbnails --thumbnail-width 9', 2, 'give one'),
+    (node, '--ros-args -p max_error:=2.0', 1, 'max_error'),
+    (node, '--ros-args -p threshold:=low', 1, 'threshold'),
+    (node, '--ros-args --params-file /missing.yaml', 1, '--ros-args'),
+    (record, '--output {output} --ros-args -r', 2, '--ros-args'),
+    (replay, 'no/such.bag', 1, 'no/such.bag does not exist'),
+    (replay, '', 2, 'BAG'),
+    (replay, '. --rate 0', 2, '0: expected a number above 0'),
+    (replay, '. --rate 2 --lossless', 2, 'not allowed with'),
+    (replay, '{bag} --ros-args -r image:=im%age', 2, 'im%age'),
+    (replay, '{bag} --ros-args -r', 2, 'remap'),
+    (replay, '{bag} --topic /other', 1, 'expected one of /camera'),
+    (demo, '--output {output} --threshold 0.8', 2, 'give --min-probability'),
+    (demo, '--output {output} --min-probability 1', 2, '--min-probability'),
+    (demo, '--output {output} --map x --query y --truth file.csv', 2, 'expected identity'),
+    (demo, '--output {output} --map x --query y --geometric-check sift', 2, 'go with --loop'),
+    (demo, '--output {output} --loop --map x --query y', 2, 'leave --map'),
+    (demo, '--output {output} --loop synthetic --truth file.csv', 2, 'has its own'),
+    (demo, '--output {output} --loop --mode paper', 2, '--threshold'),
+    (demo, '--output {output} --slam world --map a', 2, '--slam has its own drive'),
+    (demo, '--output {output} --slam world --false-closures 1.5', 2, '--false-closures 1.5'),
+]
+
+
+@pytest.mark.parametrize(('command', 'line', 'code', 'words'), WRONG)
+def test_command_with_wrong_arguments_names_them_and_writes_nothing(
+    run, traverse, tmp_path, command, line, code, words
+):
     write_bag(tmp_path / 'bag', '/camera', image_records(1))
-    arguments = [argument.format(folder=tmp_path) for argument in arguments]
-    result = run(command, *(['--ros-args'] if command is node else []), *arguments)
+    places = {'images': traverse, 'bag': tmp_path / 'bag', 'output': tmp_path / 'output'}
+    result = run(command, *line.format(**places).split())
     assert (result.code, words in result.err) == (code, True), result.err
-
-
-@pytest.mark.parametrize(
-    ('options', 'word'),
-    [
-        ('--threshold 0.8', 'give --min-probability'),
-        ('--min-probability 1', '--min-probability'),
-        ('--map x --query y --truth file.csv', 'expected identity'),
-        ('--map x --query y --geometric-check sift', 'go with --loop'),
-        ('--loop --map x --query y', 'leave --map'),
-        ('--loop synthetic --truth file.csv', 'has its own'),
-        ('--loop --mode paper', '--threshold'),
-        ('--slam world --map a', '--slam has its own drive'),
-        ('--slam world --false-closures 1.5', '--false-closures 1.5'),
-    ],
-)
-def test_demo_with_wrong_options_names_them(run, tmp_path, options, word):
-    result = run(demo, '--output', tmp_path / 'output', *options.split())
-    assert result.code == 2
-    assert word in result.err
+    assert 'did you mean' not in words or len(result.err.splitlines()) < 5
     assert not (tmp_path / 'output').exists()
 
 

@@ -65,39 +65,37 @@ def test_read_descriptors_of_strips_keeps_their_order(tmp_path, kind):
     assert float(features.weights[2, 4]) == pytest.approx(share, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ('name', 'words'),
-    [('a.npy', 'cannot be read'), ('a.npz', 'numbers are none'), ('a.npz:a', 'numbers are none')],
-)
-def test_read_descriptors_executes_nothing(tmp_path, name, words):
-    harmful = np.array([Hostile(str(tmp_path / 'trap'))], object)
-    np.save(tmp_path / 'a.npy', harmful, allow_pickle=True)
-    np.savez(tmp_path / 'a.npz', a=harmful)
-    with pytest.raises(SourceError, match=words):
-        read_descriptors(f'{tmp_path}/{name}')
-    assert not (tmp_path / 'trap').exists()
+def write(path, content):
+    """Write an array, arrays by their names, or a text."""
+    if isinstance(content, str):
+        path.write_text(content)
+    elif isinstance(content, dict):
+        savemat(path, content) if path.suffix == '.mat' else np.savez(path, **content)
+    elif content is not None:
+        np.save(path, content)
 
 
-@pytest.mark.parametrize(
-    ('array', 'words'),
-    [
-        (np.zeros(5), r'float64 \(5,\): expected real numbers'),
-        (np.zeros((5, 0)), r'\(5, 0\)'),
-        (np.zeros((5, 2), complex), 'complex128'),
-        (np.zeros((1, 1025, 1)), 'W = 1025'),
-        (np.zeros((5, 64), np.uint8), r'uint8 \(5, 64\): expected .* --descriptors-bits true'),
-        (np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))), 'row 7 has NaN'),
-    ],
+SOUND, NO_NUMBER = (
+    np.ones((40, 2)),
+    np.where(np.arange(40)[:, None] == 7, np.nan, np.ones((40, 2))),
 )
-def test_read_descriptors_of_other_arrays_is_rejected(tmp_path, array, words):
-    np.save(tmp_path / 'a.npy', array)
-    with pytest.raises(SourceError, match=words):
-        read_descriptors(f'{tmp_path}/a.npy')
+HARMFUL = np.array([Hostile('trap')], object)  # nothing of it is executed
+CELLS = {'c': np.array([SOUND], object)}
+BOTH = {'a': SOUND, 'b': SOUND}
 
 
 @pytest.mark.parametrize(
     ('name', 'content', 'words'),
     [
+        ('a.npy', HARMFUL, 'cannot be read'),
+        ('a.npz', {'a': HARMFUL}, 'numbers are none'),
+        ('a.npz:a', {'a': HARMFUL}, 'numbers are none'),
+        ('a.npy', np.zeros(5), r'float64 \(5,\): expected real numbers'),
+        ('a.npy', np.zeros((5, 0)), r'\(5, 0\)'),
+        ('a.npy', np.zeros((5, 2), complex), 'complex128'),
+        ('a.npy', np.zeros((1, 1025, 1)), 'W = 1025'),
+        ('a.npy', np.zeros((5, 64), np.uint8), r'uint8 \(5, 64\): .* --descriptors-bits true'),
+        ('a.npy', NO_NUMBER, 'row 7 has NaN'),
         ('a.csv', '', 'is empty'),
         ('a.csv', 'a,b,c\n', 'names, but no line of numbers'),
         ('a.csv', '1,2\n,3\n', "could not convert string ''"),
@@ -107,30 +105,19 @@ def test_read_descriptors_of_other_arrays_is_rejected(tmp_path, array, words):
         ('a.npy', 'text', 'of another format'),
         ('a.mat', 'MATLAB', 'cannot be read'),
         ('a.txt', 'text', 'expected a file'),
+        ('missing.npy', None, 'missing.npy cannot be read'),
+        ('a.npy:x', SOUND, 'leave :x out'),
+        ('two.npz', BOTH, r'which array\? .* a, b: give .*:NAME'),
+        ('two.npz:c', BOTH, r'c\? .* a, b'),
+        ('cell.mat', CELLS, 'arrays of numbers are none'),
     ],
 )
-def test_read_descriptors_of_damaged_files_is_rejected(tmp_path, name, content, words):
-    (tmp_path / name).write_text(content)
+def test_read_descriptors_of_other_files_is_rejected(tmp_path, monkeypatch, name, content, words):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / name.partition(':')[0], content)
     with pytest.raises(SourceError, match=words):
         read_descriptors(f'{tmp_path}/{name}')
-
-
-@pytest.mark.parametrize(
-    ('name', 'words'),
-    [
-        ('missing.npy', 'missing.npy cannot be read'),
-        ('a.npy:x', 'leave :x out'),
-        ('two.npz', r'which array\? .* a, b: give .*:NAME'),
-        ('two.npz:c', r'c\? .* a, b'),
-        ('cell.mat', 'arrays of numbers are none'),
-    ],
-)
-def test_read_descriptors_of_missing_arrays_is_rejected(tmp_path, vectors, name, words):
-    np.save(tmp_path / 'a.npy', vectors)
-    np.savez(tmp_path / 'two.npz', a=vectors, b=vectors)
-    savemat(tmp_path / 'cell.mat', {'c': np.array([vectors], object)})
-    with pytest.raises(SourceError, match=words):
-        read_descriptors(f'{tmp_path}/{name}')
+    assert not (tmp_path / 'trap').exists()
 
 
 @pytest.mark.parametrize(

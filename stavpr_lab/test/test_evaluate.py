@@ -1,13 +1,15 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``evaluate``, on synthetic traverses and on real ones."""
+"""The command evaluate, on synthetic traverses and on real ones, and the page of its report."""
 
 import csv
 import os
 import re
+import shutil
+import subprocess
 
 import cv2
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import read_json, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
@@ -40,8 +42,8 @@ def folders(tmp_path_factory):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    return runner(evaluate, monkeypatch, capsys)
+def run(runner):
+    return runner(evaluate)
 
 
 @pytest.fixture
@@ -167,8 +169,7 @@ def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run
         (['--gradient-cell', 32], '--gradient-cell'),
         (['--crop-map', 0.3], '--crop-map'),
     ):
-        code, _, errors = run('--map', saved, '--query', query, *wrong)
-        assert (code, word in errors) == (2, True)
+        run.fails(2, word, '--map', saved, '--query', query, *wrong)
 
 
 def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers, run):
@@ -182,8 +183,7 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     options = ['--dataset', f'nordland={tmp_path}', '--features', 'gradient']
     options += ['--projection', 32, '--unknown', saved]
     assert numbers(*options)['unknown_images'] == 24
-    code, _, errors = run(*options, '--seed', 1)
-    assert (code, 'those of the first sequence' in errors) == (1, True)
+    run.fails(1, 'those of the first sequence', *options, '--seed', 1)
 
 
 def test_evaluate_with_a_ground_truth_file_has_tolerance_zero(folders, numbers, tmp_path):
@@ -214,8 +214,7 @@ def test_evaluate_with_poses_accepts_near_places(folders, numbers, run, tmp_path
         ([*options, '--map-poses', tmp_path / 'short.csv'], 1, '1 poses for 60 images'),
         ([*pair(folders), '--odometry', tmp_path / 'short.csv'], 1, '1 poses for 60 images'),
     ):
-        found, _, errors = run(*wrong)
-        assert (found, word in errors) == (code, True), errors
+        run.fails(code, word, *wrong)
 
 
 def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
@@ -393,8 +392,7 @@ LOOP, PAIR = '--query x --loop-closure --truth y', '--map x --query y'
     ],
 )
 def test_evaluate_with_invalid_options_fails_before_the_work(run, options, code, word):
-    found, _, errors = run(*options.split())
-    assert (found, word in errors) == (code, True)
+    run.fails(code, word, *options.split())
 
 
 def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
@@ -406,8 +404,7 @@ def test_evaluate_of_inputs_that_do_not_fit_fails(folders, run, tmp_path):
         (['--speed', 4], 1, 'at least l = 20'),
         (['--window', 3, '--output', folder], 2, '9 .. 49'),
     ):
-        found, _, errors = run(*pair(folders), *options)
-        assert (found, word in errors) == (code, True), errors
+        run.fails(code, word, *pair(folders), *options)
     assert not folder.exists()
 
 
@@ -456,8 +453,36 @@ def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):
     (folder / 'report.html').write_text('<!doctype html>\n')
     out.write_text('{}')
     for option, path in (('--json', out), ('--output', folder)):
-        code, _, errors = run(*pair(folders), option, path)
-        assert (code, 'exists already' in errors) == (1, True), errors
+        run.fails(1, 'exists already', *pair(folders), option, path)
     out.write_text('my notes')
-    code, _, errors = run(*pair(folders), '--json', out, '--force')
-    assert (code, 'is no JSON file: it is never replaced' in errors) == (1, True), errors
+    run.fails(1, 'is no JSON file: it is never replaced', *pair(folders), '--json', out, '--force')
+
+
+CHROMIUM = shutil.which('chromium')
+CLICKS = """<script>
+document.querySelectorAll('.pair').forEach((card, i) => {
+  for (let n = 0; n < i % 3; n++) card.click();
+});
+const marked = document.getElementById('marks').textContent;
+document.title = Math.max(0, document.documentElement.scrollWidth - innerWidth) + ' ' + marked;
+</script>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
+def test_report_fits_a_phone_and_marks_pairs_by_clicks(tmp_path):
+    images = route_images(40)
+    write_images(tmp_path / 'map', images)
+    write_images(tmp_path / 'query', [image // 2 for image in images])
+    options = [f'--{name}={tmp_path / name}' for name in ('map', 'query')]
+    assert evaluate.main([*options, '--output', str(tmp_path)]) == 0
+    page = tmp_path / 'clicked.html'
+    page.write_text((tmp_path / 'report.html').read_text() + CLICKS)
+    for width in (1400, 390):
+        shot, size = tmp_path / f'{width}.png', f'--window-size={width},2400'
+        browser = [CHROMIUM, '--headless=new', '--no-sandbox', '--disable-gpu', size]
+        run = [*browser, f'--screenshot={shot}', page.as_uri()]
+        subprocess.run(run, check=True, capture_output=True, timeout=100)
+        assert cv2.imread(str(shot)).std() > 10
+        print(f'screenshot: {shot}')
+    text = subprocess.check_output([*browser, '--dump-dom', page.as_uri()], text=True, timeout=100)
+    assert '<title>0 16 of 24 pairs are marked</title>' in text  # 0 pixels are cut off

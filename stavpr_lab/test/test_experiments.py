@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's experiments: configurations, published numbers, and the command."""
 
-from evaluation_commands import read_json, runner, write_images
+from evaluation_commands import read_json, write_images
 from fixtures import route_images
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ from stavpr_ros.sources.folder import FolderSource
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    return runner(experiments, monkeypatch, capsys)
+def run(runner):
+    return runner(experiments)
 
 
 @pytest.fixture
@@ -80,8 +80,7 @@ def test_paper_table_has_all_systems_of_the_paper(nordland, tmp_path, run):
     assert '- nordland, SSM-VPR: give --features onnx' in text
     assert 'SAES:' not in text
     np.save(arrays / 'map.npy', vectors[:20])
-    code, _, errors = run('paper', *options)
-    assert (code, 'of (20, 24) images: expected (24, 24)' in errors) == (1, True)
+    run.fails(1, 'of (20, 24) images: expected (24, 24)', 'paper', *options)
 
 
 def test_ssm_vpr_is_a_column_of_the_paper(tmp_path, squeezenet_settings):
@@ -133,5 +132,4 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     ],
 )
 def test_experiments_with_invalid_options_fail_before_the_work(run, options, code, word):
-    found, _, errors = run(*options.split())
-    assert (found, word in errors) == (code, True)
+    run.fails(code, word, *options.split())

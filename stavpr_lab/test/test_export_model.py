@@ -5,7 +5,6 @@
 import hashlib
 import re
 
-from evaluation_commands import runner
 import numpy as np
 import pytest
 from stavpr_lab.commands import export_model
@@ -130,8 +129,8 @@ def repository(tmp_path_factory):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
-    return runner(export_model, monkeypatch, capsys)
+def run(runner):
+    return runner(export_model)
 
 
 def entry(repository, name, *options):

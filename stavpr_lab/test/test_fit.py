@@ -45,7 +45,7 @@ def test_evidence_is_replayed_as_it_is_computed():
     x = rng.uniform((-9, 0, -0.1, 0, 0, 0), (9, 0.5, 0.2, 4, 3, 0), (n, 6))
     drive, early, kind = np.arange(n) // 150, rng.random(n) < 0.2, (rng.random(n) < 0.9) * 1.0
     kind[:: n // 2], early[:: n // 2] = 1, False
-    scores = fit_windows._scores(x, drive, early, kind, *fit_windows.numbers_of(values, 'g'))
+    scores = fit_windows.scores_of(x, drive, early, kind, *fit_windows.numbers_of(values, 'g'))
     recent, expected = {i: evidence.RecentWindows() for i in range(2)}, np.empty(n)
     newest = 0.0
     for i, (odds, uneven, excess, lead, cells, _) in enumerate(x.tolist()):

@@ -15,6 +15,7 @@ from stavpr_ros.errors import InputError, SourceError
 # three queries in five places: 0 -> 1, 2; 1 -> nothing; 2 -> 4
 PAIRS = [(0, 1), (0, 2), (2, 4)]
 MATRIX = np.array([[0, 1, 1, 0, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 1]])
+KINDS = ('csv', 'npy', 'npz', 'png', 'pkl')
 FILES = ['a.jpg', 'b.jpg', 'c.jpg'], [f'x/{i}.png' for i in range(5)]
 
 
@@ -140,35 +141,6 @@ def test_from_file_reads_a_place_a_line(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('text', 'message'),
-    [
-        (
-            'query,place\n0,1\n0,one\n',
-            "line 3: could not convert string 'one'.*two columns",
-        ),
-        ('0,1\n\n0,1e19\n', r'line 3: column 2 has no whole number, 1e\+19: expected two columns'),
-        ('0,1.5\n', r'line 1: column 2 has no whole number, 1\.5'),
-        ('1700000000,1700000009\n', 'column 1 has stamps instead of the numbers of images'),
-        ('0,1,2\n', '3 columns, without a header of these names: expected two columns'),
-        ('query,place\n', 'no line of numbers'),
-        ('0,-1\n', 'accepts no pair'),
-        ('0,5\n', r'truth\.csv: ground truth pairs query 0 with place 5.*counted from 1'),
-        ('query,place\nb.jpg,2.png\nz.jpg,0.png\n', "'z.jpg' is the name of no image"),
-        ('query,place\nb.jpg\na.jpg,0\n', 'different numbers of columns'),
-        ('b.jpg,2\na.jpg\n', 'different numbers of columns'),
-        ('b.jpg,\na.jpg,2\n', "'' is the name of no image"),
-        ('b.jpg,nan\n', "'nan' is the name of no image"),
-        ('place\n2.png\n', 'a place for 1 queries, but there are 3'),
-    ],
-)
-def test_from_file_of_invalid_text_raises(tmp_path, text, message):
-    path = tmp_path / 'truth.csv'
-    path.write_text(text)
-    with pytest.raises((InputError, SourceError), match=message):
-        GroundTruth.from_file(path, 3, 5, names=FILES if 'g' in text else ((), ()))
-
-
-@pytest.mark.parametrize(
     'array',
     [MATRIX.astype(bool), MATRIX * 255.0, np.array(PAIRS), np.array([*PAIRS, (1, -1)], float)],
 )
@@ -184,60 +156,77 @@ def test_from_file_reads_arrays(tmp_path, array):
 
 OBJECTS = np.empty((1, 2), object)
 OBJECTS[0] = [0, [1, 2]]  # as the ground truth of VPR-Bench: a number and a list
+CLAIM = cv2.imencode('.png', np.uint8(MATRIX))[1].tobytes()[:33] + b'\x7f\xff\xff\xffIDAT'  # 2 GB
+
+
+def write(path, content):
+    """Write a text, bytes, or an array."""
+    if isinstance(content, str):
+        path.write_text(content)
+    elif isinstance(content, bytes):
+        path.write_bytes(content)
+    elif path.suffix == '.png':
+        cv2.imwrite(str(path), content)
+    else:
+        np.save(path, content) if path.suffix == '.npy' else np.savez(path, truth=content)
 
 
 @pytest.mark.parametrize(
-    ('array', 'message'),
+    ('kinds', 'content', 'message'),
     [
-        (MATRIX.T, r'shape \(5, 3\): expected \(3, 5\).*transposed'),
-        (np.zeros((3, 5), bool), 'accepts no pair'),
-        (np.random.default_rng(0).random((3, 5)), 'matrix of distances'),
-        (np.array(['a']), 'expected finite numbers'),
-        (np.array([[0, np.nan]]), 'expected finite numbers'),
-        (np.array([[0.5, 1]]), r'shape \(1, 2\)'),
-        (OBJECTS, r'contains Python objects.*runs whatever'),
+        (
+            'csv',
+            'query,place\n0,1\n0,one\n',
+            "line 3: could not convert string 'one'.*two columns",
+        ),
+        (
+            'csv',
+            '0,1\n\n0,1e19\n',
+            r'line 3: column 2 has no whole number, 1e\+19: expected two columns',
+        ),
+        ('csv', '0,1.5\n', r'line 1: column 2 has no whole number, 1\.5'),
+        ('csv', '1700000000,1700000009\n', 'column 1 has stamps instead of the numbers of images'),
+        ('csv', '0,1,2\n', '3 columns, without a header of these names: expected two columns'),
+        ('csv', 'query,place\n', 'no line of numbers'),
+        ('csv', '0,-1\n', 'accepts no pair'),
+        ('csv', '0,5\n', r'truth\.csv: ground truth pairs query 0 with place 5.*counted from 1'),
+        ('csv', 'query,place\nb.jpg,2.png\nz.jpg,0.png\n', "'z.jpg' is the name of no image"),
+        ('csv', 'query,place\nb.jpg\na.jpg,0\n', 'different numbers of columns'),
+        ('csv', 'b.jpg,2\na.jpg\n', 'different numbers of columns'),
+        ('csv', 'b.jpg,\na.jpg,2\n', "'' is the name of no image"),
+        ('csv', 'b.jpg,nan\n', "'nan' is the name of no image"),
+        ('csv', 'place\n2.png\n', 'a place for 1 queries, but there are 3'),
+        ('npy npz', MATRIX.T, r'shape \(5, 3\): expected \(3, 5\).*transposed'),
+        ('npy npz', np.zeros((3, 5), bool), 'accepts no pair'),
+        ('npy npz', np.random.default_rng(0).random((3, 5)), 'matrix of distances'),
+        ('npy npz', np.array(['a']), 'expected finite numbers'),
+        ('npy npz', np.array([[0, np.nan]]), 'expected finite numbers'),
+        ('npy npz', np.array([[0.5, 1]]), r'shape \(1, 2\)'),
+        ('npy npz', OBJECTS, r'contains Python objects.*runs whatever'),
+        ('npy', pickle.dumps(MATRIX), r'truth\.npy contains Python objects.*runs whatever'),
+        ('png', np.uint8(MATRIX.T) * 255, '5 high and 3 wide: expected 3 rows'),
+        ('png', np.uint8(MATRIX) * 128, '3 gray pixels'),
+        ('png', b'', 'damaged'),
+        ('png', CLAIM, 'damaged'),
+        *((kind, b'PK\x03\x04\xff damaged', rf'truth\.{kind}') for kind in KINDS),
+        *((kind, None, rf'truth\.{kind}') for kind in KINDS),
     ],
 )
-def test_from_file_of_an_invalid_array_raises(tmp_path, array, message):
-    np.save(tmp_path / 'truth.npy', array)
-    np.savez(tmp_path / 'truth.npz', truth=array)
-    for name in ('truth.npy', 'truth.npz'):
+def test_from_file_of_invalid_content_raises(tmp_path, kinds, content, message):
+    names = FILES if isinstance(content, str) and 'g' in content else ((), ())
+    for kind in kinds.split():
+        path = tmp_path / f'truth.{kind}'
+        if content is not None:
+            write(path, content)
         with pytest.raises((InputError, SourceError), match=message):
-            GroundTruth.from_file(tmp_path / name, 3, 5)
+            GroundTruth.from_file(path, 3, 5, names=names)
 
 
-def test_from_file_of_a_pickle_or_an_archive_without_arrays_raises(tmp_path):
-    (tmp_path / 'pickle.npy').write_bytes(pickle.dumps(MATRIX))
-    with pytest.raises(SourceError, match=r'pickle\.npy contains Python objects.*runs whatever'):
-        GroundTruth.from_file(tmp_path / 'pickle.npy', 3, 5)
+def test_from_file_of_an_archive_without_arrays_raises(tmp_path):
     with zipfile.ZipFile(tmp_path / 'text.npz', 'w') as archive:
         archive.writestr('truth', 'no array')
     with pytest.raises(SourceError, match=r'text\.npz has truth: expected one array'):
         GroundTruth.from_file(tmp_path / 'text.npz', 3, 5)
-
-
-def test_from_file_of_an_invalid_image_raises(tmp_path):
-    path = tmp_path / 'truth.png'
-    cv2.imwrite(str(path), (MATRIX * 255).astype(np.uint8))
-    with pytest.raises(InputError, match='3 high and 5 wide: expected 5 rows'):
-        GroundTruth.from_file(path, 5, 3)
-    cv2.imwrite(str(path), (MATRIX * 128).astype(np.uint8))
-    with pytest.raises(InputError, match='3 gray pixels'):
-        GroundTruth.from_file(path, 3, 5)
-    claim = path.read_bytes()[:33] + b'\x7f\xff\xff\xffIDAT'  # of 2 GB
-    for content in (b'', claim):
-        path.write_bytes(content)
-        with pytest.raises(SourceError, match='damaged'):
-            GroundTruth.from_file(path, 3, 5)
-
-
-@pytest.mark.parametrize('name', ['truth.csv', 'truth.npy', 'truth.npz', 'truth.png', 'truth.pkl'])
-def test_from_file_of_a_missing_or_damaged_file_raises(tmp_path, name):
-    with pytest.raises(SourceError, match=name):
-        GroundTruth.from_file(tmp_path / name, 3, 5)
-    (tmp_path / name).write_bytes(b'PK\x03\x04\xff damaged')
-    with pytest.raises(SourceError, match=name):
-        GroundTruth.from_file(tmp_path / name, 3, 5)
 
 
 def test_from_poses_by_hand():

@@ -33,7 +33,7 @@ def test_damaged_files_are_rejected_by_our_own_error(files, tmp_path):
     command = [sys.executable, FUZZ, str(files), '0']
     done = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.count('refused, slowest') == 7
+    assert done.stdout.count('refused, slowest') == 9
 
 
 def peak(name: str, *arguments: object) -> tuple[int, int]:

@@ -258,10 +258,11 @@ def test_monitor_without_a_node_refuses_commands(context, history):
 
 def test_monitor_survives_messages_of_other_nodes(context, history):
     node = rclpy.create_node('lonely', context=context)
-    monitor = Monitor(node, 'nobody', history)
-    monitor._on_match(PlaceMatch(status=200, probability=math.nan))
+    Monitor(node, 'nobody', history)
+    receive = {each.topic_name: each.callback for each in node.subscriptions}
+    receive['/nobody/match'](PlaceMatch(status=200, probability=math.nan))
     for data in (b'', b'12345'):
-        monitor._on_distances(Image(data=data))
+        receive['/nobody/distances'](Image(data=data))
     assert history.since(0, TIMEOUT)[1]['samples'][0]['status'] == 'unknown'
     node.destroy_node()
 

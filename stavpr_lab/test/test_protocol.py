@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of recalls: by hand, intervals of known samples, the command on arrays."""
 
-from evaluation_commands import read_json, runner
+from evaluation_commands import read_json
 import numpy as np
 import pytest
 from stavpr_lab.commands import evaluate
@@ -19,14 +19,14 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
+def command(runner, tmp_path):
     """Run --protocol on descriptors of 60 places and of the same with noise."""
     rng = np.random.default_rng(0)
     places = 1 + rng.normal(size=(60, 16))
     for name, noise in (('map', 0.0), ('query', 0.9)):
         np.save(tmp_path / name, np.float32(places + noise * rng.normal(size=places.shape)))
     arrays = '--map', tmp_path / 'map.npy', '--query', tmp_path / 'query.npy'
-    run = runner(evaluate, monkeypatch, capsys)
+    run = runner(evaluate)
     return lambda *options: run(*arrays, '--protocol', *options)
 
 

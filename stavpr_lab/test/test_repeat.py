@@ -61,8 +61,8 @@ def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(taught, tmp_pa
 
 
 def test_robot_stops_where_the_camera_shows_another_route(taught):
-    other = View(RingWorld(11), CONDITIONS['day'])
-    line, shown = other._line, []
+    world = RingWorld(11)
+    other, line, shown = View(world, CONDITIONS['day']), world.center_line[:-1], []
 
     def change(image, time):
         if time < 12:

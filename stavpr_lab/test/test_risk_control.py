@@ -7,8 +7,8 @@ import stat
 from unittest.mock import patch
 
 import cv2
-from evaluation_commands import read_json, runner, write_images
-from fixtures import route_images
+from evaluation_commands import read_json, write_images
+from fixtures import disk_of, route_images
 import numpy as np
 import pytest
 from stavpr_lab.commands import evaluate, evaluate_calibrate
@@ -129,9 +129,9 @@ def traverses(tmp_path_factory):
 
 
 @pytest.fixture
-def command(traverses, tmp_path, monkeypatch, capsys):
+def command(traverses, tmp_path, monkeypatch, runner):
     """Return the path of a copy of the map, and a function that evaluates the query on it."""
-    path, run = tmp_path / 'route.stavpr', runner(evaluate, monkeypatch, capsys)
+    path, run = tmp_path / 'route.stavpr', runner(evaluate)
     path.write_bytes((traverses / 'route.stavpr').read_bytes())
     pair = ['--map', path, '--query', traverses / 'query', '--truth', 'identity']
     monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
@@ -181,12 +181,7 @@ def test_calibration_in_a_map_is_that_of_max_error(command, traverses, tmp_path)
 def test_calibration_that_fails_leaves_the_map_as_it_is(command, monkeypatch, traverses):
     path, run = command
     content = path.read_bytes()
-
-    def fail(*_):
-        raise OSError(28, 'no space left')
-
-    with monkeypatch.context() as patched:
-        patched.setattr('stavpr_ros.output_file.os.fsync', fail)
+    with disk_of(1000):
         code, _, errors = run('--calibrate')
     assert (code, 'what was there is untouched' in errors) == (1, True), errors
     assert path.read_bytes() == content

@@ -48,9 +48,8 @@ def content():
 
 
 @pytest.fixture
-def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
-    return tmp_path / 'cache' / 'stavpr_ros'
+def cache(model_folders):
+    return model_folders[1]
 
 
 class Server:
@@ -153,8 +152,7 @@ def test_command_weights_needs_a_full_hash(cache, capsys, monkeypatch):
     ]
 
 
-def test_model_is_found_by_its_hash(tmp_path, cache, content, monkeypatch):
-    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
+def test_model_is_found_by_its_hash(tmp_path, cache, content):
     digest = hashlib.sha256(content).hexdigest()
     with pytest.raises(UnavailableError, match=f'{digest} is not in {tmp_path}/models or {cache}'):
         find_model(digest, '')

@@ -8,10 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stavpr_ros.commands.stavpr import main
 from stavpr_ros.errors import InputError
+from stavpr_ros.mapping import load_map, save_map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_slam.pose_graph import decision
 from stavpr_slam.pose_graph import graph as graph_module
-from stavpr_slam.pose_graph.g2o import _reversed, g2o_text, graph_of, read_edges
+from stavpr_slam.pose_graph.g2o import g2o_text, graph_of, read_edges, reversed_edge
 from test_pose_graph import error
 
 SIDE, LAPS = 12, 3
@@ -135,7 +136,9 @@ def test_vertices_with_gaps_and_edges_to_the_one_before(tmp_path, freedom):
     """As RTAB-Map exports its nodes."""
     edges = read_edges(write(tmp_path / 'a.g2o', freedom, 0.3))
     expected = graph_of(edges).update(final=True)
-    changed = [_reversed(*edge) if number % 3 == 0 else edge for number, edge in enumerate(edges)]
+    changed = [
+        reversed_edge(*edge) if number % 3 == 0 else edge for number, edge in enumerate(edges)
+    ]
     numbers = np.cumsum(1 + np.arange(COUNT) % 4)
     renamed = [(int(numbers[i]), int(numbers[j]), *rest) for i, j, *rest in changed]
     found = graph_of(renamed).update(final=True)
@@ -200,6 +203,15 @@ def test_command_writes_the_solution(tmp_path, capsys):
     poses = np.loadtxt(tmp_path / 'b.tum')[:, 1:]
     assert error(poses, to_poses(truth(3))) < 0.25
     assert main(['optimize_graph', str(tmp_path / 'missing.g2o')]) == 1
+
+
+def test_map_merge_with_align_moves_poses_into_the_first_frame(small_map, tmp_path, map_file):
+    shifted, both = load_map(map_file), str(tmp_path / 'both')
+    shifted.poses[:, 1] += 5
+    save_map(shifted, tmp_path / 'shifted')
+    assert main(['map', 'merge', both, map_file, str(tmp_path / 'shifted'), '--align']) == 0
+    poses = load_map(both).poses[60:]
+    np.testing.assert_allclose(poses[:, :3], small_map.poses[:, :3], atol=0.5)
 
 
 def test_false_closures_leave_the_odometry(tmp_path, capsys):

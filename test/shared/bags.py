@@ -4,15 +4,21 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import json
+import shutil
 
+import cv2
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import get_typestore, Stores
-from stavpr_ros.sources.bag import ODOMETRY, RAW
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from stavpr_ros.sources.bag import COMPRESSED, ODOMETRY, RAW
+from stavpr_ros.sources.bag_writer import write_bag
+from stavpr_ros.sources.frame import ImageRecord
 
 SECOND = 10**9
 TEXT = 'std_msgs/msg/String'
+T0 = 1_700_000_000_000_000_000
 
 
 class Bag:
@@ -25,6 +31,10 @@ class Bag:
     def make(self, kind: str, *fields: object, **named: object):
         """Return a message, its fields in the order of their definition."""
         return self._store.types[kind](*fields, **named)
+
+    def define(self, name: str, text: str) -> None:
+        """Add a type of message."""
+        self._store.register(get_types_from_msg(text, name))
 
     def header(self, stamp: int, frame_id: str = 'camera'):
         time = self.make('builtin_interfaces/msg/Time', *divmod(stamp, SECOND))
@@ -72,3 +82,58 @@ def write_odometry(path, stamps, ros1=False, images=()):
             fields = bag.header(image.stamp_ns), image.height, image.width, image.encoding
             bag.write('/image', RAW, image.time_ns, *fields, 0, image.step, image.data)
     return path
+
+
+def records(count=5, stamped=True):
+    """Yield images of noise, 6 x 8 pixels, 0.1 s apart."""
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        image = rng.integers(0, 256, (6, 8, 3), np.uint8)
+        time_ns = T0 + i * 100_000_000
+        yield ImageRecord.of_image(image, time_ns, time_ns - 7 if stamped else 0, 'camera')
+
+
+def pixels(record):
+    return record.data.reshape(record.height, record.width, 3)
+
+
+def write_images(bag, images):
+    """Write records on /raw, with a text beside each."""
+    for each in images:
+        header = bag.header(each.stamp_ns, each.frame_id)
+        bag.write('/raw', RAW, each.time_ns, header, 6, 8, 'rgb8', 0, 24, each.data)
+        bag.write('/text', TEXT, each.time_ns, 'hello')
+
+
+def write_mixed(path, ros1=False, bad=()):
+    """Write a bag with /raw, /small (PNG, those in `bad` damaged) and /text; /silent is empty."""
+    with writing(path, ros1) as bag:
+        bag.topic('/silent', RAW)
+        write_images(bag, records())
+        for i, record in enumerate(records()):
+            png = cv2.imencode('.png', pixels(record)[..., ::-1].copy())[1].ravel()
+            png = png[:40] if i in bad else png
+            header = bag.header(record.stamp_ns)
+            bag.write('/small', COMPRESSED, record.time_ns, header, 'png', png)
+    return path
+
+
+def write_split(folder, suffix):
+    """Write a bag of three parts, of three images each, with names of ``ros2 bag record``."""
+    folder.mkdir()
+    names, whole, part = [], list(records(9)), folder.with_name('part')
+    for i in range(3):
+        storage = 'mcap' if suffix == 'mcap' else 'sqlite3'
+        write_bag(part, '/raw', whole[3 * i : 3 * i + 3], storage)
+        names.append(f'drive_{i}.{suffix}')
+        (part / f'part.{suffix}').rename(folder / names[-1])
+        shutil.rmtree(part)
+    topics = [{'topic_metadata': {'name': '/raw'}, 'message_count': 9}]
+    stated = {'relative_file_paths': names, 'topics_with_message_count': topics}
+    (folder / 'metadata.yaml').write_text(json.dumps({'rosbag2_bagfile_information': stated}))
+    return folder
+
+
+def file_of(bag):
+    """Return the file of the folder of a bag."""
+    return next(file for file in bag.iterdir() if file.suffix in {'.db3', '.mcap'})

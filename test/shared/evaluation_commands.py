@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images as files, and a runner, for the tests of commands."""
+"""Images as files, and numbers, for the tests of commands."""
 
 import json
 
@@ -14,20 +14,6 @@ def write_images(folder, images):
     for i, image in enumerate(images):
         cv2.imwrite(str(folder / f'{i:03}.png'), image[:, :, ::-1])
     return folder
-
-
-def runner(command, monkeypatch, capsys):
-    """Return a function that runs a command in this process: exit code, output, errors."""
-    monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
-
-    def run(*arguments):
-        try:
-            code = command.main([str(argument) for argument in arguments])
-        except SystemExit as error:  # argparse
-            code = error.code
-        return code, *capsys.readouterr()
-
-    return run
 
 
 def read_json(text):

@@ -3,10 +3,12 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 from collections import OrderedDict
+from contextlib import contextmanager
 from functools import cache
 import os
 from pathlib import Path
 import re
+import resource
 from types import SimpleNamespace
 
 from domain import DOMAIN
@@ -123,6 +125,48 @@ def device(request):
     import torch
 
     return torch.device(request.param)
+
+
+@pytest.fixture
+def model_folders(tmp_path, monkeypatch):
+    """Set the folders of models and of downloads, and return both."""
+    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    return tmp_path / 'models', tmp_path / 'cache' / 'stavpr_ros'
+
+
+@contextmanager
+def disk_of(size: int):
+    """Let no file of this process be larger, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture
+def runner(monkeypatch, capsys):
+    """Make functions that run a command in this process: exit code, output, errors."""
+    monkeypatch.setattr('stavpr_ros.commands.program.obey_signals', lambda: None)
+
+    def make(command):
+        def run(*arguments):
+            try:
+                code = command.main([str(argument) for argument in arguments])
+            except SystemExit as error:  # argparse
+                code = error.code
+            return code, *capsys.readouterr()
+
+        def fails(code, words, *arguments):
+            found, _, errors = run(*arguments)
+            assert (found, words in errors) == (code, True), errors
+
+        run.fails = fails  # expects an exit code, and words in the errors
+        return run
+
+    return make
 
 
 @pytest.fixture

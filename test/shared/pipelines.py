@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pipelines on synthetic routes, and images for them."""
 
+from functools import partial
+
 import numpy as np
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings, read_map
@@ -11,6 +13,22 @@ from stavpr_ros.sources.frame import ImageRecord
 LENGTH, EXCLUDED = 5, 10
 MIN_PROBABILITY = 0.05  # windows as short as these are certain of nothing
 SECOND = 10**9
+
+
+class Log:
+    """A logger that keeps its lines, (level, text)."""
+
+    def __init__(self):
+        self.lines = []
+        for level in ('info', 'warning', 'error'):
+            setattr(self, level, partial(self._add, level))
+
+    def _add(self, level, text):
+        self.lines.append((level, text))
+
+    def of(self, level):
+        """Return the lines of a level as one text."""
+        return '\n'.join(text for own, text in self.lines if own == level)
 
 
 def settings_of(**changes):

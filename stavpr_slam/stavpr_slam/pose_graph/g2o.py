@@ -129,7 +129,7 @@ def _edge(tag: str, fields: list[str]) -> Edge:
     return start, end, transform, information
 
 
-def _reversed(start: int, end: int, motion: np.ndarray, information: np.ndarray) -> Edge:
+def reversed_edge(start: int, end: int, motion: np.ndarray, information: np.ndarray) -> Edge:
     """Return the same edge from its end to its start."""
     turn = adjoints(inverse(motion)[None])[0][np.ix_(ORDER, ORDER)]
     return end, start, inverse(motion), turn.T @ information @ turn
@@ -153,7 +153,7 @@ def graph_of(edges: list[Edge]) -> PoseGraph:
     for start, end, motion, information in edges:
         edge = node[start], node[end], motion, information
         if edge[1] == edge[0] - 1 and edge[1] not in odometry:
-            edge = _reversed(*edge)
+            edge = reversed_edge(*edge)
         if edge[1] == edge[0] + 1 and edge[0] not in odometry:
             odometry[edge[0]] = edge
         else:

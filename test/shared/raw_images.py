@@ -1,7 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Raw image messages: the bytes of each encoding, written from its definition."""
+"""Image messages: the bytes of each raw encoding, written from its definition, and files."""
 
+from types import SimpleNamespace
+
+import cv2
 import numpy as np
 
 # channel of the message at which red, green and blue lie
@@ -36,6 +39,23 @@ PLANES = {'nv12': (0, 1), 'nv21': (1, 0), 'nv24': (0, 1)}  # where U and V lie i
 YUV = [*PAIRS, *PLANES]
 
 
+def raw(encoding, height, width, step, data, big=False):
+    """Return a message of raw pixels."""
+    fields = {'height': height, 'width': width, 'encoding': encoding, 'is_bigendian': big}
+    return SimpleNamespace(**fields, step=step, data=data)
+
+
+def compressed(data, transport=''):
+    """Return a message with the bytes of a file."""
+    return SimpleNamespace(format=transport, data=data)
+
+
+def encoded(suffix, rgb, *options):
+    """Return the file of an image, RGB or gray, by OpenCV."""
+    image = rgb if rgb.ndim == 2 else rgb[..., ::-1].copy()
+    return cv2.imencode(suffix, image, options)[1].tobytes()
+
+
 def is_deep(encoding):
     return encoding.endswith('16') or encoding.startswith('16')
 
@@ -46,7 +66,7 @@ def padded(rows, padding):
     return rows.shape[1], rows.tobytes()
 
 
-def message(encoding, height, width, big=False, padding=0):
+def noise(encoding, height, width, big=False, padding=0):
     """Random pixels as a message's (step, bytes), and the RGB that must come out."""
     alpha = 'a' in encoding or encoding.endswith('4')
     channels = 4 if alpha else max(CHANNELS[encoding]) + 1
