@@ -212,14 +212,15 @@ def _text(value: Any) -> str:
 
 
 FIT = """
-Recall where so many images off the map are matched. Left out: each set by the weights whose mean
-recall is the largest on drives without its group (at .7 % and .2 %, of all sets there), of a grid
-of weights, with the constants K as below. Then, the weights without each group.
+Recall where so many images off the map are matched, the mean of their four kinds. Left out: each
+set by the weights whose mean recall is the largest on drives without its group (at .7 % and .2 %,
+of all sets there), of a grid of weights, with the constants K as below. Then, the weights without
+each group.
 """
 CONSTANTS = """
-At the probability .5: K as it is in the code, and K at which .5 % of the images off the map are
-matched. The method before ([contest.md](contest.md)) matched .7 % and .94 % with `gradient` and
-`hybrid`, at a mean recall of .925 and .950.
+At the probability .5: K as it is in the code, and K at which .7 % of the images off the map are
+matched, the mean of their kinds. The method before ([contest.md](contest.md)) matched 63 and 85 of
+them with `gradient` and `hybrid`, at a mean recall of .925 and .950.
 """
 ERRORS = """
 By conformal risk control over {drives} drives, early matches included

@@ -34,25 +34,25 @@ from stavpr_ros.threads import limit_threads
 LENGTH = RecognizerSettings().sequence.length
 MIDDLE = (LENGTH - 1) // 2
 LIMITS = 0.007, 0.002  # share of the images off the map that are matched, where recall is compared
-TARGET = 0.005  # the same at .5
+TARGET = 0.007  # the same at .5; all are means of the kinds of such images
 # numbers of the evidence, which are replayed, in the order of the kernel
 REPLAYED = (
     'BELIEF', 'LEAD', 'CELLS', 'RECENT', 'CERTAIN', 'UNEVEN_WEIGHT', 'EXCESS', 'EXCESS_WEIGHT',
-    'LAST',
+    'LAST', 'CREEP',
 )  # fmt: skip
 RECORDED = (
     'speeds', 'level', 'weight', 'most', 'change', 'spread', 'leave', 'enter', 'start',
-    'STANDSTILL', 'MOST_CHANGE', 'LEAST_CHANGE', 'OFFSET', 'LOOK_AHEAD', 'STRETCH',
-    'DARK_PROBABILITY', 'CLOSE', 'LINE', 'ON_LINE', 'MAX_STEP', 'APART', 'STRAIGHT', 'EVEN',
+    'STANDSTILL', 'MOST_CHANGE', 'LEAST_CHANGE', 'OFFSET', 'LEAST_LOCAL', 'MOST_CREEP',
+    'LOOK_AHEAD', 'STRETCH', 'DARK_PROBABILITY', 'CLOSE', 'LINE', 'ON_LINE', 'MAX_STEP', 'APART', 'STRAIGHT', 'EVEN',
     'EVEN_SHARE', 'BLOCKS', 'NEGLIGIBLE', 'FAR',
 )  # fmt: skip
 GRID = {
-    'BELIEF': (0.4, 0.5, 0.6), 'LEAD': (1.2, 1.5, 2.0, 2.5), 'CELLS': (1.5, 2.0, 2.5),
-    'RECENT': (3.0, 5.0, 7.0),
+    'BELIEF': (0.4, 0.5, 0.6), 'LEAD': (1.0, 1.2, 1.5), 'CELLS': (2.0, 2.5, 3.0),
+    'CREEP': (1.0, 2.0, 3.0), 'RECENT': (5.0, 7.0),
 }  # fmt: skip
-WEIGHTS = 'BELIEF', 'LEAD', 'CELLS', 'RECENT'
+WEIGHTS = 'BELIEF', 'LEAD', 'CELLS', 'CREEP', 'RECENT'
 LATE = 150  # images off the map
-ELSEWHERE = np.array([-5.0, 0, 0, 0, 0, 0])  # what their windows show
+ELSEWHERE = np.array([-5.0, 0, 0, 0, 0, 0, 0])  # what their windows show
 REPEATED, NEW, REST = 0.0, 1.0, 2.0
 Z = 1.96  # of intervals at 95 %
 Values = dict[str, float]
@@ -63,12 +63,12 @@ Values = dict[str, float]
 
 def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
     """
-    Return what each window of a drive shows, (m, 12), in order.
+    Return what each window of a drive shows, (m, 13), in order.
 
     Columns: number of the newest image, -1 = no match; matched image, place, whether by the newest
     images alone, ``NEW``, ``REPEATED`` or ``REST`` (the camera rests since the matched image),
-    log odds of the belief, unevenness, excess, logarithms of 1 + lead and 1 + cells, whether
-    nothing is probable, probability.
+    log odds of the belief, unevenness, excess, creep, logarithms of 1 + lead and 1 + cells,
+    whether nothing is probable, probability.
 
     :param with_early: also what the newest images alone show, matched or not.
     """
@@ -83,7 +83,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         q = of.quantities
         cells, nothing = np.log1p(max(q.cells, 0.0)), float(not q.belief)
         lead = np.log1p(q.images * q.lead)
-        return log_odds(q.belief), q.uneven, q.excess, lead, cells, nothing
+        return log_odds(q.belief), q.uneven, q.excess, q.creep, lead, cells, nothing
 
     def noted(result: Any, is_early: bool) -> Any:
         path = result.path
@@ -121,7 +121,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         recognizer.update(drive.features[i : i + 1], stamp)
         if with_early and state['early'] < i:
             early(0)
-    return np.array(rows, float).reshape(-1, 12)
+    return np.array(rows, float).reshape(-1, 13)
 
 
 def _prepare_once() -> None:
@@ -150,7 +150,7 @@ def record(sets: Path, quick: bool, files: dict[tuple[str, Any], Path]) -> None:
         if name:  # nothing is fitted on it
             set_value(name, value)
         kept = [d if not name or d.use != 'fit' else None for d in drives]
-        rows = [recorded(d, not name) if d else np.empty((0, 12)) for d in kept]
+        rows = [recorded(d, not name) if d else np.empty((0, 13)) for d in kept]
         to.write_bytes(pickle.dumps(rows))
         if name:
             set_value(name, before)
@@ -252,8 +252,8 @@ class Windows:
             counted = np.zeros(len(rows), bool)
             counted[whole[first]] = np.isin(shown, images)
             missing = np.setdiff1d(images, shown)
-            more = np.zeros((len(missing), 12))
-            more[:, 0], more[:, 1], more[:, 2], more[:, 4], more[:, 10] = -1, missing, -1, NEW, 1
+            more = np.zeros((len(missing), 13))
+            more[:, 0], more[:, 1], more[:, 2], more[:, 4], more[:, 11] = -1, missing, -1, NEW, 1
             rows, counted = np.append(rows, more, axis=0), np.append(counted, missing >= 0)
             at, n = rows[:, 1].astype(int), len(rows)
             right = has = unseen = np.zeros(n, bool)
@@ -263,8 +263,8 @@ class Windows:
             if drive.unseen is not None:
                 unseen = drive.unseen[at]
             parts.append((
-                np.full(n, number), rows[:, 0], rows[:, 3] > 0, rows[:, 4], rows[:, 5:11],
-                rows[:, 11], counted, right, has, unseen,
+                np.full(n, number), rows[:, 0], rows[:, 3] > 0, rows[:, 4], rows[:, 5:12],
+                rows[:, 12], counted, right, has, unseen,
             ))  # fmt: skip
         columns = [np.concatenate(each) for each in zip(*parts, strict=True)]
         return cls(feature, tuple(drives), *columns)
@@ -304,8 +304,12 @@ class Windows:
 
     def threshold(self, scores: np.ndarray, share: float, rows: np.ndarray) -> float:
         """Return the score above which a share of the rows off the map is matched."""
-        off = np.sort(scores[rows & (self.negative >= 0)])
-        return float(off[len(off) - 1 - round(share * len(off))])
+        off = rows & (self.negative >= 0)
+        order = np.argsort(-scores[off])
+        kinds = self.negative[off][order]
+        counts = np.bincount(kinds)
+        shares = np.cumsum(1 / counts[kinds]) / np.count_nonzero(counts)
+        return float(scores[off][order][np.searchsorted(shares, share + 1e-9)])
 
     def recalls(self, scores: np.ndarray, threshold: float, rows: np.ndarray) -> np.ndarray:
         """Return the recall of each set in some rows, (10,), NaN where there is none."""
@@ -333,14 +337,14 @@ def scores_of(x, drive, early, kind, constant, numbers):  # type: ignore[no-unty
     """Return the log odds of windows as :mod:`stavpr_ros.method.evidence` has them."""
     out, newest, likely, count = np.empty(len(x)), -np.inf, 0.5, 0.0
     w_belief, w_lead, w_cells, w_recent, certain, w_uneven, most, w_excess = numbers[:8]
-    last = numbers[8]
+    last, w_creep = numbers[8], numbers[9]
     for i in range(len(x)):
         if i == 0 or drive[i] != drive[i - 1]:
             newest, likely, count = -np.inf, 0.5, 1.0
-        belief, uneven, excess, lead, cells, nothing = x[i]
+        belief, uneven, excess, creep, lead, cells, nothing = x[i]
         odds = max(min(belief, certain), -certain)
         odds = max(odds - w_uneven * uneven - w_excess * min(max(excess - most, 0.0), 1.0), -9.21)
-        own = constant + w_belief * odds + w_lead * lead + w_cells * cells
+        own = constant + w_belief * odds + w_lead * lead + w_cells * cells - w_creep * creep
         if nothing:
             own = -np.inf
         share = min(max(likely, 1e-4), 1 - 1e-4)
@@ -440,12 +444,11 @@ def late_recall(windows: Windows, values: Values) -> float:
 
 def constant_at(windows: Windows, values: Values, rows: np.ndarray) -> float:
     """Return the constant K with which ``TARGET`` of the rows off the map are matched at .5."""
-    low, high, off = -20.0, 5.0, rows & (windows.negative >= 0)
-    most = TARGET * np.count_nonzero(off)
+    low, high = -20.0, 5.0
     for _ in range(16):
         middle = (low + high) / 2
         scores = windows.scores(values | {windows.feature: middle})
-        is_low = np.count_nonzero(scores[off] > 0) <= most
+        is_low = windows.threshold(scores, TARGET, rows) <= 0
         low, high = (middle, high) if is_low else (low, middle)
     return low
 

@@ -78,7 +78,7 @@ def test_impossible_error_risks_are_rejected(probabilities, risks, units):
     [
         ({}, 0.6, ''),
         ({'max_error': 0.005}, 0.92, '39 blocks, 0.025 at least'),
-        ({'sequence': SequenceSettings(12)}, 0.0002, 'length=12'),
+        ({'sequence': SequenceSettings(12)}, 0.001, 'length=12'),
         ({'min_probability': 0.8}, 0.8, ''),
         ({'max_error': 0.0}, 0.5, ''),
     ],
@@ -96,14 +96,14 @@ def test_recognizer_keeps_the_error_rate_by_its_map_or_gives_the_reason(
     assert recognizer.threshold == match.threshold
     assert word in recognizer.start_notes
     assert bool(word) == bool(recognizer.start_notes)
-    assert PlaceRecognizer(small_map, settings).threshold == pytest.approx(0.9998)
+    assert PlaceRecognizer(small_map, settings).threshold == pytest.approx(0.999)
 
 
 def test_pipeline_publishes_the_threshold_of_its_map(small_map, tmp_path):
     risks = error_risks(method=RecognizerSettings(mode='robust').calibration_key)
     save_map(replace(small_map, error_risks=risks), tmp_path / 'route.stavpr')
     pipeline = Pipeline(PipelineSettings(max_error=0.05))
-    assert pipeline.operation.threshold == pytest.approx(0.9998)
+    assert pipeline.operation.threshold == pytest.approx(0.999)
     pipeline.change(loaded=read_map(str(tmp_path / 'route.stavpr'), pipeline.settings))
     assert pipeline.operation.threshold == pytest.approx(0.4)
     pipeline.change(replace(pipeline.settings, max_error=0.1))

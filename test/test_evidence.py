@@ -24,6 +24,7 @@ def test_probability_by_hand():
     assert window.own(-7.0) == pytest.approx(expected)
     plain = window._replace(cells=0.0)
     assert window._replace(cells=-2.0).own(-7.0) == plain.own(-7.0)
+    assert plain._replace(creep=0.4).own(-7.0) == pytest.approx(plain.own(-7.0) - 2 * 0.4)
     own = plain._replace(lead=0.6).own(-7.0)
     expected = 1 / (1 + np.exp(5 * np.log(3) - own))
     assert probability_of(own, 0.25) == pytest.approx(expected)

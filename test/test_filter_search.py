@@ -48,7 +48,7 @@ def test_query_at_other_speed_is_matched(recognizer, route, speed):
 
 def test_camera_that_is_carried_elsewhere_is_matched_by_the_images_since(recognizer, route):
     images, since = np.r_[20:80, 160:200], []
-    for count, answer in enumerate(drive(recognizer, route[:, images])[60:], 1):
+    for count, answer in enumerate(drive(recognizer, route[:, images], 0.5)[60:], 1):
         if answer.accepted:
             shown = len(answer.window_stamps)
             assert answer.path.pairs[-1, 0] == shown - 1 == len(answer.window_changes) - 1

@@ -126,6 +126,21 @@ def test_excess_is_of_motion_and_not_of_noise(noise):
     assert change.excess(2.0) < 0.0
 
 
+def test_creep_is_of_a_path_that_moves_less_than_the_camera():
+    """Where the map itself changes little, a path through many of its places creeps as well."""
+    strips, query = decaying_strips(300, 0.6), decaying_strips(60, 0.6, seed=1)
+    alike = (1 - 0.3) * strips[:, 100:101] + 0.3 * strips[:, 100:200]
+    strips[:, 100:200] = alike / np.linalg.norm(alike, axis=2, keepdims=True)
+    change = learned(strips)
+    assert change.creep(20, 39, 20) == 0  # of no image
+    for i in range(query.shape[1]):
+        change.next_query(query[:, i])
+    assert change.creep(20, 39, 20) < 0.3
+    assert change.creep(20, 39, 20) + 0.5 < change.creep(20, 24, 20)
+    assert change.creep(20, 39, 20) + 0.3 < change.creep(120, 139, 20)
+    assert change.creep(20, 77, 20) == 0
+
+
 def test_equal_places_do_not_count_unless_few_would():
     strips = drive_strips(60)
     strips[:, 21:25] = strips[:, 20:21]

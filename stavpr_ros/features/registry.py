@@ -195,7 +195,7 @@ class Kind:
 
     settings: Any
     backbone: str = ''
-    constant: float = -5.1
+    constant: float = -4.6
     cells: Cells | None = None
     with_cells: float = 0.0
     route: float = -5.3
@@ -210,22 +210,22 @@ KINDS = {
         GradientSettings,
         f'{_FEATURES}.gradient:Gradient',
         cells=Cells(0, 8, 14, 2, dimension=224),
-        with_cells=-6.9,
+        with_cells=-6.6,
     ),
     'efficientnet_lite1': Kind(
         EfficientNetSettings,
         f'{_FEATURES}.efficientnet_lite:EfficientNetLite1',
-        constant=-6.7,
+        constant=-5.9,
         cells=Cells(0, 112, 7, 1, dimension=784),
-        with_cells=-10.0,
+        with_cells=-9.4,
         route=-5.8,
     ),
     'hybrid': Kind(
         HybridSettings,
         f'{_FEATURES}.hybrid:Hybrid',
-        constant=-6.7,
+        constant=-5.9,
         cells=Cells(224, 112, 7, 1, dimension=1008),
-        with_cells=-10.0,
+        with_cells=-9.4,
         route=-5.8,
     ),
     'onnx': Kind(OnnxSettings, f'{_FEATURES}.onnx:Onnx'),

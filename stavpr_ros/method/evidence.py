@@ -17,13 +17,15 @@ depend on it:
   window and light;
 - by how many **cells** c the path agrees better than that path elsewhere, its competitor
   (:mod:`stavpr_ros.method.cells`);
+- the **creep** g: how much more the images change than the map does at the speed of the path, by
+  neighbors alone and by the map around the path (:meth:`.motion.ImageChange.creep`);
 - the number l of images: a window, or the newest images alone;
 - r, the **recent** windows of the drive: whether this drive is on the map at all.
 
 The probability is 1 / (1 + exp(-x)), with::
 
     x = own + 5 min(0, ln(r / (1 - r)))
-    own = K + 0.5 odds + 1.5 ln(1 + l d) + 2 ln(1 + max(c, 0))
+    own = K + 0.5 odds + 1.5 ln(1 + l d) + 2 ln(1 + max(c, 0)) - 2 g
 
 K is of the kind of features, with its cells or without
 (:class:`stavpr_ros.features.registry.Kind`). r is the share of the latest windows
@@ -39,6 +41,7 @@ from stavpr_ros.method.model import (
     BELIEF,
     CELLS,
     CERTAIN,
+    CREEP,
     EVEN,
     EVEN_SHARE,
     EXCESS,
@@ -70,7 +73,7 @@ class Quantities(NamedTuple):
     What the evidence of a window is made of.
 
     :param belief: p; uneven: s; excess: e, logarithm of the change of the images over the map's.
-    :param lead: d; images: l; cells: c, 0 = not compared.
+    :param lead: d; images: l; cells: c, 0 = not compared; creep: g.
     """
 
     belief: float
@@ -79,6 +82,7 @@ class Quantities(NamedTuple):
     lead: float = 0.0
     images: int = 1
     cells: float = 0.0
+    creep: float = 0.0
 
     @property
     def odds(self) -> float:
@@ -89,8 +93,9 @@ class Quantities(NamedTuple):
 
     def own(self, constant: float) -> float:
         """Return the evidence of the window alone; K is of the kind of features."""
-        odds, lead = self.odds, math.log1p(self.images * self.lead)
-        return constant + BELIEF * odds + LEAD * lead + CELLS * math.log1p(max(self.cells, 0.0))
+        lead, cells = math.log1p(self.images * self.lead), math.log1p(max(self.cells, 0.0))
+        own = BELIEF * self.odds + LEAD * lead + CELLS * cells - CREEP * self.creep
+        return constant + own
 
 
 def probability_of(own: float, recent: float) -> float:

@@ -16,10 +16,13 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.compilation import kernel
 from stavpr_ros.method.model import (
+    CLOSE,
     DARK_PROBABILITY,
     LEAST_CHANGE,
+    LEAST_LOCAL,
     LOOK_AHEAD,
     MOST_CHANGE,
+    MOST_CREEP,
     OFFSET,
     STANDSTILL,
     STRETCH,
@@ -190,6 +193,28 @@ class ImageChange:
         """
         changes = np.array(self._of_window).reshape(-1, COMPARED)
         return _excess(speed, changes, *self._extended)
+
+    def creep(self, first: int, last: int, images: int) -> float:
+        """
+        Return how much more the images of a path change than the map there, as a logarithm.
+
+        A path creeps where the camera leaves the map and the places around look alike. Unlike
+        :meth:`excess`, it compares each image with the one before alone, and the map with itself
+        around the path.
+
+        :param first, last: places of the ends of the path; images: newest ones that are on it.
+        :returns: 0 to ``MOST_CREEP``: noise is no motion; 0 as long as no change is known.
+        """
+        changes = [each[0] for each in self._of_window][-images:]
+        around = self._from_before[max(first - CLOSE, 0) : last + CLOSE + 1]
+        if not changes or not (around < 1).any():
+            return 0.0
+        expected = expected_change((last - first) / max(images - 1, 1), *self._extended)
+        local = float(around[around < 1].mean())
+        local = max(math.log((local + OFFSET) / (self.curve[1] + OFFSET)), LEAST_LOCAL)
+        change = sum(changes) / len(changes)
+        creep = math.log((change + OFFSET) / (expected + OFFSET)) - local
+        return min(max(creep, 0.0), MOST_CREEP)
 
 
 # ------------------------------------------------ kernels

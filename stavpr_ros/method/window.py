@@ -253,7 +253,9 @@ class FilterWindow(QueryWindow):
         elsewhere, competitor = self.filter.best_straight(steps, slice(0, self.known), near)
         lead = max(score - max(elsewhere, 0.0), 0.0)
         cells = 0.0 if self.cells is None else self.cells.lead(path, competitor)
-        return quantities._replace(lead=lead, images=l, cells=cells)
+        first, last = self.layout.pass_before(path[[0, -1]]).tolist()
+        creep = self.change.creep(first, last, l)
+        return quantities._replace(lead=lead, images=l, cells=cells, creep=creep)
 
     def _nothing(self, l: int, position: int) -> Shown:
         """Return what images show that are probably off the map: the most probable place now."""
