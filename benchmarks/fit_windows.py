@@ -43,8 +43,8 @@ REPLAYED = (
 RECORDED = (
     'speeds', 'level', 'weight', 'most', 'change', 'spread', 'leave', 'enter', 'start',
     'STANDSTILL', 'MOST_CHANGE', 'LEAST_CHANGE', 'OFFSET', 'LEAST_LOCAL', 'MOST_CREEP',
-    'LOOK_AHEAD', 'STRETCH', 'DARK_PROBABILITY', 'CLOSE', 'LINE', 'ON_LINE', 'MAX_STEP', 'APART', 'STRAIGHT', 'EVEN',
-    'EVEN_SHARE', 'BLOCKS', 'NEGLIGIBLE', 'FAR',
+    'LOOK_AHEAD', 'STRETCH', 'DARK_PROBABILITY', 'CLOSE', 'LINE', 'ON_LINE', 'MAX_STEP', 'APART',
+    'STRAIGHT', 'EVEN', 'EVEN_SHARE', 'BLOCKS', 'NEGLIGIBLE', 'FAR',
 )  # fmt: skip
 GRID = {
     'BELIEF': (0.4, 0.5, 0.6), 'LEAD': (1.0, 1.2, 1.5), 'CELLS': (2.0, 2.5, 3.0),
