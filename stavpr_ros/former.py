@@ -1,7 +1,8 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Former names, for one release: packages ``recognition`` and ``filter``, fields of results."""
+"""Former names, for one release: packages, classes and fields of results, with a warning."""
 
+from collections.abc import Callable
 import importlib
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -13,6 +14,9 @@ import warnings
 
 FORMER = {'stavpr_ros.recognition', 'stavpr_ros.filter'}
 METHOD = 'stavpr_ros.method'
+CLASSES = {
+    'stavpr_ros.pipeline.operations': {'Localizer': 'LocalizationOperation'},
+}
 FIELDS: dict[str, dict[str, str]] = {
     'Path': {'middle': 'place', 'second_best_index': 'second_best'},
     'Match': {
@@ -47,6 +51,19 @@ class FormerNames:
             field = FIELDS[kind][name]
             warnings.warn(f'{kind}.{name} is {field} now', DeprecationWarning, stacklevel=2)
             return attrgetter(field)(self)
+
+
+def classes(module: str) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a module with former names of classes."""
+
+    def former_class(name: str) -> Any:
+        if name not in CLASSES[module]:
+            raise AttributeError(f'module {module!r} has no attribute {name!r}')
+        present = CLASSES[module][name]
+        warnings.warn(f'{module}.{name} is {present} now', DeprecationWarning, stacklevel=2)
+        return getattr(importlib.import_module(module), present)
+
+    return former_class
 
 
 class _Former(MetaPathFinder, Loader):

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Former names of the method and of results, and an import that loads nothing for them."""
+"""Former names of packages, classes and results, and an import that loads nothing for them."""
 
 import importlib
 from operator import attrgetter
@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 from stavpr_ros import method
-from stavpr_ros.former import FIELDS
+from stavpr_ros.former import CLASSES, FIELDS
 from stavpr_ros.method import Match, Path, Status
 from stavpr_ros.pipeline import ImageResult
 
@@ -21,6 +21,16 @@ def test_former_package_warns_and_has_the_names_of_the_method(name, monkeypatch)
     with pytest.warns(DeprecationWarning, match=f'{name} is stavpr_ros.method now'):
         former = importlib.import_module(name)
     assert all(getattr(former, each) is getattr(method, each) for each in method.__all__)
+
+
+@pytest.mark.parametrize('module', CLASSES)
+def test_former_class_warns_and_is_the_present_one(module):
+    for name, present in CLASSES[module].items():
+        with pytest.warns(DeprecationWarning, match=f'{module}.{name} is {present} now'):
+            former = getattr(importlib.import_module(module), name)
+        assert former is getattr(importlib.import_module(module), present)
+    with pytest.raises(AttributeError, match=f"module '{module}' has no attribute 'typo'"):
+        _ = importlib.import_module(module).typo
 
 
 @pytest.mark.parametrize('kind', FIELDS)
@@ -36,5 +46,5 @@ def test_former_field_warns_and_is_the_present_one(kind):
 
 
 def test_import_of_the_package_stays_light():
-    code = "import stavpr_ros, sys; print({'numpy', 'stavpr_ros.method'} & {*sys.modules})"
+    code = "import stavpr_ros, sys; print({'numpy', 'stavpr_ros.api'} & {*sys.modules})"
     assert subprocess.check_output([sys.executable, '-c', code], text=True) == 'set()\n'

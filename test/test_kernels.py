@@ -81,7 +81,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from stavpr_ros.mapping import build_map, KeyframeSettings
 from stavpr_ros.pipeline import PipelineSettings
-from stavpr_ros.pipeline.operations import Localizer, RouteCloser
+from stavpr_ros.pipeline.operations import LocalizationOperation, RouteCloser
 from stavpr_ros.pipeline.save_state import SaveState
 from stavpr_ros.sources.frame import Frame
 
@@ -96,7 +96,7 @@ extractor = settings.extractor()
 images = np.random.default_rng(0).integers(0, 256, (60, 96, 128, 3), np.uint8)
 route = build_map([Frame(image, i, str(i)) for i, image in enumerate(images)], extractor)
 for operation in (
-    Localizer(settings, route, extractor, SaveState()),
+    LocalizationOperation(settings, route, extractor, SaveState()),
     RouteCloser(settings, None, extractor, SaveState()),
 ):
     before = compiled()

@@ -32,7 +32,7 @@ def _run(_: object) -> None:
     from stavpr_ros.features.efficientnet_lite_file import find_file
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.pipeline import PipelineSettings
-    from stavpr_ros.pipeline.operations import Localizer, RouteCloser
+    from stavpr_ros.pipeline.operations import LocalizationOperation, RouteCloser
     from stavpr_ros.pipeline.save_state import SaveState
     from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
     from stavpr_ros.sources.frame import Frame
@@ -48,10 +48,10 @@ def _run(_: object) -> None:
         for precision in ('float32', 'int8'):
             for mode in ('robust', 'paper'):
                 settings = PipelineSettings(mode=mode, precision=precision, backend='cpu')
-                Localizer(settings, route, extractor, SaveState())
+                LocalizationOperation(settings, route, extractor, SaveState())
                 RouteCloser(settings, None, extractor, SaveState())
                 if mode == 'robust':  # maps of several sessions
-                    Localizer(settings, both, extractor, SaveState())
+                    LocalizationOperation(settings, both, extractor, SaveState())
     OffsetFilter().update(*[describe_columns(images[0])] * 2)
     for compile_kernels in plugins.load(plugins.KERNELS).values():
         compile_kernels()

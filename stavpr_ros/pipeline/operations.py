@@ -10,9 +10,10 @@ import math
 import os
 from pathlib import Path
 import time
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable, TYPE_CHECKING
 
 import numpy as np
+from stavpr_ros import former
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.maintenance.same_places import SURE
@@ -417,7 +418,7 @@ class Operation(ABC):
         return matched_pair(match, places, self._query(match), poses, distances, relative_yaw)
 
 
-class Localizer(Operation):
+class LocalizationOperation(Operation):
     """
     Recognizes the places of a map; without one, it waits for it.
 
@@ -549,7 +550,9 @@ class RouteCloser(Operation):
         return match, self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
 
 
-CLASSES = {each.name: each for each in (Localizer, Mapper, RouteCloser)}
+CLASSES = {each.name: each for each in (LocalizationOperation, Mapper, RouteCloser)}
+if not TYPE_CHECKING:
+    __getattr__ = former.classes(__name__)
 
 
 def _map_recognizer(

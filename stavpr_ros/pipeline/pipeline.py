@@ -13,7 +13,7 @@ from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.stores import is_address, store_of
 from stavpr_ros.pipeline.drives import write_drives
-from stavpr_ros.pipeline.operations import CLASSES, Localizer, Operation
+from stavpr_ros.pipeline.operations import CLASSES, LocalizationOperation, Operation
 from stavpr_ros.pipeline.save_state import MapSnapshot, OpenJournal, SaveState
 from stavpr_ros.pipeline.settings import PipelineSettings
 
@@ -82,7 +82,9 @@ class Pipeline:
         # of localization, or of loop closure for its kind of features; its files
         self._map: PlaceMap | None = None
         self._map_save_state = SaveState(open_journal=open_journal)
-        self.operation: Operation = Localizer(settings, None, None, self._map_save_state)
+        self.operation: Operation = LocalizationOperation(
+            settings, None, None, self._map_save_state
+        )
         settings.require_operation(operation)
         self._start(operation, settings, None)
 
