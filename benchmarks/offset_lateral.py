@@ -20,7 +20,7 @@ from stavpr_lab.demonstration.repeat import CONDITIONS, Taught, teach, View
 from stavpr_lab.demonstration.street.laps import RingWorld
 from stavpr_lab.demonstration.street.rendering import FOCAL
 from stavpr_lab.demonstration.street.traverses import Conditions, EPOCH
-from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros import Localizer
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.expansion import Expansion
@@ -79,12 +79,11 @@ def pose_row(taught: Taught, seed: int) -> str:
     poses = np.zeros((len(half), 7))
     poses[:, :2], poses[:, 5], poses[:, 6] = taught.poses[:, :2], np.sin(half), np.cos(half)
     places, results, count = replace(taught.place_map, poses=poses), [], 0
-    extractor = places.extractor()
     for left in (each for each in LEFT if abs(each) <= 0.4):
         for conditions in CONDITIONS.values():
-            recognizer = PlaceRecognizer(places, RecognizerSettings())
+            localizer = Localizer(places)
             for k, _, _, truth, image in drive(taught, conditions, left):
-                match = recognizer.update(extractor.extract([image]), EPOCH + k * 10**8)
+                match = localizer(image, EPOCH + k * 10**8)
                 count += 1
                 result = ImageResult(match)
                 if message := matched_pose_message(Header(), result, places, 'map'):

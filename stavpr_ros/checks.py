@@ -178,12 +178,14 @@ def _conversion(image: Any, array: np.ndarray) -> str:
     nan, inf = (int(is_bad(array).sum()) if is_number else 0 for is_bad in (np.isnan, np.isinf))
     rows = (
         (hasattr(image, 'image'), 'give its field image'),
-        (not is_number, 'give the pixels as numbers; open_source(path) reads files'),
+        (image is None, 'it was not read: check the name of its file'),
+        (array.dtype == object and isinstance(image, Iterable), 'give its images one by one'),
+        (not is_number, 'give the pixels as numbers; stavpr_ros.images(path) reads files'),
         (not array.size, 'it has no pixels: check that it was read'),
         (hasattr(image, 'convert'), "take np.asarray(image.convert('RGB'))"),  # a PIL image
         (len(shape) == 4, 'give each image alone, as image[0]'),
         (len(shape) == 2 or shape[2:] == (1,), 'gray becomes RGB by np.dstack(3 * [image])'),
-        (shape[2:] == (4,), 'take image[..., :3], without the transparency'),
+        (shape[2:] == (4,), 'take image[..., :3], of BGRA image[..., 2::-1]'),
         (shape[:1] == (3,), 'the channels come first: take image.transpose(1, 2, 0)'),
         (shape[2:] != (3,), 'an axis is missing, or has another size'),
         (nan or inf, f'it contains {nan} NaN and {inf} infinite values: replace them'),

@@ -7,6 +7,7 @@ import time
 import numpy as np
 from PIL import Image
 import pytest
+from stavpr_ros import Localizer, Map
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures, Projection
 from stavpr_ros.mapping import (
@@ -40,11 +41,19 @@ IMAGES = {
     'channels first': (RGB.transpose(2, 0, 1), 'image.transpose(1, 2, 0)'),
     'batch': (RGB[None], 'image[0]'),
     'no rows': (RGB[:0], 'no pixels'),
-    'a name': ('image.png', 'open_source(path)'),
+    'a name': ('image.png', 'stavpr_ros.images(path)'),
     'a list': (RGB.tolist(), 'np.uint8(image)'),
     'a ragged list': ([[1, 2], [3]], 'no array'),
     'a tensor with gradients': (Tensor(), 'requires grad'),
     'a frame': (Frame(RGB, 0, ''), 'field image'),
+    'BGRA': (np.dstack([RGB, RGB[..., :1]]), 'image[..., 2::-1]'),
+    'gray of 16 bits': (RGB[..., 0].astype(np.uint16), 'np.dstack(3 * [image])'),
+    'two channels': (RGB[..., :2], 'an axis is missing'),
+    'gray of Pillow': (Image.new('L', (8, 8)), "image.convert('RGB')"),
+    'palette of Pillow': (Image.new('P', (8, 8)), "image.convert('RGB')"),
+    'bytes of a file': (b'\xff\xd8\xff', 'stavpr_ros.images(path)'),
+    'not read': (None, 'check the name of its file'),
+    'a generator': ((image for image in [RGB]), 'one by one'),
 }
 ENTRIES = {
     'extract': lambda image: EXTRACTOR.extract([RGB, image]),
@@ -52,15 +61,22 @@ ENTRIES = {
     'encode_thumbnail': encode_thumbnail,
     'accept': lambda image: KeyframeSelector(KeyframeSettings()).accept(0, None, image),
     'describe_columns': describe_columns,
+    'Localizer': Localizer(Map.from_images([RGB, RGB[::-1]], EXTRACTOR, progress=False)),
+    'from_images': lambda image: Map.from_images([RGB, image], EXTRACTOR, progress=False),
 }
+WIDE = {'Frame', 'Localizer'}  # take images of 16 bits
 
 
 @pytest.mark.parametrize('entry', ENTRIES)
 @pytest.mark.parametrize('kind', IMAGES)
 def test_an_image_of_another_kind_is_a_sentence_that_converts_it(kind, entry):
     image, remedy = IMAGES[kind]
-    if (kind, entry) == ('16 bit', 'Frame'):
+    if kind == '16 bit' and entry in WIDE:
+        assert ENTRIES[entry](image)
         assert ImageRecord.of_image(Frame(image, 0, '').image, 0).encoding == 'rgb16'
+        return
+    if (kind, entry) == ('a frame', 'from_images'):
+        assert len(ENTRIES[entry](image)) == 2
         return
     with pytest.raises(InputError) as caught:
         ENTRIES[entry](image)
@@ -78,7 +94,7 @@ def test_one_image_instead_of_a_list_is_a_sentence(images):
 
 
 @pytest.mark.parametrize(('work', 'text'), [
-    (lambda: build_map([RGB], EXTRACTOR, progress=False), r'ndarray: expected Frame\('),
+    (lambda: build_map(RGB, EXTRACTOR, progress=False), 'one ndarray: expected a list'),
     (lambda: Frame(RGB, time.time(), ''), r'stamp is of type float: .*time\.time_ns\(\)'),
     (lambda: Trajectory().add(1, 'here'), r"pose 'here' is no array"),
     (lambda: Projection(np.eye(3), 'mine'), r'matrix of the projection: .*float64, .*float32'),

@@ -114,7 +114,7 @@ def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, m
 def test_arguments_of_wrong_types_are_rejected_with_the_expected_one(small_map):
     one, settings, image = recognizer(small_map), RecognizerSettings(), np.zeros((9, 9, 3))
     for call, error, words in (
-        (lambda: PlaceRecognizer('route.stavpr', settings), InputError, 'a PlaceMap, as of load_'),
+        (lambda: PlaceRecognizer('route.stavpr', settings), InputError, 'Map.load'),
         (
             lambda: PlaceRecognizer(small_map, 0.5),
             InputError,

@@ -28,8 +28,8 @@ USERS = ('stavpr_operator', 'stavpr_reader', 'stavpr_sensors')  # programs of us
 ROLES = {'publish': 'publisher', 'subscribe': 'subscriber', 'reply': 'service'}
 STANDARD = re.compile(r'parameter|transition|_states?$|type_description|/(rosout|clock)$')
 PUBLIC = (
-    'stavpr_ros.alignment', 'stavpr_ros.errors', 'stavpr_ros.features', 'stavpr_ros.mapping',
-    'stavpr_ros.pipeline', 'stavpr_ros.method', 'stavpr_ros.sources',
+    'stavpr_ros', 'stavpr_ros.alignment', 'stavpr_ros.errors', 'stavpr_ros.features',
+    'stavpr_ros.mapping', 'stavpr_ros.pipeline', 'stavpr_ros.method', 'stavpr_ros.sources',
     'stavpr_ros.sources.frame', 'stavpr_fleet', 'stavpr_slam.pose_graph',
     'stavpr_lab.evaluation.evaluate', 'stavpr_lab.evaluation.ground_truth',
     'stavpr_lab.evaluation.metrics',

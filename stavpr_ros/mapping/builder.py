@@ -25,6 +25,7 @@ from stavpr_ros.mapping.place_map import (
 )
 from stavpr_ros.mapping.trajectory import checked_pose, Trajectory
 from stavpr_ros.progress import Progress
+from stavpr_ros.sources.arrays import Images
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale
 from stavpr_ros.sources.frame import Frame
 
@@ -62,7 +63,7 @@ def fit_value_range(source: Any, extractor: FeatureExtractor) -> None:
 
 
 def extract_features(
-    frames: Iterable[Frame], extractor: FeatureExtractor, progress: bool = True
+    frames: Iterable[Frame | np.ndarray], extractor: FeatureExtractor, progress: bool = True
 ) -> LocalFeatures:
     """
     Extract the features of every image of a sequence, in batches.
@@ -75,7 +76,7 @@ def extract_features(
 
 
 def build_map(
-    frames: Iterable[Frame],
+    frames: Iterable[Frame | np.ndarray],
     extractor: FeatureExtractor,
     poses: np.ndarray | Trajectory | None = None,
     thumbnails: bool = True,
@@ -88,7 +89,8 @@ def build_map(
 
     The next images are decoded by another thread during the extraction of the last ones.
 
-    :param frames: images in the order of the route.
+    :param frames: images in the order of the route: a source, :func:`stavpr_ros.images`, or frames
+        or arrays, RGB (h, w, 3) uint8.
     :param extractor: of their features; the map records its settings.
     :param poses: of each image, shape (images, 7), see :class:`PlaceMap`; or by their stamps.
     :param thumbnails: keep a small image of each place.
@@ -99,9 +101,13 @@ def build_map(
     :raises SettingsError: a rule of motion without poses.
     """
     images: object = frames
-    if isinstance(images, str) or not isinstance(images, Iterable):
+    if isinstance(images, (str, bytes)) or not isinstance(images, Iterable):
         raise InputError(f'frames is {images!r}: expected open_source(path), or another sequence')
+    if getattr(images, 'ndim', 4) != 4:
+        raise InputError(f'frames is one {type(images).__name__}: expected a list of images')
     require_type('extractor', extractor, FeatureExtractor, 'a FeatureExtractor(...)')
+    if isinstance(frames, Images):
+        frames = frames.source
     fit_value_range(frames, extractor)
     features: list[LocalFeatures] = []
     rows_of_places: list[tuple[Place, bytes]] = []
@@ -123,7 +129,7 @@ def build_map(
 
 
 def build_journal(
-    frames: Iterable[Frame],
+    frames: Iterable[Frame | np.ndarray],
     extractor: FeatureExtractor,
     target: str | Path,
     source: str,
@@ -189,7 +195,7 @@ def _ignore(error: str) -> None:
 
 
 def _extracted(
-    frames: Iterable[Frame],
+    frames: Iterable[Frame | np.ndarray],
     extractor: FeatureExtractor,
     poses: np.ndarray | Trajectory | None,
     keyframes: KeyframeSettings | None,
@@ -271,9 +277,9 @@ def _places(
 
 
 def _with_poses(
-    frames: Iterable[Frame], poses: np.ndarray | Trajectory | None
+    images: Iterable[Frame | np.ndarray], poses: np.ndarray | Trajectory | None
 ) -> Iterator[tuple[Frame, np.ndarray | None]]:
-    frames = map(_frame, frames)
+    frames = (_frame(image, number) for number, image in enumerate(images))
     if poses is None:
         yield from ((frame, None) for frame in frames)
     elif isinstance(poses, Trajectory):
@@ -289,9 +295,15 @@ def _with_poses(
             raise InputError(f'{len(poses)} poses for {count} images: expected one each')
 
 
-def _frame(frame: Frame) -> Frame:
-    require_type('an item of frames', frame, Frame, 'Frame(image, stamp, identifier)')
-    return frame
+def _frame(image: Frame | np.ndarray, number: int) -> Frame:
+    """Return an image as a frame; its stamp and its name are those that the array carries."""
+    if isinstance(image, Frame):
+        return image
+    name = getattr(image, 'name', f'image {number}')
+    try:
+        return Frame(image, getattr(image, 'stamp', 0), name)
+    except InputError as error:
+        raise InputError(f'image {number}: {error}') from error
 
 
 def _pose(row: np.ndarray, name: str) -> np.ndarray | None:

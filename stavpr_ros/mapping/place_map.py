@@ -2,20 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference map: local features, stamps, identifiers, poses, thumbnails of places."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 import math
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, TYPE_CHECKING
 
 import cv2
 import numpy as np
-from stavpr_ros.checks import require_at_least, require_shape, rgb_image
+from stavpr_ros.checks import require_at_least, require_shape, require_type, rgb_image
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import is_thumbnail, MAX_THUMBNAIL_PIXELS
+from stavpr_ros.sources import open_source
 from stavpr_ros.units import SECOND
+
+if TYPE_CHECKING:
+    from stavpr_ros.output_file import Force
 
 THUMBNAIL_WIDTH = 192  # pixels
 MAX_SECONDS = 2**31  # of a stamp, since 1970: the range of ROS messages
@@ -170,6 +175,49 @@ class PlaceMap:
             raise InputError(f'threshold = {self.threshold}: expected a distance above 0')
         require_projection(self.projection, self.settings)
 
+    # What makes and stores maps imports this module: it is imported on use.
+
+    @staticmethod
+    def from_images(
+        source: str | Path | Iterable[Any],
+        features: str | FeatureSettings | FeatureExtractor = 'auto',
+        **options: Any,
+    ) -> 'PlaceMap':
+        """
+        Make a map of the images of a route, a place each.
+
+        :param source: path of a folder of images, a video or a bag; :func:`stavpr_ros.images` of
+            it, which has options; or RGB arrays (h, w, 3), uint8.
+        :param features: their kind, such as ``gradient``, or ``auto``: ``hybrid`` where its
+            network is there; or the settings of another map's; or an extractor.
+        :param options: of :func:`stavpr_ros.mapping.build_map`, such as ``poses``, ``keyframes``.
+        :raises InputError: no images, or an item that is no image, and how to convert it.
+        :raises SourceError: the source cannot be read, or has no images.
+        """
+        from stavpr_ros.mapping.builder import build_map
+
+        kinds = (str, FeatureSettings, FeatureExtractor)
+        require_type('features', features, kinds, "a kind, such as 'gradient', or an extractor")
+        if isinstance(features, FeatureSettings):
+            features = FeatureExtractor.from_settings(features, None)
+        elif isinstance(features, str):
+            features = FeatureExtractor(features)
+        frames: Any = open_source(source) if isinstance(source, (str, Path)) else source
+        return build_map(frames, features, **options)
+
+    @staticmethod
+    def load(path: str | Path) -> 'PlaceMap':
+        """Read a map from its file: :func:`stavpr_ros.mapping.load_map`."""
+        from stavpr_ros.mapping.map_file import load_map
+
+        return load_map(path)
+
+    def save(self, path: str | Path, storage: str = '', force: 'Force' = False) -> str:
+        """Write the map to a file, return its id: :func:`stavpr_ros.mapping.save_map`."""
+        from stavpr_ros.mapping.map_file import save_map
+
+        return save_map(self, path, storage, force)
+
     def __len__(self) -> int:
         return len(self.features)
 
@@ -246,6 +294,9 @@ class PlaceMap:
             return decode_thumbnail(self.thumbnails[place]) if len(self.thumbnails) else None
         except MapFileError:  # the file has been overwritten since it was opened
             return None
+
+
+Map = PlaceMap
 
 
 def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> PlaceMap:

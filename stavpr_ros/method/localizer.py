@@ -321,7 +321,7 @@ class PlaceRecognizer(SequenceRecognizer):
         backend: 'str | torch.device' = 'cpu',
         precision: str = 'auto',
     ) -> None:
-        maps, expected = 'a PlaceMap, as of load_map() or build_map()', 'RecognizerSettings(...)'
+        maps, expected = 'Map.load(path) or Map.from_images(source)', 'RecognizerSettings(...)'
         require_type('place_map', place_map, PlaceMap, maps)
         require_type('settings', settings, RecognizerSettings, expected)
         backend = choose_backend(backend)

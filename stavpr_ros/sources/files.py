@@ -95,6 +95,11 @@ def flat_bytes(data: Any) -> np.ndarray:
     return np.frombuffer(view, np.uint8) if view.nbytes else np.empty(0, np.uint8)
 
 
+def upper_byte(values: np.ndarray) -> np.ndarray:
+    """Return the upper bytes of values of 16 bits, uint16, as uint8."""
+    return (values >> 8).astype(np.uint8)
+
+
 class RangeFinder:
     """Converts images of 16 bits by their upper byte, and counts their values."""
 
@@ -104,7 +109,7 @@ class RangeFinder:
     def __call__(self, values: np.ndarray) -> np.ndarray:
         self.images += 1
         self._counts += np.bincount(values.reshape(-1), minlength=65536)
-        return (values >> 8).astype(np.uint8)
+        return upper_byte(values)
 
     @property
     def value_range(self) -> tuple[int, int] | None:
@@ -158,7 +163,7 @@ def decode_file(
     if image is None:
         raise _damaged(flat.size)
     if image.dtype == np.uint16:
-        image = to_bytes(image) if to_bytes else (image >> 8).astype(np.uint8)
+        image = (to_bytes or upper_byte)(image)
     image = _turned(image, turn)
     if demosaic is not None and is_mosaic:
         if image.ndim == 3:  # a TIFF that OpenCV does not decode: three equal channels

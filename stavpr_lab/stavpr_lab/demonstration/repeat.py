@@ -37,9 +37,9 @@ from stavpr_lab.demonstration.street.traverses import (
 from stavpr_nav.evidence import ImageComparison
 from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
 from stavpr_nav.observation import Observation
+from stavpr_ros import Localizer
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, PlaceMap
-from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
@@ -186,15 +186,13 @@ class Autopilot:
         settings = settings or FollowerSettings(max_speed=SPEED, max_acceleration=2.0)
         self.follower = RouteFollower(taught.run, settings)
         self._map, self._offset = taught.place_map, OffsetFilter()
-        self._extractor = self._map.extractor()
         self._comparison = ImageComparison()
-        self._recognizer = PlaceRecognizer(self._map, RecognizerSettings())
+        self._localizer = Localizer(self._map)
         self.observation: Observation | None = None
 
     def process(self, image: np.ndarray, stamp: float) -> Observation:
         """Return what an image shows."""
-        features = self._extractor.extract([image])
-        match = self._recognizer.update(features, EPOCH + round((stamp + 1e5) * 1e9))
+        match = self._localizer(image, EPOCH + round((stamp + 1e5) * 1e9))
         place, probability, offset = match.newest, match.probability, None
         if place < 0:
             place, probability = self.follower.expected_place(), math.nan
