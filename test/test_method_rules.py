@@ -233,6 +233,8 @@ RULES = [
     Rule('LEAD', put(evidence, LEAD=0.0), lambda: matched(STAGE, 3.0), 0.9, 0),
     Rule('APART', put(window, APART=0), lambda: matched(STAGE, 3.0), 0.9, 0),
     Rule('STRAIGHT', put(window, STRAIGHT=(1.0,)), lambda: matched(KNOWN[:, ::3], 5.0), 0.8, 0.5),
+    Rule('STRAIGHT, at most', put(window, STRAIGHT=window.STRAIGHT[:-1]),
+         lambda: matched(KNOWN[:, ::5], 3.0), 0.8, 0.1),
     Rule('CELLS', put(evidence, CELLS=0.0), lambda: matched(
         FINE[:, 20:120], 11.0, LENGTH, known=FINE), 0.6, 0.1),
     Rule('CREEP', put(evidence, CREEP=0.0), lambda: matched(np.hstack([ALIKE[:, 20:75], (

@@ -91,7 +91,7 @@ CLOSE = 2  # places to either side that count as the same
 LINE, ON_LINE = 5, 1.5  # images to either side of the line, places that they may be off it
 MAX_STEP = 6  # places from image to image of a path, at most
 APART = 20  # places: paths nearer than that to the path are not elsewhere
-STRAIGHT = (1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0)  # places an image, of paths elsewhere
+STRAIGHT = (1 / 3, 1 / 2, 3 / 4, 1.0, 4 / 3, 2.0, 3.0, 4.5)  # places an image, of straight paths
 ON_MAP = 0.9  # probability above which an image is on the map
 
 # ------------------------------------------------ the evidence of a window, log odds
