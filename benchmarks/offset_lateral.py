@@ -25,7 +25,7 @@ from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.expansion import Expansion
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
-from stavpr_ros.ros.messages import matched_pose_message
+from stavpr_ros.ros.messages import matched_pose_message, Outcome
 from std_msgs.msg import Header
 
 SEEDS = (7, 21, 33)
@@ -86,7 +86,7 @@ def pose_row(taught: Taught, seed: int) -> str:
                 match = localizer(image, EPOCH + k * 10**8)
                 count += 1
                 result = ImageResult(match)
-                if message := matched_pose_message(Header(), result, places, 'map'):
+                if message := matched_pose_message(Outcome(Header(), result, places)):
                     at, heading = message.pose.pose.position, taught.poses[k, 2]
                     across = np.array([-math.sin(heading), math.cos(heading)])
                     variance = across @ message.pose.covariance.reshape(6, 6)[:2, :2] @ across

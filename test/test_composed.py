@@ -32,7 +32,7 @@ def activated(node):
 
 def enqueue(node, images):
     for i, image in enumerate(images, 1):
-        node.runtime.images.on_image(image_message(image, i * SECOND))
+        node.runtime.intake.images.on_image(image_message(image, i * SECOND))
 
 
 def until_processed(node, count):
@@ -79,11 +79,11 @@ def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
     node = activated(make_node(map_path=map_file))
     monkeypatch.setattr(node.get_logger(), 'warning', lambda text, **_: logged.append(text))
     for tenths in (60, 61, 1, 2, 3):  # a clock is set
-        node.runtime.images.on_image(image_message(route[0], tenths * SECOND // 10))
+        node.runtime.intake.images.on_image(image_message(route[0], tenths * SECOND // 10))
     assert not [text for text in logged if 'reset' in text]
     for i in range(10):
         for tenths in (2 * i + 5, 2 * i + 4):
-            node.runtime.images.on_image(image_message(route[i], tenths * SECOND // 10))
+            node.runtime.intake.images.on_image(image_message(route[i], tenths * SECOND // 10))
     text = next(text for text in logged if 'reset' in text)
     assert 'reset 3 times in a row' in text
     assert 'jumped back by 0.100 s): publish the images in the order of their stamps' in text
@@ -185,7 +185,7 @@ def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
         make_node(map_path=map_file, relative_pose='none', odometry_error=0.0, **topic)
     )
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
-    assert 'correct qos_overrides./odom.subscription' in node.runtime.problem
+    assert 'correct qos_overrides./odom.subscription' in node.runtime.intake.problem
     assert node.runtime.pipeline.settings.keyframes.distance == 1
 
 
@@ -206,7 +206,7 @@ def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
 
 def test_restart_removes_the_poses_of_the_odometry(make_node, map_file):
     node = activated(make_node(map_path=map_file, keyframe_distance=1.0))
-    trajectory = node.runtime.odometry.trajectory
+    trajectory = node.runtime.intake.odometry.trajectory
     trajectory.add(SECOND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
     node.runtime.restart('the stamps jumped back')
     assert len(trajectory) == 0
@@ -216,8 +216,8 @@ def test_place_has_the_pose_at_the_stamp_of_its_image(make_node, route):
     node = activated(make_node(operation='mapping', keyframe_distance=0.1))
     for seconds in (1, 2):
         pose = np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0])
-        node.runtime.odometry.trajectory.add(seconds * SECOND, pose)
-    node.runtime.images.on_image(image_message(route[0], SECOND * 5 // 4))
+        node.runtime.intake.odometry.trajectory.add(seconds * SECOND, pose)
+    node.runtime.intake.images.on_image(image_message(route[0], SECOND * 5 // 4))
     until_processed(node, 1)
     assert node.runtime.pipeline.places.poses[0][0] == 12.5
 

@@ -22,9 +22,11 @@ from stavpr_ros.mapping.transforms import matrices
 from stavpr_ros.method import Match, Status
 from stavpr_ros.method import match as match_module
 from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.ros.messages import matched_pose_message, pose_message
+from stavpr_ros.ros.messages import matched_pose_message, Outcome, pose_message, Surroundings
 from stavpr_ros.ros.navigation import map_to_odometry, Navigation, planar
 from test_visualization import header, Publishers
+
+ABOUT = Surroundings('map', odometry_frame='odom')
 
 
 def posed(x, y, degrees):
@@ -49,7 +51,7 @@ def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
     places = replace(small_map, poses=poses)
     path = match_module.Path(np.column_stack([np.arange(4), np.arange(10, 6, -1)]), 9)
     result = ImageResult(Match(Status.MATCH, path=path), relative_yaw=math.pi)
-    message = matched_pose_message(header(0), result, places, 'map')
+    message = matched_pose_message(Outcome(header(0), result, places, Surroundings('map')))
     o = message.pose.pose.orientation
     assert message.pose.pose.position.x == 7
     assert abs(np.array([o.x, o.y, o.z, o.w]) @ posed(0, 0, 210)[3:]) == pytest.approx(1)
@@ -111,7 +113,9 @@ def publishing(map_file, monkeypatch):
         for i, image in enumerate(images, first):
             clock.time = i + 1.5
             match = pipeline.operation.process(message(image), (i + 1) * SECOND)
-            navigation.publish(header(i), match, pipeline.places, at(i - 10), 'odom')
+            navigation.publish(
+                Outcome(header(i), match, pipeline.places, replace(ABOUT, pose=at(i - 10)))
+            )
             statuses.append(match.match.accepted)
         return statuses
 
@@ -144,7 +148,8 @@ def test_transform_is_repeated_until_the_map_or_the_state_changes(publishing, ro
     publishing.show(route[:10])
     _, last = publishing.tf[-1].transforms[0]
     count, lost = len(publishing.tf), ImageResult(Match(Status.NO_MATCH, 'lost'))
-    publishing.navigation.publish(header(30), lost, publishing.pipeline.places, at(0), 'odom')
+    places = publishing.pipeline.places
+    publishing.navigation.publish(Outcome(header(30), lost, places, replace(ABOUT, pose=at(0))))
     for clock.time in (40.0, 40.0, 40.05):  # a paused clock sends no stamp twice
         beat()
     repeated = [sent.transforms[0] for sent in publishing.tf[count:]]

@@ -152,7 +152,7 @@ def queue(monkeypatch):
         if message.query_index == LAST:
             last.set()
 
-    publisher = EdgePublisher(EdgeEstimator(), '', publish, statistics, ending)
+    publisher = EdgePublisher(EdgeEstimator(), publish, statistics, ending)
     camera = object()
     pair = SimpleNamespace(
         pose=lambda place: np.array([0, 0, 0, 0, 0, 0, 1.0]), place=0, query=object(),

@@ -37,7 +37,7 @@ def make(make_node, tmp_path):
 def record(node, images, first=0):
     """Show images to a node, and wait until they are processed."""
     for i, image in enumerate(images, first + 1):
-        node.runtime.images.on_image(image_message(image, i * SECOND))
+        node.runtime.intake.images.on_image(image_message(image, i * SECOND))
         node.runtime.worker.run(lambda: None)
     while node.runtime.worker.waiting:
         node.runtime.worker.run(lambda: None)
@@ -52,8 +52,8 @@ def end(node):
 def test_node_states_at_the_end_what_it_left_out(make, route, monkeypatch):
     logged, node = [], make()
     monkeypatch.setattr(node.get_logger(), 'warning', lambda text, **_: logged.append(text))
-    node.runtime.odometry._on_odometry(Odometry())
-    node.runtime.images.on_image(Image(encoding='rgb8'))
+    node.runtime.intake.odometry._on_odometry(Odometry())
+    node.runtime.intake.images.on_image(Image(encoding='rgb8'))
     record(node, route[:1])
     assert not end(node)
     expected = '1 images of a size that their encoding cannot have, 1 messages of odometry without'

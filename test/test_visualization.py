@@ -25,6 +25,7 @@ from stavpr_ros.method import Match, Status
 from stavpr_ros.method import match as match_module
 from stavpr_ros.pipeline import ImageResult
 from stavpr_ros.pipeline.overlay import draw_match, draw_window
+from stavpr_ros.ros.messages import Outcome, Surroundings
 from stavpr_ros.ros.visualization import color, GROWTH, Visualization
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -55,6 +56,9 @@ class Publishers:
         self.by_topic[topic] = Publisher(topic in self.requested)
         return self.by_topic[topic]
 
+    def destroy_publisher(self, publisher):
+        """Nothing is left of it."""
+
     def get_clock(self):
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=Time))
 
@@ -64,7 +68,14 @@ class Publishers:
 
 def views_of(*requested):
     publishers = Publishers(requested)
-    return Visualization(publishers, lambda: None), publishers
+    return Visualization(publishers, lambda: None, lambda: None), publishers
+
+
+def show(views, header, result, operation, frame, odometry=None):
+    """Publish a result of an operation."""
+    views.operation = lambda: operation
+    about = Surroundings(frame, pose=odometry)
+    views.publish(Outcome(header, result, operation.matched_places, about))
 
 
 def header(i=0):
@@ -83,7 +94,7 @@ def test_visualization_without_subscribers_publishes_and_draws_nothing(localized
     recognizer = pipeline.operation.recognizer
     monkeypatch.setattr(recognizer, 'newest_row', lambda: pytest.fail('not requested'))
     views, publishers = views_of()
-    views.publish(header(), match, pipeline.operation, 'map')
+    show(views, header(), match, pipeline.operation, 'map')
     views.publish_route(pipeline.places, 'map')
     assert set(publishers.by_topic) == TOPICS
     assert not any(publisher.messages for publisher in publishers.by_topic.values())
@@ -96,7 +107,7 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
     assert match.accepted
     views, publishers = views_of('map_path', 'matched_path', 'markers')
     for i in range(2):
-        views.publish(header(i), result, pipeline.operation, 'map')
+        show(views, header(i), result, pipeline.operation, 'map')
     (route,) = publishers.messages('map_path')  # it has not changed
     assert route.header.frame_id == 'map'
     assert [stamped.pose.position.x for stamped in route.poses] == list(range(60))
@@ -117,9 +128,7 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
 def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
     pipeline, _ = localized
     views, publishers = views_of(*TOPICS)
-    views.publish(
-        header(), ImageResult(Match(Status.DROPPED, 'because')), pipeline.operation, 'map'
-    )
+    show(views, header(), ImageResult(Match(Status.DROPPED, 'because')), pipeline.operation, 'map')
     assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
     assert not publishers.messages('matched_path')
     assert not publishers.messages('match_image/compressed')
@@ -130,7 +139,7 @@ def test_visualization_of_loop_closures_connects_query_and_place(route):
     views, publishers = views_of('markers', 'map_path')
     matches = process(pipeline, route[:30], first=30, poses=True)
     for i, match in enumerate(matches):
-        views.publish(header(i), match, pipeline.operation, 'odom')
+        show(views, header(i), match, pipeline.operation, 'odom')
     accepted = [result.match for result in matches if result.match.accepted]
     lines = publishers.messages('markers')[-1].markers[1]
     assert lines.type == Marker.LINE_LIST
@@ -147,7 +156,7 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
     matches = process(pipeline, route[: LENGTH + 4])
     for i, match in enumerate(matches):
         odometry = np.array([0.1 * i, i, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)])
-        views.publish(header(i), match, pipeline.operation, 'map', odometry)
+        show(views, header(i), match, pipeline.operation, 'map', odometry)
     accepted = [result.match for result in matches if result.match.accepted]
     assert len(accepted) > 2
     lines = publishers.messages('markers')[-1].markers[1]
@@ -158,7 +167,7 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
     pose = pipeline.places.place(accepted[-1].newest).pose
     assert place.x == pose[0]
     assert np.hypot(query.x - place.x, query.y - place.y) == pytest.approx(0.1, abs=1e-6)
-    views.publish(header(99), matches[0], localizing(map_file).operation, 'map', odometry)
+    show(views, header(99), matches[0], localizing(map_file).operation, 'map', odometry)
     assert len(publishers.messages('markers')[-1].markers) == 1  # another map: deleted
 
 
@@ -167,7 +176,7 @@ def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     views, publishers = views_of('map_path')
     for i in range(30, 60):
         (match,) = process(pipeline, route[i : i + 1], i, True)
-        views.publish(header(), match, pipeline.operation, '')
+        show(views, header(), match, pipeline.operation, '')
     sizes = [len(message.poses) for message in publishers.messages('map_path')]
     assert sizes[0] == 31
     assert all(b >= a * GROWTH for a, b in pairwise(sizes))
@@ -177,7 +186,7 @@ def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
 def test_visualization_of_distances_is_the_newest_row(localized):
     pipeline, match = localized
     views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
-    views.publish(header(), match, pipeline.operation, 'map')
+    show(views, header(), match, pipeline.operation, 'map')
     (row,) = publishers.messages('distances')
     assert (row.encoding, row.width) == ('32FC2', 60)
     values, numbers = np.frombuffer(row.data, np.float32).reshape(-1, 2).T
@@ -203,7 +212,7 @@ def test_visualization_of_distances_states_the_places_after_an_eviction():
     views, publishers = views_of('distances')
     recognizer = SimpleNamespace(window_fill=1, newest_row=lambda: row)
     operation = SimpleNamespace(matched_places=route, recognizer=recognizer)
-    views.publish(header(), ImageResult(Match(Status.NO_MATCH)), operation, 'map')
+    show(views, header(), ImageResult(Match(Status.NO_MATCH)), operation, 'map')
     (message,) = publishers.messages('distances')
     values, numbers = np.frombuffer(message.data, np.float32).reshape(-1, 2).T
     assert (message.width, numbers[0]) == (512, 3000)

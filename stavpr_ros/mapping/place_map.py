@@ -393,9 +393,13 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
 
 def encode_thumbnail(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> bytes:
     """Return :func:`thumbnail_of` an image as a JPEG."""
-    small = thumbnail_of(image, width)
-    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-    return cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+    return encode_jpeg(thumbnail_of(image, width), 85)
+
+
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """Return an image, RGB (h, w, 3) uint8, as a JPEG."""
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def decode_thumbnail(content: bytes) -> np.ndarray | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.former import FormerNames
-from stavpr_ros.method import Candidate, Match
+from stavpr_ros.method import Candidate, Match, Status
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,3 +36,9 @@ class ImageResult(FormerNames):
     relative_yaw: float = 0.0
     image: np.ndarray | None = None
     stages: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def own_place(self) -> int:
+        """Return the place that the image has become, or else that it matches; -1 = none."""
+        is_mapped = self.match.status is Status.MAPPED
+        return self.image_index if is_mapped else self.match.newest

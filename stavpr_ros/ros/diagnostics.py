@@ -77,33 +77,8 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
     """Return the numbers behind the messages, by part."""
     counts, settings, info = health.counts, health.settings.pipeline, health.map_info
     backend = settings.matching_backend(health.settings.operation)
-    limit: dict[str, Value]
-    if settings.mode == 'robust' and health.limit is not None:
-        limit = {'min_probability': 1 - health.limit}
-    else:
-        limit = {'threshold': settings.threshold}
-    odometry = health.odometry or 'not needed'
-    if health.odometry and not health.odometry_required:
-        odometry += ', optional'
     return {
-        'input': {
-            'topic': health.input.topic,
-            'transport': health.settings.image_transport,
-            'publishers': health.input.publishers,
-            'publishers_refused': health.input.incompatible,
-            'reliability': health.input.reliability or None,
-            'received': counts.received.count,
-            'missing_by_stamps_estimate': counts.missing.count,
-            f'missing_by_stamps_estimate_{RECENT}s': counts.missing.recent.total(),
-            'rate_in_hz': counts.received.rate,
-            'last_image_age_s': counts.received.age,
-            'gaps': counts.gaps,
-            'longest_gap_s': counts.longest_gap,
-            'jumps_back': counts.jumps_back,
-            'longest_jump_back_s': counts.longest_jump_back,
-            'odometry': odometry,
-            **_drops(counts, of_input=True),
-        },
+        'input': _input_values(health),
         'map': {
             'state': info.state,
             'path': health.map_path or None,
@@ -111,25 +86,7 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             'max_places': settings.max_places,
             'features': info.features,
         },
-        'recognition': {
-            'operation': health.settings.operation,
-            'mode': settings.mode,
-            **limit,
-            'window': health.window,
-            'length': settings.sequence.length,
-            'last_status': counts.status or None,
-            'last_reason': counts.reason or None,
-            'last_newest_index': counts.place if counts.place >= 0 else None,
-            'last_distance': counts.distance,
-            'last_answer_age_s': counts.answered.age,
-            'localized': health.localized,
-            'sends_transform': health.sends_transform,
-            'camera': health.camera,
-            **{_key('edges', source): count for source, count in counts.edges.total.items()},
-            f'edges_dropped_{RECENT}s': counts.edges.recent['dropped'],
-            'last_edge_reason': counts.edge_reason or None,
-            **{_key('statuses', name): count for name, count in counts.answered.total.items()},
-        },
+        'recognition': _recognition_values(health),
         'processing': {
             'state': health.state,
             'uptime_s': counts.uptime,
@@ -144,6 +101,56 @@ def _values(health: Health) -> dict[str, dict[str, Value]]:
             **{_key(name, 'mean_ms'): mean for name, (mean, _) in counts.times.items()},
             **{_key(name, 'max_ms'): largest for name, (_, largest) in counts.times.items()},
         },
+    }
+
+
+def _input_values(health: Health) -> dict[str, Value]:
+    counts, odometry = health.counts, health.odometry or 'not needed'
+    if health.odometry and not health.odometry_required:
+        odometry += ', optional'
+    return {
+        'topic': health.input.topic,
+        'transport': health.settings.image_transport,
+        'publishers': health.input.publishers,
+        'publishers_refused': health.input.incompatible,
+        'reliability': health.input.reliability or None,
+        'received': counts.received.count,
+        'missing_by_stamps_estimate': counts.missing.count,
+        f'missing_by_stamps_estimate_{RECENT}s': counts.missing.recent.total(),
+        'rate_in_hz': counts.received.rate,
+        'last_image_age_s': counts.received.age,
+        'gaps': counts.gaps,
+        'longest_gap_s': counts.longest_gap,
+        'jumps_back': counts.jumps_back,
+        'longest_jump_back_s': counts.longest_jump_back,
+        'odometry': odometry,
+        **_drops(counts, of_input=True),
+    }
+
+
+def _recognition_values(health: Health) -> dict[str, Value]:
+    counts, settings = health.counts, health.settings.pipeline
+    limit: dict[str, Value] = {'threshold': settings.threshold}
+    if settings.mode == 'robust' and health.limit is not None:
+        limit = {'min_probability': 1 - health.limit}
+    return {
+        'operation': health.settings.operation,
+        'mode': str(settings.mode),
+        **limit,
+        'window': health.window,
+        'length': settings.sequence.length,
+        'last_status': counts.status or None,
+        'last_reason': counts.reason or None,
+        'last_newest_index': counts.place if counts.place >= 0 else None,
+        'last_distance': counts.distance,
+        'last_answer_age_s': counts.answered.age,
+        'localized': health.localized,
+        'sends_transform': health.sends_transform,
+        'camera': health.camera,
+        **{_key('edges', source): count for source, count in counts.edges.total.items()},
+        f'edges_dropped_{RECENT}s': counts.edges.recent['dropped'],
+        'last_edge_reason': counts.edge_reason or None,
+        **{_key('statuses', name): count for name, count in counts.answered.total.items()},
     }
 
 

@@ -11,22 +11,14 @@ import traceback
 import numpy as np
 from rclpy.logging import get_logger
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.pipeline.operations import Operation
-from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
-from stavpr_ros.ros.messages import (
-    loop_closure_message,
-    PoseFrames,
-    relative_pose_message,
-    time_message,
-)
+from stavpr_ros.ros.messages import loop_closure_message, Outcome, relative_pose_message
 from stavpr_ros.ros.worker import Worker
 from stavpr_ros.signals import time_left
-from std_msgs.msg import Header
 
 MAX_WAITING = 40  # closures; while there are more, the oldest goes without a relative pose
 UNLIMITED = 2**31  # closures; the thread itself drops the pose of the oldest
@@ -49,7 +41,6 @@ class EdgePublisher:
     Publishes loop closures in their order, each when its edge is ready; images never wait.
 
     :param estimator: makes the edges, on the thread.
-    :param robot_id: the parameter of this name.
     :param publish: called with each closure, on the thread.
     :param statistics: counts the edges by source.
     :param ending: set when the node ends.
@@ -58,54 +49,38 @@ class EdgePublisher:
     def __init__(
         self,
         estimator: EdgeEstimator,
-        robot_id: str,
         publish: Callable[[LoopClosure], None],
         statistics: Statistics,
         ending: threading.Event,
     ) -> None:
-        self._estimator, self._robot_id, self._publish = estimator, robot_id, publish
-        self._statistics = statistics
+        self._estimator, self._publish, self._statistics = estimator, publish, statistics
         self._worker = Worker(self._complete, UNLIMITED, ending, 'edges')
 
     def prepare(
-        self,
-        header: Header,
-        result: ImageResult,
-        operation: Operation,
-        frames: PoseFrames,
-        camera: Camera | None,
+        self, outcome: Outcome, operation: Operation
     ) -> tuple[Edge | None, list[WaitingClosure]]:
         """
         Copy all that edges need, on the thread of the pipeline: the next image changes it.
 
-        :param frames: of the poses of the places and of the odometry.
-        :param camera: of the image; None = unknown.
         :returns: the edge for the message of the match, None without a match; the closures of the
             match and of its late ones.
         """
-        places, edge = operation.matched_places, None
+        own, camera, place_map = outcome.match, outcome.about.camera, outcome.place_map
+        edge: Edge | None = None
         closures: list[WaitingClosure] = []
-        own = result.match
         if not own.accepted:
             return edge, closures
         # a route has the camera of the query
-        place_camera = camera
-        if isinstance(places, PlaceMap):  # there, no match is late
-            place_camera = places.camera_of(own.place)
+        place_camera = camera if place_map is None else place_map.camera_of(own.place)
         for match in (own, *own.late):
-            yaw = result.relative_yaw  # of a map, where no match is late
+            yaw = outcome.result.relative_yaw  # of a map, where no match is late
             pair = operation.matched_pair(match, self._estimator.method, yaw)
             if match is own:
                 edge = self._immediate(pair, camera, place_camera)
             if pair is None:
                 continue
             pose = None if np.isnan(pair.query_pose).any() else pair.query_pose
-            if match.is_late:  # its window may be an earlier one
-                stamp = time_message(match.window_stamps[-1])
-                header = Header(frame_id=header.frame_id, stamp=stamp)
-            message = loop_closure_message(
-                header, match, pair.source, self._robot_id, frames, pose
-            )
+            message = loop_closure_message(outcome, match, pose)
             if message is not None:
                 closures.append(WaitingClosure(message, pair, camera, place_camera))
         return edge, closures

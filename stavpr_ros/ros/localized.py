@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 from rclpy.node import Node
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.result import ImageResult
+from stavpr_ros.ros.messages import Outcome, Places
+from stavpr_ros.ros.output import Publishers
 from stavpr_ros.ros.qos import LATCHED
-from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import Bool, String
 
 TRIAL, CONFIRMATIONS = 5, 3  # images after a match, and how many of them must match near it
@@ -95,14 +95,15 @@ def along_route(places: PlaceMap) -> tuple[Sequence[int] | np.ndarray, int]:
     return positions, 0 if seam is None else len(places) - 1 - seam
 
 
-class LocalizedPublisher:
-    """Publishes ``~/localized`` and ``~/current_node`` when they change; on the worker."""
+class LocalizedPublisher(Publishers):
+    """Publishes ``~/localized`` and ``~/current_node`` when they change."""
 
     def __init__(self, node: Node, settings: NodeSettings) -> None:
-        self._node, self._state = node, Localization(settings)
-        self._localized = node.create_publisher(Bool, '~/localized', LATCHED)
-        self._current_node = node.create_publisher(String, '~/current_node', LATCHED)
-        self._places: PlaceMap | GrowingMap | None = None
+        super().__init__(node)
+        self._state = Localization(settings)
+        self._localized = self._make(Bool, '~/localized', LATCHED)
+        self._current_node = self._make(String, '~/current_node', LATCHED)
+        self._places: Places = None
         self._route: tuple[Sequence[int] | np.ndarray, int] = (), 0
         self._published: tuple[bool | None, str] = (None, '')
         self._publish(NOWHERE)
@@ -112,34 +113,25 @@ class LocalizedPublisher:
         """Whether the robot is localized."""
         return self._state.is_localized
 
-    def publish(
-        self,
-        result: ImageResult,
-        places: PlaceMap | GrowingMap | None,
-        odometry: np.ndarray | None,
-    ) -> None:
-        """
-        Publish what an image has changed; a robot is localized on a map only, not on a route.
-
-        :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
-        """
-        if places is not self._places:
+    def publish(self, outcome: Outcome) -> None:
+        """Publish what an image has changed; a robot is localized on a map, not on a route."""
+        place_map, match = outcome.place_map, outcome.match
+        if outcome.places is not self._places:
             self.reset()
-            self._places = places
-            if isinstance(places, PlaceMap):
-                self._route = along_route(places)
-        if result.cause or not isinstance(places, PlaceMap):
+            self._places = outcome.places
+            if place_map is not None:
+                self._route = along_route(place_map)
+        if outcome.result.cause or place_map is None:
             return
-        position = None if odometry is None else odometry[:3]
+        pose = outcome.about.pose
+        position = None if pose is None else pose[:3]
         positions, lap = self._route
-        match = result.match
         along = int(positions[match.newest]) if match.accepted else -1
         self._state.update(along, match.probability, position, lap)
         if not self.is_localized:
             self._publish(NOWHERE)
-        elif match.accepted:
-            place = places.place(match.newest)
-            self._publish(place.identifier or str(match.newest))
+        elif outcome.newest is not None:
+            self._publish(outcome.newest.identifier or str(match.newest))
 
     def reset(self) -> None:
         """Be not localized: another map, or the window was emptied."""
@@ -150,13 +142,11 @@ class LocalizedPublisher:
     def close(self) -> None:
         """Destroy the publishers, and release the map."""
         self._places = None
-        for publisher in (self._localized, self._current_node):
-            self._node.destroy_publisher(publisher)
+        super().close()
 
     def _publish(self, current_node: str) -> None:
         last, self._published = self._published, (self.is_localized, current_node)
-        with until_shutdown(self._node):
-            if last[0] is not self.is_localized:
-                self._localized.publish(Bool(data=self.is_localized))
-            if last[1] != current_node:
-                self._current_node.publish(String(data=current_node))
+        if last[0] is not self.is_localized:
+            self._send(self._localized, Bool(data=self.is_localized))
+        if last[1] != current_node:
+            self._send(self._current_node, String(data=current_node))

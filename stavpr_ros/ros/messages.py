@@ -5,10 +5,12 @@
 import array
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 import importlib.util
 import math
 from pathlib import Path
 import re
+from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
@@ -31,12 +33,12 @@ from stavpr_msgs.msg import (
     RelativePose,
 )
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, Place, PlaceMap
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.mapping.transforms import turned
-from stavpr_ros.method import Match, Status
+from stavpr_ros.method import Match
+from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.sources.frame import ImageRecord
@@ -51,31 +53,95 @@ BESIDE = (
 
 
 @dataclass(frozen=True)
-class PoseFrames:
+class Surroundings:
     """
-    Names of frames, '' = unknown.
+    What is known of an image beside its message; '' and None = unknown.
 
     :param frame: of the poses of the places.
-    :param child: of the base, whose poses they are.
-    :param odometry: of the poses of the odometry.
+    :param child: frame of the base, whose poses they are.
+    :param odometry_frame: of the poses of the odometry.
+    :param pose: of the base at the stamp of the image, from odometry, shape (7,).
+    :param camera: of the image.
     """
 
     frame: str = ''
     child: str = ''
-    odometry: str = ''
+    odometry_frame: str = ''
+    pose: np.ndarray | None = None
+    camera: Camera | None = None
 
 
-NO_FRAMES = PoseFrames()
+NOTHING_KNOWN = Surroundings()
 # copied and shared, never changed: rosidl makes all messages of a message to construct it
 NO_EDGE = RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_error=math.nan)
-_NO_MATCH = PlaceMatch(
-    sequence_first=-1,
-    sequence_last=-1,
-    sequence_middle=-1,
-    second_best_index=-1,
-    second_best_distance=math.nan,
-    relative_pose=NO_EDGE,
-)
+_NO_MATCH = PlaceMatch(relative_pose=NO_EDGE)
+
+Message = TypeVar('Message')
+Places = PlaceMap | GrowingMap | None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    All that is published of one image.
+
+    :param header: of the image.
+    :param places: the map, or the route, that the indices of the match refer to.
+    :param about: what is known of the image beside.
+    :param robot_id: the parameter of this name.
+    :param edge: of the middle pair, None = none.
+    """
+
+    header: Header
+    result: ImageResult
+    places: Places = None
+    about: Surroundings = NOTHING_KNOWN
+    robot_id: str = ''
+    edge: Edge | None = None
+
+    @property
+    def match(self) -> Match:
+        """Return the match of the image."""
+        return self.result.match
+
+    @property
+    def map_id(self) -> str:
+        """Return the map that indices refer to, '' = it is in no file."""
+        return '' if self.places is None else self.places.map_id
+
+    @property
+    def place_map(self) -> PlaceMap | None:
+        """Return the map that the image was matched with; None = a route."""
+        return self.places if isinstance(self.places, PlaceMap) else None
+
+    @cached_property
+    def newest(self) -> Place | None:
+        """Return the place of the newest image; None without a match."""
+        if self.places is None or not self.match.accepted:
+            return None
+        return self.places.place(self.match.newest)
+
+    @property
+    def newest_pose(self) -> np.ndarray | None:
+        """Return the pose of the robot at the place of the newest image, (7,); None = unknown."""
+        if self.newest is None or self.newest.pose is None:
+            return None
+        return turned(self.newest.pose, self.result.relative_yaw)
+
+
+def filled(message: Message, *sources: object, **fields: Any) -> Message:
+    """
+    Set the fields of a message, and return it.
+
+    :param sources: objects; a field is the attribute of its name of the first that has one.
+    :param fields: the exceptions, by name.
+    """
+    for name in message.get_fields_and_field_types():  # type: ignore[attr-defined]
+        if name in fields:
+            setattr(message, name, fields[name])
+        elif (source := next((each for each in sources if hasattr(each, name)), None)) is not None:
+            setattr(message, name, getattr(source, name))
+    return message
 
 
 def time_message(nanoseconds: int) -> Time:
@@ -98,151 +164,122 @@ def pose_message(pose: np.ndarray) -> Pose:
     return message
 
 
-def origin(robot_id: str, places: PlaceMap | GrowingMap | None) -> dict[str, str]:
-    """Return the fields that name the robot, and the map that indices refer to."""
-    return {'robot_id': robot_id, 'map_id': '' if places is None else places.map_id}
-
-
-def match_message(
-    header: Header,
-    result: ImageResult,
-    places: PlaceMap | GrowingMap | None = None,
-    robot_id: str = '',
-    edge: Edge | None = None,
-    frame: str = '',
-) -> PlaceMatch:
-    """
-    Return the message of a result.
-
-    :param places: the map that the indices of the match refer to.
-    :param robot_id: the parameter of this name.
-    :param edge: of the middle pair, None = none; frame: of the base.
-    """
-    match, path = result.match, result.match.path
-    message = copy(_NO_MATCH)
-    message.header, message.robot_id = header, robot_id
-    message.map_id = '' if places is None else places.map_id
-    message.status, message.reason = match.status, match.reason
-    message.place_index = match.place
-    is_mapped = match.status is Status.MAPPED
-    message.newest_index = result.image_index if is_mapped else match.newest
-    message.distance, message.threshold = match.distance, match.threshold
-    message.probability, message.inliers = match.probability, match.inliers
-    message.window_first = message.window_middle = message.window_last = header.stamp
-    if match.window_stamps:
-        stamps = match.window_stamps
-        message.window_first = time_message(stamps[0])
-        message.window_middle = time_message(stamps[(len(stamps) - 1) // 2])
-    if path.place >= 0:
-        message.sequence_first, message.sequence_last = path.first, path.last
-        message.sequence_middle, message.direction = path.place, path.direction
-        message.path_probabilities = match.path_probabilities.tolist()
-        message.path = [AlignedPair(query_index=q, place_index=m) for q, m in path.pairs.tolist()]
-        message.second_best_index = path.second_best
-        message.second_best_distance = path.second_best_distance
-    if match.accepted and places is not None:
-        place, newest = places.place(match.place), places.place(match.newest)
-        message.place_stamp, message.place_id = time_message(place.stamp), place.identifier
-        message.session, message.relative_yaw = place.session, result.relative_yaw
-        session = places.session(match.place) if isinstance(places, PlaceMap) else None
-        message.camera = session.camera if session is not None else ''
-        message.newest_stamp, message.newest_id = time_message(newest.stamp), newest.identifier
-        if edge is not None:
-            message.has_relative_pose = edge.has_pose
-            first, length = match.first_image, len(match.window_stamps)
-            pair = AlignedPlaces(
-                query_index=first + (length - 1) // 2 if first >= 0 else -1,
-                query_stamp=message.window_middle,
-                place_index=message.place_index,
-                place_stamp=message.place_stamp,
-            )
-            message.relative_pose = relative_pose_message(edge, pair, frame)
+def match_message(outcome: Outcome) -> PlaceMatch:
+    """Return the message of a result."""
+    header, match, places = outcome.header, outcome.match, outcome.places
+    path, stamps = match.path, match.window_stamps
+    middle = (len(stamps) - 1) // 2
+    message = filled(
+        copy(_NO_MATCH),
+        match,
+        outcome,
+        place_index=match.place,
+        newest_index=outcome.result.own_place,
+        window_first=time_message(stamps[0]) if stamps else header.stamp,
+        window_middle=time_message(stamps[middle]) if stamps else header.stamp,
+        window_last=header.stamp,
+        sequence_first=path.first,
+        sequence_last=path.last,
+        sequence_middle=path.place,
+        direction=path.direction if path.place >= 0 else 0,
+        path_probabilities=match.path_probabilities.tolist(),
+        path=[AlignedPair(query_index=q, place_index=m) for q, m in path.pairs.tolist()],
+        second_best_index=path.second_best,
+        second_best_distance=path.second_best_distance,
+        relative_yaw=outcome.result.relative_yaw,
+    )
+    if (newest := outcome.newest) is None or places is None:
+        return message
+    session = places.session(match.place) if isinstance(places, PlaceMap) else None
+    filled(
+        message,
+        **_names(places.place(match.place)),
+        camera='' if session is None else session.camera,
+        newest_stamp=time_message(newest.stamp),
+        newest_id=newest.identifier,
+    )
+    if (edge := outcome.edge) is not None:
+        message.has_relative_pose = edge.has_pose
+        pair = _aligned(match, places, middle, match.place)
+        message.relative_pose = relative_pose_message(edge, pair, outcome.about.child)
     return message
 
 
-def candidates_message(
-    header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None, robot_id: str = ''
-) -> PlaceCandidates | None:
+def _aligned(match: Match, places: PlaceMap | GrowingMap, query: int, place: int) -> AlignedPlaces:
+    """Return an image of the window with a place; on a route, the image is a place as well."""
+    first = match.first_image
+    stamp = places.place(first + query).stamp if first >= 0 else match.window_stamps[query]
+    return AlignedPlaces(
+        query_index=first + query if first >= 0 else -1,
+        query_stamp=time_message(stamp),
+        place_index=place,
+        place_stamp=time_message(places.place(place).stamp),
+        query_change=match.window_changes[query] if match.window_changes else math.nan,
+    )
+
+
+def _names(place: Place) -> dict[str, Any]:
+    """Return the fields that name a place beside its index."""
+    stamp = time_message(place.stamp)
+    return {'place_stamp': stamp, 'place_id': place.identifier, 'session': place.session}
+
+
+def candidates_message(outcome: Outcome) -> PlaceCandidates | None:
     """Return the message of the candidates of a match, None without any."""
+    result, places = outcome.result, outcome.places
     if not result.candidates or places is None:
         return None
-    message = PlaceCandidates(
-        header=header, **origin(robot_id, places), threshold=result.match.threshold
-    )
-    message.session_probabilities = list(result.session_probabilities)
-    for candidate in result.candidates:
-        place = places.place(candidate.place)
-        message.candidates.append(
-            PlaceCandidate(
-                place_index=candidate.place,
-                distance=candidate.distance,
-                probability=candidate.probability,
-                place_stamp=time_message(place.stamp),
-                place_id=place.identifier,
-                session=place.session,
-            )
+    candidates = [
+        filled(
+            PlaceCandidate(),
+            candidate,
+            place_index=candidate.place,
+            **_names(places.place(candidate.place)),
         )
-    return message
+        for candidate in result.candidates
+    ]
+    return filled(
+        PlaceCandidates(), outcome, result.match,
+        candidates=candidates, session_probabilities=list(result.session_probabilities),
+    )  # fmt: skip
 
 
 def loop_closure_message(
-    header: Header,
-    match: Match,
-    places: PlaceMap | GrowingMap | None,
-    robot_id: str = '',
-    frames: PoseFrames = NO_FRAMES,
-    query_pose: np.ndarray | None = None,
+    outcome: Outcome, match: Match, query_pose: np.ndarray | None = None
 ) -> LoopClosure | None:
     """
     Return the loop closure of a match, without its edge; None without a match.
 
-    :param places: the route, whose places the images of the window are, or a map.
-    :param robot_id: the parameter of this name; sessions of several robots' maps are named so.
+    The images of the window are places of a route, or the places are of a map. Sessions of the
+    maps of several robots are named by their ``robot_id``.
+
+    :param match: of the image, or one of its late ones.
     :param query_pose: of the odometry, at the image that matched, shape (7,); for maps only, a
         route has it.
     """
+    places, about = outcome.places, outcome.about
     if not match.accepted or places is None:
         return None
-    first = match.first_image
-    is_route = first >= 0
-    stamps = match.window_stamps
-    pairs = [
-        AlignedPlaces(
-            query_index=first + q if is_route else -1,
-            query_stamp=time_message(places.place(first + q).stamp if is_route else stamps[q]),
-            place_index=m,
-            place_stamp=time_message(places.place(m).stamp),
-            query_change=match.window_changes[q] if match.window_changes else math.nan,
-        )
-        for q, m in match.path.pairs.tolist()
-    ]
-    middle = match.position
-    query_stamp, query_frame = stamps[middle], frames.odometry
-    place = places.place(match.place)
-    if is_route:
-        own = places.place(first + middle)
-        query_stamp, query_pose, query_frame = own.stamp, own.pose, frames.frame
-    message = LoopClosure(
+    header, place, is_route = outcome.header, places.place(match.place), match.first_image >= 0
+    if match.is_late:  # its window may be an earlier one
+        header = Header(frame_id=header.frame_id, stamp=time_message(match.window_stamps[-1]))
+    message = filled(
+        LoopClosure(),
+        _aligned(match, places, match.position, match.place),
+        match,
+        outcome,
         header=header,
-        **origin(robot_id, places),
-        query_index=first + middle if is_route else -1,
-        query_stamp=time_message(query_stamp),
-        is_late=match.is_late,
-        query_session=robot_id,
-        place_session=robot_id if is_route else place.session,
-        place_index=match.place,
-        place_stamp=time_message(place.stamp),
-        distance=match.distance,
-        threshold=match.threshold,
-        probability=match.probability,
-        inliers=match.inliers,
+        query_session=outcome.robot_id,
+        place_session=outcome.robot_id if is_route else place.session,
         relative_pose=NO_EDGE,
-        pairs=pairs,
+        pairs=[_aligned(match, places, q, m) for q, m in match.path.pairs.tolist()],
     )
+    if is_route:
+        query_pose = places.place(match.first_image + match.position).pose
     if query_pose is not None and place.pose is not None:
         message.has_poses = True
-        message.pose_frame, message.pose_child_frame = frames.frame, frames.child
-        message.query_pose_frame = query_frame
+        message.pose_frame, message.pose_child_frame = about.frame, about.child
+        message.query_pose_frame = about.frame if is_route else about.odometry_frame
         message.query_pose, message.place_pose = pose_message(query_pose), pose_message(place.pose)
     return message
 
@@ -251,27 +288,17 @@ def relative_pose_message(
     edge: Edge, pair: AlignedPlaces | LoopClosure, frame: str
 ) -> RelativePose:
     """Return an edge as a message, with the indices and stamps of a pair; frame: of the base."""
-    message = copy(NO_EDGE)
-    message.source, message.reason, message.frame = edge.source, edge.reason, frame
-    message.query_index, message.query_stamp = pair.query_index, pair.query_stamp
-    message.place_index, message.place_stamp = pair.place_index, pair.place_stamp
-    message.is_independent, message.inliers = edge.independent, edge.inliers
-    message.reprojection_error = edge.error
+    pose = NO_EDGE.pose
     if edge.has_pose or edge.pose[6] != 1:  # the mountings may turn one without a pose
         covariance = edge.covariance.ravel()
-        message.pose = PoseWithCovariance(pose=pose_message(edge.pose), covariance=covariance)
-    return message
+        pose = PoseWithCovariance(pose=pose_message(edge.pose), covariance=covariance)
+    return filled(
+        copy(NO_EDGE), edge, pair,
+        frame=frame, pose=pose, is_independent=edge.independent, reprojection_error=edge.error,
+    )  # fmt: skip
 
 
-def newest_pose(result: ImageResult, places: PlaceMap | GrowingMap) -> np.ndarray | None:
-    """Return the pose of the robot at the place of the newest image, (7,); None = unknown."""
-    pose = places.place(result.match.newest).pose if result.match.accepted else None
-    return None if pose is None else turned(pose, result.relative_yaw)
-
-
-def matched_pose_message(
-    header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None, frame: str
-) -> PoseWithCovarianceStamped | None:
+def matched_pose_message(outcome: Outcome) -> PoseWithCovarianceStamped | None:
     """
     Return the pose of the place of the newest image; None without a match or a known pose.
 
@@ -279,30 +306,26 @@ def matched_pose_message(
     variances over the poses of the two places before and after it in its session, rotation vectors
     about the axes of the map, at least (0.1 m)^2 and (0.1 rad)^2, and, across the path, the
     variance of the lateral offset from it, which is not observed.
-
-    :param frame: of the poses of the map.
     """
-    if not result.match.accepted or places is None:
+    place, pose, places = outcome.newest, outcome.newest_pose, outcome.places
+    if place is None or place.pose is None or pose is None or places is None:
         return None
-    newest, pose = result.match.newest, newest_pose(result, places)
-    if pose is None:
-        return None
-    first = places.first if isinstance(places, GrowingMap) else 0
+    newest, first = outcome.match.newest, getattr(places, 'first', 0)  # of a route
     around = range(max(first, newest - 2), min(first + len(places), newest + 3))
-    session, near_by = places.place(newest).session, [places.place(i) for i in around]
-    near = np.array([p.pose for p in near_by if p.pose is not None and p.session == session])
+    near_by = [places.place(i) for i in around]
+    near = np.array([p.pose for p in near_by if p.pose is not None and p.session == place.session])
     from scipy.spatial.transform import Rotation
 
-    own = turned(pose, -result.relative_yaw)  # of the place
-    turns = Rotation.from_quat(near[:, 3:]) * Rotation.from_quat(own[3:]).inv()
+    own = Rotation.from_quat(place.pose[3:])
+    turns = Rotation.from_quat(near[:, 3:]) * own.inv()
     variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
     message = PoseWithCovarianceStamped()
-    message.header.stamp, message.header.frame_id = header.stamp, frame
+    message.header.stamp, message.header.frame_id = outcome.header.stamp, outcome.about.frame
     message.pose.pose = pose_message(pose)
     covariance = np.diag(np.maximum(variances, MIN_VARIANCE))
     x, y = near[-1, :2] - near[0, :2]
     if math.hypot(x, y) < SHORT:  # the robot was at rest: across the view
-        x, y = Rotation.from_quat(own[3:]).apply((1.0, 0.0, 0.0))[:2]
+        x, y = own.apply((1.0, 0.0, 0.0))[:2]
     across = np.array([-y, x]) / max(math.hypot(x, y), 1e-9)
     covariance[:2, :2] += BESIDE**2 * np.outer(across, across)
     message.pose.covariance = covariance.ravel()
@@ -320,18 +343,11 @@ def image_message(header: Header, image: np.ndarray, encoding: str = 'rgb8') -> 
 
 def record_message(record: ImageRecord) -> Image:
     """Return the message of a record, with the recorded header."""
-    message = Image(
-        header=Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id),
-        height=record.height,
-        width=record.width,
-        encoding=record.encoding,
-        is_bigendian=int(record.is_bigendian),
-        step=record.step,
-    )
     data = array.array('B')  # the one type that rclpy does not check byte by byte
     data.frombytes(memoryview(record.data).cast('B'))
-    message.data = data
-    return message
+    header = Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id)
+    is_bigendian = int(record.is_bigendian)
+    return filled(Image(), record, header=header, is_bigendian=is_bigendian, data=data)
 
 
 def odometry_pose(message: Odometry) -> np.ndarray:
@@ -372,32 +388,23 @@ def camera_of(info: CameraInfo, mount: tuple[float, ...]) -> Camera:
     )
 
 
-def map_info_message(
-    operation: str,
-    state: str,
-    path: str,
-    places: PlaceMap | GrowingMap | None,
-    extractor: FeatureExtractor | None,
-    stamp: Time,
-    robot_id: str = '',
-) -> MapInfo:
+def map_info_message(pipeline: Pipeline, robot_id: str, stamp: Time) -> MapInfo:
     """Return the description of the map in use."""
+    operation, places = pipeline.operation, pipeline.places
     message = MapInfo(
         header=Header(stamp=stamp),
-        **origin(robot_id, places),
-        operation=operation,
-        state=state,
-        path=path,
+        robot_id=robot_id,
+        operation=operation.name,
+        state=operation.map_state,
+        path=pipeline.save_state.path,
         format_version=VERSION,
     )
-    if extractor is not None:
-        settings = extractor.settings
-        message.features, message.settings = settings.kind, settings.to_json()
-        message.feature_version = settings.feature_version
-        message.strips = settings.strips
+    if operation.extractor is not None:
+        settings = operation.extractor.settings
+        filled(message, settings, features=settings.kind, settings=settings.to_json())
         message.projected = settings.projection is not None
     if places is not None:
-        message.places = len(places)
+        message.map_id, message.places = places.map_id, len(places)
         message.sessions = [session.id for session in places.sessions]
         if len(places):
             message.dimension = places.dimension

@@ -11,15 +11,13 @@ import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.method import Status
 from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.ros.messages import matched_pose_message, newest_pose, transform_message
-from stavpr_ros.ros.rclpy_workarounds import until_shutdown
+from stavpr_ros.ros.messages import matched_pose_message, Outcome, transform_message
+from stavpr_ros.ros.output import Publishers
 from stavpr_ros.ros.worker import Beat
-from std_msgs.msg import Header
 
 # (0.5 m)^2 and (15 degrees)^2, as RViz's 2D Pose Estimate: a place does not determine the lateral
 # offset from the mapped route
@@ -28,7 +26,7 @@ TF_DEPTH = 100  # as tf2_ros has it
 TF_PERIOD = 0.05  # seconds, as RTAB-Map repeats it
 
 
-class Navigation:
+class Navigation(Publishers):
     """
     Publishes ``map -> odom`` on ``/tf``, and ``initialpose`` once per relocalization.
 
@@ -40,7 +38,8 @@ class Navigation:
     """
 
     def __init__(self, node: Node, settings: NodeSettings) -> None:
-        self._node, self._settings = node, settings
+        super().__init__(node)
+        self._settings = settings
         self._tf: Any = None
         self._beat: Beat | None = None
         self._initial_pose: Any = None
@@ -50,72 +49,59 @@ class Navigation:
         self._stamp: Time | None = None  # of the last transform
         if settings.publish_tf:
             self._tf_message = tf_message()
-            self._tf = node.create_publisher(self._tf_message, '/tf', TF_DEPTH)
+            self._tf = self._make(self._tf_message, '/tf', TF_DEPTH)
             self._beat = Beat(node, TF_PERIOD, self.repeat, 'tf')
         if settings.publish_initialpose:
-            self._initial_pose = node.create_publisher(PoseWithCovarianceStamped, 'initialpose', 1)
+            self._initial_pose = self._make(PoseWithCovarianceStamped, 'initialpose')
         self._unmatched = settings.pipeline.sequence.length  # images since the last match
         self._places: PlaceMap | None = None
 
     @property
     def sends_transform(self) -> bool:
         """Whether the transform is being sent: there was a match since :meth:`forget`."""
-        return self._transform is not None and self._tf is not None
+        return self._transform is not None
 
-    def publish(
-        self,
-        header: Header,
-        result: ImageResult,
-        places: PlaceMap | GrowingMap | None,
-        odometry: np.ndarray | None,
-        odometry_frame: str,
-    ) -> None:
-        """
-        Publish transform and initial pose, in operation localization; on the worker.
-
-        :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
-        """
-        if places is not self._places:
+    def publish(self, outcome: Outcome) -> None:
+        """Publish transform and initial pose, in operation localization."""
+        match, place_map = outcome.match, outcome.place_map
+        if outcome.places is not self._places:
             self.forget()
-            self._places = places if isinstance(places, PlaceMap) else None
-        if result.cause or not isinstance(places, PlaceMap):
+            self._places = place_map
+        if outcome.result.cause or place_map is None:
             return
-        map_frame = self._settings.map_frame
-        pose = newest_pose(result, places)
         # a whole window without a match, or a new window
         length = self._settings.pipeline.sequence.length
         is_lost = self._unmatched >= length - 1
-        if result.match.status is Status.WARMING_UP:
+        if match.status is Status.WARMING_UP:
             self._unmatched = length
         else:
-            self._unmatched = 0 if result.match.accepted else self._unmatched + 1
-        if pose is not None and odometry is not None:
-            transform = transform_message(
-                map_to_odometry(pose, odometry), map_frame, odometry_frame
-            )
+            self._unmatched = 0 if match.accepted else self._unmatched + 1
+        pose, about = outcome.newest_pose, outcome.about
+        if self._tf is not None and pose is not None and about.pose is not None:
+            shift = map_to_odometry(pose, about.pose)
+            transform = transform_message(shift, about.frame, about.odometry_frame)
             with self._lock:
                 if self._transform is None:  # from the image on, not from the tolerance on
-                    self._send(transform, header.stamp)
+                    self._send_transform(transform, outcome.header.stamp)
                 self._transform = transform
             self.repeat()
-        message = matched_pose_message(header, result, places, map_frame) if is_lost else None
-        if self._initial_pose is not None and message is not None:
-            with until_shutdown(self._node):
-                self._initial_pose.publish(planar(message))
+        if self._initial_pose is None or not is_lost:
+            return
+        if (message := matched_pose_message(outcome)) is not None:
+            self._send(self._initial_pose, planar(message))
 
     def repeat(self) -> None:
         """Send the last transform, if any, for the time until the next one."""
         with self._lock:
             if self._transform is not None:
                 now = self._node.get_clock().now()
-                self._send(self._transform, (now + self._tolerance).to_msg())
+                self._send_transform(self._transform, (now + self._tolerance).to_msg())
 
-    def _send(self, transform: TransformStamped, stamp: Time) -> None:
-        if self._tf is None or stamp == self._stamp:  # tf2 refuses a stamp twice: a paused clock
+    def _send_transform(self, transform: TransformStamped, stamp: Time) -> None:
+        if stamp == self._stamp:  # tf2 refuses a stamp twice: a paused clock
             return
         self._stamp = transform.header.stamp = stamp
-        with until_shutdown(self._node):
-            self._tf.publish(self._tf_message(transforms=[transform]))
+        self._send(self._tf, self._tf_message(transforms=[transform]))
 
     def forget(self) -> None:
         """Send no transform until the next match: another map, or the node is deactivated."""
@@ -128,8 +114,7 @@ class Navigation:
         if self._beat is not None:
             self._beat.stop()
         self._places = None
-        for publisher in filter(None, (self._tf, self._initial_pose)):
-            self._node.destroy_publisher(publisher)
+        super().close()
 
 
 def map_to_odometry(place: np.ndarray, odometry: np.ndarray) -> np.ndarray:

@@ -328,16 +328,17 @@ class PlaceRecognitionNode(ManagedNode):
                 throttle_duration_sec=NAMESAKE_PERIOD,
             )
         camera = self.resolve_topic_name('image')
-        health = Health(
+        runtime = self._runtime
+        parts = {} if runtime is None else runtime.state()
+        parts['problem'] = self.problem or parts.get('problem', '')
+        return Health(
             state=self.state,
-            problem=self.problem,
             hardware_id=f'{self.settings.robot_id} {camera}'.lstrip(),
             settings=self.settings,
             counts=self.statistics.counts(),
             map_info=self._map_info.last or MapInfo(state='none'),
+            **parts,
         )
-        runtime = self._runtime
-        return health if runtime is None else runtime.complete(health)
 
     def _publish_map_info(self, state: str = '', path: str = '') -> None:
         """Publish the state of a node that is not configured, or '' = the map in use, if any."""

@@ -13,55 +13,90 @@ from rclpy.publisher import Publisher
 from rclpy.qos import qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch
-from stavpr_ros.mapping import GrowingMap, PlaceMap
 from stavpr_ros.pipeline.overlay import draw_match
-from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.relative_pose.pair import Edge
 from stavpr_ros.ros.messages import (
     candidates_message,
     image_message,
     match_message,
     matched_pose_message,
-    NO_FRAMES,
-    PoseFrames,
+    Outcome,
 )
 from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
-from std_msgs.msg import Float32, Header, Int32
+from std_msgs.msg import Float32, Int32
 
 DEPTH = 50  # matches kept for slower subscribers
 IMAGE_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def is_requested(node: Node, publisher: Publisher) -> bool:
-    """Return whether a topic has a subscriber; not after the shutdown of ROS."""
-    requested = False
-    with until_shutdown(node):
-        requested = publisher.get_subscription_count() > 0
-    return requested
+class Publishers:
+    """Publishers of the outcome of each image, which are made and destroyed together."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._create: Callable[..., Any] = node.create_publisher
+        self._destroy: Callable[[Any], object] = node.destroy_publisher
+        self._publishers: list[Publisher] = []
+
+    def publish(self, outcome: Outcome) -> None:
+        """Publish the outcome of an image; on the worker."""
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Let nothing before the next image count: the window was emptied."""
+
+    def forget(self) -> None:
+        """Let nothing before count: another map, or the node is deactivated."""
+        self.reset()
+
+    def close(self) -> None:
+        """Destroy the publishers, and release the map."""
+        for publisher in self._publishers:
+            self._destroy(publisher)
+
+    def _make(
+        self, kind: type, topic: str, qos: QoSProfile | int = 1, **options: Any
+    ) -> Publisher:
+        """Make the publisher of a topic."""
+        self._publishers.append(self._create(kind, topic, qos, **options))
+        return self._publishers[-1]
+
+    def _send(self, publisher: Publisher, message: Any) -> None:
+        """Publish a message; not after the shutdown of ROS."""
+        with until_shutdown(self._node):
+            publisher.publish(message)
+
+    def _is_requested(self, *publishers: Publisher) -> bool:
+        """Return whether one of these topics has a subscriber; not after the shutdown of ROS."""
+        requested = False
+        with until_shutdown(self._node):
+            requested = any(each.get_subscription_count() for each in publishers)
+        return requested
 
 
-class Output:
+class Output(Publishers):
     """
-    The publishers of matches.
+    The publishers of matches, and of loop closures, which wait for their edges.
 
     :param burst: matches that may be published at once.
-    :param robot_id: the parameter of this name.
     """
 
-    def __init__(self, node: ManagedNode, burst: int, robot_id: str) -> None:
-        self._node, self._robot_id = node, robot_id
-        self._qos = QoSProfile(depth=max(DEPTH, burst), reliability=ReliabilityPolicy.RELIABLE)
-        self._publishers: list[Any] = []
-        self.match = self._publisher(PlaceMatch, '~/match')
-        self.place_index = self._publisher(Int32, '~/place_index')
-        self.distance = self._publisher(Float32, '~/distance')
-        self.candidates = self._publisher(PlaceCandidates, '~/candidates')
-        self.pose = self._publisher(PoseWithCovarianceStamped, '~/pose')
-        self.loop_closure = self._publisher(LoopClosure, '~/loop_closure')
-        self.match_image = self._publisher(Image, '~/match_image', IMAGE_QOS)
+    def __init__(self, node: ManagedNode, burst: int) -> None:
+        super().__init__(node)
+        self._create = node.create_lifecycle_publisher
+        self._destroy = node.destroy_lifecycle_publisher
+        qos = QoSProfile(depth=max(DEPTH, burst), reliability=ReliabilityPolicy.RELIABLE)
+        self._match = self._make(PlaceMatch, '~/match', qos)
+        self._place_index = self._make(Int32, '~/place_index', qos)
+        self._distance = self._make(Float32, '~/distance', qos)
+        self._candidates = self._make(PlaceCandidates, '~/candidates', qos)
+        self._pose = self._make(PoseWithCovarianceStamped, '~/pose', qos)
+        self._loop_closure = self._make(LoopClosure, '~/loop_closure', qos)
+        self._match_image = self._make(Image, '~/match_image', IMAGE_QOS)
 
-    def _publisher(self, message_type: type, topic: str, qos: QoSProfile | None = None) -> Any:
+    def _make(
+        self, kind: type, topic: str, qos: QoSProfile | int = 1, **options: Any
+    ) -> Publisher:
         def on_incompatible(event: Any) -> None:
             policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
             self._node.get_logger().warning(
@@ -70,56 +105,34 @@ class Output:
             )
 
         events = PublisherEventCallbacks(incompatible_qos=on_incompatible)
-        publisher = self._node.create_lifecycle_publisher(
-            message_type, topic, qos or self._qos, event_callbacks=events
-        )
-        self._publishers.append(publisher)
-        return publisher
+        return super()._make(kind, topic, qos, event_callbacks=events, **options)
 
-    def publish(
-        self,
-        header: Header,
-        result: ImageResult,
-        places: PlaceMap | GrowingMap | None = None,
-        frames: PoseFrames = NO_FRAMES,
-        edge: Edge | None = None,
-    ) -> PlaceMatch:
-        """
-        Publish the results for one image, ``~/match`` last; return that message.
+    @property
+    def needs_candidates(self) -> bool:
+        """Whether candidates have a subscriber."""
+        return self._is_requested(self._candidates)
 
-        Loop closures are not among them: they wait for their edges.
-
-        :param places: the map that the indices of the match refer to.
-        :param frames: of its poses.
-        :param edge: of the middle pair, None = none.
-        """
-        robot_id = self._robot_id
-        message = match_message(header, result, places, robot_id, edge, frames.child)
-        pose = matched_pose_message(header, result, places, frames.frame)
-        candidates = candidates_message(header, result, places, robot_id)
-        with until_shutdown(self._node):
-            if result.match.accepted and self.place_index.get_subscription_count():
-                self.place_index.publish(Int32(data=message.place_index))
-            if result.match.accepted and self.distance.get_subscription_count():
-                self.distance.publish(Float32(data=message.distance))
-            if pose is not None:
-                self.pose.publish(pose)
-            if candidates is not None:
-                self.candidates.publish(candidates)
-            if result.image is not None and self.match_image.get_subscription_count():
-                self.match_image.publish(image_message(header, draw_match(result, places)))
-            self.match.publish(message)
-        return message
+    def publish(self, outcome: Outcome) -> None:
+        """Publish the results for one image, ``~/match`` last."""
+        result = outcome.result
+        message = match_message(outcome)
+        pose, candidates = matched_pose_message(outcome), candidates_message(outcome)
+        if result.match.accepted and self._is_requested(self._place_index):
+            self._send(self._place_index, Int32(data=message.place_index))
+        if result.match.accepted and self._is_requested(self._distance):
+            self._send(self._distance, Float32(data=message.distance))
+        if pose is not None:
+            self._send(self._pose, pose)
+        if candidates is not None:
+            self._send(self._candidates, candidates)
+        if result.image is not None and self._is_requested(self._match_image):
+            image = draw_match(result, outcome.places)
+            self._send(self._match_image, image_message(outcome.header, image))
+        self._send(self._match, message)
 
     def publish_closure(self, message: LoopClosure) -> None:
         """Publish a loop closure."""
-        with until_shutdown(self._node):
-            self.loop_closure.publish(message)
-
-    def close(self) -> None:
-        """Destroy the publishers."""
-        for publisher in self._publishers:
-            self._node.destroy_lifecycle_publisher(publisher)
+        self._send(self._loop_closure, message)
 
 
 class MapInfoPublisher:

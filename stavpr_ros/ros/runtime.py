@@ -4,17 +4,14 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 import time
 import traceback
 from typing import Any
 
-import numpy as np
-from stavpr_msgs.msg import MapInfo, PlaceMatch
-from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import GrowingMap, PlaceMap
-from stavpr_ros.mapping.camera import Camera, FORWARD, mount_of, yaw_of
+from stavpr_msgs.msg import MapInfo
+from stavpr_ros.mapping import GrowingMap
 from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline import LoadedMap, NodeSettings, Pipeline, read_map
 from stavpr_ros.pipeline.result import ImageResult
@@ -26,30 +23,19 @@ from stavpr_ros.pipeline.saving import (
     take_up_earlier_drives,
 )
 from stavpr_ros.pipeline.statistics import Statistics, WAITING
-from stavpr_ros.relative_pose.estimator import EdgeEstimator
 from stavpr_ros.ros import REPORT_PERIOD
 from stavpr_ros.ros.bond import Bond, make_bond
-from stavpr_ros.ros.edges import EdgePublisher
-from stavpr_ros.ros.health import Health
-from stavpr_ros.ros.input import ImageInput, InputStatus
-from stavpr_ros.ros.localized import LocalizedPublisher
+from stavpr_ros.ros.intake import Intake
 from stavpr_ros.ros.map_loading import MapLoader
-from stavpr_ros.ros.messages import map_info_message, nanoseconds, PoseFrames
-from stavpr_ros.ros.navigation import Navigation
-from stavpr_ros.ros.output import is_requested, Output
+from stavpr_ros.ros.messages import map_info_message, nanoseconds, Outcome, Surroundings
+from stavpr_ros.ros.publication import Publication
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
-from stavpr_ros.ros.sensors import CameraInput, OdometryInput
-from stavpr_ros.ros.subgoal import SubgoalPublisher
-from stavpr_ros.ros.visualization import Visualization
+from stavpr_ros.ros.reports import Reports
 from stavpr_ros.ros.worker import STOP_TIMEOUT, Worker
 from stavpr_ros.signals import time_left
 from stavpr_ros.threads import limit_threads
-from stavpr_ros.units import SECOND
 
-MAX_SHORT_WINDOWS = 3  # one jump of a clock is no disorder
 RECORDED = 'recorded.stavpr'  # in the maps folder, where no save_path is set
-STAMP_JUMP = 3600.0  # seconds to an image of another recording
-SKIP_SECONDS, SKIP_PERIOD = 5.0, 60.0  # of skipped images until a warning, and to the next one
 
 
 @dataclass(frozen=True)
@@ -63,13 +49,14 @@ class _Item:
 
 class Runtime:
     """
-    Everything between the configuration of the node and its cleanup.
+    Everything between the configuration of the node and its cleanup: the recognition.
 
     :param on_map_change: called when the map, or its loading state, has changed.
     :raises StavprError: invalid settings, or an invalid map or model.
 
-    ``problem`` is the error of the last subscription to odometry, '' = none. ``images`` and
-    ``odometry`` are subscriptions while the node is active. ``settings`` are those in force.
+    Images come in by ``intake``; all that is published of them goes out by ``publication``, and
+    ``reports`` log what keeps them out of the window. ``settings`` are those in force; ``last`` is
+    the outcome of the last image in the window, None = none.
     """
 
     def __init__(
@@ -81,19 +68,13 @@ class Runtime:
     ) -> None:
         self._node, self.settings, self._statistics = node, settings, statistics
         self.on_map_change = on_map_change
-        self.images: ImageInput | None = None
-        self.odometry: OdometryInput | None = None
-        self.camera: CameraInput | None = None
         self._epoch = self._pipeline_epoch = 0
-        self._since_restart = self._short_windows = 0  # images; restarts in a row before a window
-        self._logged_reasons: set[str] = set()
-        # stamp and time of the first image since the last keyframe [s]
-        self._skipped_since: tuple[float, float] | None = None
-        self._last_reason = ''  # why the last image is in no window
         self._may_lack_map = False  # active since the end of a recording was last logged
-        self.last_match = PlaceMatch()  # published for the last image in the window
-        self.last_frame = ''  # of the poses of its places
-        self.problem = ''
+        self.last: Outcome | None = None
+        self._bond: Bond | None = None
+        self._pipeline: Pipeline | None = None
+        self.intake = Intake(node, statistics, self._enqueue, self._reject, self.restart)
+        self._reports = Reports(node, statistics, self.intake.odometry_fault)
         self._maps = MapLoader(
             node,
             lambda path: read_map(path, self.settings.pipeline),
@@ -101,38 +82,33 @@ class Runtime:
             lambda: self.pipeline.places,
             on_map_change,
         )
-        self._bond: Bond | None = None
-        self._navigation: Navigation | None = None
-        if settings.publish_tf or settings.publish_initialpose:
-            self._navigation = Navigation(node, settings)
-        self._localized = LocalizedPublisher(node, settings)
-        self._subgoal = SubgoalPublisher(node, settings)
         self.worker = Worker(self._process, settings.queue_size, node.ending)
-        self._output = Output(node, settings.queue_size, settings.robot_id)
-        self._edges = EdgePublisher(
-            EdgeEstimator(settings.relative_pose),
-            settings.robot_id,
-            self._output.publish_closure,
-            self._statistics,
-            node.ending,
+        self._publication = Publication(
+            node,
+            settings,
+            statistics,
+            lambda: self.pipeline.operation,
+            lambda: self.worker.call(self._publish_route),
         )
-        self._pipeline: Pipeline | None = None
-        self._views = Visualization(node, lambda: self.worker.call(self._publish_route))
         try:
-            # a node that only localizes on a map that is named has recorded nothing
-            is_own = settings.operation != 'localization' or not settings.map_path
-            is_own = is_own or bool(settings.save_path)
-            recovered = recover_maps(self._journaled, node.get_logger(), is_own)
-            self._pipeline = self.worker.run(self._make_pipeline)
-            # a route of loop closure does not continue a map
-            continued = recovered if settings.operation != 'loop_closure' else ''
-            if map_path := settings.map_path or continued:
-                if self.updates_map:
-                    take_up_earlier_drives(map_path, node.get_logger())
-                self.load(map_path)
+            self._begin()
         except BaseException:
             self.close()
             raise
+
+    def _begin(self) -> None:
+        """Recover maps, make the pipeline, and load the map."""
+        settings, log = self.settings, self._node.get_logger()
+        # a node that only localizes on a map that is named has recorded nothing
+        is_own = settings.operation != 'localization' or not settings.map_path
+        recovered = recover_maps(self._journaled, log, is_own or bool(settings.save_path))
+        self._pipeline = self.worker.run(self._make_pipeline)
+        # a route of loop closure does not continue a map
+        continued = recovered if settings.operation != 'loop_closure' else ''
+        if map_path := settings.map_path or continued:
+            if self.updates_map:
+                take_up_earlier_drives(map_path, log)
+            self.load(map_path)
 
     @property
     def pipeline(self) -> Pipeline:
@@ -165,26 +141,16 @@ class Runtime:
     def activate(self) -> None:
         """Subscribe, with an empty window: the camera may have been moved since the last image."""
         self.reset()
-        self._skipped_since, self._last_reason, self._may_lack_map = None, '', True
-        self._update_odometry()
-        if self.settings.relative_pose in ('auto', 'pnp'):
-            self.camera = CameraInput(self._node, self.settings.camera_transform)
-        self.images = ImageInput(
-            self._node,
-            self.settings,
-            self._statistics,
-            self._enqueue,
-            lambda message, reason: self._drop(message, Status.SKIPPED, reason, 'max_rate'),
-            self.restart,
-        )
-        settings = self.settings
+        self._reports.begin()
+        self._may_lack_map, settings = True, self.settings
+        self.intake.open(settings, self.pipeline.places)
         self._bond = make_bond(self._node, settings.bond_heartbeat_period, not settings.autostart)
 
     def deactivate(self) -> None:
         """Unsubscribe; publish waiting images as dropped, and waiting closures; save a map."""
         self._unsubscribe()
-        self.worker.run(self._edges.flush)  # after the image in process
-        self.worker.run(self._forget)
+        self.worker.run(self._publication.edges.flush)  # after the image in process
+        self.worker.run(self._publication.forget)
         self._save(self.worker.run)
         self._end_bond()
 
@@ -199,19 +165,14 @@ class Runtime:
             self._unsubscribe()
             self.save_at_end()
         finally:
-            if not (self.worker.stop() & self._edges.stop()):
+            if not (self.worker.stop() & self._publication.edges.stop()):
                 self._node.left_behind = True
             self._maps.stop()
             if self._pipeline is not None:
                 delete_route = not self.settings.save_path
                 close_journals(self._pipeline, delete_route, self._node.get_logger())
-            self._output.close()
             self._end_bond()
-            self._views.close()
-            self._localized.close()
-            self._subgoal.close()
-            if self._navigation is not None:
-                self._navigation.close()
+            self._publication.close()
 
     def save_at_end(self) -> None:
         """Save a recorded map, unless the worker stays busy."""
@@ -224,24 +185,11 @@ class Runtime:
                 self._node.failed = True
             places = self._pipeline.save_state.recorded
             if self._may_lack_map and self.settings.operation == 'mapping' and not places:
-                log.warning(f'no map written, because {self._why_no_place()}')
+                log.warning(f'no map written, because {self._reports.why_no_place()}')
             self._may_lack_map = False
 
-    def _why_no_place(self) -> str:
-        """Return why no image became a place."""
-        counts = self._statistics.counts()
-        if not counts.received.count:
-            topic = self._node.resolve_topic_name('image')
-            return f'no image was received on {topic}: compare `ros2 topic list`, set image:=TOPIC'
-        causes = ', '.join(f'{n} {cause}' for cause, n in counts.dropped.total.most_common())
-        text = f'none of {counts.received.count} images became a place ({causes})'
-        return f'{text}; the last one: {self._last_reason}' if self._last_reason else text
-
     def _unsubscribe(self) -> None:
-        for subscription in (self.images, self.odometry, self.camera):
-            if subscription is not None:
-                subscription.close()
-        self.images = self.odometry = self.camera = None
+        self.intake.close()
         self._drop_waiting('the node was deactivated', 'deactivated')
 
     def _drop_waiting(self, event: str, cause: str) -> None:
@@ -249,47 +197,20 @@ class Runtime:
             reason = f'{event} before it was processed'
             self._drop(item.message, Status.DROPPED, reason, cause)
 
-    def _update_odometry(self) -> None:
-        """Subscribe to odometry while it is needed."""
-        places, settings = self.pipeline.places, self.settings
-        is_compared = settings.pipeline.compares_odometry
-        needs_odometry = settings.needs_odometry or (  # edges to places of a map, and their paths
-            (settings.relative_pose in ('auto', 'aligned') or is_compared)
-            and isinstance(places, PlaceMap)
-            and places.has_poses
-        )
-        if needs_odometry and self.odometry is None:
-            self.odometry = OdometryInput(
-                self._node,
-                self.settings.odometry_timeout,
-                self._statistics.add_odometry_rejected,
-            )
-        elif not needs_odometry and self.odometry is not None:
-            self.odometry.close()
-            self.odometry = None
-
     # changes
 
     def change(self, settings: NodeSettings) -> None:
         """
         Apply live parameters, or another operation.
 
-        A subscription to odometry that fails is logged and kept in ``problem``; everything else is
-        applied.
+        A subscription to odometry that fails is logged and kept in ``intake.problem``; everything
+        else is applied.
 
         :raises StavprError: the operation cannot be changed; nothing is changed then.
         """
         self.worker.run(lambda: self.pipeline.change(settings.pipeline, settings.operation))
         self.settings = settings
-        if self.images is not None:
-            self.images.max_rate = settings.max_rate
-            self.images.stamps.gap = settings.max_stamp_gap
-            try:
-                self._update_odometry()
-                self.problem = ''
-            except SettingsError as error:
-                self.problem = str(error)
-                self._node.get_logger().error(self.problem)
+        self.intake.change(settings, self.pipeline.places)
 
     def load(
         self, path: str, lock: AbstractContextManager[Any] | None = None, verify: bool = False
@@ -309,25 +230,18 @@ class Runtime:
 
     def _use_map(self, loaded: LoadedMap) -> None:
         self.worker.run(lambda: self.pipeline.change(loaded=loaded))
-        if self.images is not None:
-            self._update_odometry()
+        if self.intake.images is not None:
+            self.intake.follow_odometry(self.settings, self.pipeline.places)
+
+    def _publish_route(self) -> None:
+        if self._pipeline is not None:  # a subscriber may come first
+            self._publication.publish_route()
 
     def restart(self, reason: str) -> None:
         """Empty the window before the images that arrive from now on."""
-        log, length = self._node.get_logger(), self.settings.pipeline.sequence.length
-        log.info(f'window reset: {reason}')
         self._epoch += 1
-        self._short_windows = self._short_windows + 1 if self._since_restart < length else 0
-        if self._short_windows >= MAX_SHORT_WINDOWS:
-            log.warning(
-                f'the window was reset {self._short_windows} times in a row before it was full, '
-                f'so that few images match ({reason}): publish the images in the order of their '
-                'stamps, and by one publisher',
-                throttle_duration_sec=REPORT_PERIOD,
-            )
-        self._since_restart = 0
-        if (odometry := self.odometry) is not None:  # another thread may unsubscribe
-            odometry.trajectory.clear()
+        self._reports.restarted(reason, self.settings.pipeline.sequence.length)
+        self.intake.clear()
 
     def reset(self) -> None:
         """Empty the window now, and drop waiting images."""
@@ -336,63 +250,38 @@ class Runtime:
 
     def _reset_window(self) -> None:
         self.pipeline.operation.reset()
-        self._localized.reset()
+        self._publication.reset()
 
-    def _forget(self) -> None:
-        self._localized.reset()
-        if self._navigation is not None:
-            self._navigation.forget()
+    # status
 
     def map_info(self) -> MapInfo:
         """Return the description of the map in use."""
-        pipeline = self.pipeline
-        return map_info_message(
-            pipeline.operation.name,
-            'loading' if self._maps.path else pipeline.operation.map_state,
-            pipeline.save_state.path,
-            pipeline.places,
-            pipeline.operation.extractor,
-            self._node.get_clock().now().to_msg(),
-            self.settings.robot_id,
-        )
+        stamp = self._node.get_clock().now().to_msg()
+        info = map_info_message(self.pipeline, self.settings.robot_id, stamp)
+        if self._maps.path:
+            info.state = 'loading'
+        return info
 
-    def complete(self, health: Health) -> Health:
-        """Return the health of the node with the queue, the window and the subscriptions."""
-        pipeline, images, odometry = self.pipeline, self.images, self.odometry
-        camera = self.camera
-        return replace(
-            health,
-            problem=health.problem or self._maps.problem or self.problem or pipeline.problem,
-            loading=self._maps.path,
-            input=InputStatus() if images is None else images.status(),
-            odometry='' if odometry is None else odometry.freshness(),
-            queue=self.worker.waiting,
-            window=pipeline.operation.window_fill,
-            missing=pipeline.operation.missing,
-            camera='not needed' if camera is None else camera.state,
-            odometry_fault='' if odometry is None else odometry.fault(),
-            contrast=pipeline.operation.contrast,
-            applied_threshold=pipeline.operation.threshold,
-            oddities=self._oddities(),
-            localized=self._localized.is_localized,
-            sends_transform=self._navigation is not None and self._navigation.sends_transform,
-        )
-
-    def _oddities(self) -> tuple[str, ...]:
-        """Return what is odd about the inputs; log each kind once."""
-        inputs = (each for each in (self.images, self.odometry, self.camera) if each is not None)
-        texts = tuple(text for each in inputs for text in each.oddities())
-        for text in texts:
-            kind = ''.join(filter(str.isalpha, text))
-            if kind not in self._logged_reasons:
-                self._logged_reasons.add(kind)
-                self._node.get_logger().warning(text)
-        return texts
+    def state(self) -> dict[str, Any]:
+        """Return the fields of :class:`stavpr_ros.ros.health.Health` of a configured node."""
+        pipeline, operation, inputs = self.pipeline, self.pipeline.operation, self.intake.state()
+        self._reports.oddities(inputs['oddities'])
+        return inputs | {
+            'problem': self._maps.problem or self.intake.problem or pipeline.problem,
+            'loading': self._maps.path,
+            'queue': self.worker.waiting,
+            'window': operation.window_fill,
+            'missing': operation.missing,
+            'contrast': operation.contrast,
+            'applied_threshold': operation.threshold,
+            'localized': self._publication.localized.is_localized,
+            'sends_transform': self._publication.navigation.sends_transform,
+        }
 
     # images
 
     def _enqueue(self, message: Any, arrival: float) -> None:
-        self._since_restart += 1
+        self._reports.arrived()
         dropped = self.worker.put(_Item(message, arrival, self._epoch))
         if dropped is not None:
             reason = 'newer images arrived before it was processed'
@@ -402,83 +291,58 @@ class Runtime:
                 throttle_duration_sec=REPORT_PERIOD,
             )
 
+    def _reject(self, message: Any, reason: str) -> None:
+        self._drop(message, Status.SKIPPED, reason, 'max_rate')
+
     def _drop(self, message: Any, status: Status, reason: str, cause: str) -> None:
         """Publish the status of an image that is not processed."""
         self._statistics.add_drop(cause)
-        result = self.pipeline.operation.unmatched(status, reason)
-        self._output.publish(message.header, result, self.pipeline.places)
+        result, robot_id = (
+            self.pipeline.operation.unmatched(status, reason),
+            self.settings.robot_id,
+        )
+        outcome = Outcome(message.header, result, self.pipeline.places, robot_id=robot_id)
+        self._publication.output.publish(outcome)
 
     def _process(self, item: _Item) -> None:
         """Process one image, on the worker."""
         if item.epoch != self._pipeline_epoch:
             self._pipeline_epoch = item.epoch
             self._reset_window()
-        operation, waiting = self.pipeline.operation, time.monotonic() - item.arrival
-        header, places = item.message.header, operation.matched_places
-        pose, frames = self._pose_at(nanoseconds(header.stamp))
-        camera_input = self.camera  # another thread may unsubscribe
-        camera = camera_input.camera(frames.child, header.frame_id) if camera_input else None
-
-        def yaw() -> float:
-            if camera_input is None:
-                return yaw_of(mount_of(self.settings.camera_transform) or FORWARD)
-            return camera_input.yaw(frames.child, header.frame_id)
-
-        result = self._match(item.message, pose, camera, yaw)
+        header, waiting = item.message.header, time.monotonic() - item.arrival
+        places = self.pipeline.operation.matched_places
+        on_route = isinstance(places, GrowingMap)
+        about = self.intake.surroundings(header, self.settings, on_route)
+        result = self._match(item.message, about)
         began = time.monotonic()
-        if self._navigation is not None:
-            self._navigation.publish(header, result, places, pose, frames.odometry)
-        self._localized.publish(result, places, pose)
-        self._subgoal.publish(header, result, places)
-        self._views.publish(header, result, operation, frames.frame, pose)
-        edge, closures = self._edges.prepare(header, result, operation, frames, camera)
-        message = self._output.publish(header, result, places, frames, edge)
-        for closure in closures:
-            self._edges.put(closure)
+        outcome = self._publication.publish(
+            Outcome(header, result, places, about, self.settings.robot_id)
+        )
         stages = {WAITING: waiting, **result.stages, 'publishing': time.monotonic() - began}
+        self._reports.processed(result, nanoseconds(header.stamp), self.settings)
         if result.cause:
             self._statistics.add_drop(result.cause)
-            self._log_cause(result)
-            if result.match.status is Status.SKIPPED:
-                self._log_skips(result, nanoseconds(header.stamp))
-            return
-        self._skipped_since = None
-        self.last_match, self.last_frame = message, frames.frame
-        self._statistics.add_match(
-            result.match.status.name,
-            message.reason,
-            message.newest_index,
-            message.distance,
-            stages,
-        )
+        else:
+            self.last = outcome
+            match = result.match
+            self._statistics.add_match(
+                match.status.name, match.reason, result.own_place, match.distance, stages
+            )
 
-    def _pose_at(self, stamp: int) -> tuple[np.ndarray | None, PoseFrames]:
-        """Return the pose of the robot at a stamp (ns), and the frames; None = unknown."""
-        map_frame, odometry = self.settings.map_frame, self.odometry
-        if odometry is None:
-            return None, PoseFrames(map_frame)
-        # places of a route have the poses of the odometry
-        on_route = isinstance(self.pipeline.operation.matched_places, GrowingMap)
-        frame = odometry.frame if on_route else map_frame
-        return odometry.trajectory.at(stamp), PoseFrames(
-            frame, odometry.child_frame, odometry.frame
-        )
-
-    def _match(
-        self,
-        message: Any,
-        pose: np.ndarray | None,
-        camera: Camera | None,
-        yaw: Callable[[], float],
-    ) -> ImageResult:
+    def _match(self, message: Any, about: Surroundings) -> ImageResult:
         """Process an image; an internal error is logged, and invalidates this image only."""
-        candidates = (
-            is_requested(self._node, self._output.candidates) or self._views.needs_candidates
-        )
-        stamp = nanoseconds(message.header.stamp)
+        operation, stamp = self.pipeline.operation, nanoseconds(message.header.stamp)
+        out = self._publication
+        candidates = out.output.needs_candidates or out.views.needs_candidates
         try:
-            operation = self.pipeline.operation
-            result = operation.process(message, stamp, pose, camera, candidates, yaw)
+            result = operation.process(
+                message,
+                stamp,
+                about.pose,
+                about.camera,
+                candidates,
+                lambda: self.intake.yaw(about.child, message.header.frame_id, self.settings),
+            )
         except Exception as error:
             self._node.get_logger().error(
                 f'an image could not be processed: {traceback.format_exc()}'
@@ -490,50 +354,3 @@ class Runtime:
                 Status.NOT_READY, f'map {path} is being loaded', result.cause, image=result.image
             )
         return result
-
-    def _publish_route(self) -> None:
-        """Publish the route for a new subscriber, in the frame of the last image if it grows."""
-        if self._pipeline is not None:  # a subscriber may come first
-            places = self.pipeline.operation.matched_places
-            on_route = isinstance(places, GrowingMap)
-            frame = self._views.frame if on_route else self.settings.map_frame
-            self._views.publish_route(places, frame)
-
-    def _log_skips(self, result: ImageResult, stamp: int) -> None:
-        """Log that a rule of keyframes skips every image, and the remedy."""
-        self._last_reason, now = result.match.reason, (stamp / SECOND, time.monotonic())
-        began = self._skipped_since or now
-        began = self._skipped_since = began if 0 <= now[0] - began[0] < STAMP_JUMP else now
-        # the stamps count too: a replay may be faster than the camera
-        if not any(SKIP_SECONDS <= now[i] - began[i] < SKIP_PERIOD for i in range(2)):
-            return
-        if result.cause == 'no odometry':
-            fault = self.odometry.fault() if self.odometry is not None else ''
-            topic = self._node.resolve_topic_name('odom')
-            remedy = fault or f"publish it on {topic}, with stamps of the camera's clock"
-            remedy += '; or set keyframe_distance and keyframe_angle_deg to 0'
-        else:
-            rules = asdict(self.settings.pipeline.keyframes).items()
-            names = ' or '.join(f'keyframe_{name}' for name, value in rules if value)
-            remedy = f'right for a camera at rest, otherwise lower {names}'
-        self._node.get_logger().warning(
-            f'every image is skipped: {result.match.reason}; {remedy}',
-            throttle_duration_sec=SKIP_PERIOD,
-        )
-
-    def _log_cause(self, result: ImageResult) -> None:
-        """Log why an image is in no window: an invalid one once for each cause."""
-        if (
-            result.match.status is Status.INVALID_IMAGE
-            and result.cause not in self._logged_reasons
-        ):
-            self._logged_reasons.add(result.cause)
-            self._node.get_logger().warning(
-                f'invalid image: {result.match.reason} (logged once; /diagnostics counts '
-                f'"{result.cause}")'
-            )
-        elif result.match.status is Status.NOT_READY:
-            self._node.get_logger().warning(
-                f'images arrive, but cannot be matched: {result.match.reason}',
-                throttle_duration_sec=REPORT_PERIOD,
-            )

@@ -3,6 +3,7 @@
 """The services of the node; each returns the error as its message."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import os
 from typing import Any
 
@@ -15,7 +16,12 @@ from stavpr_ros.method import Match, Status
 from stavpr_ros.pipeline.maps_folder import inside
 from stavpr_ros.pipeline.result import ImageResult
 from stavpr_ros.pipeline.saving import update_own_map, write_map
-from stavpr_ros.ros.messages import candidates_message, match_message, matched_pose_message
+from stavpr_ros.ros.messages import (
+    candidates_message,
+    match_message,
+    matched_pose_message,
+    Outcome,
+)
 from stavpr_ros.ros.rclpy_workarounds import repeat_responses
 from stavpr_ros.ros.runtime import Runtime
 from std_msgs.msg import Header
@@ -84,7 +90,9 @@ class Services:
             response.success = False
             if name == 'relocalize':  # indices of -1, where the default 0 would be a place
                 result = ImageResult(Match(Status.NOT_READY, response.message))
-                response.match = match_message(Header(), result, robot_id=self._robot_id())
+                response.match = match_message(
+                    Outcome(Header(), result, robot_id=self._robot_id())
+                )
             return response
 
         return callback
@@ -136,11 +144,11 @@ class Services:
             # messages are made on the worker: a growing route may evict places before the next
             # call
             result = runtime.pipeline.operation.relocalize(count)
-            response.match = runtime.last_match
-            header, places = response.match.header, runtime.pipeline.operation.matched_places
-            candidates = candidates_message(header, result, places)
+            assert runtime.last is not None
+            response.match = match_message(runtime.last)
+            outcome = replace(runtime.last, result=result)
+            candidates, pose = candidates_message(outcome), matched_pose_message(outcome)
             response.candidates = candidates.candidates if candidates is not None else []
-            pose = matched_pose_message(header, result, places, runtime.last_frame)
             response.has_pose = pose is not None
             response.pose = pose or response.pose
 

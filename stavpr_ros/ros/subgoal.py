@@ -2,25 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The image of the map further ahead, as the subgoal of a learned policy of navigation."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage
 from stavpr_msgs.msg import PlaceCandidates
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.method import Candidate
-from stavpr_ros.pipeline import NodeSettings
-from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.ros.messages import candidates_message
-from stavpr_ros.ros.output import is_requested
-from stavpr_ros.ros.rclpy_workarounds import until_shutdown
-from std_msgs.msg import Header
+from stavpr_ros.pipeline import ImageResult, NodeSettings
+from stavpr_ros.ros.messages import candidates_message, Outcome
+from stavpr_ros.ros.output import Publishers
 
 QUALITY = 90  # of JPEG, of an image whose width is changed
 
 
-class SubgoalPublisher:
+class SubgoalPublisher(Publishers):
     """
     Publishes ``~/subgoal``, a thumbnail of the map, and its place on ``~/subgoal_place``.
 
@@ -28,34 +28,25 @@ class SubgoalPublisher:
     """
 
     def __init__(self, node: Node, settings: NodeSettings) -> None:
-        self._node, self._settings = node, settings
-        self._image = node.create_publisher(CompressedImage, '~/subgoal', 1)
-        self._place = node.create_publisher(PlaceCandidates, '~/subgoal_place', 1)
+        super().__init__(node)
+        self._settings = settings
+        self._image = self._make(CompressedImage, '~/subgoal')
+        self._place = self._make(PlaceCandidates, '~/subgoal_place')
 
-    def publish(
-        self, header: Header, result: ImageResult, places: PlaceMap | GrowingMap | None
-    ) -> None:
-        """Publish the subgoal of a match on a map; on the worker."""
-        match = result.match
-        if not (match.accepted and isinstance(places, PlaceMap)):
+    def publish(self, outcome: Outcome) -> None:
+        """Publish the subgoal of a match on a map."""
+        match, places, settings = outcome.match, outcome.place_map, self._settings
+        if not match.accepted or places is None:
             return
-        if not any(is_requested(self._node, each) for each in (self._image, self._place)):
+        if not self._is_requested(self._image, self._place):
             return
-        distance = self._settings.subgoal_distance
-        index = place_ahead(places, match.newest, distance, match.path.direction)
+        index = place_ahead(places, match.newest, settings.subgoal_distance, match.path.direction)
         subgoal = Candidate(index, match.distance, match.probability)
-        only = ImageResult(match, candidates=(subgoal,))
-        message = candidates_message(header, only, places, self._settings.robot_id)
-        content = thumbnail_of_width(places, index, self._settings.subgoal_width)
-        with until_shutdown(self._node):
-            self._place.publish(message)
-            if content:
-                self._image.publish(CompressedImage(header=header, format='jpeg', data=content))
-
-    def close(self) -> None:
-        """Destroy the publishers."""
-        for publisher in (self._image, self._place):
-            self._node.destroy_publisher(publisher)
+        only = replace(outcome, result=ImageResult(match, candidates=(subgoal,)))
+        self._send(self._place, candidates_message(only))
+        if content := thumbnail_of_width(places, index, settings.subgoal_width):
+            image = CompressedImage(header=outcome.header, format='jpeg', data=content)
+            self._send(self._image, image)
 
 
 def place_ahead(places: PlaceMap, index: int, distance: float, direction: int = 1) -> int:
@@ -96,6 +87,4 @@ def thumbnail_of_width(places: PlaceMap, index: int, width: int) -> bytes:
     size = width, max(1, round(width * image.shape[0] / image.shape[1]))
     shrinks = width < image.shape[1]
     image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, jpeg = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    return jpeg.tobytes()
+    return encode_jpeg(image, QUALITY)

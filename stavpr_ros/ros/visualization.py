@@ -7,7 +7,6 @@ from collections.abc import Callable
 import math
 from typing import Any
 
-import cv2
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path
 import numpy as np
@@ -15,15 +14,14 @@ from rclpy.event_handler import PublisherEventCallbacks, UnsupportedEventTypeErr
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
-from stavpr_ros.pipeline.result import ImageResult
-from stavpr_ros.ros.messages import image_message, pose_message
-from stavpr_ros.ros.output import is_requested
+from stavpr_ros.ros.messages import image_message, Outcome, Places, pose_message
+from stavpr_ros.ros.output import Publishers
 from stavpr_ros.ros.qos import LATCHED
-from stavpr_ros.ros.rclpy_workarounds import until_shutdown
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -32,27 +30,32 @@ COLUMNS = 512  # of ~/distances, at most
 GROWTH = 1.05  # a growing route is published again when it has grown by this factor
 QUALITY = 80  # of JPEG
 
-Places = PlaceMap | GrowingMap | None
 
-
-class Visualization:
+class Visualization(Publishers):
     """
     Publishers of the map's route, matched poses, markers, match images and distances.
 
+    :param operation: returns the operation; its places are those of the matches.
     :param on_subscriber: called on another thread when the route has a new subscriber; it calls
         :meth:`publish_route` on the worker.
 
     ``frame`` is the last image's.
     """
 
-    def __init__(self, node: Node, on_subscriber: Callable[[], object]) -> None:
-        self._node, self._on_subscriber = node, on_subscriber
+    def __init__(
+        self,
+        node: Node,
+        operation: Callable[[], Operation],
+        on_subscriber: Callable[[], object],
+    ) -> None:
+        super().__init__(node)
+        self.operation, self._on_subscriber = operation, on_subscriber
         self._route = self._latched(Path, '~/map_path')
-        self._matched = node.create_publisher(Path, '~/matched_path', 1)
-        self._markers = node.create_publisher(MarkerArray, '~/markers', 1)
-        self._image = node.create_publisher(CompressedImage, '~/match_image/compressed', 1)
-        self._window = node.create_publisher(Image, '~/window_image', 1)
-        self._distances = node.create_publisher(Image, '~/distances', 10)
+        self._matched = self._make(Path, '~/matched_path')
+        self._markers = self._make(MarkerArray, '~/markers')
+        self._image = self._make(CompressedImage, '~/match_image/compressed')
+        self._window = self._make(Image, '~/window_image')
+        self._distances = self._make(Image, '~/distances', 10)
         self._published: tuple[Places, int, str] = (None, 0, '')
         self.frame = ''
         self._poses: deque[PoseStamped] = deque(maxlen=KEPT)
@@ -65,41 +68,26 @@ class Visualization:
         """Whether the markers, which show candidates, have a subscriber."""
         return self._is_requested(self._markers)
 
-    def publish(
-        self,
-        header: Header,
-        result: ImageResult,
-        operation: Operation,
-        frame: str,
-        odometry: np.ndarray | None = None,
-    ) -> None:
-        """
-        Publish the requested topics for one image; on the worker.
-
-        :param frame: of the poses of the places.
-        :param odometry: pose at the stamp of the image, shape (7,); None = unknown.
-        """
-        places = operation.matched_places
-        place_map = places if isinstance(places, PlaceMap) else None
-        if frame != self.frame or place_map is not self._map:
-            self.frame, self._map, self._correction = frame, place_map, None
+    def publish(self, outcome: Outcome) -> None:
+        """Publish the requested topics for one image."""
+        result, frame = outcome.result, outcome.about.frame
+        if frame != self.frame or outcome.place_map is not self._map:
+            self.frame, self._map, self._correction = frame, outcome.place_map, None
             self._poses.clear()
             self._lines.clear()
-        self._note(header, result, places, odometry)
-        with until_shutdown(self._node):
-            self.publish_route(places, frame)
-            if self._is_requested(self._matched) and result.match.accepted:
-                own = Header(stamp=header.stamp, frame_id=frame)
-                self._matched.publish(Path(header=own, poses=list(self._poses)))
-            if self._is_requested(self._markers):
-                self._markers.publish(self._markers_message(header, result, places))
-            if result.image is not None and self._is_requested(self._image):
-                bgr = cv2.cvtColor(draw_match(result, places), cv2.COLOR_RGB2BGR)
-                _, jpeg = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-                image = CompressedImage(header=header, format='jpeg', data=jpeg.tobytes())
-                self._image.publish(image)
-            if self._is_requested(self._window) or self._is_requested(self._distances):
-                self._publish_distances(header, result, operation)
+        self._note(outcome)
+        self.publish_route(outcome.places, frame)
+        if self._is_requested(self._matched) and result.match.accepted:
+            own = Header(stamp=outcome.header.stamp, frame_id=frame)
+            self._send(self._matched, Path(header=own, poses=list(self._poses)))
+        if self._is_requested(self._markers):
+            self._send(self._markers, self._markers_message(outcome))
+        if result.image is not None and self._is_requested(self._image):
+            jpeg = encode_jpeg(draw_match(result, outcome.places), QUALITY)
+            image = CompressedImage(header=outcome.header, format='jpeg', data=jpeg)
+            self._send(self._image, image)
+        if self._is_requested(self._window, self._distances):
+            self._publish_distances(outcome)
 
     def publish_route(self, places: Places, frame: str) -> None:
         """Publish the poses of all places, if they are requested and not published yet."""
@@ -117,71 +105,60 @@ class Visualization:
             message.poses = [
                 PoseStamped(header=message.header, pose=pose_message(pose)) for pose in poses_known
             ]
-        self._route.publish(message)
+        self._send(self._route, message)
 
     def close(self) -> None:
         """Destroy the publishers, and release the map: the executor may keep them for a while."""
         self._on_subscriber, self._published = lambda: None, (None, 0, '')
         self._map = None
-        for publisher in (
-            *(self._route, self._matched, self._markers),
-            *(self._image, self._window, self._distances),
-        ):
-            self._node.destroy_publisher(publisher)
+        super().close()
 
-    def _publish_distances(
-        self, header: Header, result: ImageResult, operation: Operation
-    ) -> None:
-        recognizer, places = operation.recognizer, operation.matched_places
+    def _publish_distances(self, outcome: Outcome) -> None:
+        recognizer, places, match = self.operation().recognizer, outcome.places, outcome.match
         if recognizer is None or places is None or not recognizer.window_fill:
             return
         row = recognizer.newest_row()
         if not row.size:
             return
-        first = places.first if isinstance(places, GrowingMap) else 0
-        near = places_to_draw(result.match, first, len(row))
+        first = getattr(places, 'first', 0)  # of a route
+        near = places_to_draw(match, first, len(row))
         if self._is_requested(self._window):
-            rows = recognizer.window_columns(near)
-            self._window.publish(
-                image_message(header, draw_window(rows, int(near[0]), result.match))
-            )
+            drawn = draw_window(recognizer.window_columns(near), int(near[0]), match)
+            self._send(self._window, image_message(outcome.header, drawn))
         if self._is_requested(self._distances):
             row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]
             numbers = np.arange(first, first + row.size)[None]
             columns = np.stack(
                 [least_of_each(row, COLUMNS)[0], least_of_each(numbers, COLUMNS)[0]], axis=1
             ).astype(np.float32)
-            self._distances.publish(image_message(header, columns[None], '32FC2'))
+            self._send(self._distances, image_message(outcome.header, columns[None], '32FC2'))
 
-    def _note(
-        self, header: Header, result: ImageResult, places: Places, odometry: np.ndarray | None
-    ) -> None:
+    def _note(self, outcome: Outcome) -> None:
         """
         Keep the pose of the matched place, and the line from the query to it.
 
         On a map, the query is where the odometry leads to from the last match: a long line is a
         jump.
         """
-        match = result.match
-        if not match.accepted or places is None:
+        match, places, odometry = outcome.match, outcome.places, outcome.about.pose
+        if places is None or outcome.newest is None or (pose := outcome.newest.pose) is None:
             return
-        pose = places.place(match.newest).pose
-        if pose is not None:
-            stamped = Header(stamp=header.stamp, frame_id=self.frame)
-            self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
+        stamped = Header(stamp=outcome.header.stamp, frame_id=self.frame)
+        self._poses.append(PoseStamped(header=stamped, pose=pose_message(pose)))
         query = None
         if match.first_image >= 0:
-            query = places.place(result.image_index).pose
-        elif pose is not None and odometry is not None:
+            query = places.place(outcome.result.image_index).pose
+        elif odometry is not None:
             if self._correction is not None:
                 query = to_poses(self._correction @ matrices(odometry))
             self._correction = matrices(pose) @ inverse(matrices(odometry))
-        if pose is not None and query is not None:
+        if query is not None:
             self._lines.append((_point(query), _point(pose), color(match.probability)))
 
-    def _markers_message(self, header: Header, result: ImageResult, places: Places) -> MarkerArray:
+    def _markers_message(self, outcome: Outcome) -> MarkerArray:
         """Return the lines, the matched place with its text, and the candidates."""
-        own, match = Header(stamp=header.stamp, frame_id=self.frame), result.match
+        match, places = outcome.match, outcome.places
+        own = Header(stamp=outcome.header.stamp, frame_id=self.frame)
         markers = [Marker(header=own, action=Marker.DELETEALL)]
 
         def add(kind: int, **fields: Any) -> Marker:
@@ -198,13 +175,13 @@ class Visualization:
         if places is not None:
             best = [(match.newest, match.probability, 0.8)] if match.accepted else []
             for place, probability, size in best + [
-                (each.place, each.probability, 0.4) for each in result.candidates
+                (each.place, each.probability, 0.4) for each in outcome.result.candidates
             ]:
                 if (pose := places.place(place).pose) is not None:
                     ball = add(Marker.SPHERE, color=color(probability))
                     ball.pose.position = _point(pose)
                     ball.scale.x = ball.scale.y = ball.scale.z = size
-            if match.accepted and (pose := places.place(match.newest).pose) is not None:
+            if outcome.newest is not None and (pose := outcome.newest.pose) is not None:
                 text = add(Marker.TEXT_VIEW_FACING, color=color(match.probability))
                 text.pose.position = _point(pose)
                 text.pose.position.z += 1.0
@@ -221,12 +198,9 @@ class Visualization:
 
         events = PublisherEventCallbacks(matched=on_matched)
         try:
-            return self._node.create_publisher(kind, topic, LATCHED, event_callbacks=events)
+            return self._make(kind, topic, LATCHED, event_callbacks=events)
         except UnsupportedEventTypeError:  # then it is published with the next image
-            return self._node.create_publisher(kind, topic, LATCHED)
-
-    def _is_requested(self, publisher: Publisher) -> bool:
-        return is_requested(self._node, publisher)
+            return self._make(kind, topic, LATCHED)
 
 
 def color(probability: float) -> ColorRGBA:

@@ -249,11 +249,11 @@ def answers(drive: Drive) -> Iterator[Any]:
     for i, result in enumerate(drive.process(pipeline)):
         message = None
         if importlib.util.find_spec('stavpr_msgs'):
-            from stavpr_ros.ros.messages import match_message, time_message
+            from stavpr_ros.ros.messages import match_message, Outcome, time_message
             from std_msgs.msg import Header
 
             header = Header(stamp=time_message((i + 1) * SECOND))
-            message = match_message(header, result, pipeline.operation.matched_places)
+            message = match_message(Outcome(header, result, pipeline.operation.matched_places))
         yield plain((result, message))
 
 
