@@ -6,6 +6,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, ExitStack
+from dataclasses import fields
 import heapq
 import math
 import sys
@@ -113,14 +114,8 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
     ) as bar:
         prepare_transport()
         with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
-            how = ReplayOptions(
-                options.rate or 1.0,
-                options.lossless,
-                options.timeout,
-                options.wait,
-                options.start_paused,
-                options.clock or 0.0,
-            )
+            names = (each.name for each in fields(ReplayOptions))
+            how = ReplayOptions(**{name: getattr(options, name) for name in names})
             replayer = Replayer(node, notify, how, others)
             with closing(replayer), ExitStack() as stack:
                 if options.record:
@@ -255,7 +250,9 @@ def _parser() -> argparse.ArgumentParser:
         help='publish these topics under their names; without a name: all (cameras, tf, ...)',
     )
     pace = parser.add_mutually_exclusive_group()
-    pace.add_argument('--rate', type=positive, metavar='R', help='factor on the recorded pace (1)')
+    pace.add_argument(
+        '--rate', type=positive, default=1.0, metavar='R', help='factor on the recorded pace (1)'
+    )
     pace.add_argument(
         '--lossless', action='store_true', help='send each image after the result of the last one'
     )
@@ -289,10 +286,11 @@ def _parser() -> argparse.ArgumentParser:
         nargs='?',
         type=positive,
         const=CLOCK_RATE,
+        default=0.0,
         metavar='HZ',
         help=f'publish the recorded time on /clock for use_sim_time ({CLOCK_RATE:g} Hz)',
     )
-    parser.add_argument('--start-paused', action='store_true', help='start paused')
+    parser.add_argument('--start-paused', dest='paused', action='store_true', help='start paused')
     parser.add_argument(
         '--timeout',
         type=positive,
