@@ -216,10 +216,11 @@ class KeyframeSelector:
         :param image: RGB, uint8, shape (h, w, 3), kept.
         :raises InputError: an invalid pose or image; nothing is changed.
         """
-        rgb_image(image)
-        pose = None if pose is None else checked_pose(pose)
-        compared, self._compared = self._compared, None
+        pose, compared = None if pose is None else checked_pose(pose), self._compared
         is_compared = compared is not None and compared[0] is image
+        if not is_compared:
+            rgb_image(image)
+        self._compared = None
         self._last = compared if is_compared else (image, None)
         self._stamp, self._pose = stamp, pose
 
