@@ -22,21 +22,15 @@ class Intake:
     """
     The subscriptions to images, odometry and camera_info, each while it is needed.
 
-    :param enqueue, reject, restart: see :class:`stavpr_ros.ros.input.ImageInput`.
+    :param callbacks: enqueue, reject and restart of :class:`stavpr_ros.ros.input.ImageInput`.
 
     ``problem`` is the error of the last subscription to odometry, '' = none.
     """
 
     def __init__(
-        self,
-        node: ManagedNode,
-        statistics: Statistics,
-        enqueue: Callable[[Any, float], None],
-        reject: Callable[[Any, str], None],
-        restart: Callable[[str], None],
+        self, node: ManagedNode, statistics: Statistics, *callbacks: Callable[..., None]
     ) -> None:
-        self._node, self._statistics = node, statistics
-        self._callbacks = enqueue, reject, restart
+        self._node, self._statistics, self._callbacks = node, statistics, callbacks
         self.images: ImageInput | None = None
         self.odometry: OdometryInput | None = None
         self.camera: CameraInput | None = None
@@ -105,7 +99,8 @@ class Intake:
 
     def odometry_fault(self) -> str:
         """Return why no odometry can arrive, '' = nothing known."""
-        return '' if self.odometry is None else self.odometry.fault()
+        odometry = self.odometry  # another thread may unsubscribe
+        return '' if odometry is None else odometry.fault()
 
     def state(self) -> dict[str, Any]:
         """Return the fields of :class:`stavpr_ros.ros.health.Health` on the subscriptions."""

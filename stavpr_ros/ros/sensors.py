@@ -128,7 +128,6 @@ class CameraInput:
         self._node, self._fixed_mount = node, mount_of(transform)
         self._info: CameraInfo | None = None
         self._known: tuple[Any, ...] = ()  # message, frames and camera of the last call
-        self._yaw: tuple[str | None, str, float] = (None, '', 0.0)  # frames, result of a call
         self.assumed = False
         topic = camera_info_topic(node)
         self.problem = f'nothing was received on {topic}'
@@ -152,12 +151,8 @@ class CameraInput:
         """
         if self._fixed_mount is None and not base:
             return 0.0
-        if self._yaw[:2] != (base, frame):
-            mount = self._mount(base, frame)
-            if mount is None:
-                return 0.0
-            self._yaw = base, frame, yaw_of(mount)
-        return self._yaw[2]
+        mount = self._mount(base, frame)
+        return 0.0 if mount is None else yaw_of(mount)
 
     @property
     def state(self) -> str:
