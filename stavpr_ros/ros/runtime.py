@@ -208,7 +208,7 @@ class Runtime:
 
         :raises StavprError: the operation cannot be changed; nothing is changed then.
         """
-        self.worker.run(lambda: self.pipeline.change(settings.pipeline, settings.operation))
+        self._change(settings=settings.pipeline, operation=settings.operation)
         self.settings = settings
         self.intake.change(settings, self.pipeline.places)
 
@@ -228,8 +228,19 @@ class Runtime:
         if recognizer is not None and recognizer.start_notes:
             self._node.get_logger().info(recognizer.start_notes)
 
+    def _change(self, **changes: Any) -> None:
+        """Change the pipeline; with another operation, its last outcome, and its map, are gone."""
+
+        def change() -> None:
+            operation = self.pipeline.operation
+            self.pipeline.change(**changes)
+            if self.pipeline.operation is not operation:
+                self.last = None
+
+        self.worker.run(change)
+
     def _use_map(self, loaded: LoadedMap) -> None:
-        self.worker.run(lambda: self.pipeline.change(loaded=loaded))
+        self._change(loaded=loaded)
         if self.intake.images is not None:
             self.intake.follow_odometry(self.settings, self.pipeline.places)
 

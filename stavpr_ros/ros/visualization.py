@@ -111,6 +111,7 @@ class Visualization(Publishers):
         """Destroy the publishers, and release the map: the executor may keep them for a while."""
         self._on_subscriber, self._published = lambda: None, (None, 0, '')
         self._map = None
+        del self.operation
         super().close()
 
     def _publish_distances(self, outcome: Outcome) -> None:
