@@ -25,7 +25,6 @@ from stavpr_ros.pipeline import node_settings, NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
 from stavpr_ros.ros.health import Health, INVALID
-from stavpr_ros.ros.output import MapInfoPublisher
 from stavpr_ros.ros.parameters import (
     declare_parameters,
     inside_maps_folder,
@@ -35,6 +34,7 @@ from stavpr_ros.ros.parameters import (
     typed,
     unknown_parameters,
 )
+from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.runtime import Runtime
 from stavpr_ros.ros.services import Services
@@ -71,7 +71,9 @@ class PlaceRecognitionNode(ManagedNode):
         self._runtime: Runtime | None = None
         self.statistics = Statistics()
         self.problem = ''  # why the last transition failed
-        self._map_info = MapInfoPublisher(self)
+        self._map_info: MapInfo | None = None  # the last one
+        self._info_publisher = self.create_publisher(MapInfo, '~/map_info', LATCHED)
+        self._info_lock = threading.RLock()
         self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
@@ -204,7 +206,7 @@ class PlaceRecognitionNode(ManagedNode):
             if runtime is not None:
                 runtime.close()
                 del runtime
-            if self._map_info.last is not None:
+            if self._map_info is not None:
                 self._publish_map_info('none')
         gc.unfreeze()
         # runtime and worker refer to each other: without it, the map would stay in memory
@@ -336,21 +338,30 @@ class PlaceRecognitionNode(ManagedNode):
             hardware_id=f'{self.settings.robot_id} {camera}'.lstrip(),
             settings=self.settings,
             counts=self.statistics.counts(),
-            map_info=self._map_info.last or MapInfo(state='none'),
+            map_info=self._map_info or MapInfo(state='none'),
             **parts,
         )
 
     def _publish_map_info(self, state: str = '', path: str = '') -> None:
-        """Publish the state of a node that is not configured, or '' = the map in use, if any."""
+        """
+        Publish the description of the map, if any, where it has changed.
 
-        def describe() -> MapInfo | None:
-            runtime = self._runtime
+        :param state: of a node that is not configured, '' = of the map in use; path: of its file.
+        """
+        with self._info_lock:  # in the order of the changes
             if state:
                 operation, robot_id = self.settings.operation, self.settings.robot_id
-                return MapInfo(operation=operation, state=state, path=path, robot_id=robot_id)
-            return None if runtime is None else runtime.map_info()
-
-        self._map_info.publish(describe)
+                info = MapInfo(operation=operation, state=state, path=path, robot_id=robot_id)
+            elif (runtime := self._runtime) is not None:
+                info = runtime.map_info()
+            else:
+                return
+            info.header.stamp = self.get_clock().now().to_msg()
+            last, self._map_info = self._map_info, info
+            if last is not None:
+                last.header = info.header  # a new stamp alone is no change
+            if last != info and self.context.ok():
+                self._info_publisher.publish(info)
 
     def destroy_node(self) -> None:
         """End the worker, save a recorded map, log the counts, and destroy the node."""

@@ -1,9 +1,8 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The publishers of results and of the description of the map."""
+"""The publishers of results."""
 
 from collections.abc import Callable
-import threading
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -12,7 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import qos_policy_name_from_kind, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
-from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch
+from stavpr_msgs.msg import LoopClosure, PlaceCandidates, PlaceMatch
 from stavpr_ros.pipeline.overlay import draw_match
 from stavpr_ros.ros.messages import (
     candidates_message,
@@ -21,7 +20,6 @@ from stavpr_ros.ros.messages import (
     matched_pose_message,
     Outcome,
 )
-from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode, until_shutdown
 from std_msgs.msg import Float32, Int32
 
@@ -44,10 +42,6 @@ class Publishers:
 
     def reset(self) -> None:
         """Let nothing before the next image count: the window was emptied."""
-
-    def forget(self) -> None:
-        """Let nothing before count: another map, or the node is deactivated."""
-        self.reset()
 
     def close(self) -> None:
         """Destroy the publishers, and release the map."""
@@ -133,26 +127,3 @@ class Output(Publishers):
     def publish_closure(self, message: LoopClosure) -> None:
         """Publish a loop closure."""
         self._send(self._loop_closure, message)
-
-
-class MapInfoPublisher:
-    """Publishes ``~/map_info`` when it has changed, in the order of the changes."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(MapInfo, '~/map_info', LATCHED)
-        self._lock = threading.RLock()
-        self.last: MapInfo | None = None
-
-    def publish(self, describe: Callable[[], MapInfo | None]) -> None:
-        """Publish the description if it differs from the last one; None = there is none."""
-        with self._lock:
-            info = describe()
-            if info is None:
-                return
-            info.header.stamp = self._node.get_clock().now().to_msg()
-            last, self.last = self.last, info
-            if last is not None:
-                last.header = info.header  # a new stamp alone is no change
-            if last != info and self._node.context.ok():
-                self._publisher.publish(info)

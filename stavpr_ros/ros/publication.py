@@ -69,8 +69,8 @@ class Publication:
 
     def forget(self) -> None:
         """Let nothing before count: the node is deactivated."""
-        for each in self.all:
-            each.forget()
+        self.reset()
+        self.navigation.forget()
 
     def close(self) -> None:
         """Destroy the publishers."""
