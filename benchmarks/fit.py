@@ -4,8 +4,8 @@
 Fit the evidence of mode robust: weights, constants, error rates; half and double of its numbers.
 
 ``make fit``; ``--quick``: fewer drives; ``--numbers``: with half and double of each number (an
-hour more); ``--routes``: with loop closures; ``--cache FOLDER`` keeps features and records. Writes benchmarks/results/fit.md and
-docs/error_rates.png.
+hour more); ``--routes``: with loop closures; ``--cache FOLDER`` keeps features and records. Writes
+benchmarks/results/fit.md and docs/error_rates.png.
 """
 
 from collections.abc import Sequence

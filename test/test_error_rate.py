@@ -36,7 +36,7 @@ def error_risks(risks=(3.0, 1.0, 0.0), units=39, method='robust'):
         (error_risks(), 0.1, 0.2),  # bounds 4 / 40, 2 / 40, 1 / 40
         (error_risks(), 0.0999, 0.6),
         (error_risks(), 0.025, 0.9),
-        (error_risks(), 0.005, 0.92),  # too few blocks, and the built-in table is stricter
+        (error_risks(), 0.005, 0.95),  # too few blocks, and the built-in table is stricter
         (
             error_risks((2.0, 0.9, 0.0), 9),
             0.09,
@@ -77,7 +77,7 @@ def test_impossible_error_risks_are_rejected(probabilities, risks, units):
     ('changes', 'probability', 'word'),
     [
         ({}, 0.6, ''),
-        ({'max_error': 0.005}, 0.92, '39 blocks, 0.025 at least'),
+        ({'max_error': 0.005}, 0.95, '39 blocks, 0.025 at least'),
         ({'sequence': SequenceSettings(12)}, 0.001, 'length=12'),
         ({'min_probability': 0.8}, 0.8, ''),
         ({'max_error': 0.0}, 0.5, ''),

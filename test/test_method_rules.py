@@ -186,7 +186,7 @@ RULES = [
         KNOWN[:, np.r_[20:40, 40:80:3, 80:100, 100:140:3]], 9.0, LENGTH), 0.8, 0.7),
     Rule('spread', model(spread=0.0), lambda: places_off(SWAYING, 5.0, True), 0.1, 0.25),
     Rule('most', model(most=1e9), inverted, 0.2, 0.05),
-    Rule('high speeds', model(speeds=MODEL.speeds[:-2]), lambda: matched(FAST, 3), 0.5, 0),
+    Rule('high speeds', model(speeds=MODEL.speeds[:-2]), lambda: matched(FAST, 3), 0.5, 0.1),
     Rule('low speeds', model(speeds=MODEL.speeds[3:]), lambda: matched(
         crawling(alike(0.3, 60, 85), 2), 0.05), 0.8, 0.1),
     Rule('weight', model(weight=0.05), lambda: matched(STAGE, 6.0), 0.88, 0.82),
@@ -196,7 +196,7 @@ RULES = [
     Rule('alpha by change', put(ImageChange, weight=lambda *_: 1.0), lambda: matched(
         crawling(np.where(abs(IMAGES - 105) < 4, alike(0.8), OTHER)[:, 90:120], 5), 0), 0, 0.25),
     Rule('MOST_CHANGE', put(motion, MOST_CHANGE=1e9), lambda: matched(
-        KNOWN[:, :60], 3.0, known=crawling(KNOWN[:, :60], 4)), 0.7, 0.1),
+        KNOWN[:, :60], 3.0, known=crawling(KNOWN[:, :60], 4)), 0.7, 0.5),
     Rule('LEAST_CHANGE', put(motion, LEAST_CHANGE=0.0), lambda: matched(
         np.hstack([KNOWN[:, 20:80], crawling(KNOWN[:, 120:132], 3)]), 0.0, 60), 0.7, 0.6),
     Rule('STANDSTILL', put(motion, STANDSTILL=0.0), lambda: resting(6.0), 1, 0.8),
@@ -210,7 +210,7 @@ RULES = [
         np.rint(np.arange(20, 140, 1.5)).astype(int), 3.0, False), 0.1, 0.25),
     Rule('ON_LINE', in_kernel(path, 'centered_place', ON_LINE=1e9),
          lambda: places_off(STOP_AND_GO, 3.0, False), 0.15, 1.5),
-    Rule('MAX_STEP', in_kernel(path, 'follow', MAX_STEP=1), lambda: matched(FAST, 3), 0.5, 0),
+    Rule('MAX_STEP', in_kernel(path, 'follow', MAX_STEP=1), lambda: matched(FAST, 3), 0.5, 0.1),
     Rule('half at rest', without_half, resting_beyond, 0.1, 0.5),
     Rule('share of the image', put(window, close_sums=lambda *each: np.ones(len(each[-1]))),
          lambda: newest_beyond(6.0), 0.2, 0.33),

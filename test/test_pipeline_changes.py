@@ -53,7 +53,7 @@ def test_min_probability_and_candidates_change_with_a_full_window(operation, rou
     assert result.candidates == ()
     pipeline.change(replace(pipeline.settings, min_probability=0.5, max_error=0.01))
     result = process(pipeline, route[13:14], first=13)[0]
-    assert result.match.threshold == pytest.approx(0.6)
+    assert result.match.threshold == pytest.approx(0.5)
 
 
 def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
