@@ -102,14 +102,14 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
             rows.append((state['image'], *about, kind, *quantities(which), path.probability))
         return result
 
-    def matched(radius: int) -> Any:
+    def matched() -> Any:
         shown.clear()
-        return noted(match(radius), False)
+        return noted(match(), False)
 
-    def early(radius: int) -> Any:
+    def early() -> Any:
         state['early'] = state['image']
         shown.clear()
-        return noted(newest(radius), True) if with_early else type(match(radius))()
+        return noted(newest(), True) if with_early else type(match())()
 
     def keep(*arguments: Any) -> Any:
         shown.append(show(*arguments))
@@ -120,7 +120,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         state['image'] = i
         recognizer.update(drive.features[i : i + 1], stamp)
         if with_early and state['early'] < i:
-            early(0)
+            early()
     return np.array(rows, float).reshape(-1, 13)
 
 

@@ -11,7 +11,8 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import InputError
 from stavpr_ros.method import Candidate, PlaceRecognizer, RecognizerSettings
-from stavpr_ros.method.match import ranked_candidates, WindowSequences
+from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.match import WindowSequences
 from stavpr_ros.method.settings import RobustOptions
 
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -54,7 +55,8 @@ def test_ranked_candidates_equal_plain_loop(case):
     costs, places = np.array(costs, np.float32), np.array(places, np.int32)
     nearest = nearest_of(costs, places, float(costs.min())) if np.isfinite(costs).any() else None
     before = costs.copy()
-    found = ranked_candidates(nearest, WindowSequences(costs, places), count, nms_radius)
+    layout = ColumnLayout(nms_radius=nms_radius)
+    found = layout.ranked(nearest, WindowSequences(costs, places), count)
     expected = plain(costs.tolist(), places.tolist(), count, nms_radius)
     assert known(found) == [(int(places[i]), float(costs[i])) for i in expected]
     np.testing.assert_array_equal(costs, before)

@@ -116,14 +116,14 @@ def test_odometry_is_not_compared_over_the_seam(open_map, drift):
 
 def test_columns_repeat_the_first_places():
     same_as = np.append(np.arange(20), np.arange(4))
-    layout = ColumnLayout(same_as=same_as, gap=3, against=True, repeated=6)
+    layout = ColumnLayout(same_as=same_as, nms_radius=1, against=True, repeated=6)
     assert layout.lap == 20
     names = layout.names_of(layout.columns).tolist()
     assert names[:30] == [*range(24), *range(4, 10)]
     assert names[30:] == [*range(23, -1, -1), *range(19, 13, -1)]
     along, against = np.arange(24, 28), layout.columns[54:58]
     assert layout.repeated(along) == slice(24, 30)
-    assert layout.repeated(against) == slice(57, 63)
+    assert layout.repeated(against) == slice(61, 67)  # 7 columns are between
     assert layout.repeated(along - 1) == layout.repeated(against - 1) == slice(0, 0)
     near = layout.around(0, 1).tolist()  # places 19, 0, 1, 20, 21, in both directions
     assert [layout.names_of(np.arange(*each)).tolist() for each in near] == [

@@ -54,6 +54,7 @@ def test_published_figure(device):
     assert found == pytest.approx(0.28724851, abs=1e-6)
 
 
+@pytest.mark.parametrize('radius', [0, 3])
 @pytest.mark.parametrize(
     ('l', 'n', 'beta', 'levels', 'banned'),
     [
@@ -65,11 +66,11 @@ def test_published_figure(device):
         (3, 5, 2.0, None, 1),  # no path
     ],
 )
-def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned):
+def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned, radius):
     """Distances, lengths, nearest start and second best, and the path that the CPU finds."""
     rng, sequence = np.random.default_rng(n), SequenceSettings(l, beta)
-    window = DeviceLmDtwWindow(sequence, n, ColumnLayout(), device)
-    twin = LmDtwWindow(sequence, n)
+    layout = ColumnLayout(nms_radius=radius)
+    window, twin = DeviceLmDtwWindow(sequence, n, layout, device), LmDtwWindow(sequence, n, layout)
     rows = random_distances(n, (2 * l + 1, n), levels)
     rows[rng.random(rows.shape) < banned] = np.inf
     for t, row in enumerate(rows):
@@ -77,21 +78,20 @@ def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned):
         twin.push(row, row, t)
         if t + 1 < l:
             continue
-        for radius in (0, 3):
-            (found, sequences), (expected, _) = window.match(radius), twin.match(radius)
-            q, m = oracle.match_sequence(rows[t + 1 - l : t + 1], beta, np.float32)
-            answer = oracle.best_match(q, m, radius)
-            np.testing.assert_equal(vars(found), vars(expected))
-            if answer is None:
-                assert found.place < 0
-                continue
-            assert (found.first, found.last) == (answer.start, answer.last)
-            assert found.distance == answer.distance
-            costs, middles = sequences()[:2]
-            np.testing.assert_array_equal(costs, q)
-            m = np.where(np.isfinite(q), m, 0)
-            np.testing.assert_array_equal(middles, SequenceDistances(q, m).middles)
-            assert best_match(SequenceDistances(q, m), radius).first == answer.start
+        (found, sequences), (expected, _) = window.match(), twin.match()
+        q, m = oracle.match_sequence(rows[t + 1 - l : t + 1], beta, np.float32)
+        answer = oracle.best_match(q, m, radius)
+        np.testing.assert_equal(vars(found), vars(expected))
+        if answer is None:
+            assert found.place < 0
+            continue
+        assert (found.first, found.last) == (answer.start, answer.last)
+        assert found.distance == answer.distance
+        costs, middles = sequences()[:2]
+        np.testing.assert_array_equal(costs, q)
+        m = np.where(np.isfinite(q), m, 0)
+        np.testing.assert_array_equal(middles, SequenceDistances(q, m).middles)
+        assert best_match(SequenceDistances(q, m), radius).first == answer.start
     window.reset()
     assert len(window.images) == 0
 
@@ -184,7 +184,7 @@ def test_empty_map_has_no_distances_and_no_match(device):
         row = matcher.distances(query.strips[:, 0], query.weights[:, 0])
         assert row.shape == (0,)
         window.push(row, query.strips[:, 0], t)
-    assert window.match(20).path.place < 0
+    assert window.match().path.place < 0
 
 
 def test_invalid_settings_are_rejected(device):

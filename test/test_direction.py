@@ -135,7 +135,7 @@ def test_panoramic_camera_is_recognized_on_its_way_back(tmp_path):
 
 def test_changes_of_passes_are_to_the_passes_before():
     changes = np.array([[0.0, 1, 2, 3], [0, 0, 12, 13]])
-    layout = ColumnLayout(same_as=np.arange(4), gap=3, against=True)
+    layout = ColumnLayout(same_as=np.arange(4), against=True)
     near, farther = layout.changes_of_passes(changes)
     assert (near[5:].tolist(), farther[6:].tolist()) == ([3, 2, 1], [13, 12])
     assert [layout.direction_of(column) for column in layout.columns] == [1] * 4 + [-1] * 4

@@ -23,7 +23,6 @@ from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.localizer import position_of, SequenceRecognizer
 from stavpr_ros.method.model import MODEL
 from stavpr_ros.method.motion import ImageChange
-from stavpr_ros.method.sessions import session_gap
 from stavpr_ros.method.settings import ROBUST
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
@@ -55,7 +54,7 @@ class CityLayout(ColumnLayout):
     def __init__(
         self, places: np.ndarray, firsts: np.ndarray, same_as: np.ndarray, nms_radius: int
     ) -> None:
-        super().__init__(firsts, same_as, session_gap(nms_radius))
+        super().__init__(firsts, same_as, nms_radius)
         self.loaded = places
 
     def names_of(self, columns: np.ndarray) -> np.ndarray:

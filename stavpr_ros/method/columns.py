@@ -24,12 +24,16 @@ states of these columns are moved one lap back (:meth:`ColumnLayout.repeated`)::
                                |<- shows 0 ... c-1
 """
 
+from dataclasses import replace
+import math
 import sys
 
 import numpy as np
 from stavpr_ros.compilation import kernel
+from stavpr_ros.errors import InputError
 from stavpr_ros.method.filter import NO_PLACES
-from stavpr_ros.method.model import CLOSE
+from stavpr_ros.method.match import Candidate, WindowMatch, WindowSequences
+from stavpr_ros.method.model import CLOSE, MODEL
 from stavpr_ros.prepare.normalization import ONE_SESSION
 
 
@@ -41,7 +45,8 @@ class ColumnLayout:
         one is 0. One session: each place is the column of its number.
     :param same_as: for each place, itself, or the place of an earlier session that shows the
         same, (n,); not needed for one session.
-    :param gap: columns between two sessions: more than a camera moves from image to image.
+    :param nms_radius: places that are at most so many positions apart are neighbors. A gap has
+        more columns, and more than a camera moves from image to image.
     :param against: the camera may move against the map, too; not without places.
     :param repeated: first places of a closed route of one session that follow its last one.
 
@@ -55,11 +60,12 @@ class ColumnLayout:
         self,
         firsts: np.ndarray = ONE_SESSION,
         same_as: np.ndarray = NO_PLACES,
-        gap: int = 0,
+        nms_radius: int = 0,
         against: bool = False,
         repeated: int = 0,
     ) -> None:
         self.starts = self.firsts = firsts
+        self.nms_radius = nms_radius
         self.runs, self.gaps = [slice(None)], NO_PLACES
         self.columns: np.ndarray | None = None
         self.lap = 0
@@ -76,6 +82,7 @@ class ColumnLayout:
             ends = np.append(firsts[1:], n)[::-1]
             self.firsts = np.append(firsts, self._along + n - ends)
         passes = len(self._places)
+        gap = max(math.ceil(max(MODEL.speeds)) + 1, nms_radius) + 1
         self.columns = np.arange(passes) + gap * np.repeat(
             np.arange(len(self.firsts)), np.diff(self.firsts, append=passes)
         )
@@ -174,7 +181,7 @@ class ColumnLayout:
         return int(run.start), int(run.stop)
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
-        """Return positions: those at most nms_radius apart are neighbors in one session."""
+        """Return positions: those at most ``nms_radius`` apart are neighbors in one session."""
         return np.asarray(places) if self.columns is None else self.columns[self._same_as[places]]
 
     def around(self, column: int, radius: int) -> np.ndarray:
@@ -212,6 +219,75 @@ class ColumnLayout:
         apart = self._apart(positions, positions[np.argmax(sums)])
         best = int(np.argmax(np.where(apart <= CLOSE, own, -1)))
         return np.minimum(sums, 1), int(columns[best])
+
+    def in_places(self, match: WindowMatch, seeks_second: bool = False) -> WindowMatch:
+        """
+        Return a match whose columns have become places.
+
+        :param seeks_second: for the second best; the one of the match is at another position else.
+        """
+        path = match.path
+        if self.columns is None or path.place < 0:
+            return match
+
+        def sequences() -> WindowSequences:
+            costs, columns, probabilities = match.sequences()
+            possible = np.isfinite(costs)
+            if probabilities is not None:
+                probabilities = probabilities[possible]
+            places = self.names_of(columns[possible])
+            return WindowSequences(costs[possible], places, probabilities)
+
+        place, second = self.names_of(np.array([path.place, path.second_best])).tolist()
+        second, distance = second if path.second_best >= 0 else -1, path.second_best_distance
+        if seeks_second:
+            others = self.ranked(Candidate(place, path.distance), sequences(), 2)[1:]
+            second = others[0].place if others else -1
+            distance = others[0].distance if others else math.nan
+        pairs = path.pairs.copy()
+        pairs[:, 1] = self.names_of(pairs[:, 1])
+        in_places = replace(
+            path,
+            pairs=pairs,
+            place=place,
+            second_best=second,
+            second_best_distance=distance,
+            direction=self.direction_of(path.place),
+        )
+        return WindowMatch(in_places, sequences)
+
+    def ranked(
+        self, nearest: Candidate | None, sequences: WindowSequences, count: int
+    ) -> list[Candidate]:
+        """
+        Rank places by non-maximum suppression: no candidate is close to one ranked before it.
+
+        The first is the nearest sequence, the second its second best. O(count x n).
+
+        :param nearest: the nearest sequence; None if there is none.
+        :param sequences: all sequences, in any order; the most probable first; else of equal costs
+            the first one.
+        :param count: most candidates, at least 0.
+        :raises InputError: count below 0.
+        """
+        if count < 0:
+            raise InputError(f'count = {count} candidates: expected at least 0')
+        if nearest is None or not count:
+            return []
+        costs, places, probabilities = sequences
+        # the costs of improbable places are equal: 1 up to the last digit
+        keys = costs.copy() if probabilities is None else -probabilities
+        keys[~np.isfinite(costs)], positions = np.inf, self.positions(places)
+        ranked = [nearest]
+        while len(ranked) < count and len(costs):
+            apart = self._apart(positions, int(self.positions(ranked[-1].place)))
+            keys[apart <= self.nms_radius] = np.inf
+            best = int(np.argmin(keys))
+            if math.isinf(keys[best]):
+                break
+            probability = math.nan if probabilities is None else float(probabilities[best])
+            ranked.append(Candidate(int(places[best]), float(costs[best]), probability))
+        return ranked
 
 
 # ------------------------------------------------ kernels

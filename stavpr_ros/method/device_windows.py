@@ -12,7 +12,7 @@ from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.device_filter import DevicePlaceFilter
-from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
@@ -113,7 +113,8 @@ class DeviceLmDtwWindow(QueryWindow):
         self._rows = torch.full((l, n + k - 1), torch.inf, device=device)  # oldest image first
         self._distances = torch.full((n,), torch.inf, device=device)
         self._lengths = torch.zeros(n, dtype=torch.int64, device=device)
-        self._radius = torch.zeros((), dtype=torch.int64, device=device)
+        radius = min(layout.nms_radius, n)  # no two midpoints are farther apart
+        self._radius = torch.tensor(radius, device=device)
         # of the nearest start and the nearest elsewhere: s, m and q; and the cells of the nearest
         self._out = torch.zeros(6 + l * k, dtype=torch.float64, device=device)
         self._received = HostCopy(self._out)
@@ -150,11 +151,10 @@ class DeviceLmDtwWindow(QueryWindow):
         parts = starts, lengths.index_select(0, starts), nearest, cells
         torch.cat([part.double() for part in parts], out=self._out)
 
-    def match(self, nms_radius: int) -> WindowMatch:
+    def match(self) -> WindowMatch:
         """Find the nearest start and its second best on the device; trace the path on the host."""
         if not self._width:
             return WindowMatch()
-        self._radius.fill_(min(nms_radius, self._width))  # no two midpoints are farther apart
         self._graph()
         self._received.receive()
         self._received.wait()
@@ -173,7 +173,7 @@ class DeviceLmDtwWindow(QueryWindow):
             second_best=(2 * second + second_length - 1) // 2 if has_second else -1,
             second_best_distance=second_distance if has_second else float('nan'),
         )
-        return in_places(WindowMatch(path, self._sequences), self.layout, nms_radius)
+        return self.layout.in_places(WindowMatch(path, self._sequences), True)
 
     def _sequences(self) -> WindowSequences:
         """Copy distances and lengths of all starts to the host."""

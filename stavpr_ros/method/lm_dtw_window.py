@@ -13,7 +13,7 @@ from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.checks import no_nan
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.method.columns import ColumnLayout
-from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.query_window import QueryWindow
 
 
@@ -91,14 +91,14 @@ class LmDtwWindow(QueryWindow):
         self._rows[:, remaining : self._width] = np.inf
         self.known = max(0, self.known - count)
 
-    def match(self, nms_radius: int) -> WindowMatch:
+    def match(self) -> WindowMatch:
         """See :meth:`QueryWindow.match`."""
         n, k, first = self.known, self._k, self.first
         # columns behind the known ones are +inf, as the padding that the kernel needs
         rows = self._rows[self._end - self.length : self._end, : padded_width(n, k)]
         window = np.ascontiguousarray(rows)
         matches = match_padded(window, n, k)
-        nearest = best_match(matches, nms_radius)
+        nearest = best_match(matches, self.layout.nms_radius)
         if nearest is None:
             return WindowMatch()
         pairs = trace_sequence(window[:, :n], nearest.first, k)
@@ -114,4 +114,4 @@ class LmDtwWindow(QueryWindow):
         match = WindowMatch(
             path, lambda: WindowSequences(matches.distances, matches.middles + first)
         )
-        return in_places(match, self.layout, nms_radius)
+        return self.layout.in_places(match, True)

@@ -35,16 +35,7 @@ from stavpr_ros.mapping import PlaceMap
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.method.cells import CellAgreement
-from stavpr_ros.method.match import (
-    Candidate,
-    distinct_places,
-    Limits,
-    Match,
-    Path,
-    ranked_candidates,
-    Status,
-    WindowMatch,
-)
+from stavpr_ros.method.match import Candidate, Limits, Match, Path, Status, WindowMatch
 from stavpr_ros.method.model import EARLY, UNUSUAL
 from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.relative_motion import (
@@ -53,10 +44,9 @@ from stavpr_ros.method.relative_motion import (
     Run,
     with_odometry_test,
 )
-from stavpr_ros.method.sessions import time_note
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
-from stavpr_ros.method.windows import window_of
+from stavpr_ros.method.windows import time_note, window_of
 from stavpr_ros.prepare.blocks import converted_blocks
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
@@ -160,7 +150,12 @@ class SequenceRecognizer(ABC):
 
         :returns: places, int64, and the costs of their sequences, at most ``count`` of each.
         """
-        return distinct_places(self._sequences(), count)
+        costs, places, _ = self._sequences()
+        order = np.argsort(costs, kind='stable')
+        order = order[np.isfinite(costs[order])]
+        _, first = np.unique(places[order], return_index=True)
+        order = order[np.sort(first)[:count]]
+        return places[order].astype(np.int64), costs[order]
 
     def ranked(self, count: int, match: Match | None = None) -> list[Candidate]:
         """
@@ -177,9 +172,7 @@ class SequenceRecognizer(ABC):
         match, nearest = match or self._newest, None
         if (place := match.path.place) >= 0:
             nearest = Candidate(place, match.distance, match.probability)
-        layout, radius = self._window.layout, self._settings.nms_radius
-        where = layout.positions, layout.lap
-        return ranked_candidates(nearest, self._sequences(), count, radius, *where)
+        return self._window.layout.ranked(nearest, self._sequences(), count)
 
     def newest_row(self) -> np.ndarray:
         """
@@ -226,18 +219,18 @@ class SequenceRecognizer(ABC):
 
         :param odometry_xy: of the newest image by odometry, (2,); NaN = unknown.
         """
-        window, radius, run = self._window, self._settings.nms_radius, None
+        window, run = self._window, None
         self._motion.trajectory.append(odometry_xy)
         fill, shown = len(window.images), WindowMatch()
         if fill == window.length:
-            shown = window.match(radius)
+            shown = window.match()
             match, run = self._decide(shown.path, self._limits)
         else:
             reason = f'{fill} of {window.length} images in the window'
             match = self._build(shown.path, self._limits, Status.WARMING_UP, reason)
         runs = [run]
         if match.status is not Status.MATCH:
-            newest = window.match_newest(radius)
+            newest = window.match_newest()
             if newest.path.place >= 0:
                 early, run = self._decide(newest.path, self._limits.raised(EARLY))
                 runs.append(run)

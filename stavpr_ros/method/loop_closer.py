@@ -12,6 +12,7 @@ from stavpr_ros.checks import require_at_least, require_choice
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import route_evidence_of
+from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.localizer import position_of, SequenceRecognizer
 from stavpr_ros.method.match import Limits, Match, Status, WindowColumns
@@ -69,12 +70,13 @@ class LoopCloser(SequenceRecognizer):
         require_choice('precision', precision, ('auto', *PRECISIONS))
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
         options, sequence = settings.applied_options, settings.sequence
+        layout = ColumnLayout(nms_radius=settings.nms_radius)
         window: QueryWindow
         if options.place_filter:
             constant = route_evidence_of(feature_settings.kind)
-            window = FilterWindow(sequence, 0, None, True, AROUND, True, constant=constant)
+            window = FilterWindow(sequence, 0, layout, True, AROUND, True, constant=constant)
         else:
-            window = LmDtwWindow(sequence, 0, None, options.query_znorm, AROUND)
+            window = LmDtwWindow(sequence, 0, layout, options.query_znorm, AROUND)
         super().__init__(settings, feature_settings, window, self._track)
         W = feature_settings.strips
         self._exclude, self._exclude_ns, self._limit = exclude, round(exclude_seconds * 1e9), limit
@@ -186,7 +188,7 @@ class LoopCloser(SequenceRecognizer):
         """
         if not self._window.full:
             return []
-        path = self._window.match_oldest(self._settings.nms_radius, match.accepted).path
+        path = self._window.match_oldest(match.accepted).path
         status, reason = self._limits.decide(path.distance, path.probability)
         if status is not Status.MATCH:
             return []

@@ -7,15 +7,11 @@ from dataclasses import dataclass, field, replace
 import enum
 from functools import cached_property
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import aligned_index, NO_PATH
-from stavpr_ros.errors import InputError
 from stavpr_ros.former import FormerNames
-
-if TYPE_CHECKING:
-    from stavpr_ros.method.columns import ColumnLayout
 
 NO_SHARES: np.ndarray = np.empty(0)
 MIN_SHARE = 1e-9  # of a place of the path; ratios to it are finite
@@ -281,98 +277,3 @@ class Match(FormerNames):
         return replace(
             self, status=status, reason=reason, probability=probability, inliers=inliers
         )
-
-
-def ranked_candidates(
-    nearest: Candidate | None,
-    sequences: WindowSequences,
-    count: int,
-    nms_radius: int,
-    positions: Callable[[np.ndarray | int], np.ndarray] = np.asarray,
-    lap: int = 0,
-) -> list[Candidate]:
-    """
-    Rank places by non-maximum suppression: no candidate is close to one ranked before it.
-
-    The first is the nearest sequence, the second its second best. O(count x n).
-
-    :param nearest: the nearest sequence; None if there is none.
-    :param sequences: all sequences, in any order; the most probable first; else of equal costs
-        the first one.
-    :param count: most candidates, at least 0.
-    :param nms_radius: candidates are more than this many places from each other.
-    :param positions: of places, between which the distance is measured; lap: of a closed route,
-        else 0.
-    :raises InputError: count below 0.
-    """
-    if count < 0:
-        raise InputError(f'count = {count} candidates: expected at least 0')
-    if nearest is None or not count:
-        return []
-    costs, places, probabilities = sequences
-    # the costs of improbable places are equal: 1 up to the last digit
-    keys = costs.copy() if probabilities is None else -probabilities
-    keys[~np.isfinite(costs)], at_position = np.inf, positions(places)
-    ranked = [nearest]
-    while len(ranked) < count and len(costs):
-        apart = np.abs(at_position - positions(ranked[-1].place))
-        keys[np.minimum(apart, np.abs(lap - apart) if lap else apart) <= nms_radius] = np.inf
-        best = int(np.argmin(keys))
-        if math.isinf(keys[best]):
-            break
-        probability = math.nan if probabilities is None else float(probabilities[best])
-        ranked.append(Candidate(int(places[best]), float(costs[best]), probability))
-    return ranked
-
-
-def in_places(
-    match: WindowMatch, layout: 'ColumnLayout', nms_radius: int | None = None
-) -> WindowMatch:
-    """
-    Return a match whose columns have become places.
-
-    :param nms_radius: of the second best; None = the one of the match is at another position.
-    """
-    path = match.path
-    if layout.columns is None or path.place < 0:
-        return match
-
-    def sequences() -> WindowSequences:
-        costs, columns, probabilities = match.sequences()
-        possible = np.isfinite(costs)
-        if probabilities is not None:
-            probabilities = probabilities[possible]
-        return WindowSequences(costs[possible], layout.names_of(columns[possible]), probabilities)
-
-    place, second = layout.names_of(np.array([path.place, path.second_best])).tolist()
-    second, distance = second if path.second_best >= 0 else -1, path.second_best_distance
-    if nms_radius is not None:
-        best = Candidate(place, path.distance)
-        others = ranked_candidates(best, sequences(), 2, nms_radius, layout.positions)[1:]
-        second = others[0].place if others else -1
-        distance = others[0].distance if others else float('nan')
-    pairs = path.pairs.copy()
-    pairs[:, 1] = layout.names_of(pairs[:, 1])
-    in_places = replace(
-        path,
-        pairs=pairs,
-        place=place,
-        second_best=second,
-        second_best_distance=distance,
-        direction=layout.direction_of(path.place),
-    )
-    return WindowMatch(in_places, sequences)
-
-
-def distinct_places(sequences: WindowSequences, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the nearest distinct places, nearest first (the lowest index on a tie).
-
-    :returns: places and costs, at most ``count`` of each.
-    """
-    costs, places, _ = sequences
-    order = np.argsort(costs, kind='stable')
-    order = order[np.isfinite(costs[order])]
-    _, first = np.unique(places[order], return_index=True)
-    order = order[np.sort(first)[:count]]
-    return places[order].astype(np.int64), costs[order]

@@ -107,14 +107,10 @@ class QueryWindow(ABC):
         return np.ones(n, bool)
 
     @abstractmethod
-    def match(self, nms_radius: int) -> WindowMatch:
-        """
-        Return the match of the images in the window, in mode paper of a full one.
+    def match(self) -> WindowMatch:
+        """Return the match of the images in the window, in mode paper of a full one."""
 
-        :param nms_radius: of the non-maximum suppression, places.
-        """
-
-    def match_newest(self, nms_radius: int) -> WindowMatch:
+    def match_newest(self) -> WindowMatch:
         """
         Return the match of the newest images, since the camera has come to the map.
 
@@ -123,7 +119,7 @@ class QueryWindow(ABC):
         """
         return WindowMatch()
 
-    def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
+    def match_oldest(self, is_matched: bool) -> WindowMatch:
         """
         Return the match of the oldest image by the whole window, where it had none as the middle.
 

@@ -13,7 +13,7 @@ from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.evidence import probability_of, Quantities, RecentWindows, unevenness
 from stavpr_ros.method.filter import Filter, NEGLIGIBLE, PlaceFilter, SPACING
-from stavpr_ros.method.match import in_places, Path, WindowMatch, WindowSequences
+from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.model import APART, CLOSE, MODEL, Model, ON_MAP, ROUTE_IMAGES, STRAIGHT
 from stavpr_ros.method.motion import ImageChange
 from stavpr_ros.method.path import centered_place, close_sums, follow
@@ -175,7 +175,7 @@ class FilterWindow(QueryWindow):
             self._shown = self._latest = None
         self._append(stamp, change, self.filter.count - 1)
 
-    def match(self, nms_radius: int) -> WindowMatch:
+    def match(self) -> WindowMatch:
         """Return the match of the middle image; of a camera at rest, as before it stopped."""
         if not self.known:
             return WindowMatch()
@@ -191,9 +191,9 @@ class FilterWindow(QueryWindow):
                 self._latest = self._show((len(shown.path) + 1) // 2)
             least = min(shown.probability, self._latest.probability)
             shown = shown._replace(probability=least)
-        return self._match(shown, self.images, middle, nms_radius)
+        return self._match(shown, self.images, middle)
 
-    def match_newest(self, nms_radius: int) -> WindowMatch:
+    def match_newest(self) -> WindowMatch:
         """Return the match of the newest images: :meth:`QueryWindow.match_newest`."""
         if self._is_route or not self.known:
             return WindowMatch()
@@ -205,16 +205,16 @@ class FilterWindow(QueryWindow):
         shown, numbers = self._show(since), self.images['number']
         images = self.images[numbers > numbers[-1] - since]
         middle = int(images['number'][(len(images) - 1) // 2])
-        return self._match(shown, images, middle, nms_radius)
+        return self._match(shown, images, middle)
 
-    def match_oldest(self, nms_radius: int, is_matched: bool) -> WindowMatch:
+    def match_oldest(self, is_matched: bool) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
         self.images['is_matched'][(len(self.images) - 1) // 2] = is_matched
         if self.images['is_matched'][0] or not is_matched:
             return WindowMatch()
         oldest = int(self.images['number'][0])
         count = self.filter.count - oldest
-        return self._match(self._show(count, 0), self.images, oldest, nms_radius)
+        return self._match(self._show(count, 0), self.images, oldest)
 
     def _show(self, l: int, position: int | None = None) -> Shown:
         """Return what the newest l images that moved show."""
@@ -264,9 +264,7 @@ class FilterWindow(QueryWindow):
         columns, none = nothing.astype(int), Quantities(0.0)
         return Shown(path, position, none, -math.inf, 0.0, columns, nothing, np.ones(l))
 
-    def _match(
-        self, shown: Shown, images: np.ndarray, number: int, nms_radius: int
-    ) -> WindowMatch:
+    def _match(self, shown: Shown, images: np.ndarray, number: int) -> WindowMatch:
         """
         Return the match of an image.
 
@@ -281,7 +279,7 @@ class FilterWindow(QueryWindow):
         shares = shares if certain > 0 else shares[:0]
         place = int(shown.path[row])
         share = certain / peak if peak > certain else 1.0  # no place is above the match
-        second, probability = self._second_best(shown, place, nms_radius)
+        second, probability = self._second_best(shown, place)
         probability *= share
         pairs = np.empty((len(images), 2), np.int32)
         pairs[:, 0], pairs[:, 1] = np.arange(len(images)), columns + first
@@ -295,11 +293,11 @@ class FilterWindow(QueryWindow):
             1 - probability if probability > 0 else float('nan'),
         )
         sequences = partial(self._sequences, shown, share, self.known, first)
-        return in_places(WindowMatch(path, sequences), self.layout)
+        return self.layout.in_places(WindowMatch(path, sequences))
 
-    def _second_best(self, shown: Shown, place: int, radius: int) -> tuple[int, float]:
+    def _second_best(self, shown: Shown, place: int) -> tuple[int, float]:
         """Return the most probable column elsewhere, and its probability, 0 if none."""
-        near = self.layout.around(place, radius)
+        near = self.layout.around(place, self.layout.nms_radius)
         elsewhere = ~_inside(shown.candidates, near)
         now = self.filter.by_place()[: self.known]
         now[shown.candidates] = 0

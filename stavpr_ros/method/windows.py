@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The window of a map, by mode and backend, and the columns of its places."""
+"""The window of a map, by mode and backend; the columns of its places, and what they cost."""
 
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,6 @@ from stavpr_ros.method.filter import SPACING
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.model import MODEL
 from stavpr_ros.method.query_window import QueryWindow
-from stavpr_ros.method.sessions import session_gap
 from stavpr_ros.method.settings import PAPER, RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG
@@ -68,10 +67,16 @@ def layout_of(
     same_as = place_map.same_as
     if same_as is None:
         same_as = np.arange(n)
-    firsts = ONE_SESSION if index is None else np.flatnonzero(np.diff(index, prepend=-1))
+    firsts = np.flatnonzero(np.diff(index, prepend=-1)) if index is not None and n else ONE_SESSION
     repeated, seam = 0, place_map.seam
     if length and seam is not None:
         repeated = min(n - 1 - 2 * seam, int(length * max(MODEL.speeds)))
         repeated = repeated if repeated > MAX_LAG else 0
-    gap, same_as = session_gap(nms_radius), same_as.astype(np.int64)
-    return ColumnLayout(firsts, same_as, gap, against, repeated) if n else ColumnLayout()
+    same_as = same_as.astype(np.int64)
+    return ColumnLayout(firsts, same_as, nms_radius, against and n > 0, repeated)
+
+
+def time_note(place_map: PlaceMap) -> str:
+    """Return what several sessions cost, for the log of a start, '' of a map of one."""
+    n = len(place_map.sessions)
+    return f'{n} sessions: an image takes up to {n} times the time of one' if n > 1 else ''

@@ -284,7 +284,7 @@ def _report(arguments: argparse.Namespace) -> 'Report':
         settings_json,
     )
     from stavpr_lab.evaluation.report import Report
-    from stavpr_ros.method.sessions import time_note
+    from stavpr_ros.method.windows import time_note
 
     began = time.perf_counter()
     settings = recognizer_settings(arguments)
