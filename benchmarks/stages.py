@@ -32,6 +32,7 @@ from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.mapping import descriptor_map, PlaceMap
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.cells import CellAgreement
+from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.filter import PlaceFilter
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.model import APART, MODEL, STRAIGHT
@@ -119,7 +120,7 @@ def paper_stages(run: Run, n: int, seed: int) -> None:
     padded = np.full((SEQUENCE.length, padded_width(n, SEQUENCE.k)), np.inf, np.float32)
     padded[:, :n] = window
     sizes = Sizes(n, 0, l=SEQUENCE.length, k=SEQUENCE.k)
-    push = partial(LmDtwWindow(SEQUENCE, n).push, window[-1], window, 0)
+    push = partial(LmDtwWindow(SEQUENCE, n, ColumnLayout()).push, window[-1], window, 0)
     add('window_push', call=push, works=[bounds.window_push(sizes)])
     kernel = partial(match_padded, padded, n, SEQUENCE.k)
     matches = kernel()

@@ -8,6 +8,7 @@ import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.localizer import EARLY
+from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
 
@@ -158,7 +159,7 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
     """Without evidence, at the speed before: the camera may move there."""
     dark = features_of(route).strips.copy()
     dark[:, 20:50] = 0
-    window = FilterWindow(SequenceSettings(4), PLACES, constant=-7.0)
+    window = FilterWindow(SequenceSettings(4), PLACES, ColumnLayout(), constant=-7.0)
     seen = PlaceChanges(PLACES, MAX_LAG)
     seen.add(dark)
     window.change.learn(seen.changes)
@@ -167,7 +168,7 @@ def test_equal_images_in_dark_stretch_of_map_move_on(route):
         z = np.where(np.abs(at - i) < 2, -4, 0).astype(np.float32)
         lit = i < 18
         z = z if lit else np.zeros_like(z)
-        window.add(z, i, window.change.curve[1] * lit)
+        window.add(z, i, window.change.curve[1] * lit, z)
     assert window.filter.count == images
     by_place = window.filter.by_place()
     mean = by_place @ at / by_place.sum()

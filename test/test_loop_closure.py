@@ -249,16 +249,15 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(
 ):
     """Those before are late; a number moves the place, and ``evict`` evicts the one before."""
     closer = LoopCloser(settings_of(ROBUST), 12, laps.settings)
-    monkeypatch.setattr(type(closer._window), 'is_standstill', property(lambda _: at_rest))
     monkeypatch.setattr(LoopCloser, 'first', property(lambda _: first))
-    found, images, place, first, at_rest = [], 0, PLACE, 0, False
+    found, images, place, first = [], 0, PLACE, 0
     for event in events:
         if event == 'reset':
             closer.reset()
         elif event == 'evict':
             place, first = place + 1, place + 1
         elif isinstance(event, str):
-            at_rest = event == 'rest'
+            closer._window.is_standstill = event == 'rest'
         elif isinstance(event, int):
             place += event
         else:

@@ -125,7 +125,9 @@ class FleetRecognizer(SequenceRecognizer):
         positions = () if city.poses is None else city.poses[:, :2]
         kind, strips = city.settings.kind, city.settings.strips
         self._constant, self._cells = evidence_of(kind, strips, city.dimension)
-        self._filter_window = FilterWindow(settings.sequence, 0, constant=self._constant)
+        self._filter_window = FilterWindow(
+            settings.sequence, 0, ColumnLayout(), constant=self._constant
+        )
         super().__init__(settings, city.settings, self._filter_window, positions)
         self._city, self._timeout = city, timeout
         index = city.store.index

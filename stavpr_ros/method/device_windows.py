@@ -13,8 +13,7 @@ from stavpr_ros.device_graph import DeviceGraph, HostCopy
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.device_filter import DevicePlaceFilter
 from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
-from stavpr_ros.method.query_window import QueryWindow
-from stavpr_ros.method.window import FilterWindow
+from stavpr_ros.method.window import FilterWindow, QueryWindow
 from stavpr_ros.prepare.normalization import MIN_DEVIATION
 import torch
 
@@ -82,10 +81,10 @@ class DeviceFilterWindow(FilterWindow):
         row: Any = self._newest
         return row.cpu().numpy() if isinstance(row, torch.Tensor) else super().newest_row()
 
-    def _as_columns(self, row: torch.Tensor) -> torch.Tensor:
+    def _z(self, row: torch.Tensor) -> torch.Tensor:
         if self._row_columns is None:  # the map has been learned
             n = len(row)
-            counted = self._counted(n) if self._normalizes else None
+            counted = self.change.distinct(n)
             self._row_columns = RowColumns(counted, self.layout, n, self._device)
         return self._row_columns(row)
 

@@ -14,7 +14,8 @@ from stavpr_ros.checks import no_nan
 from stavpr_ros.memory import aligned_empty
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
-from stavpr_ros.method.query_window import QueryWindow
+from stavpr_ros.method.window import QueryWindow
+from stavpr_ros.prepare.normalization import z_normalized
 
 
 class LmDtwWindow(QueryWindow):
@@ -27,18 +28,20 @@ class LmDtwWindow(QueryWindow):
     :param sequence: l and k.
     :param places: number of places n.
     :param layout: of the places.
-    :param normalizes, around: see :class:`stavpr_ros.method.query_window.QueryWindow`.
+    :param normalizes: z-normalize the distances of each image.
+    :param around: see :func:`stavpr_ros.prepare.normalization.z_normalized`.
     """
 
     def __init__(
         self,
         sequence: SequenceSettings,
         places: int,
-        layout: ColumnLayout | None = None,
+        layout: ColumnLayout,
         normalizes: bool = False,
         around: int = 0,
     ) -> None:
-        super().__init__(sequence.length, layout or ColumnLayout(), normalizes, around)
+        super().__init__(sequence.length, layout)
+        self._normalizes, self._around = normalizes, around
         self._k, self._width = sequence.k, 0  # columns
         self._rows: np.ndarray = np.empty((2 * self.length, 0), np.float32)
         self.grow(self.layout.width(places))
@@ -49,7 +52,9 @@ class LmDtwWindow(QueryWindow):
 
         :raises InputError: NaN or -inf in the row; the window is unchanged.
         """
-        row = self._as_columns(row)
+        if self._normalizes:
+            row = z_normalized(row, self._around, firsts=self.layout.starts)
+        row = self.layout.to_columns(row)
         if not row.sum() > -np.inf:
             no_nan(row, 'image distances')
         self._append(stamp)

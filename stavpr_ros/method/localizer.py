@@ -37,7 +37,6 @@ from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.match import Candidate, Limits, Match, Path, Status, WindowMatch
 from stavpr_ros.method.model import EARLY, UNUSUAL
-from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.relative_motion import (
     Positions,
     RelativeMotion,
@@ -45,7 +44,7 @@ from stavpr_ros.method.relative_motion import (
     with_odometry_test,
 )
 from stavpr_ros.method.settings import RecognizerSettings
-from stavpr_ros.method.window import FilterWindow
+from stavpr_ros.method.window import FilterWindow, QueryWindow
 from stavpr_ros.method.windows import time_note, window_of
 from stavpr_ros.prepare.blocks import converted_blocks
 from stavpr_ros.prepare.matcher import make_matcher

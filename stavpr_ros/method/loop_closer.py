@@ -17,7 +17,6 @@ from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.localizer import position_of, SequenceRecognizer
 from stavpr_ros.method.match import Limits, Match, Status, WindowColumns
 from stavpr_ros.method.model import AROUND, BAND, CONFIRMED, LONGEST_GAP, LONGEST_WAIT
-from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.matcher import CpuRouteMatcher, PRECISIONS
@@ -54,6 +53,7 @@ class LoopCloser(SequenceRecognizer):
     :raises SettingsError: invalid settings.
     """
 
+    _window: FilterWindow | LmDtwWindow
     no_places = 'no earlier place is old enough to be matched with'
 
     def __init__(
@@ -71,10 +71,10 @@ class LoopCloser(SequenceRecognizer):
         self._track: list[np.ndarray] = []  # position of each place that is not evicted
         options, sequence = settings.applied_options, settings.sequence
         layout = ColumnLayout(nms_radius=settings.nms_radius)
-        window: QueryWindow
+        window: FilterWindow | LmDtwWindow
         if options.place_filter:
             constant = route_evidence_of(feature_settings.kind)
-            window = FilterWindow(sequence, 0, layout, True, AROUND, True, constant=constant)
+            window = FilterWindow(sequence, 0, layout, True, constant=constant)
         else:
             window = LmDtwWindow(sequence, 0, layout, options.query_znorm, AROUND)
         super().__init__(settings, feature_settings, window, self._track)
@@ -186,7 +186,7 @@ class LoopCloser(SequenceRecognizer):
 
         It is a backward pass over the window. Windows without a match have none of it either.
         """
-        if not self._window.full:
+        if self.window_fill < self._window.length:
             return []
         path = self._window.match_oldest(match.accepted).path
         status, reason = self._limits.decide(path.distance, path.probability)

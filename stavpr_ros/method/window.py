@@ -1,7 +1,8 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The window of mode robust: what the latest images show, by filter, paths and evidence."""
+"""The window of a query, and in mode robust what it shows, by filter, paths and evidence."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 import math
@@ -14,15 +15,120 @@ from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.evidence import probability_of, Quantities, RecentWindows, unevenness
 from stavpr_ros.method.filter import Filter, NEGLIGIBLE, PlaceFilter, SPACING
 from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
-from stavpr_ros.method.model import APART, CLOSE, MODEL, Model, ON_MAP, ROUTE_IMAGES, STRAIGHT
+from stavpr_ros.method.model import (
+    APART,
+    AROUND,
+    CLOSE,
+    MODEL,
+    Model,
+    ON_MAP,
+    ROUTE_IMAGES,
+    STRAIGHT,
+)
 from stavpr_ros.method.motion import ImageChange
 from stavpr_ros.method.path import centered_place, close_sums, follow
 from stavpr_ros.method.place_means import PlaceMeans
-from stavpr_ros.method.query_window import QueryWindow
+from stavpr_ros.prepare.normalization import z_normalized
 
 MIN_IMAGES = 2  # of a match by the newest images alone
 LEAST = 1e-9  # probability that shares are relative to
 NOT_COMPARED: np.ndarray = np.empty(0, np.float32)  # a row without distances
+
+# An image of the window:
+# stamp       ns; 0 = unknown
+# change      from the image before; mode robust
+# number      of the filter's last update; images of a camera at rest share one
+# is_matched  it had a match as the middle image
+WINDOW_IMAGE = np.dtype([('stamp', 'i8'), ('change', 'f8'), ('number', 'i8'), ('is_matched', '?')])
+
+
+class QueryWindow(ABC):
+    """
+    The latest l images of a query, their distances to all places, and what they show.
+
+    A recognizer has one window, which is all that is reset between two queries beside running
+    means.
+
+    :param length: l.
+    :param layout: of the places in columns.
+
+    ``images`` are those in the window, oldest first, (m,), ``WINDOW_IMAGE``; ``is_standstill`` is
+    whether the newest one equals the one before, up to noise; False without a filter.
+    """
+
+    def __init__(self, length: int, layout: ColumnLayout) -> None:
+        self.length, self.layout = length, layout
+        self.first = self.known = 0
+        self.is_standstill = False
+        # one behind the other; at the end, the window moves to the front
+        self._images, self._end = np.empty(2 * length, WINDOW_IMAGE), 0
+        self.images = self._images[:0]
+
+    @property
+    def changes(self) -> tuple[float, ...]:
+        """Change of each image from the one before, oldest first; empty without a filter."""
+        return ()
+
+    @abstractmethod
+    def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
+        """
+        Add the newest image, and drop the oldest.
+
+        :param row: its distances to the places, (n,), float32, as the matcher returns them.
+        :param strips: its features, centered, (W, d).
+        :param stamp: ns; 0 = unknown.
+        """
+
+    @abstractmethod
+    def newest_row(self) -> np.ndarray:
+        """Return the distances of the newest image to the columns, (width,)."""
+
+    @abstractmethod
+    def at(self, columns: np.ndarray) -> np.ndarray:
+        """Return the distances of the images to columns, oldest first, (images, m), float32."""
+
+    def _append(self, stamp: int, change: float = 0.0, number: int = 0) -> None:
+        before = min(len(self.images), self.length - 1)
+        if self._end == len(self._images):
+            self._move_to_front(before)
+        self._images[self._end] = stamp, change, number, False
+        self._end += 1
+        self.images = self._images[self._end - before - 1 : self._end]
+
+    def _move_to_front(self, count: int) -> None:
+        """Move the newest images, so many, from the end of the memory to its front."""
+        self._images[:count], self._end = self._images[self._end - count :], count
+
+    @abstractmethod
+    def match(self) -> WindowMatch:
+        """Return the match of the images in the window, in mode paper of a full one."""
+
+    def match_newest(self) -> WindowMatch:
+        """
+        Return the match of the newest images, since the camera has come to the map.
+
+        :returns: without a sequence where the full window shows the same, or in loop closure and
+            mode paper.
+        """
+        return WindowMatch()
+
+    def match_oldest(self, is_matched: bool) -> WindowMatch:
+        """
+        Return the match of the oldest image by the whole window, where it had none as the middle.
+
+        :param is_matched: whether the window itself is matched.
+        :returns: without a sequence where the oldest image had a match, or the window has none,
+            and in mode paper.
+        """
+        return WindowMatch()
+
+    def reset(self) -> None:
+        """Drop all images."""
+        self.images, self._end, self.is_standstill = self._images[:0], 0, False
+
+    def evict(self, count: int) -> None:
+        """Drop the oldest places; the others move up."""
+        self.first += count
 
 
 class Shown(NamedTuple):
@@ -53,14 +159,14 @@ class FilterWindow(QueryWindow):
     :param sequence: l and k.
     :param places: number of places n.
     :param layout: of the places.
-    :param normalizes, around: see :class:`stavpr_ros.method.query_window.QueryWindow`.
     :param is_route: for loop closure: the mean z of each place is subtracted
-        (:mod:`stavpr_ros.method.place_means`), and paths are compared with no others.
+        (:mod:`stavpr_ros.method.place_means`) and that around it, and paths are compared with no
+        others.
     :param constant: of the evidence (:class:`stavpr_ros.features.registry.Kind`).
-    :param cells: of the images; None = they are not compared.
     :param model: of the filter.
 
-    ``change`` compares images, ``filter`` contains the states, ``recent`` is of the drive.
+    ``change`` compares images, ``filter`` contains the states, ``recent`` is of the drive;
+    ``cells``, of the images, are None unless they are compared.
     """
 
     filter_class: Callable[..., Filter] = PlaceFilter
@@ -69,22 +175,19 @@ class FilterWindow(QueryWindow):
         self,
         sequence: SequenceSettings,
         places: int,
-        layout: ColumnLayout | None = None,
-        normalizes: bool = False,
-        around: int = 0,
+        layout: ColumnLayout,
         is_route: bool = False,
         *,
         constant: float = 0.0,
-        cells: CellAgreement | None = None,
         model: Model = MODEL,
     ) -> None:
-        layout = layout or ColumnLayout()
         length, width = sequence.length, layout.width(places)
-        super().__init__(length, layout, normalizes, around)
+        super().__init__(length, layout)
         self._is_route = is_route
         self.filter: Filter = self.filter_class(width, length, model, layout.gaps)
         self.change = ImageChange(layout.passes(places), length)
-        self._constant, self.cells, self.recent = constant, cells, RecentWindows()
+        self._constant, self.recent = constant, RecentWindows()
+        self.cells: CellAgreement | None = None
         self._means = PlaceMeans()
         self._width, self._newest = width, NOT_COMPARED
         self._shown: Shown | None = None  # by the latest images that moved
@@ -95,11 +198,6 @@ class FilterWindow(QueryWindow):
     def changes(self) -> tuple[float, ...]:
         """Change of each image from the one before, oldest first."""
         return tuple(self.images['change'].tolist())
-
-    @property
-    def is_standstill(self) -> bool:
-        """Whether the newest image equals the one before, up to noise."""
-        return self.change.is_standstill(float(self.images['change'][-1]))
 
     def reset(self) -> None:
         """Drop all images."""
@@ -126,16 +224,17 @@ class FilterWindow(QueryWindow):
         for part in (self.filter, self.change, self._means):
             part.evict(count)
 
-    def _counted(self, n: int) -> np.ndarray:
-        """See :meth:`QueryWindow._counted`; of places of a standstill, one."""
-        return self.change.distinct(n)
-
     def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
         """See :meth:`QueryWindow.push`."""
-        row, change = self._as_columns(row), self.change.next_query(strips)
+        row, change = self._z(row), self.change.next_query(strips)
         if self._is_route:
             row = self._means.subtracted(row, self.change.is_standstill(change))
         self.add(row, stamp, change, strips)
+
+    def _z(self, row: Any) -> Any:
+        """Return distances to the places as z of the columns."""
+        around, counted = AROUND * self._is_route, self.change.distinct(len(row))
+        return self.layout.to_columns(z_normalized(row, around, counted, self.layout.starts))
 
     def newest_row(self) -> np.ndarray:
         """See :meth:`QueryWindow.newest_row`; as it was added, also of a camera at rest."""
@@ -150,7 +249,7 @@ class FilterWindow(QueryWindow):
         rows = self.images['number'] - (self.filter.count - count)
         return self.filter.z(columns, count)[rows]
 
-    def add(self, z: Any, stamp: int, change: float, strips: np.ndarray | None = None) -> None:
+    def add(self, z: Any, stamp: int, change: float, strips: np.ndarray) -> None:
         """
         Add the newest image.
 
@@ -164,13 +263,14 @@ class FilterWindow(QueryWindow):
         if self._repeated.stop:
             self.filter.move_back(self._repeated, self.layout.lap)
             self._repeated = slice(0, 0)
-        moved = not self.filter.count or not self.change.is_standstill(change)
+        self.is_standstill = self.change.is_standstill(change)
+        moved = not self.filter.count or not self.is_standstill
         if not moved:
             by_pass = self.layout.to_passes(self.filter.by_place())[: self.known]
             moved = self.change.is_dark_stretch(by_pass)
         if moved:
             self.filter.update(z, self.change.weight(change))
-            if self.cells is not None and strips is not None:
+            if self.cells is not None:
                 self.cells.push(strips)
             self._shown = self._latest = None
         self._append(stamp, change, self.filter.count - 1)
@@ -270,11 +370,10 @@ class FilterWindow(QueryWindow):
 
         :param images: of the window that are matched; number: of the image among these.
         """
-        first = self.first
-        numbers = images['number'] - (self.filter.count - len(shown.path))
+        first, oldest = self.first, self.filter.count - len(shown.path)
+        numbers, row = images['number'] - oldest, number - oldest
         columns, shares = shown.path[numbers], shown.shares[numbers]
         peak = float(shown.probabilities.max(initial=0.0))
-        row = number - (self.filter.count - len(shown.path))
         certain = shown.probability * float(shown.shares[row])
         shares = shares if certain > 0 else shares[:0]
         place = int(shown.path[row])
@@ -297,12 +396,12 @@ class FilterWindow(QueryWindow):
 
     def _second_best(self, shown: Shown, place: int) -> tuple[int, float]:
         """Return the most probable column elsewhere, and its probability, 0 if none."""
-        near = self.layout.around(place, self.layout.nms_radius)
-        elsewhere = ~_inside(shown.candidates, near)
-        now = self.filter.by_place()[: self.known]
+        now, is_near = self.filter.by_place()[: self.known], np.zeros(self.known, bool)
         now[shown.candidates] = 0
-        for low, end in near.tolist():
-            now[max(low, 0) : max(end, 0)] = 0
+        for low, end in self.layout.around(place, self.layout.nms_radius).tolist():
+            near = slice(max(low, 0), max(end, 0))
+            now[near], is_near[near] = 0, True
+        elsewhere = ~is_near[shown.candidates]
         second = int(np.argmax(now))
         probability = float(now[second]) * NEGLIGIBLE
         if elsewhere.any():
@@ -318,9 +417,3 @@ class FilterWindow(QueryWindow):
         probabilities *= share
         costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
         return WindowSequences(costs, np.arange(first, first + n), probabilities)
-
-
-def _inside(columns: np.ndarray, slices: np.ndarray) -> np.ndarray:
-    """Return which columns are in one of the slices, (m,), bool."""
-    inside = (columns[:, None] >= slices[:, 0]) & (columns[:, None] < slices[:, 1])
-    return np.any(inside, axis=1)

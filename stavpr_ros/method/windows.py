@@ -11,9 +11,8 @@ from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.filter import SPACING
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.model import MODEL
-from stavpr_ros.method.query_window import QueryWindow
 from stavpr_ros.method.settings import PAPER, RecognizerSettings
-from stavpr_ros.method.window import FilterWindow
+from stavpr_ros.method.window import FilterWindow, QueryWindow
 from stavpr_ros.prepare.blocks import MAX_LAG
 from stavpr_ros.prepare.normalization import ONE_SESSION
 
@@ -36,7 +35,7 @@ def window_of(
     length = sequence.length + SPACING if options.place_filter else 0
     layout = layout_of(place_map, settings.nms_radius, settings.moves_against, length)
     if options.place_filter:
-        arguments = sequence, n, layout, True
+        arguments = sequence, n, layout
         if isinstance(backend, str):
             return FilterWindow(*arguments, constant=constant)
         from stavpr_ros.method.device_windows import DeviceFilterWindow
