@@ -38,9 +38,8 @@ from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.model import APART, MODEL, STRAIGHT
 from stavpr_ros.pipeline import LoadedMap, Pipeline, PipelineSettings
 from stavpr_ros.prepare.blocks import Int8Features
-from stavpr_ros.prepare.centering import MeanCentering, normalize
+from stavpr_ros.prepare.centering import MeanCentering, normalize, z_normalized
 from stavpr_ros.prepare.matcher import make_matcher
-from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.sources.frame import ImageRecord
 from timing import best_seconds, timed
 import torch

@@ -11,7 +11,7 @@ from stavpr_ros.alignment.device import lm_dtw, spatial_alignment
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.method.columns import ColumnLayout
-from stavpr_ros.method.device_windows import DeviceLmDtwWindow
+from stavpr_ros.method.device import DeviceLmDtwWindow
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.prepare.matcher import make_matcher
 import torch

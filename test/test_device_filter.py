@@ -9,9 +9,9 @@ from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import Session
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.method.device_windows import z_normalized_on_device
+from stavpr_ros.method.device import z_normalized_on_device
 from stavpr_ros.method.settings import RobustOptions
-from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.prepare.centering import z_normalized
 import torch
 
 pytestmark = pytest.mark.usefixtures('one_thread')

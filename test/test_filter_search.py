@@ -7,8 +7,8 @@ from places import features_of, map_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
-from stavpr_ros.method.localizer import EARLY
 from stavpr_ros.method.columns import ColumnLayout
+from stavpr_ros.method.localizer import EARLY
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
 

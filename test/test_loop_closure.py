@@ -25,8 +25,8 @@ from stavpr_ros.method.match import Limits, Match, Path
 from stavpr_ros.method.model import CLOSE
 from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare import route_features
+from stavpr_ros.prepare.centering import z_normalized
 from stavpr_ros.prepare.matcher import CpuMatcher
-from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.prepare.route_features import ROOM, RouteFeatures
 
 pytestmark = pytest.mark.usefixtures('one_thread')

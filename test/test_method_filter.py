@@ -13,7 +13,7 @@ from stavpr_ros.devices import why_no_cuda
 from stavpr_ros.errors import InputError, SettingsError, StavprError
 from stavpr_ros.method.filter import PlaceFilter, power, STEEPEST
 from stavpr_ros.method.model import Model
-from stavpr_ros.method.straight import FAR
+from stavpr_ros.method.path import FAR
 from stavpr_ros.threads import one_thread
 
 pytestmark = pytest.mark.usefixtures('one_thread')
@@ -30,7 +30,7 @@ def make(request, monkeypatch):
     """Return a function that makes a filter: of arrays, and of tensors on each device."""
     if request.param == 'arrays':
         return PlaceFilter
-    module = pytest.importorskip('stavpr_ros.method.device_filter', exc_type=ImportError)
+    module = pytest.importorskip('stavpr_ros.method.device', exc_type=ImportError)
     monkeypatch.setattr(module, 'PLACES_AT_ONCE', 32)
     return partial(module.DevicePlaceFilter, device=request.param)
 
@@ -396,7 +396,7 @@ def test_arguments_that_do_not_fit_are_an_error_and_change_nothing(make, call):
 
 
 def test_errors_name_what_came_and_what_was_expected(make, device):
-    module = pytest.importorskip('stavpr_ros.method.device_filter', exc_type=ImportError)
+    module = pytest.importorskip('stavpr_ros.method.device', exc_type=ImportError)
     of_device = module.DevicePlaceFilter(9, 3, device=device)
     for name, wrong in (('grow', 9), ('evict', 1)):
         with pytest.raises(SettingsError, match="backend 'cpu'"):

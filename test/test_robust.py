@@ -19,8 +19,8 @@ from stavpr_ros.prepare.centering import (
     STRENGTH,
     unit_norm,
     Whitening,
+    z_normalized,
 )
-from stavpr_ros.prepare.normalization import z_normalized
 
 SHORT = SequenceSettings(length=5, beta=2.0)
 

@@ -24,7 +24,7 @@ from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.windows import layout_of
-from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.prepare.centering import z_normalized
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 LENGTH, PLACES = 10, 90

@@ -9,7 +9,7 @@ from stavpr_ros.features import FeatureSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.method.motion import change_weights
-from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.prepare.centering import z_normalized
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 PLACES, STOP, STANDING, D = 160, 70, 400, 32

@@ -26,8 +26,8 @@ from stavpr_ros.method.motion import ImageChange
 from stavpr_ros.method.settings import ROBUST
 from stavpr_ros.method.window import FilterWindow
 from stavpr_ros.prepare.blocks import MAX_LAG, PlaceChanges
+from stavpr_ros.prepare.centering import MIN_DEVIATION
 from stavpr_ros.prepare.matcher import CpuMatcher
-from stavpr_ros.prepare.normalization import MIN_DEVIATION
 from stavpr_ros.threads import call_on_thread
 
 CHUNK = 32  # places that are fetched together

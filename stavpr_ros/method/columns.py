@@ -34,7 +34,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.method.filter import NO_PLACES
 from stavpr_ros.method.match import Candidate, WindowMatch, WindowSequences
 from stavpr_ros.method.model import CLOSE, MODEL
-from stavpr_ros.prepare.normalization import ONE_SESSION
+from stavpr_ros.prepare.centering import ONE_SESSION
 
 
 class ColumnLayout:

@@ -36,7 +36,7 @@ from stavpr_ros.compilation import kernel, parallel_kernel
 from stavpr_ros.errors import InputError
 from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.method.model import MODEL, Model
-from stavpr_ros.method.straight import best_straight, PART
+from stavpr_ros.method.path import best_straight, PART
 from stavpr_ros.threads import one_thread
 
 NO_PLACES: np.ndarray = np.empty(0, np.int64)

@@ -15,12 +15,12 @@ from stavpr_ros.memory import aligned_empty
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.match import Path, WindowMatch, WindowSequences
 from stavpr_ros.method.window import QueryWindow
-from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.prepare.centering import z_normalized
 
 
 class LmDtwWindow(QueryWindow):
     """
-    LM-DTW on the CPU; its twin is in :mod:`stavpr_ros.method.device_windows`.
+    LM-DTW on the CPU; its twin is in :mod:`stavpr_ros.method.device`.
 
     The distances are one row behind the other, as the images, so that those of the window are one
     slice, oldest image first, as LM-DTW takes them.
@@ -29,7 +29,7 @@ class LmDtwWindow(QueryWindow):
     :param places: number of places n.
     :param layout: of the places.
     :param normalizes: z-normalize the distances of each image.
-    :param around: see :func:`stavpr_ros.prepare.normalization.z_normalized`.
+    :param around: see :func:`stavpr_ros.prepare.centering.z_normalized`.
     """
 
     def __init__(

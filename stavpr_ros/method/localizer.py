@@ -6,7 +6,7 @@ The chain, image by image (:meth:`PlaceRecognizer.update`).
 1. **Light**: the running mean of the query is subtracted, and the rest whitened
    (:class:`stavpr_ros.prepare.centering.MeanCentering`).
 2. **Distances** to all places (:mod:`stavpr_ros.prepare.matcher`), normalized to **z**
-   (:func:`stavpr_ros.prepare.normalization.z_normalized`).
+   (:func:`stavpr_ros.prepare.centering.z_normalized`).
 3. **Motion**: whether the camera moved, and how much (:class:`.motion.ImageChange`).
 4. **Window and filter**: an image that moved advances the states
    (:meth:`.window.FilterWindow.add`, :meth:`.filter.Filter.update`).

@@ -28,7 +28,7 @@ from stavpr_ros.method.model import (
 from stavpr_ros.method.motion import ImageChange
 from stavpr_ros.method.path import centered_place, close_sums, follow
 from stavpr_ros.method.place_means import PlaceMeans
-from stavpr_ros.prepare.normalization import z_normalized
+from stavpr_ros.prepare.centering import z_normalized
 
 MIN_IMAGES = 2  # of a match by the newest images alone
 LEAST = 1e-9  # probability that shares are relative to

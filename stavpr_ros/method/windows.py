@@ -14,7 +14,7 @@ from stavpr_ros.method.model import MODEL
 from stavpr_ros.method.settings import PAPER, RecognizerSettings
 from stavpr_ros.method.window import FilterWindow, QueryWindow
 from stavpr_ros.prepare.blocks import MAX_LAG
-from stavpr_ros.prepare.normalization import ONE_SESSION
+from stavpr_ros.prepare.centering import ONE_SESSION
 
 if TYPE_CHECKING:
     import torch
@@ -38,7 +38,7 @@ def window_of(
         arguments = sequence, n, layout
         if isinstance(backend, str):
             return FilterWindow(*arguments, constant=constant)
-        from stavpr_ros.method.device_windows import DeviceFilterWindow
+        from stavpr_ros.method.device import DeviceFilterWindow
 
         return DeviceFilterWindow(*arguments, constant=constant, device=backend)
     if isinstance(backend, str):
@@ -48,7 +48,7 @@ def window_of(
             f"options {options} with backend '{backend}': without the place filter, it runs mode "
             "paper only; take 'cpu'"
         )
-    from stavpr_ros.method.device_windows import DeviceLmDtwWindow
+    from stavpr_ros.method.device import DeviceLmDtwWindow
 
     return DeviceLmDtwWindow(sequence, n, layout, backend)
 

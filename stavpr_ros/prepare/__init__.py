@@ -9,7 +9,7 @@ alignment of :mod:`stavpr_ros.alignment` makes one distance of the W x W strip d
 1. centering: the part that all images of a drive share distinguishes no places, so the mean of the
    map is subtracted from its places, and the running mean of the query from its images;
 2. whitening: the directions in which places vary most are shrunk (:mod:`.centering`);
-3. after the alignment, z-normalization over all places (:mod:`.normalization`).
+3. after the alignment, z-normalization over all places (:mod:`.centering`).
 
 A matcher has the prepared places in its memory (:mod:`.matcher`),
 in float32 or int8 (:class:`.blocks.Int8Features`), or the places of a route that grows
@@ -32,8 +32,8 @@ exceed the memory:
 (20, True)
 """
 
+from stavpr_ros.prepare.centering import z_normalized
 from stavpr_ros.prepare.matcher import make_matcher
-from stavpr_ros.prepare.normalization import z_normalized
 from stavpr_ros.prepare.prepared_map import prepare_map, PreparedMap
 
 __all__ = ['PreparedMap', 'make_matcher', 'prepare_map', 'z_normalized']
