@@ -50,9 +50,9 @@ class ColumnLayout:
     :param against: the camera may move against the map, too; not without places.
     :param repeated: first places of a closed route of one session that follow its last one.
 
-    ``runs`` are the places of each session, ``starts`` the first of each, ``firsts`` its first
-    passes, ``columns`` the columns of the passes, None where each is the column of its number, and
-    ``gaps`` the columns between.
+    ``starts`` are the first places of the sessions, ``firsts`` their first passes, ``columns`` the
+    columns of the passes, None where each is the column of its number, and ``gaps`` the columns
+    between.
     ``lap`` is the number of places of a closed route's lap, 0 of another route.
     """
 
@@ -65,14 +65,11 @@ class ColumnLayout:
         repeated: int = 0,
     ) -> None:
         self.starts = self.firsts = firsts
-        self.nms_radius = nms_radius
-        self.runs, self.gaps = [slice(None)], NO_PLACES
+        self.nms_radius, self.lap, self.gaps = nms_radius, 0, NO_PLACES
         self.columns: np.ndarray | None = None
-        self.lap = 0
         if len(firsts) == 1 and not against and not repeated:
             return
         n = len(same_as)
-        self.runs = [slice(*pair) for pair in zip(firsts, [*firsts[1:], n], strict=True)]
         self.lap = n - int(same_as[-1]) - 1 if repeated else 0
         seam_places = np.arange(n, n + repeated) - self.lap
         self._places = np.append(np.arange(n), seam_places)  # of each pass
@@ -98,16 +95,11 @@ class ColumnLayout:
         """Return the number of passes of so many places."""
         return places if self.columns is None else len(self._places)
 
-    def of_passes(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of places (..., n) as values of their passes."""
-        return values if self.columns is None else values[..., self._places]
-
     def changes_of_passes(self, changes: np.ndarray) -> np.ndarray:
         """Return changes from the places 1, 2, ... before (L, n) as changes of passes."""
-        changes = self.of_passes(changes)
         if self.columns is None:
             return changes
-        n, first = len(self._same_as), self._along
+        changes, n, first = changes[:, self._places], len(self._same_as), self._along
         for apart, row in enumerate(changes, 1):
             if self.lap:
                 row[n : n + apart] = row[n + apart]  # over the seam: as behind it
@@ -132,11 +124,9 @@ class ColumnLayout:
 
     def sums_of_places(self, values: np.ndarray) -> np.ndarray:
         """Return the sums of the values of each place's columns, (n,)."""
-        sums = self.to_places(values)
-        if self.columns is not None and len(self._places) > len(sums):
-            n = len(sums)
-            sums = sums + np.bincount(self._places[n:], values[self.columns[n:]], n)
-        return sums
+        if self.columns is None:
+            return values
+        return np.bincount(self._places, values[self.columns], len(self._same_as))
 
     def to_passes(self, values: np.ndarray) -> np.ndarray:
         """Return the values of the columns that are passes."""
@@ -177,8 +167,9 @@ class ColumnLayout:
         """Return the first place of a place's session, and the first one behind it."""
         if self.columns is None:
             return 0, sys.maxsize
-        run = self.runs[int(np.searchsorted(self.firsts, place, 'right')) - 1]
-        return int(run.start), int(run.stop)
+        session = int(np.searchsorted(self.starts, place, 'right'))
+        ends = [*self.starts.tolist(), len(self._same_as)]
+        return ends[session - 1], ends[session]
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
         """Return positions: those at most ``nms_radius`` apart are neighbors in one session."""

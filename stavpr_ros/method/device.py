@@ -183,13 +183,14 @@ class RowColumns:
     def __init__(
         self, counted: np.ndarray | None, layout: ColumnLayout, places: int, device: torch.device
     ) -> None:
-        self._layout = layout
+        self._cuts = layout.starts[1:].tolist()
         self._counted = None if counted is None else torch.from_numpy(counted).to(device)
-        columns = torch.from_numpy(layout.columns_of(np.arange(layout.passes(places))))
-        self._columns = columns.to(device)
-        self._places = torch.from_numpy(layout.of_passes(np.arange(places))).to(device)
+        sources = layout.to_columns(np.arange(float(places)))
+        columns = np.flatnonzero(np.isfinite(sources))
+        self._columns = torch.from_numpy(columns).to(device)
+        self._places = torch.from_numpy(sources[columns].astype(np.int64)).to(device)
         self._row = torch.zeros(places, device=device)
-        self._out = torch.full((layout.width(places),), torch.inf, device=device)
+        self._out = torch.full((len(sources),), torch.inf, device=device)
         self._graph = DeviceGraph(device, self._compute)
 
     def __call__(self, row: torch.Tensor) -> torch.Tensor:
@@ -202,8 +203,8 @@ class RowColumns:
     def _compute(self) -> None:
         row = self._row
         if (counted := self._counted) is not None:
-            runs = self._layout.runs
-            row = torch.cat([z_normalized_on_device(row[run], counted[run]) for run in runs])
+            parts = row.tensor_split(self._cuts), counted.tensor_split(self._cuts)
+            row = torch.cat(list(map(z_normalized_on_device, *parts)))
         self._out.index_copy_(0, self._columns, row[self._places])
 
 
