@@ -21,8 +21,9 @@ from stavpr_ros.alignment import (
 )
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.prepare import prepare_map, z_normalized
+from stavpr_ros.prepare.centering import z_normalized
 from stavpr_ros.prepare.matcher import CpuMatcher, make_matcher, PRECISIONS
+from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.threads import limit_threads
 
 ADAPTIVE = SpatialSettings()

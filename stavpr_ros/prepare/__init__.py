@@ -19,7 +19,9 @@ exceed the memory:
 >>> import numpy as np
 >>> from stavpr_ros.alignment import SpatialSettings
 >>> from stavpr_ros.features import FeatureSettings, LocalFeatures
->>> from stavpr_ros.prepare import make_matcher, prepare_map, z_normalized
+>>> from stavpr_ros.prepare.centering import z_normalized
+>>> from stavpr_ros.prepare.matcher import make_matcher
+>>> from stavpr_ros.prepare.prepared_map import prepare_map
 >>> strips = np.random.default_rng(0).standard_normal((7, 50, 24)).astype(np.float32)
 >>> strips /= np.linalg.norm(strips, axis=2, keepdims=True)
 >>> weights = np.full((7, 50), 7**-0.5, np.float32)
@@ -31,9 +33,3 @@ exceed the memory:
 >>> int(z.argmin()), bool(z.min() < -5)
 (20, True)
 """
-
-from stavpr_ros.prepare.centering import z_normalized
-from stavpr_ros.prepare.matcher import make_matcher
-from stavpr_ros.prepare.prepared_map import prepare_map, PreparedMap
-
-__all__ = ['PreparedMap', 'make_matcher', 'prepare_map', 'z_normalized']
