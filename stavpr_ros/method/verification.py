@@ -101,20 +101,15 @@ class PlaceVerifier:
             if len(self._known) > CACHED:
                 self._known.popitem(last=False)
         self._known.move_to_end(place)
-        return self._common(self._query_keypoints(query), self._known[place])
-
-    def _query_keypoints(self, query: np.ndarray) -> Keypoints:
         gray = self._small_gray(query, 'query')
         # compared by content: a caller may use the memory of an image again for the next
         if self._query is None or not np.array_equal(self._query[0], gray):
             self._query = gray, self._detected(gray)
-        return self._query[1]
-
-    def _common(self, query: Keypoints, place: Keypoints) -> int:
-        mine, theirs = mutual_matches(query.descriptors, place.descriptors, RATIO)
-        if len(mine) < MIN_MATCHES:
+        mine, theirs = self._query[1], self._known[place]
+        pairs = mutual_matches(mine.descriptors, theirs.descriptors, RATIO)
+        if len(pairs[0]) < MIN_MATCHES:
             return 0
-        return _explained(query.points[mine], place.points[theirs])
+        return _explained(mine.points[pairs[0]], theirs.points[pairs[1]])
 
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return an image at the common width, (h, w) uint8."""

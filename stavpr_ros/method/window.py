@@ -328,6 +328,8 @@ class FilterWindow(QueryWindow):
         belief = float(probabilities.max())
         place = centered_place(columns, of_images, position, at)
         path = follow(columns, of_images, position, round(place))
+        shares = close_sums(columns, of_images, path)
+        shares = np.minimum(shares / max(shares[position], LEAST), 1)
         z = self.filter.z(path[:, None], l)[:, 0]
         excess = 0.0
         if l == self.length:
@@ -337,9 +339,6 @@ class FilterWindow(QueryWindow):
         own = quantities.own(self._constant)
         # most of a route passes no earlier place: its windows say nothing about the next one
         probability = probability_of(own, 0.5 if self._is_route else self.recent.share)
-        shares = close_sums(columns, of_images, path)
-        shares /= max(shares[position], LEAST)
-        shares = np.minimum(shares, 1)
         return Shown(path, position, quantities, own, probability, columns, probabilities, shares)
 
     def _compared(self, quantities: Quantities, path: np.ndarray, position: int) -> Quantities:
