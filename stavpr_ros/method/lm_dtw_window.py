@@ -57,14 +57,12 @@ class LmDtwWindow(QueryWindow):
         row = self.layout.to_columns(row)
         if not row.sum() > -np.inf:
             no_nan(row, 'image distances')
+        if self._end == len(self._rows):
+            self._rows[: self.length - 1] = self._rows[1 - self.length :]
         self._append(stamp)
         newest, m = self._rows[self._end - 1], len(row)
         newest[:m], newest[m : self._width] = row, np.inf
         self.known = max(self.known, m)
-
-    def _move_to_front(self, count: int) -> None:
-        self._rows[:count] = self._rows[self._end - count :]
-        super()._move_to_front(count)
 
     def newest_row(self) -> np.ndarray:
         """See :meth:`QueryWindow.newest_row`."""

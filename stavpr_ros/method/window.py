@@ -90,14 +90,10 @@ class QueryWindow(ABC):
     def _append(self, stamp: int, change: float = 0.0, number: int = 0) -> None:
         before = min(len(self.images), self.length - 1)
         if self._end == len(self._images):
-            self._move_to_front(before)
+            self._images[:before], self._end = self._images[-before:], before
         self._images[self._end] = stamp, change, number, False
         self._end += 1
         self.images = self._images[self._end - before - 1 : self._end]
-
-    def _move_to_front(self, count: int) -> None:
-        """Move the newest images, so many, from the end of the memory to its front."""
-        self._images[:count], self._end = self._images[self._end - count :], count
 
     @abstractmethod
     def match(self) -> WindowMatch:
