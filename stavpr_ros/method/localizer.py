@@ -267,17 +267,20 @@ class SequenceRecognizer(ABC):
         is_oldest: bool = False,
     ) -> Match:
         """Build a match of the images of a path, or of the window."""
-        window, count = self._window, len(path.pairs)
-        images = int(path.pairs[-1, 0]) + 1 if count else len(window.images)
+        images = self._window.images
+        if len(path.pairs):
+            images = images[-1 - int(path.pairs[-1, 0]) :]
+        has_changes = isinstance(self._window, FilterWindow)
+        changes = images['change'] if has_changes else images['change'][:0]
         return Match(
             status,
             reason,
             limits,
             path,
             probability,
-            window_stamps=tuple(window.images['stamp'][-images:].tolist()),
-            window_changes=window.changes[-images:],
-            first_image=self._first_image(images),
+            window_stamps=tuple(images['stamp'].tolist()),
+            window_changes=tuple(changes.tolist()),
+            first_image=self._first_image(len(images)),
             is_oldest=is_oldest,
         )
 

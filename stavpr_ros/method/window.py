@@ -36,7 +36,7 @@ NOT_COMPARED: np.ndarray = np.empty(0, np.float32)  # a row without distances
 
 # An image of the window:
 # stamp       ns; 0 = unknown
-# change      from the image before; mode robust
+# change      from the image before; 0 in mode paper
 # number      of the filter's last update; images of a camera at rest share one
 # is_matched  it had a match as the middle image
 WINDOW_IMAGE = np.dtype([('stamp', 'i8'), ('change', 'f8'), ('number', 'i8'), ('is_matched', '?')])
@@ -63,11 +63,6 @@ class QueryWindow(ABC):
         # one behind the other; at the end, the window moves to the front
         self._images, self._end = np.empty(2 * length, WINDOW_IMAGE), 0
         self.images = self._images[:0]
-
-    @property
-    def changes(self) -> tuple[float, ...]:
-        """Change of each image from the one before, oldest first; empty without a filter."""
-        return ()
 
     @abstractmethod
     def push(self, row: Any, strips: np.ndarray, stamp: int) -> None:
@@ -189,11 +184,6 @@ class FilterWindow(QueryWindow):
         self._shown: Shown | None = None  # by the latest images that moved
         self._latest: Shown | None = None  # by half of them
         self._repeated = slice(0, 0)  # columns that the latest path is in, beyond a lap
-
-    @property
-    def changes(self) -> tuple[float, ...]:
-        """Change of each image from the one before, oldest first."""
-        return tuple(self.images['change'].tolist())
 
     def reset(self) -> None:
         """Drop all images."""
