@@ -62,7 +62,7 @@ class CellAgreement:
         return self._mean(images, path) - elsewhere
 
     def _mean(self, images: Sequence[Any], path: np.ndarray) -> float:
-        pairs = [(image, column) for image, column in zip(images, path.tolist(), strict=True)]
+        pairs = list(zip(images, path.tolist(), strict=True))
         new = [(image, column) for image, column in pairs if column not in image[2]]
         if new:
             strips = self._strips_of(np.array([column for _, column in new]))

@@ -48,8 +48,7 @@ class LoopCloser(SequenceRecognizer):
         excluded images.
     :param exclude_seconds: places younger than so many seconds are not part of the map either.
     :param precision: of the route's features once it is settled, ``float32``, also by ``auto``, or
-        ``int8``; see
-        :mod:`stavpr_ros.prepare.route_features`.
+        ``int8``; see :mod:`stavpr_ros.prepare.route_features`.
     :raises SettingsError: invalid settings.
     """
 
