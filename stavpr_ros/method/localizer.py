@@ -202,11 +202,8 @@ class SequenceRecognizer(ABC):
         return window.at(window.layout.columns_of(places - window.first))
 
     def _require_one_image(self, features: Any, where: str, dimension: int) -> None:
-        if not isinstance(features, LocalFeatures):
-            expected = (
-                'the LocalFeatures of one image, as of place_map.extractor().extract([image])'
-            )
-            require_type('features', features, LocalFeatures, expected)
+        expected = 'the LocalFeatures of one image, as of place_map.extractor().extract([image])'
+        require_type('features', features, LocalFeatures, expected)
         features.require_fit(self._feature_settings, where, dimension)
         if (count := features.strips.shape[1]) != 1:
             raise InputError(f'features of {count} images: expected one image')

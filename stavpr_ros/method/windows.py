@@ -63,15 +63,12 @@ def layout_of(
     :param length: l, of a window that goes on over the seam of a closed route.
     """
     index, n = place_map.session_index, len(place_map)
-    same_as = place_map.same_as
-    if same_as is None:
-        same_as = np.arange(n)
+    same_as = np.arange(n) if place_map.same_as is None else place_map.same_as.astype(np.int64)
     firsts = np.flatnonzero(np.diff(index, prepend=-1)) if index is not None and n else ONE_SESSION
     repeated, seam = 0, place_map.seam
     if length and seam is not None:
         repeated = min(n - 1 - 2 * seam, int(length * max(MODEL.speeds)))
         repeated = repeated if repeated > MAX_LAG else 0
-    same_as = same_as.astype(np.int64)
     return ColumnLayout(firsts, same_as, nms_radius, against and n > 0, repeated)
 
 
