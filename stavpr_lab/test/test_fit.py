@@ -42,16 +42,16 @@ def test_half_and_double_of_every_number_differ_from_it():
 def test_evidence_is_replayed_as_it_is_computed():
     """Over two drives, with early windows, and such of a camera at rest."""
     rng, n, values = np.random.default_rng(0), 300, fit_windows.values_now('g')
-    x = rng.uniform((-9, 0, -0.1, 0, 0, 0), (9, 0.5, 0.2, 4, 3, 0), (n, 6))
+    x = rng.uniform((-9, 0, -0.1, 0, 0, 0, 0), (9, 0.5, 0.2, 1, 4, 3, 0), (n, 7))
     drive, early, kind = np.arange(n) // 150, rng.random(n) < 0.2, (rng.random(n) < 0.9) * 1.0
     kind[:: n // 2], early[:: n // 2] = 1, False
     scores = fit_windows.scores_of(x, drive, early, kind, *fit_windows.numbers_of(values, 'g'))
     recent, expected = {i: evidence.RecentWindows() for i in range(2)}, np.empty(n)
     newest = 0.0
-    for i, (odds, uneven, excess, lead, cells, _) in enumerate(x.tolist()):
+    for i, (odds, uneven, excess, creep, lead, cells, _) in enumerate(x.tolist()):
         belief = 1 / (1 + np.exp(-odds))
         quantities = evidence.Quantities(
-            belief, uneven, excess, np.expm1(lead), cells=np.expm1(cells)
+            belief, uneven, excess, np.expm1(lead), cells=np.expm1(cells), creep=creep
         )
         own, of_drive = quantities.own(values['g']), recent[int(drive[i])]
         expected[i] = evidence.probability_of(own, of_drive.share)
