@@ -7,8 +7,8 @@ The tuned numbers of the method, each with its unit and meaning; numba's kernels
 numbers of the filter, the place and the evidence at half and at double of their value, with
 ``gradient``: benchmarks/results/fit.md. They were chosen on drives of Gardens Point, the walk by
 night, the corridor, Nordland and the office. ``ROUTE_IMAGES``, ``CONFIRMED`` and K of a route were
-chosen on these routes driven twice (benchmarks/results/robust_mode.md), on no other ones; they and
-odometry have no half and double. Error rates are in :mod:`.error_rate`.
+chosen on these routes driven twice, where ``--routes`` measures other values; odometry has no half
+and double. Error rates are in :mod:`.error_rate`.
 """
 
 from dataclasses import dataclass
