@@ -3,6 +3,7 @@
 """Loop closure: bounded memory, exclusion by seconds, resets, against a plain loop."""
 
 from dataclasses import replace
+from functools import partial
 import math
 
 import numpy as np
@@ -16,18 +17,18 @@ from stavpr_ros.method.loop_closer import (
     AROUND,
     BAND,
     CONFIRMED,
-    EVICTED,
     LONGEST_GAP,
     LoopCloser,
     MIN_PLACES,
+    PathConfirmation,
 )
-from stavpr_ros.method.match import Limits, Match, Path
+from stavpr_ros.method.match import Limits, Match, Path, WindowColumns
 from stavpr_ros.method.model import CLOSE
 from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare import route_features
 from stavpr_ros.prepare.centering import z_normalized
 from stavpr_ros.prepare.matcher import CpuMatcher
-from stavpr_ros.prepare.route_features import ROOM, RouteFeatures
+from stavpr_ros.prepare.route_features import ROOM
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 SHORT = SequenceSettings(length=5, beta=2.0)
@@ -140,39 +141,11 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
     assert closer.first > 0
 
 
-@pytest.mark.parametrize(('centering', 'limit'), [(True, None), (True, 90), (False, 83)])
-def test_route_features_are_original_less_mean(laps, centering, limit):
-    """At the limit, an eighth is evicted."""
-    route, evicted = RouteFeatures(laps.settings, centering, False, limit), 0
-    for i in range(len(laps)):
-        if route.count == limit:
-            evicted += limit // EVICTED
-            route.evict(limit // EVICTED)
-            mean = centering * laps.strips[:, evicted:i].mean(axis=1)
-            np.testing.assert_allclose(route.mean, mean, atol=1e-6, rtol=0)
-        route.append(laps[i : i + 1])
-    assert bool(evicted) == bool(limit)
-    added, kept = laps[evicted:], route.strips[:, : route.count]
-    expected = added.strips - route.mean[:, None]
-    expected /= np.linalg.norm(expected, axis=2, keepdims=True)
-    zero = (added.strips == 0).all(axis=2)
-    assert zero.any()
-    expected[zero] = 0
-    error = 2e-6 if centering else 0
-    np.testing.assert_allclose(kept, expected if centering else added.strips, atol=error, rtol=0)
-    original = route.original()
-    np.testing.assert_allclose(original.strips, added.strips, atol=error, rtol=0)
-    assert not original.strips[zero].any()
-    assert np.array_equal(original.weights, added.weights)
-    assert route.room == (limit or 512)
-
-
 def test_late_matches_close_what_was_not_certain_at_first():
     """
     A second lap in bad light, where evidence grows slowly.
 
-    Some waited for the others of their path. Of those of oldest images, each is that of a filter
-    which is read there. No image has two.
+    Some waited for the others of their path, and some are of oldest images. No image has two.
     """
     length, lap, exclude = 20, 80, 20
     strips = laps_of(2 * lap, lap).strips
@@ -193,17 +166,8 @@ def test_late_matches_close_what_was_not_certain_at_first():
             assert found.position == (0 if found.is_oldest else middle)
             assert abs(int(found.path.pairs[found.position, 1]) - found.place) <= CLOSE
             late[found.first_image + found.position] = found.place
+            oldest += found.is_oldest
             closed.append(found.first_image + found.position)
-        newest = [each for each in (*match.late, *closer._waiting) if each.last_image == i]
-        found = newest[0] if newest else match
-        if not found.is_oldest:
-            continue
-        oldest += 1
-        window = closer._window
-        columns, probabilities = window.filter.beliefs(length)
-        sums = [probabilities[0, abs(columns - each) <= CLOSE].sum() for each in columns]
-        assert found.probability > 0.5
-        assert max(sums) > 0.1
     assert len(closed) == len(set(closed))
     assert len(late) > oldest >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
@@ -241,23 +205,19 @@ PLACE = 8
         ([SURE, 'reset', SURE], []),
         ([SURE, 'evict', DOUBTFUL, SURE], [2, 1]),
         ([DOUBTFUL, SURE, 'rest', SURE, SURE, 'drive', SURE], [4, 0, 1, 2, 3]),
-        ([math.nan], [0]),  # mode paper
     ],
 )
-def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(
-    laps, monkeypatch, events, closed
-):
+def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(events, closed):
     """Those before are late; a number moves the place, and ``evict`` evicts the one before."""
-    closer = LoopCloser(settings_of(ROBUST), 12, laps.settings)
-    monkeypatch.setattr(LoopCloser, 'first', property(lambda _: first))
-    found, images, place, first = [], 0, PLACE, 0
+    paths, columns = PathConfirmation(SHORT.length), WindowColumns(0, np.zeros((1, 1)))
+    found, images, place, first, at_rest = [], 0, PLACE, 0, False
     for event in events:
         if event == 'reset':
-            closer.reset()
+            paths.reset()
         elif event == 'evict':
             place, first = place + 1, place + 1
         elif isinstance(event, str):
-            closer._window.is_standstill = event == 'rest'
+            at_rest = event == 'rest'
         elif isinstance(event, int):
             place += event
         else:
@@ -269,7 +229,9 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(
                 window_stamps=(0,),
                 first_image=images,
             )
-            match = closer._confirmed(match, [])
+            if match.accepted:
+                keep = partial(replace, columns=columns)
+                match = paths.take(match, [], keep, at_rest, first)
             waits = not match.accepted and event != NONE
             assert match.reason == 'its path is not confirmed yet' * waits
             assert not waits or not match.with_probability(1.0).accepted

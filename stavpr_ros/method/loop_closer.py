@@ -3,6 +3,7 @@
 """Loop closure: the map is the route so far, without its latest images."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 import math
 
@@ -25,6 +26,66 @@ from stavpr_ros.prepare.route_features import RouteFeatures
 EVICTED = 8  # the oldest one in so many is evicted at a time
 NO_MATCH = -LONGEST_GAP - 1, 0  # image and place that no match continues
 MIN_PLACES = 5  # fewer distances have no meaningful mean and deviation
+
+
+class PathConfirmation:
+    """
+    Decides from which match on a path is confirmed, in mode robust.
+
+    Streets in one light look alike for about a window: a path is confirmed by half a window
+    of matches that are certain, or by two windows of any. Matches that waited are late ones of
+    the match that confirms them. A camera at rest confirms nothing.
+
+    :param length: images of a window.
+    """
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+        # of the latest path: image and place of its last match; probabilities; waiting matches
+        self._last = NO_MATCH
+        self._path: deque[float] = deque(maxlen=2 * length)
+        self._waiting: deque[Match] = deque(maxlen=LONGEST_WAIT * length)
+
+    def reset(self) -> None:
+        """Let the next match begin another path."""
+        self._last = NO_MATCH
+
+    def take(
+        self,
+        match: Match,
+        oldest: list[Match],
+        keep: Callable[[Match], Match],
+        is_at_rest: bool,
+        first: int,
+    ) -> Match:
+        """
+        Return an accepted match; as no match while its path is not confirmed.
+
+        :param oldest: the match of the oldest image, or none.
+        :param keep: returns a match with all that is needed of it later.
+        :param first: the oldest place that is not evicted.
+        """
+        images, apart = match.last_image - self._last[0], abs(match.place - self._last[1])
+        if images > LONGEST_GAP or apart > BAND * images:  # another path begins
+            self._path.clear()
+            self._waiting.clear()
+        self._last = match.last_image, match.place
+        self._waiting += oldest
+        if not is_at_rest:
+            self._path.append(match.probability)
+        certain = sum(probability > CONFIRMED for probability in self._path)
+        if certain < self._length // 2 and len(self._path) < 2 * self._length:
+            self._waiting.append(keep(match))
+            return replace(
+                match,
+                limits=Limits(0.0, 1.0),
+                status=Status.NO_MATCH,
+                reason='its path is not confirmed yet',
+            )
+        # places of the others have been evicted
+        late = tuple(each for each in self._waiting if each.path.pairs[:, 1].min() >= first)
+        self._waiting.clear()
+        return replace(match, late=late)
 
 
 class LoopCloser(SequenceRecognizer):
@@ -86,11 +147,7 @@ class LoopCloser(SequenceRecognizer):
         # stamps of the latest places, not yet old enough in seconds
         self._recent_stamps: deque[int] = deque()
         self._places = 0  # the newest image may be matched with so many of the oldest places
-        length = sequence.length
-        # of the latest path: image and place of its last match; probabilities; waiting matches
-        self._last = NO_MATCH
-        self._path: deque[float] = deque(maxlen=2 * length)
-        self._waiting: deque[Match] = deque(maxlen=LONGEST_WAIT * length)
+        self._confirmation = PathConfirmation(sequence.length)
 
     def __len__(self) -> int:
         """Return the number of places that are not evicted; ``first + len`` images have come."""
@@ -114,7 +171,7 @@ class LoopCloser(SequenceRecognizer):
         """
         super().reset()
         self._recent_stamps.clear()
-        self._last = NO_MATCH
+        self._confirmation.reset()
 
     def update(
         self, features: LocalFeatures, stamp: int = 0, pose: np.ndarray | None = None
@@ -131,45 +188,13 @@ class LoopCloser(SequenceRecognizer):
         self._track.append(odometry_xy)
         self._window.push(self._distances(), self._route.newest[:, 0], stamp)
         match = self._match(odometry_xy)
-        return self._confirmed(match, self._oldest(match))
+        oldest, is_at_rest = self._oldest(match), self._window.is_standstill
+        if not match.accepted or math.isnan(match.probability):
+            return match
+        return self._confirmation.take(match, oldest, self._late, is_at_rest, self.first)
 
     def _first_image(self, images: int) -> int:
         return self.first + len(self) - images
-
-    def _confirmed(self, match: Match, oldest: list[Match]) -> Match:
-        """
-        Return the match; mode robust: no match while its path is not confirmed.
-
-        Streets in one light look alike for about a window: a path is confirmed by half a window
-        of matches that are certain, or by two windows of any. Matches that waited are late ones of
-        the match that confirms them. A camera at rest confirms nothing.
-
-        :param oldest: the match of the oldest image, or none.
-        """
-        if not match.accepted or math.isnan(match.probability):
-            return match
-        images, apart = match.last_image - self._last[0], abs(match.place - self._last[1])
-        if images > LONGEST_GAP or apart > BAND * images:  # another path begins
-            self._path.clear()
-            self._waiting.clear()
-        self._last = match.last_image, match.place
-        self._waiting += oldest
-        if not self._window.is_standstill:
-            self._path.append(match.probability)
-        certain = sum(probability > CONFIRMED for probability in self._path)
-        length = self._settings.sequence.length
-        if certain < length // 2 and len(self._path) < 2 * length:
-            self._waiting.append(self._late(match))
-            return replace(
-                match,
-                limits=Limits(0.0, 1.0),
-                status=Status.NO_MATCH,
-                reason='its path is not confirmed yet',
-            )
-        # places of the others have been evicted
-        late = tuple(each for each in self._waiting if each.path.pairs[:, 1].min() >= self.first)
-        self._waiting.clear()
-        return replace(match, late=late)
 
     def _late(self, match: Match) -> Match:
         """Return a match of the present window with all that is needed of it later."""
