@@ -1,21 +1,29 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The node in a process of another program: its executor, its context, its end."""
+"""The node in a process of another program: its executor, its context, its end, its journal."""
 
+import os
+import random
+import resource
 import threading
 import time
 
 import cv2
+from nav_msgs.msg import Odometry
 import numba
 import numpy as np
-from processes import SECOND, TIMEOUT
+from processes import node_process, SECOND, TIMEOUT
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from robot import image_message
-from stavpr_ros.errors import SettingsError
+from robot import image_message, PARAMETERS
+from sensor_msgs.msg import Image
+from stavpr_msgs.msg import PlaceMatch
+from stavpr_ros.errors import OutputError
 from stavpr_ros.mapping import load_map
+from stavpr_ros.mapping.journal_map import journals, recover
+from stavpr_ros.pipeline import saving
 from stavpr_ros.threads import limit_threads
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -73,18 +81,16 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
 
 
 def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
-    make_node, map_file, route, monkeypatch
+    make_node, map_file, route, capfd
 ):
-    logged = []
     node = activated(make_node(map_path=map_file))
-    monkeypatch.setattr(node.get_logger(), 'warning', lambda text, **_: logged.append(text))
     for tenths in (60, 61, 1, 2, 3):  # a clock is set
         node.runtime.intake.images.on_image(image_message(route[0], tenths * SECOND // 10))
-    assert not [text for text in logged if 'reset' in text]
+    assert 'in a row' not in capfd.readouterr().err
     for i in range(10):
         for tenths in (2 * i + 5, 2 * i + 4):
             node.runtime.intake.images.on_image(image_message(route[i], tenths * SECOND // 10))
-    text = next(text for text in logged if 'reset' in text)
+    text = capfd.readouterr().err
     assert 'reset 3 times in a row' in text
     assert 'jumped back by 0.100 s): publish the images in the order of their stamps' in text
 
@@ -117,55 +123,6 @@ def test_shutdown_of_ros_before_the_node_saves_the_map(make_node, context, route
     node.destroy_node()
     assert 0 < len(load_map(path)) <= 20
     assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
-
-
-def test_integer_where_a_number_is_expected_is_converted(make_node):
-    """As in `threshold: 1` of a parameter file, and in `ros2 param set NODE threshold 1`."""
-    node = make_node(mode='paper', threshold=1)
-    assert repr(node.settings.pipeline.threshold) == '1.0'
-    assert set_parameter(node, 'threshold', 2).successful
-    assert repr(node.get_parameter('threshold').value) == '2.0'
-
-
-@pytest.mark.parametrize(
-    ('name', 'value', 'expected'),
-    [
-        ('threshold', 'high', "threshold = 'high' has the wrong type: expected a number"),
-        ('queue_size', 4.5, 'queue_size = 4.5 has the wrong type: expected an integer'),
-        ('publish_tf', 1, 'publish_tf = 1 has the wrong type: expected true or false'),
-        ('robot_id', 2, 'robot_id = 2 has the wrong type: expected text'),
-    ],
-)
-def test_parameter_of_the_wrong_type_is_rejected_by_name(make_node, name, value, expected):
-    with pytest.raises(SettingsError, match=expected):
-        make_node(**{name: value})
-    result = set_parameter(make_node(), name, value)
-    assert (result.successful, expected in result.reason) == (False, True)
-
-
-def test_parameters_that_are_rejected_change_nothing(make_node, map_file):
-    node = make_node(map_path=map_file)
-    assert node.trigger_configure() == SUCCESS
-    before = node.settings
-    for name, value, words in (
-        ('map_path', 'other.stavpr', 'call the service ~/load_map'),
-        ('operation', 'mapping', 'call the service ~/set_operation'),
-        ('nms_radius', 7, 'while the node is unconfigured'),
-        ('threshold', 0.8, 'is of mode paper'),
-        ('min_probability', 1.0, 'below 1'),
-        ('save_path', '/missing/route.stavpr', 'save_path'),
-        ('geometric_check', 'eye', 'take one of none'),
-    ):
-        result = set_parameter(node, name, value)
-        assert (result.successful, words in result.reason) == (False, True)
-        assert node.get_parameter(name).value != value
-        assert node.settings is before
-    assert set_parameter(node, 'map_path', map_file).successful  # the current value
-    together = [Parameter('candidates', value=3), Parameter('min_probability', value=1.0)]
-    assert not node.set_parameters_atomically(together).successful
-    assert node.settings.pipeline.candidates == 10
-    assert set_parameter(node, 'candidates', 3).successful
-    assert node.runtime.pipeline.settings.candidates == 3
 
 
 def test_operation_of_the_service_lasts_until_the_next_configuration(make_node, map_file):
@@ -204,22 +161,16 @@ def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
     assert other.count_subscribers('/odom') == 1
 
 
-def test_restart_removes_the_poses_of_the_odometry(make_node, map_file):
-    node = activated(make_node(map_path=map_file, keyframe_distance=1.0))
-    trajectory = node.runtime.intake.odometry.trajectory
-    trajectory.add(SECOND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
-    node.runtime.restart('the stamps jumped back')
-    assert len(trajectory) == 0
-
-
-def test_place_has_the_pose_at_the_stamp_of_its_image(make_node, route):
+def test_place_has_the_pose_at_the_stamp_of_its_image_until_a_restart(make_node, route):
     node = activated(make_node(operation='mapping', keyframe_distance=0.1))
+    trajectory = node.runtime.intake.odometry.trajectory
     for seconds in (1, 2):
-        pose = np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0])
-        node.runtime.intake.odometry.trajectory.add(seconds * SECOND, pose)
+        trajectory.add(seconds * SECOND, np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0]))
     node.runtime.intake.images.on_image(image_message(route[0], SECOND * 5 // 4))
     until_processed(node, 1)
     assert node.runtime.pipeline.places.poses[0][0] == 12.5
+    node.runtime.restart('the stamps jumped back')
+    assert len(trajectory) == 0
 
 
 def test_save_path_that_cannot_be_written_is_rejected(make_node, tmp_path):
@@ -245,29 +196,180 @@ def test_limit_of_threads_can_be_removed(make_node):
         assert node.trigger_cleanup() == SUCCESS
 
 
-@pytest.mark.parametrize(
-    ('name', 'remedy'),
-    [('sequence_lenght', 'did you mean sequence_length?'), ('beta', 'see `ros2 param list`')],
-)
-def test_unknown_parameter_is_logged_and_not_set(make_node, capfd, name, remedy):
-    node = make_node(**{name: 5})
-    words = f'parameter {name!r} is unknown: {remedy}'
-    assert words in capfd.readouterr().err
-    assert set_parameter(node, name, 5).reason == words
+@pytest.fixture
+def make(make_node, tmp_path):
+    """Make and activate a node that records into the maps folder."""
+
+    def make(**parameters):
+        values = {'operation': 'mapping', 'maps_folder': str(tmp_path)}
+        node = make_node(**values | parameters)
+        assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+        return node
+
+    return make
 
 
-def test_lost_images_are_logged_once_with_their_remedy(make_node, capfd):
-    node = make_node(diagnostics_period=0.1)
-    node.statistics.add_drop('lost in transport', 3)
-    published = threading.Event()
-    publish, reports = node._diagnostics._publisher.publish, []
+def record(node, images, first=0):
+    """Show images to a node, and wait until they are processed."""
+    for i, image in enumerate(images, first + 1):
+        node.runtime.intake.images.on_image(image_message(image, i * SECOND))
+        node.runtime.worker.run(lambda: None)
+    while node.runtime.worker.waiting:
+        node.runtime.worker.run(lambda: None)
+    node.runtime.worker.run(lambda: None)
 
-    def count(message):
-        publish(message)
-        reports.append(message)
-        if len(reports) == 4:
-            published.set()
 
-    node._diagnostics._publisher.publish = count
-    assert published.wait(TIMEOUT)
-    assert capfd.readouterr().err.count('3 images lost in transport in the last 10 s: ') == 1
+def end(node):
+    node.destroy_node()
+    return node.failed
+
+
+def test_node_states_at_the_end_what_it_left_out(make, route, capfd):
+    node = make()
+    node.runtime.intake.odometry._on_odometry(Odometry())
+    node.runtime.intake.images.on_image(Image(encoding='rgb8'))
+    record(node, route[:1])
+    assert not end(node)
+    expected = '1 images of a size that their encoding cannot have, 1 messages of odometry without'
+    assert f'left out: {expected} a valid pose\n' in capfd.readouterr().err
+
+
+def test_node_without_save_path_continues_its_recording_at_the_next_start(make, route, tmp_path):
+    node = make()
+    record(node, route[:12])
+    assert not end(node)
+    assert os.listdir(tmp_path) == ['recorded.stavpr.journal']
+    node = make()
+    assert node.runtime.map_info().path == str(tmp_path / 'recorded.stavpr')
+    assert journals(tmp_path / 'recorded.stavpr') == []
+    record(node, route[12:14], first=12)  # as a session of its own
+    assert len(node.runtime.pipeline.places) == 14
+    assert not end(node)
+    node = make(operation='localization')  # recognizes what was recorded
+    record(node, route[:12], first=20)
+    assert len(node.runtime.pipeline.places) == 14
+    assert node.runtime.pipeline.operation.relocalize(0).match.newest == 11
+
+
+def test_localization_on_another_map_names_the_journal_and_leaves_it(
+    make, route, map_file, tmp_path, capfd
+):
+    node = make()
+    record(node, route[:5])
+    end(node)
+    assert not end(make(operation='localization', map_path=map_file))
+    assert os.listdir(tmp_path) == ['recorded.stavpr.journal']
+    assert 'recorded.stavpr.journal has places of another recording' in capfd.readouterr().err
+    assert len(make(operation='mapping').runtime.pipeline.places) == 5
+
+
+def test_node_whose_last_save_fails_keeps_the_journal_and_reports_failure(
+    make, route, tmp_path, monkeypatch
+):
+    path = tmp_path / 'route.stavpr'
+    node = make(save_path=str(path))
+    record(node, route[:5])
+    with monkeypatch.context() as disk:
+
+        def fail(*_):
+            raise OutputError('the disk is full')
+
+        disk.setattr(saving, 'save_map', fail)
+        assert end(node)
+    assert os.listdir(tmp_path) == ['route.stavpr.journal']
+    make(save_path=str(path))
+    assert len(load_map(path)) == 5
+
+
+@pytest.mark.parametrize('operation', ['mapping', 'loop_closure'])
+def test_node_that_ends_without_a_loss_deletes_the_journal(make, route, tmp_path, operation):
+    """Its map is saved, or its route is not to be saved."""
+    files = ['route.stavpr'] if operation == 'mapping' else []
+    node = make(operation=operation, save_path=''.join(str(tmp_path / name) for name in files))
+    record(node, route[:5])
+    assert [name for name in os.listdir(tmp_path) if name.endswith('.journal')]
+    assert not end(node)
+    assert os.listdir(tmp_path) == files
+
+
+def test_node_that_cannot_write_a_journal_records_all_the_same(make, route, tmp_path):
+    (tmp_path / 'file').touch()
+    node = make(maps_folder=str(tmp_path / 'file'))
+    record(node, route[:5])
+    assert len(node.runtime.pipeline.places) == 5
+
+
+# -------------------------------------------------------------------------------------- processes
+
+
+@pytest.fixture
+def recording(robot, tmp_path):
+    """Start a node process that records to a file; it ends with the test."""
+    started = []
+
+    def start():
+        files = {'save_path': tmp_path / 'route.stavpr', 'maps_folder': tmp_path}
+        given = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
+        started.append(node_process(tmp_path / 'log', **given))
+        # a killed node stays in the graph for a while: wait for the log of the new one
+        robot.until(lambda: 'backend' in started[-1].output(), 'the node')
+        robot.wait_for_node()
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.end()
+
+
+def mapped(robot):
+    """Return the stamps of the images that were published as places."""
+    recorded = PlaceMatch.MAPPED, PlaceMatch.MATCH
+    places = [match for match in robot.answers if match.status in recorded]
+    return {match.header.stamp.sec * SECOND for match in places}
+
+
+@pytest.mark.parametrize('kills', [2, pytest.param(20, marks=pytest.mark.long)])
+def test_node_killed_at_a_random_moment_loses_no_published_place(
+    recording, robot, route, tmp_path, kills
+):
+    """
+    The next start makes a map of the journal, which the recording continues.
+
+    A node that is killed before its first place leaves no journal: the next one begins a new map,
+    which gets a numbered name.
+    """
+    path, random_ = tmp_path / 'route.stavpr', random.Random(0)
+    published, begin = set(), robot.stamp
+    for _ in range(kills):
+        process, first = recording(), robot.stamp + SECOND
+        published |= mapped(robot)  # of the killed node, received late
+        robot.forget()
+        for image in route[: random_.randrange(1, 20)]:
+            robot.stamp += SECOND
+            robot.publisher.publish(image_message(image, robot.stamp))
+        count = random_.randrange(1, 1 + (robot.stamp - first) // SECOND + 1)
+        robot.until(lambda count=count: len(mapped(robot)) >= count, 'some places')
+        process.popen.kill()
+        process.wait()
+        published |= mapped(robot)
+    assert sum(recover(journal).recorded for journal in journals(path)) > 0
+    stamps = [load_map(file).stamps.tolist() for file in sorted(tmp_path.glob('route*.stavpr'))]
+    assert {stamp for stamp in published if stamp > begin} <= set().union(*stamps)
+    assert all(each == sorted(set(each)) for each in stamps)
+    assert [name for name in os.listdir(tmp_path) if name.startswith('.')] == []
+
+
+def test_node_on_a_full_disk_ends_with_an_error_and_names_the_journal(
+    recording, robot, route, tmp_path
+):
+    path = tmp_path / 'route.stavpr'
+    process = recording()
+    robot.drive(route[:10])
+    robot.until(lambda: bool(journals(path)), 'the journal')
+    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (40_000, resource.RLIM_INFINITY))
+    robot.drive(route[10:15])
+    assert process.stop() == 1
+    output = process.output()
+    assert 'the map is not saved: ' in output
+    assert f'places that are in no map stay in {path}.journal' in output
+    assert 10 <= recover(journals(path)[0]).places <= 15

@@ -142,12 +142,11 @@ def test_behavior_tree_has_nodes_of_nav2_and_reads_the_place():
     assert by_tag['ScriptCondition']['code'] == f"place != '{NOWHERE}'"
 
 
-@pytest.mark.parametrize('namespace', ['', '/fleet/robot_2'])
-def test_behavior_tree_reads_the_topic_of_the_node_in_its_own_namespace(robot, start, namespace):
+def test_behavior_tree_reads_the_topic_of_the_node_in_its_own_namespace(robot, start):
     """Nav2 subscribes by a node in the namespace of bt_navigator."""
     topic = next(ElementTree.parse(TREE).getroot().iter('ControllerSelector')).get('topic_name')
-    start('-r', f'__ns:={namespace or "/"}', wait=False)
-    navigator = rclpy.create_node('navigator', context=robot.context, namespace=namespace)
+    start('-r', '__ns:=/fleet/robot_2', wait=False)
+    navigator = rclpy.create_node('navigator', context=robot.context, namespace='/fleet/robot_2')
     places = robot.listen(String, navigator.resolve_topic_name(topic), LATCHED)
     navigator.destroy_node()
     robot.until(lambda: bool(places), 'the place')

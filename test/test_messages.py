@@ -10,13 +10,13 @@ import numpy as np
 from places import features_of, map_of, route_strips
 import pytest
 from scipy.spatial.transform import Rotation
-from stavpr_msgs.msg import PlaceMatch
+from stavpr_msgs.msg import PlaceMatch, RelativePose
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Session
 from stavpr_ros.method import Match, Path, Status
 from stavpr_ros.method.match import Limits
 from stavpr_ros.pipeline import ImageResult
-from stavpr_ros.relative_pose.pair import matched_pair
+from stavpr_ros.relative_pose.pair import matched_pair, Source
 from stavpr_ros.ros.messages import (
     BESIDE,
     image_message,
@@ -79,9 +79,10 @@ def test_stamps_after_2038_wrap_as_in_the_messages_of_others():
         assert nanoseconds(message) == seconds * SECOND + 5
 
 
-def test_status_equals_the_constants_of_the_message():
-    constants = {name: getattr(PlaceMatch, name) for name in Status.__members__}
-    assert constants == {status.name: status.value for status in Status}
+@pytest.mark.parametrize(('own', 'message'), [(Status, PlaceMatch), (Source, RelativePose)])
+def test_names_equal_the_constants_of_the_message(own, message):
+    constants = {name: getattr(message, name) for name in own.__members__}
+    assert constants == {each.name: each.value for each in own}
 
 
 def test_loop_closure_message_needs_a_match(places):

@@ -1,22 +1,23 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The node over ROS: images in, matches out; parameters that change meanwhile."""
+"""The node over ROS: images in, matches out; parameters that change meanwhile; its clock."""
 
+from builtin_interfaces.msg import Time
 import numpy as np
 import pytest
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from robot import image_message, LENGTH, SECOND
-from sensor_msgs.msg import Image
+from rosgraph_msgs.msg import Clock
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.ros import output
 from stavpr_ros.ros.messages import nanoseconds
 from std_msgs.msg import Float32, Int32
 
+WARMING_UP, MATCH = PlaceMatch.WARMING_UP, PlaceMatch.MATCH
 THRESHOLD = 0.2
 PAPER = {'mode': 'paper', 'threshold': THRESHOLD}
 
@@ -56,7 +57,7 @@ def test_node_publishes_the_matches_of_the_library(robot, start, small_map, rout
         same_match(message, core)
         if core.path.place >= 0:
             windows.append(message)
-        if message.status == PlaceMatch.MATCH:
+        if message.status == MATCH:
             matches.append(message)
     assert 10 <= len(matches) < len(images) - LENGTH + 1
     robot.until(lambda: len(places) == len(distances) == len(matches), 'the plain topics')
@@ -84,7 +85,7 @@ def test_node_after_a_burst_has_one_match_for_each_image(robot, start, route):
     assert matches[-1].status != PlaceMatch.DROPPED  # the newest
     assert int(robot.counts('processing').get(key, 0)) - counted == len(dropped)
     match = robot.drive(route[40:46])[-1]
-    assert (match.status, match.newest_index) == (PlaceMatch.MATCH, 45)
+    assert (match.status, match.newest_index) == (MATCH, 45)
 
 
 def test_node_with_changing_parameters_publishes_one_match_per_image(robot, start, route):
@@ -111,26 +112,7 @@ def test_node_with_changing_parameters_publishes_one_match_per_image(robot, star
     stamps = [nanoseconds(match.header.stamp) for match in robot.answers[before:]]
     assert sorted(stamps) == [SECOND + i * SECOND // 30 for i in range(count)]
     statuses = {match.status for match in robot.answers[before:]}
-    assert {PlaceMatch.WARMING_UP, PlaceMatch.SKIPPED} <= statuses
-
-
-def test_node_draws_match_images_for_a_subscriber_only(robot, start, route, monkeypatch):
-    calls, draw = [], output.draw_match
-    monkeypatch.setattr(output, 'draw_match', lambda *args: calls.append(args) or draw(*args))
-    start()
-    robot.drive(route[:4])
-    assert calls == []
-    drawn = robot.listen(Image, '/stavpr/match_image')
-
-    def received():
-        robot.show(route[4])
-        return bool(drawn)
-
-    robot.until(received, 'an image')
-    match = robot.drive(route[5:10])[-1]
-    robot.until(lambda: drawn[-1].header == match.header, 'the last image')
-    image = np.frombuffer(drawn[-1].data, np.uint8).reshape(drawn[-1].height, -1, 3)
-    np.testing.assert_array_equal(image[14:96, :128], route[9][14:])  # below the label
+    assert {WARMING_UP, PlaceMatch.SKIPPED} <= statuses
 
 
 def test_node_with_the_name_of_another_logs_it(robot, start):
@@ -142,8 +124,56 @@ def test_node_with_the_name_of_another_logs_it(robot, start):
         other.destroy_node()
 
 
-def test_node_with_an_incompatible_subscriber_logs_it(robot, start):
+# simulated time
+
+
+@pytest.fixture
+def set_clock(robot):
+    """Publish the time of a simulation until the node has it; from then on it stands still."""
+    publisher = robot.node.create_publisher(Clock, '/clock', QoSProfile(depth=1))
+
+    def set_clock(seconds):
+        def there():
+            publisher.publish(Clock(clock=Time(sec=seconds)))
+            return bool(robot.arrays) and robot.arrays[-1].header.stamp.sec == seconds
+
+        robot.until(lambda: publisher.get_subscription_count() > 0, 'a subscriber of /clock')
+        robot.until(there, f'{seconds} s')
+
+    yield set_clock
+    robot.node.destroy_publisher(publisher)
+
+
+def test_change_of_use_sim_time_keeps_the_window(robot, start, set_clock, route):
     start()
-    requested = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    robot.listen(PlaceMatch, '/stavpr/match', requested)
-    robot.until_logged('a subscriber of ~/match receives nothing: it requests another durability')
+    robot.drive(route[:5])
+    robot.set(use_sim_time=True)
+    set_clock(50)
+    assert robot.show(route[5]).status == MATCH
+    robot.set(use_sim_time=False)
+    assert robot.show(route[6]).status == MATCH
+    assert robot.counts('input')['rate_in_hz'] != '0.000'
+    assert not [line for line in robot.log if 'the clock jumped' in line]
+
+
+def test_simulated_clock_stands_still_and_jumps_back(robot, start, set_clock, route):
+    """Diagnostics continue; a jump resets the window, though the stamps of the images go on."""
+    start(use_sim_time=True)
+
+    def stamps():  # one of an earlier node may arrive late
+        return [array.header.stamp.sec for array in robot.arrays[-3:]]
+
+    robot.until(lambda: stamps() == [0, 0, 0], 'diagnostics without a clock')
+    set_clock(100)
+    uptimes = [float(robot.counts('processing')['uptime_s']) for _ in range(3)]
+    assert uptimes == sorted(set(uptimes))
+    assert robot.arrays[-1].header.stamp == Time(sec=100)
+    set_clock(1000)
+    assert robot.statuses(route[:6]) == 3 * [WARMING_UP] + 3 * [MATCH]
+    set_clock(5000)
+    assert robot.show(route[6]).status == MATCH
+    set_clock(4950)
+    robot.until_logged('window reset: the clock jumped back by 50.000 s')
+    assert robot.statuses(route[7:12])[::4] == [WARMING_UP, MATCH]
+    assert robot.answers[-1].newest_index == 11
+    assert robot.counts('input')['jumps_back'] == '0'

@@ -38,12 +38,9 @@ def test_mount_of_text_is_a_pose():
     assert abs(found[3:] @ FORWARD[3:]) == pytest.approx(1)
     assert mount_of('1, 2, 3, 0, 0, 0, 1') == (1, 2, 3, 0, 0, 0, 1)
     assert mount_of(' ') is None
-
-
-@pytest.mark.parametrize('text', ['1 2 3', 'a b c d e f', '0 0 0 0 0 0 0', '0 0 nan 0 0 0'])
-def test_mount_of_other_text_is_rejected(text):
-    with pytest.raises(SettingsError, match='x y z roll pitch yaw'):
-        mount_of(text)
+    for text in ('1 2 3', 'a b c d e f', '0 0 0 0 0 0 0', '0 0 nan 0 0 0'):
+        with pytest.raises(SettingsError, match='x y z roll pitch yaw'):
+            mount_of(text)
 
 
 def test_camera_of_binned_and_cut_out_images():
@@ -53,12 +50,6 @@ def test_camera_of_binned_and_cut_out_images():
     camera = camera_of(message, FORWARD)
     assert (camera.width, camera.height, camera.focal) == (200, 150, (150.0, 150.0))
     assert camera.center == ((320 - 100) / 2 - 0.5, (240 - 40) / 2 - 0.5)
-
-
-def test_sources_equal_the_constants_of_the_message():
-    assert {name: getattr(RelativePose, name) for name in Source.__members__} == {
-        source.name: source.value for source in Source
-    }
 
 
 @pytest.fixture
@@ -134,17 +125,24 @@ def test_images_do_not_wait_for_edges(closing, monkeypatch):
     assert {camera.focal for camera in seen if camera} == {(300.0, 300.0)}
 
 
-@pytest.fixture
-def queue(monkeypatch):
-    """Return a publisher of edges whose first PnP waits, what it has published, and its counts."""
-    free, started, ending = threading.Event(), threading.Event(), threading.Event()
+class SlowEstimator(EdgeEstimator):
+    """Its PnP waits until it is free."""
 
-    def slow(self, pair, query_camera, place_camera):
-        started.set()
-        free.wait(60)
+    def __init__(self):
+        super().__init__()
+        self.free, self.started = threading.Event(), threading.Event()
+
+    def _pnp(self, pair, query_camera, place_camera):
+        self.started.set()
+        self.free.wait(60)
         return Edge(Source.PNP)
 
-    monkeypatch.setattr(EdgeEstimator, '_pnp', slow)
+
+@pytest.fixture
+def queue():
+    """Return a publisher of edges whose first PnP waits, what it has published, and its counts."""
+    estimator, ending = SlowEstimator(), threading.Event()
+    free, started = estimator.free, estimator.started
     published, statistics, last = [], Statistics(), threading.Event()
 
     def publish(message):
@@ -152,7 +150,7 @@ def queue(monkeypatch):
         if message.query_index == LAST:
             last.set()
 
-    publisher = EdgePublisher(EdgeEstimator(), publish, statistics, ending)
+    publisher = EdgePublisher(estimator, publish, statistics, ending)
     camera = object()
     pair = SimpleNamespace(
         pose=lambda place: np.array([0, 0, 0, 0, 0, 0, 1.0]), place=0, query=object(),

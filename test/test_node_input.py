@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
-from robot import image_message, RELIABLE, SECOND
+from robot import RELIABLE, SECOND
 from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceMatch
 from std_msgs.msg import Header
@@ -44,29 +44,6 @@ def stranger(context):
     node = rclpy.create_node('stranger', context=context)
     yield node
     node.destroy_node()
-
-
-def test_invalid_images_are_counted_and_explained_once_a_cause(robot, start, route):
-    start()
-    invalid = {kind: image_message(route[0]) for kind in ('cut off', 'encoding', 'depth')}
-    invalid['cut off'].height = 10**6
-    invalid['encoding'].encoding = 'teleport8'
-    invalid['depth'].encoding = '32FC1'
-    before = robot.counts('input')
-    for i in range(2):
-        for kind, message in invalid.items():
-            match = robot.show(message)
-            assert (match.status, bool(match.reason)) == (INVALID, True), kind
-        matches = robot.drive(route[3 * i : 3 * i + 3])
-    assert [match.status for match in matches] == [WARMING_UP] + [MATCH] * 2
-    assert matches[-1].newest_index == 5
-    robot.until_diagnosed('input', WARN, 'cut off 2')
-    after = robot.counts('input')
-    for kind in invalid:
-        key = f'dropped_invalid_{kind.replace(" ", "_")}'
-        assert int(after[key]) == int(before.get(key, 0)) + 2
-        line = f'logged once; /diagnostics counts "invalid: {kind}"'
-        assert sum(line in text for text in robot.log) == 1
 
 
 def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):

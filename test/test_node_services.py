@@ -1,22 +1,25 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Services of the node: valid and invalid requests, and maps that change during a stream."""
+"""Services, states and transitions of the node: valid and invalid requests at any time."""
 
 from contextlib import contextmanager
+import dataclasses
 from dataclasses import replace
 import threading
+import weakref
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
-from rclpy.qos import QoSProfile
-from robot import image_message, LENGTH, SECOND
-from stavpr_msgs.msg import PlaceMatch
+from robot import image_message, LATCHED, LENGTH, SECOND
+from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
-from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import load_map, save_map
+from stavpr_ros.features.registry import settings_class
+from stavpr_ros.mapping import load_map, PlaceMap, save_map
 from stavpr_ros.pipeline import read_map
 from stavpr_ros.ros import map_loading, runtime
 from std_srvs.srv import Trigger
@@ -24,33 +27,38 @@ from std_srvs.srv import Trigger
 PAPER = {'mode': 'paper', 'threshold': 0.2}  # certain after one window
 
 
-@contextmanager
-def while_loading(robot, path, monkeypatch):
-    """Load a file: reading it takes until the end of the block, and then it is no map."""
-    futures, end = [], threading.Event()
+@pytest.fixture
+def disk(monkeypatch):
+    """Return an event: while it is not set, the disk does not deliver maps."""
+    ready = threading.Event()
+    ready.set()
+    monkeypatch.setattr(runtime, 'read_map', lambda *file: (ready.wait(), read_map(*file))[1])
+    yield ready
+    ready.set()
 
-    def read_slowly(file, settings):
-        end.wait()
-        raise MapFileError(f'{file} is no map')
+
+@contextmanager
+def while_loading(robot, path, disk):
+    """Load a file: reading it takes until the end of the block, and then there is none."""
+    futures = []
 
     def loading():
         return bool(robot.infos) and robot.infos[-1].state == 'loading'
 
-    with monkeypatch.context() as disk:
-        disk.setattr(runtime, 'read_map', read_slowly)
-        with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
-            yield path
-            end.set()
-            robot.until(futures[0].done, 'the response of load_map')
+    disk.clear()
+    with robot.request(futures, LoadMap, 'load_map', loading, path=str(path)):
+        yield path
+        disk.set()
+        robot.until(futures[0].done, 'the response of load_map')
     assert not futures[0].result().success
     assert path.name in futures[0].result().message
 
 
-def test_services_while_a_map_is_loaded_are_served(robot, start, route, tmp_path, monkeypatch):
+def test_services_while_a_map_is_loaded_are_served(robot, start, route, tmp_path, disk):
     """All but a second load_map: a file on a broken disk stops nothing else."""
     start(map_path='', operation='mapping')
     robot.drive(route[:3])
-    with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch):
+    with while_loading(robot, tmp_path / 'slow.stavpr', disk):
         robot.does(SaveMap, 'save_map', path=str(tmp_path / 'recorded.stavpr'))
         robot.does(Trigger, 'reset')
         robot.does(SetOperation, 'set_operation', operation='localization')
@@ -60,13 +68,12 @@ def test_services_while_a_map_is_loaded_are_served(robot, start, route, tmp_path
         assert robot.transition('cleanup')
 
 
-def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, monkeypatch):
+def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, disk, monkeypatch):
     start(map_path='')
-    end = threading.Event()
-    monkeypatch.setattr(runtime, 'read_map', lambda path, settings: end.wait())
+    disk.clear()
     monkeypatch.setattr(map_loading, 'LOAD_TIMEOUT', 0.1)
     message = robot.refuses(LoadMap, 'load_map', path=str(tmp_path / 'slow.stavpr'))
-    end.set()
+    disk.set()
     assert message == f'{tmp_path}/slow.stavpr was not read within 0.1 s: copy it to a faster disk'
 
 
@@ -106,23 +113,6 @@ def test_services_and_parameters_name_files_in_the_maps_folder_only(
     robot.set(save_path='')
 
 
-def test_requests_of_many_clients_wait_and_all_get_a_response(robot, start):
-    """200 at once, while the first one takes long."""
-    node, end = start(), threading.Event()
-    client = robot.node.create_client(Trigger, '/stavpr/reset', qos_profile=QoSProfile(depth=1000))
-    try:
-        robot.does(Trigger, 'reset')
-        robot.until(client.service_is_ready, 'the service')
-        robot.until(client.call_async(Trigger.Request()).done, 'the first response')
-        node.runtime.worker.call(end.wait)
-        responses = [client.call_async(Trigger.Request()) for _ in range(200)]
-        end.set()
-        robot.until(lambda: all(each.done() for each in responses), 'all responses')
-    finally:
-        end.set()
-        robot.node.destroy_client(client)
-
-
 def test_services_without_a_map_return_the_reason(robot, start, route, map_file, tmp_path):
     """Images too, until a map is loaded."""
     start(map_path='', robot_id='r1')
@@ -149,11 +139,9 @@ def test_services_without_a_map_return_the_reason(robot, start, route, map_file,
     assert robot.drive(route[:LENGTH])[-1].newest_index == LENGTH - 1
 
 
-def test_images_while_the_first_map_is_loaded_are_not_ready(
-    robot, start, route, tmp_path, monkeypatch
-):
+def test_images_while_the_first_map_is_loaded_are_not_ready(robot, start, route, tmp_path, disk):
     start(map_path='')
-    with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch) as slow:
+    with while_loading(robot, tmp_path / 'slow.stavpr', disk) as slow:
         matches = robot.drive(route[:5])
         assert {match.status for match in matches} == {PlaceMatch.NOT_READY}
         assert {match.reason for match in matches} == {f'map {slow} is being loaded'}
@@ -199,26 +187,22 @@ def test_node_that_maps_with_odometry_saves_and_publishes_poses(robot, start, ro
 
 
 def test_load_map_during_a_stream_processes_every_image(
-    robot, start, small_map, route, tmp_path, monkeypatch
+    robot, start, small_map, route, tmp_path, disk
 ):
     """At 20 Hz: matches with the old map, a window that fills, matches with the new map."""
     save_map(replace(small_map, ids=('new',) * 60), tmp_path / 'new.stavpr')
     start(queue_size=1000, **PAPER)
     robot.drive(route[20:28])
-    before, sent, later = len(robot.answers), [], threading.Event()
+    before, sent = len(robot.answers), []
+    disk.clear()
 
     def publish():
         stamp = robot.stamp + (1 + len(sent)) * SECOND
         sent.append(image_message(route[28 + len(sent) % 30], stamp))
         robot.publisher.publish(sent[-1])
         if len(sent) == 8:
-            later.set()
+            disk.set()
 
-    def read_during_the_stream(*given):
-        later.wait()
-        return read_map(*given)
-
-    monkeypatch.setattr(runtime, 'read_map', read_during_the_stream)
     timer = robot.node.create_timer(0.05, publish)
     robot.does(LoadMap, 'load_map', path=str(tmp_path / 'new.stavpr'))
     during = len(sent)
@@ -235,11 +219,11 @@ def test_load_map_during_a_stream_processes_every_image(
 
 
 def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
-    robot, start, route, tmp_path, monkeypatch
+    robot, start, route, tmp_path, disk
 ):
     start()
     matches = robot.drive(route[:6])
-    with while_loading(robot, tmp_path / 'slow.stavpr', monkeypatch):
+    with while_loading(robot, tmp_path / 'slow.stavpr', disk):
         matches += robot.drive(route[6:14])
     damaged = tmp_path / 'damaged.stavpr'
     damaged.write_bytes(b'PK' + bytes(1000))
@@ -272,3 +256,148 @@ def test_relocalize_returns_the_last_match_with_candidates_and_pose(robot, start
     response = robot.does(Relocalize, 'relocalize')  # though there is no match
     assert (str(response.match), response.message) == (str(strange), strange.reason)
     assert (response.has_pose, response.pose) == (False, PoseWithCovarianceStamped())
+
+
+STATES = ('unconfigured', 'inactive', 'active')
+
+
+@pytest.fixture
+def node(start):
+    """Start a node that is not configured and has no map."""
+    return start(wait=False, autostart=False, map_path='', mode='paper', threshold=0.2)
+
+
+def configure(robot, path, *, activate=False):
+    robot.set(map_path=path)
+    assert robot.transition('configure')
+    if activate:
+        assert robot.transition('activate')
+        robot.wait_for_node()
+
+
+def rejections(robot):
+    """Return the message of each service; all must fail."""
+    requests = {
+        'reset': (Trigger, {}),
+        'load_map': (LoadMap, {'path': 'any.stavpr'}),
+        'save_map': (SaveMap, {'path': 'any.stavpr'}),
+        'relocalize': (Relocalize, {}),
+        'set_operation': (SetOperation, {'operation': 'mapping'}),
+    }
+    return [robot.refuses(kind, name, **fields) for name, (kind, fields) in requests.items()]
+
+
+def test_node_through_all_states_behaves_as_each_state(robot, node, map_file, route):
+    warming = [PlaceMatch.WARMING_UP] * (LENGTH - 1)
+    assert robot.state() == 'unconfigured'
+    assert all('is unconfigured: configure it first' in message for message in rejections(robot))
+    assert robot.until_diagnosed(
+        'processing', DiagnosticStatus.OK, 'unconfigured: no image is processed'
+    )
+
+    configure(robot, map_file)
+    assert robot.state() == 'inactive'
+    robot.until_map(state='loaded', places=60, path=map_file)
+    infos = robot.listen(MapInfo, '/stavpr/map_info', LATCHED)
+    robot.until(lambda: bool(infos), 'the map, for a late subscriber')
+    assert robot.publisher.get_subscription_count() == 0
+    assert 'in the window' in robot.refuses(Relocalize, 'relocalize')
+    robot.until_diagnosed('processing', DiagnosticStatus.OK, 'inactive: no image is processed')
+
+    received = []
+    for first in (10, 20):  # both times with an empty window, counts go on
+        assert robot.transition('activate')
+        assert robot.state() == 'active'
+        robot.wait_for_node()
+        assert robot.statuses(route[first : first + LENGTH - 1]) == warming
+        match = robot.show(route[first + LENGTH - 1])
+        assert (match.status, match.newest_index) == (PlaceMatch.MATCH, first + LENGTH - 1)
+        robot.until_diagnosed('processing', DiagnosticStatus.OK, 'ms an image')
+        received.append(int(robot.counts('input')['received']))
+
+        assert robot.transition('deactivate')
+        assert robot.state() == 'inactive'
+        robot.wait_for_nobody()
+        before = len(robot.answers)
+        robot.publisher.publish(image_message(route[0], 50))
+        assert robot.does(Relocalize, 'relocalize')  # the window is kept
+        assert len(robot.answers) == before
+
+    assert received[1] >= received[0] + LENGTH
+    assert robot.transition('cleanup')
+    assert robot.state() == 'unconfigured'
+    robot.until_map(state='none', places=0)
+    assert all('is unconfigured' in message for message in rejections(robot))
+    robot.until(lambda: infos[-1].state == 'none', 'the end of the map')
+    assert [info.state for info in infos] == ['loaded', 'none']
+
+
+def test_node_at_invalid_transitions_rejects_them(robot, node, map_file):
+    steps = (None, 'configure', 'activate')
+    invalid = (
+        ('activate', 'deactivate', 'cleanup', 'teleport'),
+        ('configure', 'deactivate', 'teleport'),
+        ('configure', 'activate', 'cleanup', 'teleport'),
+    )
+    robot.set(map_path=map_file)
+    for step, labels, state in zip(steps, invalid, STATES, strict=True):
+        assert step is None or robot.transition(step)
+        for label in labels:
+            assert not robot.transition(label), (state, label)
+            assert robot.state() == state
+        for number in (0, 77, Transition.TRANSITION_ON_CONFIGURE_SUCCESS):
+            assert not robot.call(
+                ChangeState, 'change_state', transition=Transition(id=number)
+            ).success
+        assert robot.state() == state
+        robot.until_logged(f'from state {state}')
+    assert robot.call(
+        ChangeState, 'change_state', transition=Transition(id=Transition.TRANSITION_DEACTIVATE)
+    ).success
+
+
+def with_missing_model(whole: PlaceMap) -> PlaceMap:
+    """Return a map whose network has no file."""
+    network = settings_class('onnx')(model='', layer='y', sha256='0' * 64)
+    settings = dataclasses.replace(whole.settings, kind='onnx', backbone=network)
+    return dataclasses.replace(
+        whole, features=dataclasses.replace(whole.features, settings=settings)
+    )
+
+
+@pytest.mark.parametrize('fault', ['missing', 'model'])
+def test_node_after_a_failed_configuration_can_be_configured(
+    robot, node, map_file, small_map, route, tmp_path, fault
+):
+    path = tmp_path / f'{fault}.stavpr'
+    words = {
+        'missing': 'does not exist',
+        'model': 'copy the file that the map was built with there',
+    }[fault]
+    if fault == 'model':
+        save_map(with_missing_model(small_map), path)
+    robot.set(map_path=str(path))
+    assert not robot.transition('configure')
+    assert robot.state() == 'unconfigured'
+    robot.until_logged(words)
+    assert (
+        'cannot configure' in robot.until_diagnosed('map', DiagnosticStatus.ERROR, words).message
+    )
+    assert all('cannot configure' in message and words in message for message in rejections(robot))
+    assert not robot.transition('activate')
+    configure(robot, map_file, activate=True)
+    assert robot.statuses(route[:LENGTH])[-1] == PlaceMatch.MATCH
+    robot.until_diagnosed('map', DiagnosticStatus.OK, '60 places of')
+
+
+def test_node_without_its_map_frees_it(robot, node, map_file, monkeypatch):
+    """By cleanup, and by another map, even if its hashes are compared for hours."""
+    monkeypatch.setattr(map_loading, 'REST', 1e9)
+    configure(robot, map_file)
+    places = weakref.ref(node.runtime.pipeline.places)
+    assert robot.transition('cleanup')
+    robot.until(lambda: places() is None, 'the end of the map')
+    assert robot.transition('configure')
+    places = weakref.ref(node.runtime.pipeline.places)
+    robot.does(LoadMap, 'load_map', path=map_file)
+    robot.until(lambda: places() is None, 'the end of the old map')

@@ -3,14 +3,14 @@
 """Parameters of any name, type and value: each is set, or rejected with a reason."""
 
 import math
-import re
 
 from hypothesis import given, HealthCheck, settings, strategies
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-import rclpy
+from rclpy.lifecycle import TransitionCallbackReturn
 from robot import parameters_of
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.parameters import BY_NAME, PARAMETERS, REMOVED
 
 NESTED = '[' * 2000
@@ -50,26 +50,70 @@ def test_parameters_that_rclpy_cannot_read_get_a_response(robot, start):
     assert values == [0.25, 10]
 
 
-def test_nested_text_is_rejected_with_a_reason(make_node):
-    node = make_node(map_path='')
-    strange = Parameter(name='feature_settings', value=ParameterValue(type=4, string_value=NESTED))
-    service = service_of(node, SetParameters)
-    response = service.callback(
-        SetParameters.Request(parameters=[strange]), SetParameters.Response()
-    )
-    assert 'expected a JSON object' in response.results[0].reason
-    assert len(response.results[0].reason) < 1000
+# at the start, and of a node that localizes
+WRONG_TYPES = [
+    ('threshold', 'high', 'has the wrong type: expected a number'),
+    ('queue_size', 4.5, 'has the wrong type: expected an integer'),
+    ('publish_tf', 1, 'has the wrong type: expected true or false'),
+    ('robot_id', 2, 'has the wrong type: expected text'),
+]
+NOT_DECLARED = {
+    'sequence_lenght': 'is unknown: did you mean sequence_length?',
+    'beta': 'is unknown: see `ros2 param list`',
+} | {name: f'was removed in 1.0: {remedy}' for name, remedy in REMOVED.items()}
+REJECTED = [
+    *WRONG_TYPES,
+    *((name, 'package.module:name', words) for name, words in NOT_DECLARED.items()),
+    ('map_path', 'other.stavpr', 'call the service ~/load_map'),
+    ('operation', 'mapping', 'call the service ~/set_operation'),
+    ('nms_radius', 7, 'while the node is unconfigured'),
+    ('threshold', 0.8, 'is of mode paper'),
+    ('min_probability', 1.0, 'below 1'),
+    ('save_path', '/missing/route.stavpr', 'save_path'),
+    ('geometric_check', 'eye', 'take one of none'),
+    ('save_path', 'a' * 20_000, 'expected at most 4096, none of them a control'),
+    ('save_path', '\x1b[2J', 'none of them a control'),
+    ('robot_id', 'a\nb', 'none of them a control'),
+]
 
 
-@pytest.mark.parametrize('value', ['a' * 20_000, 'a\nb', '\x1b[2J'])
-def test_text_that_harms_a_log_is_rejected_by_name(make_node, value):
-    node = make_node(map_path='')
-    for name in ('save_path', 'robot_id'):
-        (result,) = node.set_parameters([rclpy.Parameter(name, value=value)])
-        assert re.match(
-            f'{name} = .* expected at most 4096, none of them a control', result.reason
-        )
-        assert len(result.reason) < 300
+def test_parameters_that_are_rejected_by_name_change_nothing(make_node, map_file):
+    node = make_node(map_path=map_file)
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    before = node.settings
+    for name, value, words in REJECTED:
+        (result,) = node.set_parameters(parameters_of({name: value}))
+        assert (result.successful, words in result.reason) == (False, True), result.reason
+        assert name in result.reason
+        assert len(result.reason) < 1000
+        assert not node.has_parameter(name) or node.get_parameter(name).value != value
+        assert node.settings is before
+    together = parameters_of({'candidates': 3, 'min_probability': 1.0})
+    assert not node.set_parameters_atomically(together).successful
+    assert node.settings.pipeline.candidates == 10
+    for values in ({'map_path': map_file}, {'candidates': 3}):  # the first one is the current one
+        assert node.set_parameters(parameters_of(values))[0].successful
+    assert node.runtime.pipeline.settings.candidates == 3
+
+
+def test_parameters_of_the_start_are_rejected_or_logged_by_name(make_node, capfd):
+    for name, value, words in WRONG_TYPES:
+        with pytest.raises(SettingsError, match=f'{name} = {value!r} {words}'):
+            make_node(**{name: value})
+    node = make_node(**dict.fromkeys(NOT_DECLARED, 'package.module:name'))
+    (result,) = node.set_parameters(parameters_of({'feature_settings': NESTED}))
+    assert 'expected a JSON object' in result.reason
+    assert len(result.reason) < 1000
+    logged = capfd.readouterr().err
+    assert all(f'parameter {name!r} {words}' in logged for name, words in NOT_DECLARED.items())
+
+
+def test_integer_where_a_number_is_expected_is_converted(make_node):
+    """As in `threshold: 1` of a parameter file, and in `ros2 param set NODE threshold 1`."""
+    node = make_node(mode='paper', threshold=1)
+    assert repr(node.settings.pipeline.threshold) == '1.0'
+    assert node.set_parameters(parameters_of({'threshold': 2}))[0].successful
+    assert repr(node.get_parameter('threshold').value) == '2.0'
 
 
 def test_any_parameter_is_set_or_rejected_with_a_reason(make_node):
@@ -101,13 +145,3 @@ def test_parameter_by_its_earlier_name_is_set_with_a_warning(make_node, capfd):
     assert node.settings.pipeline.keyframes.angle == 7
     assert "parameter 'keyframe_angle' is keyframe_angle_deg now" in capfd.readouterr().err
     assert not node.has_parameter('keyframe_angle')
-
-
-def test_removed_parameter_is_named_with_a_remedy(make_node, capfd):
-    for name, remedy in REMOVED.items():
-        sentence = f'parameter {name!r} was removed in 1.0: {remedy}'
-        node = make_node(**{name: 'package.module:name'})
-        assert sentence in capfd.readouterr().err
-        result = node.set_parameters(parameters_of({name: 1.0}))[0]
-        assert (result.successful, result.reason) == (False, sentence)
-        assert not node.has_parameter(name)

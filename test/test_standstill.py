@@ -9,7 +9,6 @@ from stavpr_ros.features import FeatureSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.method.motion import change_weights
-from stavpr_ros.prepare.centering import z_normalized
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 PLACES, STOP, STANDING, D = 160, 70, 400, 32
@@ -122,12 +121,3 @@ def test_change_weights_are_small_at_standstills_alone():
     assert change_weights(turns).min() > 0.15
     assert (change_weights(np.zeros(50)) == 1).all()
     assert change_weights(np.empty(0)).shape == (0,)
-
-
-def test_places_that_do_not_count_have_no_share_in_mean_and_deviation():
-    row = np.random.default_rng(0).normal(3, 2, 50).astype(np.float32)
-    counted = np.arange(50) < 30
-    row[40:] = -9
-    z = z_normalized(row, counted=counted)
-    np.testing.assert_allclose(z[:30], z_normalized(row[:30]), atol=1e-6)
-    np.testing.assert_allclose(z[40:], (-9 - row[:30].mean()) / row[:30].std(), rtol=1e-5)

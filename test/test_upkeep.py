@@ -226,6 +226,12 @@ def drives(rebuilt, around, tmp_path):
     return [str(file) for file in files]
 
 
+def changed(path, place_map, version=None):
+    """Save another map as the next version of a file."""
+    before = current_version(path)
+    return save_version(path, FileVersion.of(path), place_map, before, version or before, None)
+
+
 @pytest.mark.parametrize('length', [0, 1000])
 def test_damaged_version_is_kept_anew_from_the_map(first, path, length):
     """A battery that was pulled cut the copy of the present version, which the map still is."""
@@ -233,8 +239,7 @@ def test_damaged_version_is_kept_anew_from_the_map(first, path, length):
     history.mkdir()
     old = history / f'{before.map_id}.stavpr'
     old.write_bytes(path.read_bytes()[:length])
-    smaller = select_places(first, np.arange(20))
-    save_version(path, FileVersion.of(path), smaller, before, before, None)
+    changed(path, select_places(first, np.arange(20)))
     assert (len(load_map(path)), len(load_map(old))) == (20, len(first))
 
 
@@ -344,9 +349,8 @@ def test_map_that_another_program_has_replaced_stays(path, first, rebuilt):
 def test_old_versions_are_deleted(path, first, monkeypatch):
     monkeypatch.setattr(versions, 'KEPT', 2)
     for day in range(1, 4):
-        opened, before = FileVersion.of(path), current_version(path)
-        changed = replace(first, stamps=first.stamps + day)
-        save_version(path, opened, changed, before, Version('', changes=(f'{day}',)), None)
+        later = replace(first, stamps=first.stamps + day)
+        changed(path, later, Version('', changes=(f'{day}',)))
     files = sorted(Path(f'{path}.history').glob('*.stavpr'))
     assert len(files) == 2
     assert [each.changes for each in versions.versions(path)][:3] == [('3',), ('2',), ('1',)]
@@ -357,9 +361,8 @@ def test_old_versions_are_deleted(path, first, monkeypatch):
 def test_versions_of_a_branch_that_was_left_are_deleted(path, first):
     folder, ids = Path(f'{path}.history'), []
     for day in (1, 2, 3):
-        opened, before = FileVersion.of(path), current_version(path)
-        changed = replace(first, stamps=first.stamps + day)
-        ids.append(save_version(path, opened, changed, before, Version(''), None).map_id)
+        later = replace(first, stamps=first.stamps + day)
+        ids.append(changed(path, later, Version('')).map_id)
         (folder / 'notes.txt').touch()
         if day == 2:
             assert roll_back(path).map_id == ids[0]

@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import CompressedImage
 from stavpr_ros.errors import ImageError, SourceError
-from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros import input as ros_input
-from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.sources import files
 from stavpr_ros.sources.bag import BagSource, COMPRESSED
 from stavpr_ros.sources.encodings import decode_message
@@ -208,54 +206,45 @@ def test_node_decodes_video_in_compressed_images(
             decode_message(image_input.passed[0])
 
 
-def test_topics_of_other_transports_have_a_remedy(tmp_path):
+def test_bag_of_another_transport_has_a_remedy_and_damaged_messages_are_errors(tmp_path):
     kind = 'theora_image_transport/msg/Packet'
-    with writing(tmp_path / 'drive') as bag:
+    with writing(tmp_path / 'theora') as bag:
         bag.define(kind, 'uint8[] data\n')
         bag.write('/camera/theora', kind, SECOND, np.zeros(9, np.uint8))
     with pytest.raises(SourceError, match='republish TRANSPORT raw'):
-        BagSource(tmp_path / 'drive')
-
-
-def test_damaged_foxglove_message_of_a_bag_is_an_error_of_its_image(tmp_path):
-    with writing(tmp_path / 'drive') as bag:
+        BagSource(tmp_path / 'theora')
+    with writing(tmp_path / 'damaged') as bag:
         bag.define(FOXGLOVE, DEFINITIONS[FOXGLOVE])
         for content in (b'', b'\0\1\0\0', b'\0\1\0\0' + 40 * b'\xff'):
             bag.write_bytes('/video', FOXGLOVE, SECOND, content)
     errors = []
-    assert list(BagSource(tmp_path / 'drive', on_error=errors.append)) == []
+    assert list(BagSource(tmp_path / 'damaged', on_error=errors.append)) == []
     assert [each.kind for each in errors] == 3 * ['damaged']
 
 
-def test_node_subscribes_below_the_topic_of_images_and_counts_lost_packets(
-    context, monkeypatch, encoded, codec
-):
+@pytest.fixture
+def installed(monkeypatch):
+    """Make a class of messages known to the node, as that of packets."""
     monkeypatch.setattr(ros_input, 'message_class', lambda name: CompressedImage)
-    node, statistics, queue, late = ManagedNode('n', context=context), Statistics(), [], []
-    settings = SimpleNamespace(image_transport='ffmpeg', max_rate=1.0, max_stamp_gap=2.0)
-    images = ros_input.ImageInput(
-        node,
-        settings,
-        statistics,
-        lambda message, arrival: queue.append(message),
-        lambda message, reason: late.append(message),
-        lambda reason: None,
-    )
-    try:
-        assert images.topic == '/image/ffmpeg'
-        for i in (0, 1, 2, 3, 5, 6):
-            message = message_of(encoded[i], FFMPEG, codec, i)
-            if i == 2:  # faster than max_rate: decoded, since the next ones depend on it
-                message.header.stamp = Time(sec=2, nanosec=1)
-            images.on_image(message)
-        assert [each.header.stamp.sec for each in queue] == [1, 2, 4, 6, 7]
-        check([*IMAGES[:3], decode_message(queue[2]), IMAGES[4], *map(decode_message, queue[3:])])
-        assert len(late) == 1
-        images._on_lost(3)  # by the middleware, the one above among them
-        assert statistics.counts().dropped.total['lost in transport'] == 3
-        images.on_image(message_of(encoded[7], FFMPEG, codec, 7))
-        with pytest.raises(ImageError, match='before a key frame'):
-            decode_message(queue[-1])
-    finally:
-        images.close()
-        node.destroy_node()
+
+
+@pytest.mark.parametrize('image_input', ['ffmpeg'], indirect=True)
+def test_node_subscribes_below_the_topic_of_images_and_counts_lost_packets(
+    installed, image_input, encoded, codec
+):
+    images, queue = image_input, image_input.passed
+    assert images.topic == '/image/ffmpeg'
+    images.max_rate = 1.0
+    for i in (0, 1, 2, 3, 5, 6):
+        message = message_of(encoded[i], FFMPEG, codec, i)
+        if i == 2:  # faster than max_rate: decoded, since the next ones depend on it
+            message.header.stamp = Time(sec=2, nanosec=1)
+        images.on_image(message)
+    assert [each.header.stamp.sec for each in queue] == [1, 2, 4, 6, 7]
+    check([*IMAGES[:3], decode_message(queue[2]), IMAGES[4], *map(decode_message, queue[3:])])
+    assert len(images.rejected) == 1
+    images._on_lost(3)  # by the middleware, the one above among them
+    assert images.statistics.counts().dropped.total['lost in transport'] == 3
+    images.on_image(message_of(encoded[7], FFMPEG, codec, 7))
+    with pytest.raises(ImageError, match='before a key frame'):
+        decode_message(queue[-1])

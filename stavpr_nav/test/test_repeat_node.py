@@ -316,9 +316,9 @@ def test_two_laps_of_a_closed_map(rover, repeat, map_file, tmp_path):
     same_as[9] = 2
     closed = replace(select_places(load_map(map_file), np.arange(10)), same_as=same_as)
     save_map(closed, tmp_path / 'closed.stavpr')
-    node = repeat(map_path=str(tmp_path / 'closed.stavpr'))
-    assert node._run.seam == 2
-    rover.images, rover.seam, rover.map_id = rover.images[:10], 2, node._map.map_id
+    repeat(map_path=str(tmp_path / 'closed.stavpr'))
+    rover.images, rover.seam = rover.images[:10], 2
+    rover.map_id = load_map(tmp_path / 'closed.stavpr').map_id
     handle = rover.send(place_index=5, start_index=3, laps=2)
     assert handle.accepted
     result = rover.result_of(handle.get_result_async()).result
@@ -336,8 +336,8 @@ def test_map_of_several_sessions_is_repeated_by_matches_of_any(rover, repeat, ma
     same_as = np.tile(np.arange(n), 2).astype(np.int32)
     same_as[n + 40 :] = np.arange(n + 40, 2 * n)  # a detour
     save_map(replace(both, same_as=same_as), tmp_path / 'both.stavpr')
-    node = repeat(map_path=str(tmp_path / 'both.stavpr'), give_up_after=2.0)
-    rover.images, rover.map_id = [*rover.images[:n]] * 2, node._map.map_id
+    repeat(map_path=str(tmp_path / 'both.stavpr'), give_up_after=2.0)
+    rover.images, rover.map_id = rover.images[:n] * 2, load_map(tmp_path / 'both.stavpr').map_id
     rover.place = n + 3.0
     handle = rover.send(place_index=n + 9, start_index=n + 3)
     result = rover.result_of(handle.get_result_async()).result

@@ -192,16 +192,20 @@ def default_context():
 
 @pytest.fixture
 def image_input(context, request):
-    """Return the input of a node, by its transport: images are given to it and ``passed`` on."""
+    """Return the input of a node, by its transport: images are ``passed`` on or ``rejected``."""
     from stavpr_ros.pipeline.statistics import Statistics
     from stavpr_ros.ros.input import ImageInput
     from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 
     node, transport = ManagedNode('n', context=context), getattr(request, 'param', 'raw')
     settings = SimpleNamespace(image_transport=transport, max_rate=0.0, max_stamp_gap=2.0)
-    calls = (lambda message, _: images.passed.append(message)), print, print
-    images = ImageInput(node, settings, Statistics(), *calls)
-    images.passed = []
+    passed, rejected, statistics = [], [], Statistics()
+    calls = (
+        (lambda message, _: passed.append(message)),
+        lambda message, _: rejected.append(message),
+    )
+    images = ImageInput(node, settings, statistics, *calls, print)
+    images.passed, images.rejected, images.statistics = passed, rejected, statistics
     yield images
     images.close()
     node.destroy_node()
@@ -272,6 +276,36 @@ def start(robot, map_file, tmp_path_factory):
     for each in started:
         each.end()
     robot.wait_for_nobody()
+
+
+@pytest.fixture(scope='module')
+def node_of_file(robot, map_file, tmp_path_factory):
+    """Start the node that the tests of a file share; see ``running``."""
+    from robot import NodeThread
+
+    files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
+    thread = NodeThread(robot.context, [], files)
+    robot.wait_for_node()
+    yield thread.node
+    thread.end()
+    robot.wait_for_nobody()
+
+
+@pytest.fixture
+def running(robot, node_of_file):
+    """Return that node; its window is empty, and parameters are as at its start, also after."""
+    from stavpr_ros.parameters import PARAMETERS
+    from std_srvs.srv import Trigger
+
+    def values():
+        return {row.name: node_of_file.get_parameter(row.name).value for row in PARAMETERS}
+
+    robot.stamp += 10**10
+    robot.does(Trigger, 'reset')
+    before = values()
+    yield node_of_file
+    after = values()
+    robot.set(**{name: value for name, value in before.items() if value != after[name]})
 
 
 @pytest.fixture
