@@ -30,7 +30,7 @@ from stavpr_lab.evaluation.metrics import accepted_counts
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.mapping import build_map, Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 
@@ -190,7 +190,7 @@ def evaluate_tower(folder: Path, feature: str, making: FeatureExtractor) -> dict
     return {'images': images, 'matched': matched}
 
 
-def _map(source: Any, making: FeatureExtractor) -> PlaceMap:
+def _map(source: Any, making: FeatureExtractor) -> Map:
     return build_map(source, making, thumbnails=False, progress=False)
 
 

@@ -24,7 +24,7 @@ from results import commit, cpu_model, RESULTS, table, write_json
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import descriptor_map, PlaceMap, save_map
+from stavpr_ros.mapping import descriptor_map, Map, save_map
 from stavpr_ros.mapping.builder import extract_features
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
@@ -98,7 +98,7 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
 
 def reduced(
     features: LocalFeatures, query: LocalFeatures, dimension: int
-) -> tuple[PlaceMap, LocalFeatures]:
+) -> tuple[Map, LocalFeatures]:
     """Return a city and a query, projected as ``map compact --pca`` does."""
     place_map = with_principal_components(descriptor_map(features), dimension)
     projection = place_map.projection
@@ -108,7 +108,7 @@ def reduced(
 
 
 def drive(
-    place_map: PlaceMap, query: LocalFeatures, true: np.ndarray, tolerance: int
+    place_map: Map, query: LocalFeatures, true: np.ndarray, tolerance: int
 ) -> dict[str, float]:
     """
     Return precision, recall and times of a query.

@@ -24,7 +24,7 @@ from stavpr_lab.evaluation.drive import Drive as ChangedDrive
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.mapping import Map, select_places
 from stavpr_ros.sources import open_source
 
 CHANGES = 'same', 'drop 0.3', '0.5x', '2x', '3x'  # the first two of damaged drives, and --quick
@@ -43,7 +43,7 @@ class Sets(NamedTuple):
     """Pairs with the set that they count for and their group; negatives with kind and groups."""
 
     pairs: list[tuple[str, str, Pair]]
-    negatives: list[tuple[str, tuple[str, ...], PlaceMap, PlaceMap]]
+    negatives: list[tuple[str, tuple[str, ...], Map, Map]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Drive:
 
     kind: str
     groups: tuple[str, ...]
-    places: PlaceMap
+    places: Map
     features: LocalFeatures
     stamps: np.ndarray
     images: np.ndarray
@@ -97,13 +97,13 @@ def damaged(image: np.ndarray, damage: str) -> np.ndarray:
 def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor) -> Sets:
     """Extract the features; the truth of office and track is the best path by gradient."""
 
-    def read(name: str, damage: str = '', by: FeatureExtractor = making) -> PlaceMap:
+    def read(name: str, damage: str = '', by: FeatureExtractor = making) -> Map:
         source: Any = open_source(folder / name)
         if damage:
             source = [replace(f, image=damaged(f.image, damage)) for f in source]
         return extracted(source, by)
 
-    sets, places = Sets([], []), dict[str, PlaceMap]()
+    sets, places = Sets([], []), dict[str, Map]()
     named = {'walk_day': 'day', 'walk_night': 'night', 'walk_night_map': 'night map'}
     for case in short_cases(folder):
         reference, query = extracted(case.places, making), extracted(case.query, making)
@@ -158,11 +158,11 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
     return sets
 
 
-def _cut(places: PlaceMap, end: int | None) -> PlaceMap:
+def _cut(places: Map, end: int | None) -> Map:
     return select_places(places, np.arange(len(places))[:end])
 
 
-def _first(places: PlaceMap) -> PlaceMap:
+def _first(places: Map) -> Map:
     return _cut(places, MOST)
 
 

@@ -17,7 +17,7 @@ from data import data_folder
 import numpy as np
 from stavpr_fleet import FleetRecognizer, open_city_map, upload
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
+from stavpr_ros.mapping import build_map, descriptor_map, Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import unit_norm
 from stavpr_ros.sources import open_source
@@ -53,7 +53,7 @@ def generated(traverses: list[LocalFeatures], count: int, seed: int = 0) -> Loca
     return LocalFeatures(strips, weights, traverses[0].settings)
 
 
-def city(route: PlaceMap, distractors: list[PlaceMap], count: int) -> tuple[PlaceMap, int]:
+def city(route: Map, distractors: list[Map], count: int) -> tuple[Map, int]:
     """Return a map of ``count`` places, the route in its middle, and the route's first place."""
     others = [one.features for one in distractors]
     extra = count - len(route) - sum(map(len, others))

@@ -18,7 +18,7 @@ from off_map_page import KINDS
 from results import table
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.features import LocalFeatures, registry
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.method.loop_closer import LoopCloser
 
@@ -32,8 +32,8 @@ WRONG = 20.0
 class Drives(NamedTuple):
     """Two drives, the second one's truth on the first one (None = no place is right), groups."""
 
-    first: PlaceMap
-    second: PlaceMap
+    first: Map
+    second: Map
     truth: GroundTruth | None
     groups: tuple[str, ...]
 

@@ -42,7 +42,7 @@ from stavpr_lab.evaluation.metrics import (
 from stavpr_ros.alignment.settings import SpatialSettings, STRATEGIES
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import build_map, PlaceMap, select_places
+from stavpr_ros.mapping import build_map, Map, select_places
 from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.progress import Progress
@@ -74,8 +74,8 @@ class Pair:
     """A query and a map of one route, features extracted."""
 
     name: str
-    places: PlaceMap
-    query: PlaceMap
+    places: Map
+    query: Map
     truth: GroundTruth
 
     @property
@@ -169,14 +169,14 @@ class Outcome:
 
 
 def matches_of(
-    place_map: PlaceMap, features: LocalFeatures, stamps: np.ndarray | None = None
+    place_map: Map, features: LocalFeatures, stamps: np.ndarray | None = None
 ) -> list[Match]:
     """Return the matches of a drive, one an image, by a recognizer of its own."""
     return recognize_all(PlaceRecognizer(place_map, SETTINGS), features, stamps)
 
 
 def outcome(
-    place_map: PlaceMap,
+    place_map: Map,
     features: LocalFeatures,
     truth: GroundTruth,
     unseen: np.ndarray | None = None,
@@ -307,7 +307,7 @@ def start_numbers(counts: Sequence[int | None]) -> dict[str, Any]:
     }
 
 
-def with_standstill(place_map: PlaceMap) -> PlaceMap:
+def with_standstill(place_map: Map) -> Map:
     """Return a map whose camera stood for ``STANDING`` places more in its middle."""
     n = len(place_map)
     return select_places(place_map, np.sort(np.append(np.arange(n), np.full(STANDING, n // 2))))
@@ -354,15 +354,13 @@ class Measurement:
         for name, counts in starts(pair, self.coarser):
             self.add('start', name, start_numbers(counts))
 
-    def floors(self, floors: dict[str, PlaceMap]) -> None:
+    def floors(self, floors: dict[str, Map]) -> None:
         """Add the rows of floors on maps of other floors: each match is wrong."""
         self.off_map += self._floors(TOWER, floors, floors)
         standing = {name: with_standstill(place_map) for name, place_map in floors.items()}
         self._floors(f'{TOWER}, standstill', standing, floors)
 
-    def _floors(
-        self, name: str, maps: dict[str, PlaceMap], floors: dict[str, PlaceMap]
-    ) -> list[Outcome]:
+    def _floors(self, name: str, maps: dict[str, Map], floors: dict[str, Map]) -> list[Outcome]:
         pairs = [(a, b) for a in floors for b in floors if a != b][:: self.coarser]
         shares, outcomes = {}, []
         for map_name, query_name in Progress(pairs, desc='floors', leave=False):
@@ -402,16 +400,16 @@ def extractor(feature: str, folder: Path) -> FeatureExtractor:
     return FeatureExtractor(KINDS[feature])
 
 
-def extracted(source: Any, making: FeatureExtractor) -> PlaceMap:
+def extracted(source: Any, making: FeatureExtractor) -> Map:
     """Return a map of all images of a source."""
     return build_map(source, making, thumbnails=False, progress=False)
 
 
 def pairs_of(folder: Path, feature: str, making: FeatureExtractor) -> Iterator[Pair]:
     """Yield the pairs of the data sets; the features of a source are extracted once."""
-    pairs: dict[int, tuple[Any, PlaceMap]] = {}  # with its source, so that its id stays its own
+    pairs: dict[int, tuple[Any, Map]] = {}  # with its source, so that its id stays its own
 
-    def features(source: Any) -> PlaceMap:
+    def features(source: Any) -> Map:
         if id(source) not in pairs:
             pairs[id(source)] = source, extracted(source, making)
         return pairs[id(source)][1]

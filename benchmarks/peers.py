@@ -26,7 +26,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, Ranking
 from stavpr_lab.evaluation.seqslam import match_differences, SeqSlamSettings
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, PlaceMap, select_places
+from stavpr_ros.mapping import build_map, Map, select_places
 from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.sources import open_source
 import torch
@@ -119,7 +119,7 @@ def peer_methods(
 
 
 def methods(
-    options: Any, place_map: PlaceMap, query: PlaceMap, truth: GroundTruth
+    options: Any, place_map: Map, query: Map, truth: GroundTruth
 ) -> Iterator[tuple[str, Matches]]:
     """Yield name and matches of each method."""
     places, queries = (image_vectors(each.features) for each in (place_map, query))

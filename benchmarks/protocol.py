@@ -33,7 +33,7 @@ from stavpr_lab.evaluation.protocol import (
 from stavpr_lab.evaluation.seqslam import differences, preprocess, SeqSlamSettings
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, PlaceMap, select_places
+from stavpr_ros.mapping import build_map, Map, select_places
 from stavpr_ros.sources import open_source
 
 WALK, TRAIN = 'walk_by_night', 'nordland_64x32'
@@ -78,7 +78,7 @@ def clean(*traverses: FrameSource) -> np.ndarray:
 
 
 @cache
-def features(path: Path, making: FeatureExtractor) -> PlaceMap:
+def features(path: Path, making: FeatureExtractor) -> Map:
     """Return a map of a folder of images."""
     return build_map(open_source(path), making, thumbnails=False, progress=False)
 

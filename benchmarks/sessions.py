@@ -19,7 +19,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.same_places import with_last_related
 from stavpr_ros.maintenance.upkeep import update_map
-from stavpr_ros.mapping import build_map, merge_maps, PlaceMap, select_places
+from stavpr_ros.mapping import build_map, Map, merge_maps, select_places
 from stavpr_ros.mapping.versions import Version
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
@@ -49,8 +49,8 @@ class Session:
     :param position: of each image along the route, in images of one session, (N,).
     """
 
-    drive: PlaceMap
-    mirrored: PlaceMap
+    drive: Map
+    mirrored: Map
     position: np.ndarray
 
     def part(self, images: slice) -> 'Session':
@@ -74,7 +74,7 @@ class Route:
     period: float = np.inf
 
 
-def path(reference: PlaceMap, drive: PlaceMap, is_closed: bool) -> np.ndarray:
+def path(reference: Map, drive: Map, is_closed: bool) -> np.ndarray:
     """Return the best path of a whole drive on a reference, (N,)."""
     d = PlaceRecognizer(reference, RecognizerSettings()).distances(drive.features)
     z = (d - d.mean(axis=1, keepdims=True)) / d.std(axis=1, keepdims=True)
@@ -97,7 +97,7 @@ def path(reference: PlaceMap, drive: PlaceMap, is_closed: bool) -> np.ndarray:
 def routes(folder: Path) -> Iterator[Route]:
     """Yield the routes with several sessions."""
 
-    def session(name: str, reference: PlaceMap | None = None, is_closed: bool = False) -> Session:
+    def session(name: str, reference: Map | None = None, is_closed: bool = False) -> Session:
         source = open_source(folder / name)
         flipped = (replace(frame, image=np.fliplr(frame.image)) for frame in source)
         drive, mirrored = (
@@ -131,7 +131,7 @@ def routes(folder: Path) -> Iterator[Route]:
 
 
 def measure(
-    place_map: PlaceMap,
+    place_map: Map,
     positions: dict[int, float],
     query: Session,
     route: Route,
@@ -151,7 +151,7 @@ def measure(
     return counts, float(np.median(times))
 
 
-def poisoned(session: Session, other: PlaceMap, is_closed: bool) -> Iterator[PlaceMap]:
+def poisoned(session: Session, other: Map, is_closed: bool) -> Iterator[Map]:
     """Yield drives that must not change a map: another route, mirrored, the wrong start."""
     yield other
     yield session.mirrored
@@ -160,7 +160,7 @@ def poisoned(session: Session, other: PlaceMap, is_closed: bool) -> Iterator[Pla
         yield select_places(session.drive, np.r_[n // 2 : n, : n // 2])
 
 
-def drive_route(route: Route, other: PlaceMap) -> list[str]:
+def drive_route(route: Route, other: Map) -> list[str]:
     """Return the cells of a route."""
     counts, places, times, changes = np.zeros((4, 2), int), np.zeros(4, int), np.zeros(4), []
     images = changed = poisons = 0
@@ -195,9 +195,7 @@ def drive_route(route: Route, other: PlaceMap) -> list[str]:
     return [route.name, str(images), recall, wrong, sizes, took, f'{changed} of {poisons}']
 
 
-def update(
-    place_map: PlaceMap, drive: PlaceMap, version: Version, name: str
-) -> tuple[PlaceMap, Version, str]:
+def update(place_map: Map, drive: Map, version: Version, name: str) -> tuple[Map, Version, str]:
     """Return a map after a drive, its version, and what has changed; a rejected one: why."""
     try:
         place_map, version = update_map(place_map, drive, name, version)

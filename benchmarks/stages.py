@@ -29,7 +29,7 @@ from stavpr_ros.alignment.lm_dtw import (
 from stavpr_ros.alignment.settings import SequenceSettings, SpatialSettings
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.features.registry import evidence_of
-from stavpr_ros.mapping import descriptor_map, PlaceMap
+from stavpr_ros.mapping import descriptor_map, Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.columns import ColumnLayout
@@ -270,7 +270,7 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
     poses = np.zeros((n, 7))
     poses[:, 0], poses[:, 6] = np.arange(n), 1
     names = ('',) * n
-    place_map = PlaceMap(features, extractor.projection, np.zeros(n, np.int64), names, poses)
+    place_map = Map(features, extractor.projection, np.zeros(n, np.int64), names, poses)
     pipeline = Pipeline(PipelineSettings(backend=run.device, precision=precision))
     pipeline.change(loaded=LoadedMap('', place_map, extractor))
     following, accepted = cycle(range(DRIVEN)), {0.5: 0, 1.0: 0}

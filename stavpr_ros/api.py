@@ -9,7 +9,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from stavpr_ros.checks import require_choice, require_type, rgb_image
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources.files import reduce, scale, upper_byte
 
@@ -38,7 +38,7 @@ class Localizer:
 
     def __init__(
         self,
-        route: PlaceMap,
+        route: Map,
         *,
         settings: RecognizerSettings | None = None,
         backend: 'str | torch.device' = 'cpu',

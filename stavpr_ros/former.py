@@ -15,6 +15,8 @@ import warnings
 FORMER = {'stavpr_ros.recognition', 'stavpr_ros.filter'}
 METHOD = 'stavpr_ros.method'
 CLASSES = {
+    'stavpr_ros.mapping': {'PlaceMap': 'Map'},
+    'stavpr_ros.mapping.place_map': {'PlaceMap': 'Map'},
     'stavpr_ros.pipeline.operations': {'Localizer': 'LocalizationOperation'},
 }
 FIELDS: dict[str, dict[str, str]] = {

@@ -27,8 +27,8 @@ from stavpr_ros.errors import (
 )
 from stavpr_ros.mapping import (
     load_map,
+    Map,
     open_map,
-    PlaceMap,
     save_map,
     Session,
     verify_map,
@@ -39,7 +39,7 @@ from stavpr_ros.mapping.stored_features import StoredFeatures
 
 
 @pytest.fixture(scope='module')
-def example() -> PlaceMap:
+def example() -> Map:
     return example_map()
 
 
@@ -54,7 +54,7 @@ def originals(tmp_path_factory) -> list[bytes]:
     return example_files(tmp_path_factory.mktemp('originals'))
 
 
-def assert_same(a: PlaceMap, b: PlaceMap) -> None:
+def assert_same(a: Map, b: Map) -> None:
     assert (a.settings, a.ids, a.sessions) == (b.settings, b.ids, b.sessions)
     assert tuple(a.thumbnails) == tuple(b.thumbnails)
     assert np.array_equal(a.features.weights, b.features.weights)
@@ -191,7 +191,7 @@ def test_features_extracted_now_are_those_of_a_kept_map(kind):
 
 
 def test_map_without_optional_parts_has_three_parts(example, tmp_path):
-    plain = PlaceMap(example.features, None, example.stamps, ('',) * 24)
+    plain = Map(example.features, None, example.stamps, ('',) * 24)
     save_map(plain, tmp_path / 'plain')
     assert sorted(load_file(tmp_path / 'plain')) == ['stamps', 'strips', 'weights']
     loaded = load_map(tmp_path / 'plain')

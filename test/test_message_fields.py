@@ -26,7 +26,7 @@ from rclpy.qos import QoSProfile
 from robot import image_message, LENGTH, NodeThread, PARAMETERS, Robot, SECOND
 from sensor_msgs.msg import CameraInfo
 from stavpr_msgs.msg import LoopClosure, MapInfo, PlaceCandidates, PlaceMatch, RelativePose
-from stavpr_ros.mapping import load_map, PlaceMap, save_map, Session
+from stavpr_ros.mapping import load_map, Map, save_map, Session
 from stavpr_ros.ros.messages import nanoseconds, time_message
 from std_srvs.srv import Trigger
 
@@ -56,7 +56,7 @@ class Drive:
     mode: str = 'robust'
     operation: str = 'localization'
     path: str = ''
-    places: PlaceMap | None = None
+    places: Map | None = None
     has_camera: bool = False
     began: int = 0
     reset: int = 0

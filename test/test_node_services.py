@@ -19,7 +19,7 @@ from robot import image_message, LATCHED, LENGTH, SECOND
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.mapping import load_map, PlaceMap, save_map
+from stavpr_ros.mapping import load_map, Map, save_map
 from stavpr_ros.pipeline import read_map
 from stavpr_ros.ros import map_loading, runtime
 from std_srvs.srv import Trigger
@@ -356,7 +356,7 @@ def test_node_at_invalid_transitions_rejects_them(robot, node, map_file):
     ).success
 
 
-def with_missing_model(whole: PlaceMap) -> PlaceMap:
+def with_missing_model(whole: Map) -> Map:
     """Return a map whose network has no file."""
     network = settings_class('onnx')(model='', layer='y', sha256='0' * 64)
     settings = dataclasses.replace(whole.settings, kind='onnx', backbone=network)

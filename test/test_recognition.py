@@ -14,7 +14,7 @@ from stavpr_ros.alignment import best_match, match_sequence, SequenceSettings, S
 from stavpr_ros.alignment.lm_dtw import trace_sequence
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import build_map, load_map, PlaceMap
+from stavpr_ros.mapping import build_map, load_map, Map
 from stavpr_ros.method import Candidate, PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.match import WindowSequences
@@ -34,14 +34,14 @@ from stavpr_ros.sources import open_source
 SHORT = SequenceSettings(length=5, beta=2.0)
 
 
-def recognizer(place_map: PlaceMap, threshold: float = 0.3, **changes) -> PlaceRecognizer:
+def recognizer(place_map: Map, threshold: float = 0.3, **changes) -> PlaceRecognizer:
     changes = {'sequence': SHORT, 'nms_radius': 5, 'mode': 'paper'} | changes
     threshold = threshold if changes['mode'] == 'paper' else None
     return PlaceRecognizer(place_map, RecognizerSettings(threshold, **changes))
 
 
-def empty_map(like: PlaceMap) -> PlaceMap:
-    return PlaceMap(like.features[0:0], like.projection, like.stamps[:0], (), None, ())
+def empty_map(like: Map) -> Map:
+    return Map(like.features[0:0], like.projection, like.stamps[:0], (), None, ())
 
 
 def test_recognizer_of_its_own_map_matches_every_window(small_map):
@@ -100,7 +100,7 @@ def test_recognizer_on_empty_map_never_matches(small_map, mode):
 @pytest.mark.parametrize('places', [1, 4])
 def test_recognizer_on_map_shorter_than_window_matches(small_map, places):
     stamps, ids = small_map.stamps[:places], small_map.ids[:places]
-    short = PlaceMap(small_map.features[:places], small_map.projection, stamps, ids, None, ())
+    short = Map(small_map.features[:places], small_map.projection, stamps, ids, None, ())
     answer = recognize_all(recognizer(short, 2.0), small_map.features[:6])[-1]
     assert answer.status is Status.MATCH
     assert 0 <= answer.place < places

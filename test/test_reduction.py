@@ -9,7 +9,7 @@ from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map as map_of
-from stavpr_ros.mapping import GrowingMap, load_map, PlaceMap, save_map, select_places
+from stavpr_ros.mapping import GrowingMap, load_map, Map, save_map, select_places
 from stavpr_ros.mapping.reduction import with_principal_components
 from stavpr_ros.sources.frame import Frame
 
@@ -80,7 +80,7 @@ def test_compact_reduces_map_to_principal_components(whole, tmp_path, capsys):
     save_map(whole, saved)
     assert map_command.main(['compact', saved, compact, '--pca', f'{D}']) == 0
     found = load_map(compact)
-    assert isinstance(found, PlaceMap)
+    assert isinstance(found, Map)
     assert found.features.strips.shape == (7, 30, D)
     assert found.projection.name == f'principal components 224 -> {D} of 30 places'
     assert map_command.main(['compact', compact, smaller, '--pca', '4']) == 0

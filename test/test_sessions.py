@@ -17,8 +17,8 @@ from stavpr_ros.maintenance.same_places import SURE, with_last_related, with_sam
 from stavpr_ros.mapping import (
     GrowingMap,
     load_map,
+    Map,
     merge_maps,
-    PlaceMap,
     save_map,
     select_places,
     select_session,
@@ -233,7 +233,7 @@ def floors(small_map, tmp_path_factory):
     n = len(UPSTAIRS)
     features, stamps = small_map.extractor().extract(UPSTAIRS), (1 + np.arange(n)) * SECOND
     poses = np.array([at(i) for i in range(n)])
-    upstairs = PlaceMap(features, small_map.projection, stamps, ('',) * n, poses)
+    upstairs = Map(features, small_map.projection, stamps, ('',) * n, poses)
     save_map(upstairs, folder / 'floor-1.stavpr')
     return folder
 

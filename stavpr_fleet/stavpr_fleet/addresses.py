@@ -11,7 +11,7 @@ from stavpr_fleet.qdrant_store import (
     upload_to_qdrant,
 )
 from stavpr_fleet.recognizer import FleetMap
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.stores import Store
 
 
@@ -25,7 +25,7 @@ def open_city_map(address: str) -> FleetMap:
     return FleetMap.of(FaissStore(rest) if scheme == 'faiss' else QdrantStore(_points(address)))
 
 
-def upload(place_map: PlaceMap, address: str, force: bool = False) -> None:
+def upload(place_map: Map, address: str, force: bool = False) -> None:
     """
     Write a map to an address.
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from stavpr_fleet.store import PlaceStore, sample_places
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import Place, PlaceMap
+from stavpr_ros.mapping import Map, Place
 
 
 class RemoteFeatures(LocalFeatures):
@@ -49,7 +49,7 @@ class RemoteFeatures(LocalFeatures):
 
 
 @dataclass(frozen=True, eq=False)
-class CityMap(PlaceMap):
+class CityMap(Map):
     """
     A map in a :class:`PlaceStore`. Stamps, poses and identifiers are known of fetched places.
 
@@ -85,7 +85,7 @@ class CityMap(PlaceMap):
         city.remember(sample_places(n), sample)
         return city
 
-    def remember(self, places: np.ndarray, fetched: PlaceMap) -> None:
+    def remember(self, places: np.ndarray, fetched: Map) -> None:
         """Keep stamps, poses and identifiers of places that were fetched."""
         self.stamps[places] = fetched.stamps
         if self.poses is not None and fetched.poses is not None:
@@ -94,5 +94,5 @@ class CityMap(PlaceMap):
         self.fetched_ids.update((place, name) for place, name in names if name)
 
     def place(self, index: int) -> Place:
-        """See :meth:`PlaceMap.place`; of a place that was not fetched, the session alone."""
+        """See :meth:`Map.place`; of a place that was not fetched, the session alone."""
         return replace(super().place(index), identifier=self.fetched_ids.get(index, ''))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from stavpr_fleet.store import map_vectors, MapIndex
 from stavpr_ros.errors import FleetError, OutputTakenError, UnavailableError
-from stavpr_ros.mapping import open_map, PlaceMap, save_map, select_places
+from stavpr_ros.mapping import Map, open_map, save_map, select_places
 
 EXACT = 4096  # places up to which all vectors are compared
 REDUCED = 128  # dimensions that larger maps' vectors are reduced to
@@ -63,13 +63,13 @@ class FaissStore:
         """See :class:`stavpr_fleet.store.PlaceStore`."""
         return np.asarray(self._index.search(vectors, count)[1])
 
-    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
+    def fetch(self, places: np.ndarray) -> tuple[Map, np.ndarray]:
         """See :class:`stavpr_fleet.store.PlaceStore`."""
         same_as = self._map.same_as
         return select_places(self._map, places), places if same_as is None else same_as[places]
 
 
-def upload_to_faiss(place_map: PlaceMap, path: str, force: bool = False) -> None:
+def upload_to_faiss(place_map: Map, path: str, force: bool = False) -> None:
     """
     Write a map and its index; a map that is the file itself gets an index only.
 

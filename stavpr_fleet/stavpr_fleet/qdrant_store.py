@@ -29,7 +29,7 @@ from stavpr_ros.errors import (
     UnavailableError,
 )
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import load_map, PlaceMap, save_map, select_places, Session
+from stavpr_ros.mapping import load_map, Map, save_map, select_places, Session
 
 INDEX_POINT = 2**40
 TIMEOUT = 5  # seconds that the server may take for a response
@@ -231,7 +231,7 @@ class QdrantStore:
             row[: len(places)] = places
         return out
 
-    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
+    def fetch(self, places: np.ndarray) -> tuple[Map, np.ndarray]:
         """See :class:`stavpr_fleet.store.PlaceStore`."""
         payloads = self._points.payloads(places.tolist())
         if missing := set(places.tolist()) - payloads.keys():
@@ -240,7 +240,7 @@ class QdrantStore:
             return _read_places([payloads[place] for place in places.tolist()], self.index)
 
 
-def upload_to_qdrant(place_map: PlaceMap, points: Points, force: bool = False) -> None:
+def upload_to_qdrant(place_map: Map, points: Points, force: bool = False) -> None:
     """
     Write a map into an empty collection.
 
@@ -295,9 +295,7 @@ def _read_index(payload: dict[str, Any]) -> MapIndex:
     )
 
 
-def _written_places(
-    place_map: PlaceMap, selected: PlaceMap, places: np.ndarray
-) -> Iterator[dict[str, Any]]:
+def _written_places(place_map: Map, selected: Map, places: np.ndarray) -> Iterator[dict[str, Any]]:
     strips = selected.features.strips.astype(np.float16)
     for i, place in enumerate(places.tolist()):
         pose, session = place_map.pose(place), place_map.session(place)
@@ -313,7 +311,7 @@ def _written_places(
         }
 
 
-def _read_places(payloads: list[dict[str, Any]], index: MapIndex) -> tuple[PlaceMap, np.ndarray]:
+def _read_places(payloads: list[dict[str, Any]], index: MapIndex) -> tuple[Map, np.ndarray]:
     W, d = index.sample.settings.strips, index.sample.dimension
     parts = [np.frombuffer(base64.b64decode(one['strips']), '<f2') for one in payloads]
     strips = np.stack(parts).reshape(-1, W, d).transpose(1, 0, 2).astype(np.float32)

@@ -15,7 +15,7 @@ from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.errors import SettingsError, StavprError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.features.registry import evidence_of
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.memory import aligned_zeros
 from stavpr_ros.method import Match, RecognizerSettings, Status
 from stavpr_ros.method.cells import CellAgreement
@@ -96,7 +96,7 @@ class _Lookup(NamedTuple):
 
     chunks: list[int]
     places: np.ndarray
-    fetched: PlaceMap | None
+    fetched: Map | None
     same_as: np.ndarray
 
 

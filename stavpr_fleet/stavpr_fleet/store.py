@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 from stavpr_ros.errors import FleetError
-from stavpr_ros.mapping import PlaceMap, select_places, Session
+from stavpr_ros.mapping import Map, select_places, Session
 from stavpr_ros.prepare.blocks import converted_blocks
 from stavpr_ros.prepare.centering import evenly, MeanCentering, normalize
 
@@ -38,7 +38,7 @@ class MapIndex:
     places: int
     firsts: np.ndarray
     sessions: tuple[Session, ...]
-    sample: PlaceMap
+    sample: Map
     map_id: str = ''
 
     def __post_init__(self) -> None:
@@ -56,7 +56,7 @@ class MapIndex:
             raise FleetError(f'{len(self.sessions)} sessions for {len(firsts)} runs of places')
 
     @classmethod
-    def of(cls, place_map: PlaceMap) -> 'MapIndex':
+    def of(cls, place_map: Map) -> 'MapIndex':
         """Return the index of a map."""
         numbers = place_map.session_index
         firsts, sessions = np.zeros(1, np.int64), ()
@@ -96,7 +96,7 @@ class PlaceStore(Protocol):
         :raises FleetError: the store cannot be reached, or its data is damaged.
         """
 
-    def fetch(self, places: np.ndarray) -> tuple[PlaceMap, np.ndarray]:
+    def fetch(self, places: np.ndarray) -> tuple[Map, np.ndarray]:
         """
         Return places as a map, and of each itself or the place that shows the same, int64.
 
@@ -125,7 +125,7 @@ def place_vectors(strips: np.ndarray) -> np.ndarray:
     return normalize(np.concatenate(groups, axis=1))
 
 
-def map_vectors(place_map: PlaceMap, index: MapIndex) -> np.ndarray:
+def map_vectors(place_map: Map, index: MapIndex) -> np.ndarray:
     """Return the vectors of all places, (n, D), float32; features are read block by block."""
     centering = index.centering()
     vectors = np.empty((len(place_map), index.dimension), np.float32)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 import numpy as np
 from stavpr_lab.evaluation.plots import page, QUIET, show_distances
-from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.mapping import Map, select_places
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import evenly
 
@@ -17,7 +17,7 @@ COMPARED = 500  # places of the matrix, at most
 SHOWN = 8  # thumbnails
 
 
-def plot_map(place_map: PlaceMap, path: Path) -> None:
+def plot_map(place_map: Map, path: Path) -> None:
     """Draw an opened map to a PNG file; of a long map, evenly spaced places."""
     with page(path, 13, 7.4) as figure:
         halves: Any = figure.subfigures(1, 2, width_ratios=(1, 1.2))
@@ -34,7 +34,7 @@ def plot_map(place_map: PlaceMap, path: Path) -> None:
         _draw_matrix(right, right.subplots(), place_map)
 
 
-def _runs(place_map: PlaceMap) -> list[tuple[str, np.ndarray]]:
+def _runs(place_map: Map) -> list[tuple[str, np.ndarray]]:
     """Return name and places of each session."""
     index = place_map.session_index
     if index is None:
@@ -45,7 +45,7 @@ def _runs(place_map: PlaceMap) -> list[tuple[str, np.ndarray]]:
     ]
 
 
-def _draw_route(axes: Axes, place_map: PlaceMap) -> None:
+def _draw_route(axes: Axes, place_map: Map) -> None:
     axes.set_title('route from above', fontsize=10.5, loc='left')
     assert place_map.poses is not None
     for name, places in _runs(place_map):
@@ -64,7 +64,7 @@ def _draw_route(axes: Axes, place_map: PlaceMap) -> None:
         axes.legend(loc='best')
 
 
-def _draw_sessions(axes: Axes, place_map: PlaceMap) -> None:
+def _draw_sessions(axes: Axes, place_map: Map) -> None:
     """Draw which places of earlier sessions each session shows, and its own ones."""
     axes.set_title('places by session; gray: of an earlier session', fontsize=10.5, loc='left')
     runs = _runs(place_map)
@@ -79,7 +79,7 @@ def _draw_sessions(axes: Axes, place_map: PlaceMap) -> None:
     axes.invert_yaxis()
 
 
-def _draw_thumbnails(figure: SubFigure, place_map: PlaceMap, columns: int) -> None:
+def _draw_thumbnails(figure: SubFigure, place_map: Map, columns: int) -> None:
     places = evenly(len(place_map), SHOWN).tolist()
     grid = figure.subplots(SHOWN // columns, columns, squeeze=False)
     for axes in grid.flat:
@@ -93,7 +93,7 @@ def _draw_thumbnails(figure: SubFigure, place_map: PlaceMap, columns: int) -> No
             axes.imshow(image, interpolation='lanczos')
 
 
-def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: PlaceMap) -> None:
+def _draw_matrix(figure: Figure | SubFigure, axes: Axes, place_map: Map) -> None:
     """Draw the distances of places to each other, as mode robust compares images."""
     n, places = len(place_map), evenly(len(place_map), COMPARED)
     part = select_places(place_map, places)

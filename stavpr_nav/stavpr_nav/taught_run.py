@@ -22,7 +22,7 @@ import re
 import numpy as np
 from stavpr_nav.follower import TaughtRun
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.units import SECOND
 
 COLUMNS = ['stamp', 'speed', 'turn']
@@ -65,7 +65,7 @@ def read_velocities(path: str | Path) -> tuple[np.ndarray, str]:
 
 
 def taught_places(
-    place_map: PlaceMap, velocities: np.ndarray | None = None, session: str = ''
+    place_map: Map, velocities: np.ndarray | None = None, session: str = ''
 ) -> np.ndarray:
     """
     Return the places of the taught session, in the order of the run, shape (n,).
@@ -95,7 +95,7 @@ def taught_places(
     return np.flatnonzero(np.isin(index, [number for number in parts if is_same[number]]))
 
 
-def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
+def positions(place_map: Map, taught: np.ndarray) -> np.ndarray:
     """
     Return the position of each place of the map among the taught ones, (N,), int; -1 = unknown.
 
@@ -121,7 +121,7 @@ def positions(place_map: PlaceMap, taught: np.ndarray) -> np.ndarray:
 
 
 def taught_run(
-    place_map: PlaceMap, velocities: np.ndarray | None = None, taught: np.ndarray | None = None
+    place_map: Map, velocities: np.ndarray | None = None, taught: np.ndarray | None = None
 ) -> TaughtRun:
     """
     Return the velocities of the taught run at its places of a map.

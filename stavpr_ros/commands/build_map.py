@@ -20,7 +20,7 @@ from stavpr_ros.output_file import MAP, require_replaceable
 
 if TYPE_CHECKING:
     import numpy as np
-    from stavpr_ros.mapping import PlaceMap, Trajectory
+    from stavpr_ros.mapping import Map, Trajectory
     from stavpr_ros.sources.bag import BagSource
     from stavpr_ros.sources.folder import FolderSource
     from stavpr_ros.sources.frame import Frame
@@ -213,7 +213,7 @@ def _poses(
     return poses[:: arguments.every]
 
 
-def _build(arguments: argparse.Namespace) -> 'tuple[PlaceMap, Path]':
+def _build(arguments: argparse.Namespace) -> 'tuple[Map, Path]':
     """Return the map, and the journal that it is in."""
     from stavpr_ros.commands.feature_options import make_extractor
     from stavpr_ros.mapping import KeyframeSettings, Trajectory
@@ -276,7 +276,7 @@ def _source_of(arguments: argparse.Namespace) -> str:
     return json.dumps({name: options[name] for name in sorted(decisive)})
 
 
-def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float | None':
+def _suggested(place_map: 'Map', arguments: argparse.Namespace) -> 'float | None':
     """Return the threshold of mode paper for a map, None = unknown; print the reason."""
     from stavpr_ros.errors import InputError
     from stavpr_ros.maintenance.threshold import suggest_threshold
@@ -291,7 +291,7 @@ def _suggested(place_map: 'PlaceMap', arguments: argparse.Namespace) -> 'float |
         return None
 
 
-def _report(place_map: 'PlaceMap', output: str) -> None:
+def _report(place_map: 'Map', output: str) -> None:
     megabytes = Path(output).stat().st_size / 1e6
     shape = f'{place_map.settings.strips} strips of {place_map.dimension} dimensions'
     say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')

@@ -25,7 +25,7 @@ from stavpr_ros.output_file import MAP, PNG, require_replaceable
 from stavpr_ros.units import DATED, SECOND
 
 if TYPE_CHECKING:
-    from stavpr_ros.mapping import PlaceMap
+    from stavpr_ros.mapping import Map
 
 MAX_NAME = 64  # characters of the name of a camera
 # Tools of other packages, and the packages that provide them.
@@ -217,7 +217,7 @@ def _tool(name: str) -> Callable[..., Any]:
     return tool
 
 
-def describe(place_map: 'PlaceMap', path: Path) -> str:
+def describe(place_map: 'Map', path: Path) -> str:
     """Return the contents of an opened map, a line each."""
     import numpy as np
     from stavpr_ros.mapping.map_version2 import VERSION
@@ -295,7 +295,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     return 1 if bad else 0
 
 
-def _verified(path: str) -> 'PlaceMap':
+def _verified(path: str) -> 'Map':
     """Open a map, and compare all of it with its hashes."""
     from stavpr_ros.mapping import open_map, verify_map
 
@@ -372,7 +372,7 @@ def _close(arguments: argparse.Namespace) -> None:
     _write(place_map, arguments)
 
 
-def _write(place_map: 'PlaceMap', arguments: argparse.Namespace) -> None:
+def _write(place_map: 'Map', arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import save_map
     from stavpr_ros.prepare.prepared_map import statistics_of_map, with_codes
 
@@ -425,7 +425,7 @@ def _update(arguments: argparse.Namespace) -> None:
 
 
 @contextmanager
-def _drive(arguments: argparse.Namespace, place_map: 'PlaceMap') -> 'Iterator[PlaceMap]':
+def _drive(arguments: argparse.Namespace, place_map: 'Map') -> 'Iterator[Map]':
     """
     Yield the images of a drive, with the features of a map.
 

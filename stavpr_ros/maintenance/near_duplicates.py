@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
-from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.mapping import Map, select_places
 from stavpr_ros.method.model import STANDSTILL
 from stavpr_ros.prepare.blocks import converted_blocks, PlaceChanges
 from stavpr_ros.prepare.centering import MeanCentering
@@ -16,7 +16,7 @@ from stavpr_ros.progress import Progress
 MIN_MOTION = 0.1  # share of the median step; a camera that moved farther was not at rest
 
 
-def without_duplicates(place_map: PlaceMap) -> PlaceMap:
+def without_duplicates(place_map: Map) -> Map:
     """
     Return a map with the first place of each stop of the camera only.
 
@@ -47,7 +47,7 @@ def without_duplicates(place_map: PlaceMap) -> PlaceMap:
 
 
 def _centered(
-    place_map: PlaceMap, centering: MeanCentering, text: str
+    place_map: Map, centering: MeanCentering, text: str
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield the centered features of each block, (W, m, d); a terminal shows the progress."""
     with Progress(total=len(place_map), desc=text, unit='place') as bar:

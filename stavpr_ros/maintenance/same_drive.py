@@ -10,7 +10,7 @@ after another encoding as JPEG (medians), 37 or more between drives in the same 
 from collections.abc import Iterable
 
 import numpy as np
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.units import DATED
 
 PROBES = 64  # images of a drive that are compared, from its first to its last one
@@ -21,7 +21,7 @@ Row = tuple[str, int, str]
 """Name of a drive, stamp of its first image, ns, 0 = unknown, and the bits, hexadecimal."""
 
 
-def rows_of(place_map: PlaceMap, name: str) -> list[Row]:
+def rows_of(place_map: Map, name: str) -> list[Row]:
     """Return a row for each session of a map; name: of a map without sessions."""
     index, rows = place_map.session_index, []
     index = np.zeros(len(place_map)) if index is None else index

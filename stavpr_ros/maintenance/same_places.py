@@ -12,7 +12,7 @@ import math
 import numpy as np
 from stavpr_ros.alignment.settings import SequenceSettings
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import PlaceMap, select_places
+from stavpr_ros.mapping import Map, select_places
 from stavpr_ros.method.localizer import PlaceRecognizer
 from stavpr_ros.method.match import Match
 from stavpr_ros.method.settings import RecognizerSettings
@@ -51,14 +51,14 @@ class SamePlaces:
         return np.where(self.middles >= 0, self.middles, self._near)
 
 
-def with_last_related(place_map: PlaceMap) -> PlaceMap:
+def with_last_related(place_map: Map) -> Map:
     """Return the map with the places of its last session related, as by with_same_places."""
     return with_same_places(place_map, len(place_map.sessions) - 1)
 
 
-def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
+def with_same_places(place_map: Map, first: int = 1) -> Map:
     """
-    Return the map with the places of its sessions related (:attr:`PlaceMap.same_as`).
+    Return the map with the places of its sessions related (:attr:`Map.same_as`).
 
     Each session is driven, as a query of mode robust, on a map of the sessions before it. Where it
     is matched, its place is the matched one. Sessions of cameras whose yaws differ by more than 45
@@ -85,14 +85,14 @@ def with_same_places(place_map: PlaceMap, first: int = 1) -> PlaceMap:
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 
-def _looks_elsewhere(place_map: PlaceMap, session: int, other: int) -> bool:
+def _looks_elsewhere(place_map: Map, session: int, other: int) -> bool:
     yaws = place_map.sessions[session].yaw, place_map.sessions[other].yaw
     if yaws[0] is None or yaws[1] is None:
         return False
     return abs(math.remainder(yaws[0] - yaws[1], 2 * math.pi)) > math.pi / 4
 
 
-def with_seam(place_map: PlaceMap, is_closed: bool = False) -> PlaceMap:
+def with_seam(place_map: Map, is_closed: bool = False) -> Map:
     """
     Return the map of a closed route with its end related to its start, another map as it is.
 
@@ -125,7 +125,7 @@ def with_seam(place_map: PlaceMap, is_closed: bool = False) -> PlaceMap:
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 
-def recognized(reference: PlaceMap, drive: PlaceMap, images: np.ndarray) -> np.ndarray:
+def recognized(reference: Map, drive: Map, images: np.ndarray) -> np.ndarray:
     """Return the place of a reference that each image of a drive shows, -1 = none, (m,)."""
     settings = RecognizerSettings(min_probability=SURE)
     recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.progress import Progress
 
@@ -37,7 +37,7 @@ def alter_image(image: np.ndarray, variant: int, rng: np.random.Generator) -> np
     return (np.clip(value, 0, 1) * 255).astype(np.uint8)
 
 
-def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
+def suggest_threshold(place_map: Map, model: str = '') -> float:
     """
     Estimate the distances of wrong matches from altered windows of the map.
 
@@ -46,7 +46,7 @@ def suggest_threshold(place_map: PlaceMap, model: str = '') -> float:
     suggestion is the median of their distances. It is a start: where precision matters, evaluate
     with a second real drive.
 
-    :param model: file of the network, see :meth:`PlaceMap.extractor`.
+    :param model: file of the network, see :meth:`Map.extractor`.
     :raises InputError: the map has no thumbnails, or has no place outside nms_radius.
     """
     settings = RecognizerSettings(mode='paper')

@@ -19,7 +19,7 @@ import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
 from stavpr_ros.maintenance.same_places import recognized, SamePlaces
-from stavpr_ros.mapping import merge_maps, PlaceMap, select_places
+from stavpr_ros.mapping import Map, merge_maps, select_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.mapping.versions import current_version, KEPT, save_version, Version
 from stavpr_ros.method.error_rate import least_probability
@@ -41,9 +41,7 @@ LAP = 40  # places of a closed route at least
 PROBES, FAR = 24, 25  # images of the geometric check; places to where another one is
 
 
-def update_map(
-    place_map: PlaceMap, drive: PlaceMap, name: str, version: Version
-) -> tuple[PlaceMap, Version]:
+def update_map(place_map: Map, drive: Map, name: str, version: Version) -> tuple[Map, Version]:
     """
     Return a map after a drive, and its version, without id and parent.
 
@@ -82,7 +80,7 @@ def update_map(
 
 
 def update_file(
-    path: str | Path, opened: FileVersion | None, place_map: PlaceMap, drive: PlaceMap, name: str
+    path: str | Path, opened: FileVersion | None, place_map: Map, drive: Map, name: str
 ) -> Version:
     """
     Let a drive update the map of a file, and return its new version.
@@ -139,7 +137,7 @@ class _OnMap:
         return int(np.median(back[is_again])) if is_again.any() else 0
 
 
-def _recognize(place_map: PlaceMap, drive: PlaceMap) -> _OnMap:
+def _recognize(place_map: Map, drive: Map) -> _OnMap:
     settings, n = RecognizerSettings(min_probability=least_probability(MAX_ERROR)), len(drive)
     recognizer, certain, moves = PlaceRecognizer(place_map, settings), SamePlaces(n), []
     for i in range(n):
@@ -152,7 +150,7 @@ def _recognize(place_map: PlaceMap, drive: PlaceMap) -> _OnMap:
     return _OnMap(certain.middles, certain.places, np.array(moves), roots, sessions)
 
 
-def _require_certain(drive: PlaceMap, on_map: _OnMap) -> None:
+def _require_certain(drive: Map, on_map: _OnMap) -> None:
     """Reject a drive of which too few images are certain, or later ones disagree."""
     certain, roots, sessions = on_map.certain, on_map.roots, on_map.sessions
     if len(certain) < max(MIN_IMAGES, MIN_CERTAIN * on_map.moves.sum()):
@@ -170,7 +168,7 @@ def _require_certain(drive: PlaceMap, on_map: _OnMap) -> None:
             )
 
 
-def _require_fitting_thumbnails(place_map: PlaceMap, drive: PlaceMap, on_map: _OnMap) -> None:
+def _require_fitting_thumbnails(place_map: Map, drive: Map, on_map: _OnMap) -> None:
     """Reject a drive whose thumbnails fit other places better, or mirrored ones."""
     if not (len(place_map.thumbnails) and len(drive.thumbnails)):
         return
@@ -217,8 +215,8 @@ def _most_certain(on_map: _OnMap, limit: int) -> np.ndarray:
 
 
 def _with_drive(
-    place_map: PlaceMap, drive: PlaceMap, name: str, images: np.ndarray, places: np.ndarray
-) -> PlaceMap:
+    place_map: Map, drive: Map, name: str, images: np.ndarray, places: np.ndarray
+) -> Map:
     """
     Return the map with images of a drive as a session.
 
@@ -250,7 +248,7 @@ def _with_drive(
 
 
 def _poses(
-    place_map: PlaceMap, drive: PlaceMap, images: np.ndarray, places: np.ndarray
+    place_map: Map, drive: Map, images: np.ndarray, places: np.ndarray
 ) -> np.ndarray | None:
     """Return the poses of images in the frame of the map: of their places, else by odometry."""
     if place_map.poses is None:

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference map: build, grow, save and load it; keyframes and trajectories."""
 
+from typing import TYPE_CHECKING
+
+from stavpr_ros import former
 from stavpr_ros.mapping.builder import build_map, extract_features
 from stavpr_ros.mapping.growing_map import GrowingMap
 from stavpr_ros.mapping.keyframes import (
@@ -15,8 +18,8 @@ from stavpr_ros.mapping.merging import merge_maps, select_places, select_session
 from stavpr_ros.mapping.place_map import (
     descriptor_map,
     encode_thumbnail,
+    Map,
     Place,
-    PlaceMap,
     Session,
     thumbnail_of,
 )
@@ -26,8 +29,8 @@ __all__ = [
     'GrowingMap',
     'KeyframeSelector',
     'KeyframeSettings',
+    'Map',
     'Place',
-    'PlaceMap',
     'Session',
     'Trajectory',
     'build_map',
@@ -48,3 +51,6 @@ __all__ = [
     'thumbnail_of',
     'verify_map',
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = former.classes(__name__)

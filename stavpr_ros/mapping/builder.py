@@ -18,8 +18,8 @@ from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.keyframes import KeyframeSelector, KeyframeSettings
 from stavpr_ros.mapping.place_map import (
     encode_thumbnail,
+    Map,
     Place,
-    PlaceMap,
     plain_text,
     THUMBNAIL_WIDTH,
 )
@@ -83,7 +83,7 @@ def build_map(
     progress: bool = True,
     keyframes: KeyframeSettings | None = None,
     thumbnail_width: int = THUMBNAIL_WIDTH,
-) -> PlaceMap:
+) -> Map:
     """
     Make a map with one place for each image, or for each keyframe.
 
@@ -92,7 +92,7 @@ def build_map(
     :param frames: images in the order of the route: a source, :func:`stavpr_ros.images`, or frames
         or arrays, RGB (h, w, 3) uint8.
     :param extractor: of their features; the map records its settings.
-    :param poses: of each image, shape (images, 7), see :class:`PlaceMap`; or by their stamps.
+    :param poses: of each image, shape (images, 7), see :class:`Map`; or by their stamps.
     :param thumbnails: keep a small image of each place.
     :param progress: show a progress bar.
     :param keyframes: minimum differences between places; None = every image is one.
@@ -118,7 +118,7 @@ def build_map(
             rows_of_places += [(each.place, each.thumbnail) for each in batch]
     places, encoded = zip(*rows_of_places, strict=True)
     rows = np.array([np.full(7, np.nan) if each.pose is None else each.pose for each in places])
-    return PlaceMap(
+    return Map(
         features=LocalFeatures.concatenate(features),
         projection=extractor.projection,
         stamps=np.array([each.stamp for each in places], np.int64),
@@ -156,7 +156,7 @@ def build_journal(
         with closing(_extracted(frames, extractor, poses, *options, progress, last)) as batches:
             for batch, features in batches:
                 if writer is None:
-                    template = PlaceMap(
+                    template = Map(
                         features[:1], extractor.projection, np.zeros(1, np.int64), ('',)
                     )
                     writer = JournalWriter.create(target, Base(), template, _ignore, source)

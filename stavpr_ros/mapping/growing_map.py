@@ -12,8 +12,8 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures, Projection
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import (
     decode_thumbnail,
+    Map,
     Place,
-    PlaceMap,
     require_projection,
     Session,
 )
@@ -37,7 +37,7 @@ class GrowingMap:
     :raises InputError: the settings name another projection.
     """
 
-    map_id = ''  # a PlaceMap has the id of its file
+    map_id = ''  # a Map has the id of its file
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class GrowingMap:
         self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
 
     @classmethod
-    def from_map(cls, place_map: PlaceMap, limit: int) -> 'GrowingMap':
+    def from_map(cls, place_map: Map, limit: int) -> 'GrowingMap':
         """
         Continue a map; its content is copied.
 
@@ -217,7 +217,7 @@ class GrowingMap:
         del self.ids[:count], self.thumbnails[:count]
         self.first, self._count = self.first + count, n - count
 
-    def snapshot(self) -> PlaceMap:
+    def snapshot(self) -> Map:
         """Return the map as it is now, in memory of its own."""
         features = self.features
         if self._held_features is None:
@@ -228,7 +228,7 @@ class GrowingMap:
             own = np.arange(self._count, dtype=np.int32)
             same_as = own if same_as is None else np.concatenate([same_as, own[len(same_as) :]])
             same_as[list(self._related)] = list(self._related.values())
-        return PlaceMap(
+        return Map(
             same_as=same_as,
             sessions=sessions,
             session_index=session_index,

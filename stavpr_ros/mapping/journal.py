@@ -30,7 +30,7 @@ from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.map_container import errors_of, MapFile, read_json
 from stavpr_ros.mapping.map_content import require_jpegs, require_weights
 from stavpr_ros.mapping.map_file import in_memory, map_of
-from stavpr_ros.mapping.place_map import Place, PlaceMap
+from stavpr_ros.mapping.place_map import Map, Place
 from stavpr_ros.mapping.stored_features import require_normalized
 from stavpr_ros.regular_file import open_regular
 
@@ -92,7 +92,7 @@ class JournalPlace(NamedTuple):
         return b''.join((row.data, identifier, self.thumbnail))
 
     @classmethod
-    def decode(cls, content: bytes, template: PlaceMap) -> Self:
+    def decode(cls, content: bytes, template: Map) -> Self:
         """
         Make a place of the content of its record.
 
@@ -115,7 +115,7 @@ class JournalPlace(NamedTuple):
             strips[:, None], weights[:, None], template.settings, template.features.cells
         )
         stamps, poses = np.array([row['stamp']]), row['pose'][None]
-        places = PlaceMap(features, template.projection, stamps, (identifier,), poses)
+        places = Map(features, template.projection, stamps, (identifier,), poses)
         return cls(int(row['number']), places.place(0), features, thumbnail)
 
 

@@ -16,14 +16,14 @@ from stavpr_ros.mapping.growing_map import GrowingMap
 from stavpr_ros.mapping.journal import Base, JournalReader, row_of, SUFFIX
 from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
-from stavpr_ros.mapping.place_map import PlaceMap, Session
+from stavpr_ros.mapping.place_map import Map, Session
 from stavpr_ros.mapping.stored_features import StoredFeatures, StoredThumbnails
 from stavpr_ros.output_file import explained, FileVersion, numbered, write_at
 
 DAMAGED = '.damaged'  # suffix of journals that were not read to their end
 
 
-def journal_map(path: Path) -> PlaceMap:
+def journal_map(path: Path) -> Map:
     """
     Return the places of a journal as a map, whose features and thumbnails take no memory.
 
@@ -39,7 +39,7 @@ def journal_map(path: Path) -> PlaceMap:
     return place_map
 
 
-def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
+def _recorded(reader: JournalReader, folder: Path) -> Map:
     """
     Return the places of a journal, with a temporary file in a folder.
 
@@ -74,7 +74,7 @@ def _recorded(reader: JournalReader, folder: Path) -> PlaceMap:
     file.parts = {'strips': strips, 'thumbnails': Part('U8', (ends[-1],), first)}
     poses = np.array([np.full(7, np.nan) if one.pose is None else one.pose for one in places])
     cells = template.features.cells
-    return PlaceMap(
+    return Map(
         features=StoredFeatures(file, np.concatenate(weights, axis=1), template.settings, cells),
         projection=template.projection,
         stamps=np.array([place.stamp for place in places], np.int64),
@@ -115,7 +115,7 @@ def journals(target: str | Path) -> list[Path]:
 def recover(
     journal: str | Path,
     output: str | Path | None = None,
-    relate: Callable[[PlaceMap], PlaceMap] = lambda place_map: place_map,
+    relate: Callable[[Map], Map] = lambda place_map: place_map,
 ) -> Recovered:
     """
     Make a map of the places in a journal and of the map that they continue; delete the journal.
@@ -154,7 +154,7 @@ def recover(
     return Recovered(str(target), places, places - len(base or ()), tuple(problems))
 
 
-def _base_map(base: Base) -> tuple[PlaceMap | None, str]:
+def _base_map(base: Base) -> tuple[Map | None, str]:
     """Return the map that a journal continues, or None and why it is missing."""
     if not base.places:
         return None, ''
@@ -167,9 +167,7 @@ def _base_map(base: Base) -> tuple[PlaceMap | None, str]:
     return place_map, ''
 
 
-def _continued(
-    base: PlaceMap, recorded: PlaceMap, opened: Base, sessions: tuple[Session, ...]
-) -> PlaceMap:
+def _continued(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, ...]) -> Map:
     """
     Return a map with the recorded places behind it.
 
@@ -191,7 +189,7 @@ def _continued(
     return growing.snapshot()
 
 
-def _save_beside(place_map: PlaceMap, target: Path) -> Path:
+def _save_beside(place_map: Map, target: Path) -> Path:
     """Save a map under a name that is free, or that is of an earlier state of it."""
     for path in numbered(target):
         version = FileVersion.of(path)
@@ -202,7 +200,7 @@ def _save_beside(place_map: PlaceMap, target: Path) -> Path:
     raise AssertionError
 
 
-def _begins(path: Path, place_map: PlaceMap) -> bool:
+def _begins(path: Path, place_map: Map) -> bool:
     """Return whether a file is a map of the first places of this one."""
     try:
         stamps = open_map(path).stamps

@@ -15,7 +15,7 @@ import time
 from stavpr_ros.errors import JournalError, OutputError
 from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, JournalReader, SUFFIX
 from stavpr_ros.mapping.map_file import save_map
-from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.place_map import Map
 from stavpr_ros.output_file import create_temporary, explained, numbered, sync_folder, write_at
 
 SYNC_PERIOD = 1.0  # seconds between syncs, and between attempts after an error
@@ -63,7 +63,7 @@ class JournalWriter:
         cls,
         target: str | Path,
         base: Base,
-        template: PlaceMap,
+        template: Map,
         log: Callable[[str], object],
         source: str = '',
     ) -> 'JournalWriter':

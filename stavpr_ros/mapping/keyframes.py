@@ -170,7 +170,7 @@ class KeyframeSelector:
         0.1 s or more before the last keyframe's: the clock has jumped back.
 
         :param stamp: nanoseconds; 0 = unknown.
-        :param pose: where it was taken, shape (7,), see :class:`PlaceMap`; None = unknown.
+        :param pose: where it was taken, shape (7,), see :class:`Map`; None = unknown.
         :returns: the reason in words; empty if there is none.
         :raises InputError: an invalid pose.
         """

@@ -27,7 +27,7 @@ from stavpr_ros.mapping.map_schema import (
     VALUE_RANGE,
 )
 from stavpr_ros.mapping.map_version2 import ERROR_RISKS, KNOWN_SECTIONS
-from stavpr_ros.mapping.place_map import ErrorRisks, PlaceMap, Session
+from stavpr_ros.mapping.place_map import ErrorRisks, Map, Session
 from stavpr_ros.mapping.stored_features import (
     CHANGES,
     LONGEST,
@@ -64,7 +64,7 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[int | str, ...]]] = {
 _TOGETHER = (('ids', 'id_ends'), ('thumbnails', 'thumbnail_ends'))
 
 
-def map_content(file: MapFile) -> PlaceMap:
+def map_content(file: MapFile) -> Map:
     """
     Return the map in a file; the large parts stay there.
 
@@ -115,7 +115,7 @@ def map_content(file: MapFile) -> PlaceMap:
         check(data := missing | sections[name]['data'], f'section {name}')
         return _made(make, data)
 
-    return PlaceMap(
+    return Map(
         features=features,
         projection=projection,
         stamps=arrays['stamps'],

@@ -24,7 +24,7 @@ from stavpr_ros.mapping.map_version2 import (
     read_header,
     write_parts,
 )
-from stavpr_ros.mapping.place_map import ErrorRisks, PlaceMap
+from stavpr_ros.mapping.place_map import ErrorRisks, Map
 from stavpr_ros.mapping.stored_features import MapStatistics, STATISTICS, StoredFeatures
 from stavpr_ros.output_file import atomic_output, Force, MAP
 from stavpr_ros.regular_file import open_regular
@@ -35,7 +35,7 @@ STORAGE = {'float32': 'F32', 'float16': 'F16'}
 
 
 def save_map(
-    place_map: PlaceMap,
+    place_map: Map,
     path: str | Path,
     storage: str = '',
     force: Force = False,
@@ -60,7 +60,7 @@ def save_map(
         return write_parts(file, manifest, parts)
 
 
-def _manifest(place_map: PlaceMap, statistics: MapStatistics | None) -> dict[str, Any]:
+def _manifest(place_map: Map, statistics: MapStatistics | None) -> dict[str, Any]:
     data: dict[str, Any] = {}
     if place_map.camera is not None:
         data['intrinsics'] = asdict(place_map.camera)
@@ -121,7 +121,7 @@ def _part(name: str, array: np.ndarray) -> Part:
     return Part(dtype, array.shape, content=[array.astype(DTYPES[dtype], copy=False)])
 
 
-def _parts(place_map: PlaceMap, storage: str) -> dict[str, Part]:
+def _parts(place_map: Map, storage: str) -> dict[str, Part]:
     features, projection, n = place_map.features, place_map.projection, len(place_map)
     own_storage = features.storage if isinstance(features, StoredFeatures) else 'float32'
     require_choice('storage', storage or own_storage, STORAGE)
@@ -168,7 +168,7 @@ def _strips(features: LocalFeatures, dtype: np.dtype) -> Iterator[np.ndarray]:
 # --------------------------------------------------------------------------------------- reading
 
 
-def load_map(path: str | Path) -> PlaceMap:
+def load_map(path: str | Path) -> Map:
     """
     Read a map into memory, and check all of it.
 
@@ -178,7 +178,7 @@ def load_map(path: str | Path) -> PlaceMap:
     return in_memory(open_map(path))
 
 
-def in_memory(place_map: PlaceMap) -> PlaceMap:
+def in_memory(place_map: Map) -> Map:
     """
     Return an opened map, its features and thumbnails read and checked.
 
@@ -189,7 +189,7 @@ def in_memory(place_map: PlaceMap) -> PlaceMap:
     return replace(place_map, features=place_map.features[:], thumbnails=thumbnails)
 
 
-def open_map(path: str | Path) -> PlaceMap:
+def open_map(path: str | Path) -> Map:
     """
     Read a map whose features and thumbnails stay in the file and are read on every use.
 
@@ -203,7 +203,7 @@ def open_map(path: str | Path) -> PlaceMap:
         return map_of(MapFile(open_regular(path), path))
 
 
-def map_of(file: MapFile) -> PlaceMap:
+def map_of(file: MapFile) -> Map:
     """
     Return the map in an open file; see :func:`open_map`.
 
@@ -215,7 +215,7 @@ def map_of(file: MapFile) -> PlaceMap:
     return map_content(file)
 
 
-def verify_map(place_map: PlaceMap, rest: Callable[[float], None] = lambda seconds: None) -> None:
+def verify_map(place_map: Map, rest: Callable[[float], None] = lambda seconds: None) -> None:
     """
     Verify the hashes of the parts that are still on disk; of a map in memory, nothing.
 

@@ -9,14 +9,14 @@ from itertools import count
 import numpy as np
 from stavpr_ros.errors import FeatureMismatchError, InputError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping.place_map import PlaceMap, Session
+from stavpr_ros.mapping.place_map import Map, Session
 
 
 def merge_maps(
-    maps: Sequence[PlaceMap],
+    maps: Sequence[Map],
     names: Sequence[str],
     cameras: Sequence[tuple[str, float | None]] = (),
-) -> PlaceMap:
+) -> Map:
     """
     Return one map with the places of all, in their order; without threshold and error risks.
 
@@ -60,7 +60,7 @@ def merge_maps(
         np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
     ]
     thumbnails = [content for each in maps for content in each.thumbnails or [b''] * len(each)]
-    return PlaceMap(
+    return Map(
         features=LocalFeatures.concatenate([each.features for each in maps]),
         projection=maps[0].projection,
         stamps=np.concatenate([each.stamps for each in maps]),
@@ -74,7 +74,7 @@ def merge_maps(
     )
 
 
-def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> PlaceMap:
+def select_session(place_map: Map, session_id: str, keep: bool = True) -> Map:
     """
     Return the places of one session only, or of all others.
 
@@ -92,7 +92,7 @@ def select_session(place_map: PlaceMap, session_id: str, keep: bool = True) -> P
     return replace(chosen_map, error_risks=None)  # they are of drives on all sessions
 
 
-def select_places(place_map: PlaceMap, places: np.ndarray) -> PlaceMap:
+def select_places(place_map: Map, places: np.ndarray) -> Map:
     """
     Return a map of selected places.
 
@@ -130,7 +130,7 @@ def _free_id(base: str, sessions: list[Session]) -> str:
     return next(name for name in names if name not in others)
 
 
-def _joined_same_as(maps: Sequence[PlaceMap]) -> np.ndarray | None:
+def _joined_same_as(maps: Sequence[Map]) -> np.ndarray | None:
     if all(each.same_as is None for each in maps):
         return None
     parts, first = [], 0

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 import cv2
 import numpy as np
+from stavpr_ros import former
 from stavpr_ros.checks import require_at_least, require_shape, require_type, rgb_image
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures, Projection
@@ -112,7 +113,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class PlaceMap:
+class Map:
     """
     Places in the order of the route; place i is column i of everything.
 
@@ -182,7 +183,7 @@ class PlaceMap:
         source: str | Path | Iterable[Any],
         features: str | FeatureSettings | FeatureExtractor = 'auto',
         **options: Any,
-    ) -> 'PlaceMap':
+    ) -> 'Map':
         """
         Make a map of the images of a route, a place each.
 
@@ -206,7 +207,7 @@ class PlaceMap:
         return build_map(frames, features, **options)
 
     @staticmethod
-    def load(path: str | Path) -> 'PlaceMap':
+    def load(path: str | Path) -> 'Map':
         """Read a map from its file: :func:`stavpr_ros.mapping.load_map`."""
         from stavpr_ros.mapping.map_file import load_map
 
@@ -228,7 +229,7 @@ class PlaceMap:
             'sessions': len(self.sessions),
         }
         names = ''.join(f', {name}' for name, value in parts.items() if value)
-        return f'PlaceMap({len(self)} places, {self.features!r}{names})'
+        return f'Map({len(self)} places, {self.features!r}{names})'
 
     @property
     def settings(self) -> FeatureSettings:
@@ -296,17 +297,14 @@ class PlaceMap:
             return None
 
 
-Map = PlaceMap
-
-
-def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> PlaceMap:
+def descriptor_map(features: LocalFeatures, poses: np.ndarray | None = None) -> Map:
     """
     Make a map of features whose images are unknown, such as descriptors from a file.
 
-    :param poses: shape (n, 7), see :class:`PlaceMap`.
+    :param poses: shape (n, 7), see :class:`Map`.
     """
     n = len(features)
-    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses)
+    return Map(features, None, np.zeros(n, np.int64), ('',) * n, poses)
 
 
 def require_projection(projection: Projection | None, settings: FeatureSettings) -> None:
@@ -408,3 +406,7 @@ def decode_thumbnail(content: bytes) -> np.ndarray | None:
         return None
     image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+if not TYPE_CHECKING:
+    __getattr__ = former.classes(__name__)

@@ -8,13 +8,13 @@ import numpy as np
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import LocalFeatures, Projection
 from stavpr_ros.features.extractor import normalize
-from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.place_map import Map
 
 BLOCK_PLACES = 1024  # at a time: features of an opened map stay in its file
 STRIPS_A_DIRECTION = 3  # of fewer, directions follow chance (docs/performance.md)
 
 
-def with_principal_components(place_map: PlaceMap, dimension: int) -> PlaceMap:
+def with_principal_components(place_map: Map, dimension: int) -> Map:
     """
     Project a map's features to the directions in which they vary most around their mean.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from stavpr_ros import plugins
 from stavpr_ros.errors import SettingsError, UnavailableError
-from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.place_map import Map
 
 FLEET = ('faiss', 'qdrant', 'qdrant+https')
 """Schemes of the package stavpr_fleet, for the message where it is missing."""
@@ -23,8 +23,8 @@ class Store:
     :param upload: writes a map to an address; its third argument permits to replace one.
     """
 
-    open_map: Callable[[str], PlaceMap]
-    upload: Callable[[PlaceMap, str, bool], None]
+    open_map: Callable[[str], Map]
+    upload: Callable[[Map, str, bool], None]
 
 
 def schemes() -> list[str]:

@@ -20,7 +20,7 @@ from stavpr_ros.errors import InputError, MapFileError, OutputError
 from stavpr_ros.mapping.map_container import read_json
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.map_schema import integer, list_of, record, text
-from stavpr_ros.mapping.place_map import PlaceMap
+from stavpr_ros.mapping.place_map import Map
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output
 
@@ -101,7 +101,7 @@ def versions(path: str | Path) -> list[Version]:
 def save_version(
     path: str | Path,
     opened: FileVersion | None,
-    place_map: PlaceMap,
+    place_map: Map,
     before: Version,
     version: Version,
     statistics: MapStatistics | None,
@@ -163,7 +163,7 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
 
 
 def _write_version(
-    path: str | Path, place_map: PlaceMap, before: Version, statistics: MapStatistics | None
+    path: str | Path, place_map: Map, before: Version, statistics: MapStatistics | None
 ) -> str:
     """Write a version, beside the present one, into the history; return its id."""
     folder, old = history_of(path), _file(path, before)

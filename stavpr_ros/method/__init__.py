@@ -10,13 +10,13 @@ windows by LM-DTW (:mod:`.lm_dtw_window`).
 
 >>> import numpy as np
 >>> from stavpr_ros.features import FeatureSettings, LocalFeatures
->>> from stavpr_ros.mapping import PlaceMap
+>>> from stavpr_ros.mapping import Map
 >>> from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 >>> strips = np.random.default_rng(0).standard_normal((7, 60, 24)).astype(np.float32)
 >>> strips /= np.linalg.norm(strips, axis=2, keepdims=True)
 >>> weights = np.full((7, 60), 7**-0.5, np.float32)
 >>> features = LocalFeatures(strips, weights, FeatureSettings('gradient', None, 7))
->>> place_map = PlaceMap(features, None, np.arange(60), ('',) * 60)
+>>> place_map = Map(features, None, np.arange(60), ('',) * 60)
 >>> recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='robust'))
 >>> for image in range(10, 50):
 ...     match = recognizer.update(features[image : image + 1])

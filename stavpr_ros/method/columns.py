@@ -5,7 +5,7 @@ Columns of the filter's states: places, with a gap between two sessions.
 
 Columns of a gap have infinite distances, and a state that enters one leaves the map, so that no
 path continues from one session into another. A place and the place of an earlier session with the
-same view (:attr:`stavpr_ros.mapping.PlaceMap.same_as`) are one position: their probabilities add
+same view (:attr:`stavpr_ros.mapping.Map.same_as`) are one position: their probabilities add
 up, and neither is the second best of the other.
 
 A place in a direction is a **pass**: n passes along the map have the numbers of their places, and

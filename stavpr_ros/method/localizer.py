@@ -31,7 +31,7 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import evidence_of
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.trajectory import checked_pose
 from stavpr_ros.method.cells import CellAgreement
@@ -308,13 +308,13 @@ class PlaceRecognizer(SequenceRecognizer):
 
     def __init__(
         self,
-        place_map: PlaceMap,
+        place_map: Map,
         settings: RecognizerSettings,
         backend: 'str | torch.device' = 'cpu',
         precision: str = 'auto',
     ) -> None:
         maps, expected = 'Map.load(path) or Map.from_images(source)', 'RecognizerSettings(...)'
-        require_type('place_map', place_map, PlaceMap, maps)
+        require_type('place_map', place_map, Map, maps)
         require_type('settings', settings, RecognizerSettings, expected)
         backend = choose_backend(backend)
         settings = replace(settings, error_risks=place_map.error_risks)

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from stavpr_ros.checks import require_at_least, require_choice, require_shape
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.method.match import Match, Status
 
 METHODS = ('orb', 'sift')
@@ -78,10 +78,10 @@ class PlaceVerifier:
         if settings.method == 'sift':
             self._detector = library.SIFT_create(FEATURES)
         self._query: tuple[np.ndarray, Keypoints] | None = None  # small and gray; its keypoints
-        self._places: PlaceMap | GrowingMap | None = None
+        self._places: Map | GrowingMap | None = None
         self._known: OrderedDict[int, Keypoints] = OrderedDict()
 
-    def inliers(self, query: np.ndarray, places: PlaceMap | GrowingMap, place: int) -> int | None:
+    def inliers(self, query: np.ndarray, places: Map | GrowingMap, place: int) -> int | None:
         """
         Count the matches of an image and a place that one geometry explains.
 
@@ -211,7 +211,7 @@ class GeometricCheck:
     def checked(
         self,
         match: Match,
-        places: PlaceMap | GrowingMap,
+        places: Map | GrowingMap,
         query: np.ndarray | None,
         is_weighed: bool,
     ) -> Match:

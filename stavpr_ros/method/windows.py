@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.filter import SPACING
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def window_of(
-    place_map: PlaceMap,
+    place_map: Map,
     settings: RecognizerSettings,
     backend: 'str | torch.device',
     constant: float,
@@ -54,7 +54,7 @@ def window_of(
 
 
 def layout_of(
-    place_map: PlaceMap, nms_radius: int, against: bool = False, length: int = 0
+    place_map: Map, nms_radius: int, against: bool = False, length: int = 0
 ) -> ColumnLayout:
     """
     Return the layout of a map.
@@ -72,7 +72,7 @@ def layout_of(
     return ColumnLayout(firsts, same_as, nms_radius, against and n > 0, repeated)
 
 
-def time_note(place_map: PlaceMap) -> str:
+def time_note(place_map: Map) -> str:
     """Return what several sessions cost, for the log of a start, '' of a map of one."""
     n = len(place_map.sessions)
     return f'{n} sessions: an image takes up to {n} times the time of one' if n > 1 else ''

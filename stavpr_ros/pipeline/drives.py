@@ -18,7 +18,7 @@ from typing import Any
 
 from stavpr_ros.errors import InputError, MapFileError, OutputTakenError
 from stavpr_ros.maintenance.upkeep import update_file
-from stavpr_ros.mapping import load_map, open_map, PlaceMap, save_map
+from stavpr_ros.mapping import load_map, Map, open_map, save_map
 from stavpr_ros.mapping.journal_map import DAMAGED
 from stavpr_ros.mapping.versions import history_of, versions
 from stavpr_ros.output_file import explained, FileVersion, numbered
@@ -87,7 +87,7 @@ def _folder(path: str) -> Path:
     return history_of(path) / 'drives'
 
 
-def _write(path: str, drive: PlaceMap) -> None:
+def _write(path: str, drive: Map) -> None:
     """Write a drive under a name that no other drive of the map has."""
     folder, names = _folder(path), set()
     with explained(folder):

@@ -17,7 +17,7 @@ from stavpr_ros import former
 from stavpr_ros.errors import ImageError, InputError, SettingsError, StavprError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.maintenance.same_places import SURE
-from stavpr_ros.mapping import encode_thumbnail, GrowingMap, PlaceMap, thumbnail_of, verify_map
+from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Map, thumbnail_of, verify_map
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import image_change, KeyframeSelector, small_gray
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
@@ -88,13 +88,13 @@ class Operation(ABC):
     def __init__(
         self,
         settings: PipelineSettings,
-        place_map: PlaceMap | None,
+        place_map: Map | None,
         extractor: FeatureExtractor | None,
         save_state: SaveState,
     ) -> None:
         self.settings, self.extractor, self.save_state = settings, extractor, save_state
         self.drives: list[GrowingMap] = []  # which may update the map; empty = none is recorded
-        self.places: PlaceMap | GrowingMap | None = place_map
+        self.places: Map | GrowingMap | None = place_map
         self.reference = place_map  # that images are matched with; None = the recorded route
         self.recognizer: SequenceRecognizer | None = None
         self._start(place_map)
@@ -115,7 +115,7 @@ class Operation(ABC):
         self.drives.append(GrowingMap(settings, self.extractor.projection, limit))
 
     @abstractmethod
-    def _start(self, place_map: PlaceMap | None) -> None:
+    def _start(self, place_map: Map | None) -> None:
         """Make the places and their recognizer: all that may fail or takes long."""
 
     @abstractmethod
@@ -127,7 +127,7 @@ class Operation(ABC):
         """
 
     @property
-    def matched_places(self) -> PlaceMap | GrowingMap | None:
+    def matched_places(self) -> Map | GrowingMap | None:
         """Return the places that matches are of: the map, or the recorded route."""
         return self.places if self.reference is None else self.reference
 
@@ -323,7 +323,7 @@ class Operation(ABC):
     def _relative_yaw(self, match: Match, yaw: Callable[[], float] | None) -> float:
         """Return the yaw by the mountings, where the map states the mounting of its camera."""
         places = self.matched_places
-        if yaw is None or not (match.accepted and isinstance(places, PlaceMap)):
+        if yaw is None or not (match.accepted and isinstance(places, Map)):
             return 0.0
         session = places.session(match.place)
         if session is None or session.yaw is None:
@@ -402,7 +402,7 @@ class Operation(ABC):
         places, recognizer = self.matched_places, self.recognizer
         if not match.accepted or places is None or recognizer is None:
             return None
-        if isinstance(places, PlaceMap) and (
+        if isinstance(places, Map) and (
             relative_pose == 'none' or places.place(match.place).pose is None
         ):
             return None
@@ -427,7 +427,7 @@ class LocalizationOperation(Operation):
 
     name = 'localization'
 
-    def _start(self, place_map: PlaceMap | None) -> None:
+    def _start(self, place_map: Map | None) -> None:
         settings = self.settings
         if self.extractor is None or place_map is None:
             return
@@ -466,7 +466,7 @@ class Mapper(Operation):
     name = 'mapping'
     places: GrowingMap
 
-    def _start(self, place_map: PlaceMap | None) -> None:
+    def _start(self, place_map: Map | None) -> None:
         limit = self.settings.max_places
         self.extractor = extractor = self.extractor or self.settings.extractor()
         extractor.extract([BLANK_IMAGE])
@@ -527,7 +527,7 @@ class RouteCloser(Operation):
     name = 'loop_closure'
     places: GrowingMap
 
-    def _start(self, place_map: PlaceMap | None) -> None:
+    def _start(self, place_map: Map | None) -> None:
         settings, self.reference = self.settings, None
         self.extractor = extractor = self.extractor or settings.extractor()
         self.recognizer = self._closer = _loop_closer(settings, settings.exclude_places, extractor)
@@ -556,7 +556,7 @@ if not TYPE_CHECKING:
 
 
 def _map_recognizer(
-    settings: PipelineSettings, operation: str, place_map: PlaceMap, extractor: FeatureExtractor
+    settings: PipelineSettings, operation: str, place_map: Map, extractor: FeatureExtractor
 ) -> SequenceRecognizer:
     """Return the recognizer of a map, compiled and with an empty window."""
     recognizer: SequenceRecognizer
@@ -573,7 +573,7 @@ def _map_recognizer(
     return recognizer
 
 
-def _partial_recognizer(settings: PipelineSettings, place_map: PlaceMap) -> SequenceRecognizer:
+def _partial_recognizer(settings: PipelineSettings, place_map: Map) -> SequenceRecognizer:
     others = settings.precision, settings.direction
     if settings.backend == 'cuda' or others[0] == 'int8' or others[1] != 'forward':
         raise SettingsError(
@@ -607,7 +607,7 @@ def _noise(features: LocalFeatures, count: int) -> LocalFeatures:
 
 
 def _warm_up(
-    recognizer: SequenceRecognizer, images: LocalFeatures, place_map: PlaceMap | None = None
+    recognizer: SequenceRecognizer, images: LocalFeatures, place_map: Map | None = None
 ) -> None:
     """
     Compile and allocate everything, so that the first image is as fast as the others.

@@ -6,7 +6,7 @@ import math
 
 import cv2
 import numpy as np
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.method import Match
 from stavpr_ros.pipeline.result import ImageResult
 
@@ -16,7 +16,7 @@ SIZE = (900, 240)  # pixels of the drawn distances, about
 _INK, _PAPER, _EMPTY = (32, 34, 38), (250, 250, 248), (226, 226, 222)
 
 
-def draw_match(result: ImageResult, places: PlaceMap | GrowingMap | None) -> np.ndarray:
+def draw_match(result: ImageResult, places: Map | GrowingMap | None) -> np.ndarray:
     """
     Draw an image beside its nearest place, with status and probability, or distance.
 

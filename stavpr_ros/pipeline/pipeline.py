@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stavpr_ros.errors import InputError, MapFileError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import GrowingMap, load_map, merge_maps, open_map, PlaceMap
+from stavpr_ros.mapping import GrowingMap, load_map, Map, merge_maps, open_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.stored_features import StoredFeatures
 from stavpr_ros.mapping.stores import is_address, store_of
@@ -23,7 +23,7 @@ class LoadedMap:
     """A map, its file, and the extractor of its features."""
 
     path: str
-    places: PlaceMap
+    places: Map
     extractor: FeatureExtractor
 
 
@@ -43,7 +43,7 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     return LoadedMap(path, place_map, extractor)
 
 
-def _joined(folder: Path) -> PlaceMap:
+def _joined(folder: Path) -> Map:
     """Return the maps of a folder as one."""
     files = sorted(folder.glob('*.stavpr'))
     if not files:
@@ -80,7 +80,7 @@ class Pipeline:
     ) -> None:
         self.settings, self._open_journal = settings, open_journal
         # of localization, or of loop closure for its kind of features; its files
-        self._map: PlaceMap | None = None
+        self._map: Map | None = None
         self._map_save_state = SaveState(open_journal=open_journal)
         self.operation: Operation = LocalizationOperation(
             settings, None, None, self._map_save_state
@@ -89,7 +89,7 @@ class Pipeline:
         self._start(operation, settings, None)
 
     @property
-    def places(self) -> PlaceMap | GrowingMap | None:
+    def places(self) -> Map | GrowingMap | None:
         """Return the map, or the recorded route."""
         return self.operation.places
 
@@ -204,7 +204,7 @@ class Pipeline:
                 'the recorded route would be lost: save_map, then set_operation localization'
             )
 
-    def _places_as_map(self) -> tuple[PlaceMap | None, SaveState]:
+    def _places_as_map(self) -> tuple[Map | None, SaveState]:
         """Return a copy of the recorded places, or the map, and its files; None without any."""
         places = self.places
         if places is None or not len(places):

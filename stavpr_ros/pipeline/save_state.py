@@ -8,12 +8,12 @@ import os
 
 import numpy as np
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import GrowingMap, PlaceMap, Session
+from stavpr_ros.mapping import GrowingMap, Map, Session
 from stavpr_ros.mapping.journal import Base, JournalPlace
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.output_file import FileVersion, Force
 
-OpenJournal = Callable[[Base, PlaceMap], JournalWriter | None]
+OpenJournal = Callable[[Base, Map], JournalWriter | None]
 
 
 @dataclass(eq=False)
@@ -62,7 +62,7 @@ class SaveState:
         newest = places.place(places.first + len(places) - 1)
         if self.journal is None and self.recorded == self.saved:
             stamps, ids = np.array([newest.stamp]), (newest.identifier,)
-            template = PlaceMap(features, places.projection, stamps, ids, camera=places.camera)
+            template = Map(features, places.projection, stamps, ids, camera=places.camera)
             if newest.session:
                 session = (Session(newest.session),)
                 index = np.zeros(1, np.int32)
@@ -85,7 +85,7 @@ class SaveState:
 class MapSnapshot:
     """A map to be written, and its state when it was copied."""
 
-    places: PlaceMap
+    places: Map
     state: SaveState
     recorded: int
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from stavpr_ros.errors import JournalError, OutputTakenError, StavprError
 from stavpr_ros.maintenance.same_places import with_last_related
-from stavpr_ros.mapping import PlaceMap, save_map
+from stavpr_ros.mapping import Map, save_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
@@ -122,7 +122,7 @@ def recover_maps(target: str | Path, log: 'Logger | Any', is_own: bool = True) -
 
 
 def open_journal(
-    target: Path, base: Base, template: PlaceMap, log: 'Logger | Any'
+    target: Path, base: Base, template: Map, log: 'Logger | Any'
 ) -> JournalWriter | None:
     """
     Open the journal of the first unsaved place; None, and an error in the log, if it fails.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment.cpu.int8 import Int8Strips
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.prepare.blocks import (
@@ -110,7 +110,7 @@ def _of_codes(features: StoredFeatures) -> LocalFeatures:
     return Int8Features(strips, features.weights, features.settings, features.cells)
 
 
-def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> MapStatistics:
+def with_codes(statistics: MapStatistics, place_map: Map, storage: str) -> MapStatistics:
     """Add the features, rounded for precision int8; see :func:`statistics_of_map`."""
     features = _AsStored(place_map.features, storage)
     rounded = MeanCentering(features, statistics=statistics).places(features, rounds=True)
@@ -118,7 +118,7 @@ def with_codes(statistics: MapStatistics, place_map: PlaceMap, storage: str) -> 
     return replace(statistics, codes=rounded.strips.rounded())
 
 
-def statistics_of_map(place_map: PlaceMap, storage: str = '') -> MapStatistics | None:
+def statistics_of_map(place_map: Map, storage: str = '') -> MapStatistics | None:
     """
     Learn the statistics of a map that :func:`stavpr_ros.mapping.save_map` writes.
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
 from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses, turned
@@ -46,8 +46,8 @@ class EdgeEstimator:
 
     def __init__(self, method: str = 'auto') -> None:
         self.method = method
-        self._source: tuple[PlaceMap | GrowingMap, Camera] | None = None
-        self._last: tuple[PlaceMap | GrowingMap, np.ndarray] | None = None
+        self._source: tuple[Map | GrowingMap, Camera] | None = None
+        self._last: tuple[Map | GrowingMap, np.ndarray] | None = None
         self._views: OrderedDict[int, View | None] = OrderedDict()
         self._landmarks: OrderedDict[int, tuple[Landmarks, float, list[int]]] = OrderedDict()
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import GrowingMap, PlaceMap
+from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.method import Match
 
 NEIGHBORS = 4  # places before and after a place that its keypoints are triangulated with
@@ -79,7 +79,7 @@ class MatchedPair:
         the cameras, radians to the left.
     """
 
-    source: PlaceMap | GrowingMap
+    source: Map | GrowingMap
     place: int
     query: np.ndarray | None
     query_poses: np.ndarray
@@ -110,7 +110,7 @@ class MatchedPair:
 
 def matched_pair(
     match: Match,
-    places: PlaceMap | GrowingMap,
+    places: Map | GrowingMap,
     query: np.ndarray | None,
     query_poses: np.ndarray,
     distances_to: Callable[[np.ndarray], np.ndarray] | None,
@@ -149,7 +149,7 @@ def matched_pair(
     )  # fmt: skip
 
 
-def _thumbnail(places: PlaceMap | GrowingMap, position: int) -> bytes:
+def _thumbnail(places: Map | GrowingMap, position: int) -> bytes:
     try:
         return places.thumbnails[position]
     except MapFileError:  # the file has been overwritten since it was opened

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.camera import FORWARD, mount_of, yaw_of
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.pipeline.statistics import Statistics
@@ -120,7 +120,7 @@ class Intake:
         is_compared = settings.pipeline.compares_odometry
         needs_odometry = settings.needs_odometry or (  # edges to places of a map, and their paths
             (settings.relative_pose in ('auto', 'aligned') or is_compared)
-            and isinstance(places, PlaceMap)
+            and isinstance(places, Map)
             and places.has_poses
         )
         if needs_odometry and self.odometry is None:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 from rclpy.node import Node
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.pipeline import NodeSettings
 from stavpr_ros.ros.messages import Outcome, Places
 from stavpr_ros.ros.output import Publishers
@@ -76,7 +76,7 @@ class Localization:
             self._first, self._tried, self._confirmed = place, 0, 0
 
 
-def along_route(places: PlaceMap) -> tuple[Sequence[int] | np.ndarray, int]:
+def along_route(places: Map) -> tuple[Sequence[int] | np.ndarray, int]:
     """
     Return the position of each place along the route, (n,), and the places of a closed lap.
 

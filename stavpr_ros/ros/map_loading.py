@@ -9,7 +9,7 @@ import threading
 import time
 
 from stavpr_ros.errors import MapFileError, StavprError
-from stavpr_ros.mapping import GrowingMap, PlaceMap, verify_map
+from stavpr_ros.mapping import GrowingMap, Map, verify_map
 from stavpr_ros.pipeline import LoadedMap
 from stavpr_ros.ros.rclpy_workarounds import ManagedNode
 from stavpr_ros.ros.worker import END_POLL
@@ -39,7 +39,7 @@ class MapLoader:
         node: ManagedNode,
         read: Callable[[str], LoadedMap],
         use: Callable[[LoadedMap], None],
-        in_use: Callable[[], PlaceMap | GrowingMap | None],
+        in_use: Callable[[], Map | GrowingMap | None],
         on_change: Callable[[], None],
     ) -> None:
         self._node, self._read, self._use, self._in_use = node, read, use, in_use
@@ -110,7 +110,7 @@ class MapLoader:
                 )
         return reading.result()
 
-    def _verify(self, path: str, places: PlaceMap) -> None:
+    def _verify(self, path: str, places: Map) -> None:
         """Compare the file of the map in use with its hashes; log damage, and keep it."""
 
         def rest(seconds: float) -> None:

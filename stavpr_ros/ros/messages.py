@@ -33,7 +33,7 @@ from stavpr_msgs.msg import (
     RelativePose,
 )
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.mapping import GrowingMap, Place, PlaceMap
+from stavpr_ros.mapping import GrowingMap, Map, Place
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
 from stavpr_ros.mapping.transforms import turned
@@ -77,7 +77,7 @@ NO_EDGE = RelativePose(query_index=-1, place_index=-1, inliers=-1, reprojection_
 _NO_MATCH = PlaceMatch(relative_pose=NO_EDGE)
 
 Message = TypeVar('Message')
-Places = PlaceMap | GrowingMap | None
+Places = Map | GrowingMap | None
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,9 @@ class Outcome:
         return '' if self.places is None else self.places.map_id
 
     @property
-    def place_map(self) -> PlaceMap | None:
+    def place_map(self) -> Map | None:
         """Return the map that the image was matched with; None = a route."""
-        return self.places if isinstance(self.places, PlaceMap) else None
+        return self.places if isinstance(self.places, Map) else None
 
     @cached_property
     def newest(self) -> Place | None:
@@ -190,7 +190,7 @@ def match_message(outcome: Outcome) -> PlaceMatch:
     )
     if (newest := outcome.newest) is None or places is None:
         return message
-    session = places.session(match.place) if isinstance(places, PlaceMap) else None
+    session = places.session(match.place) if isinstance(places, Map) else None
     filled(
         message,
         **_names(places.place(match.place)),
@@ -205,7 +205,7 @@ def match_message(outcome: Outcome) -> PlaceMatch:
     return message
 
 
-def _aligned(match: Match, places: PlaceMap | GrowingMap, query: int, place: int) -> AlignedPlaces:
+def _aligned(match: Match, places: Map | GrowingMap, query: int, place: int) -> AlignedPlaces:
     """Return an image of the window with a place; on a route, the image is a place as well."""
     first = match.first_image
     stamp = places.place(first + query).stamp if first >= 0 else match.window_stamps[query]
@@ -411,7 +411,7 @@ def map_info_message(pipeline: Pipeline, robot_id: str, stamp: Time) -> MapInfo:
         message.has_stamps, message.has_ids = bool(np.any(places.stamps)), any(places.ids)
         message.has_poses = places.poses is not None and bool(np.isfinite(places.poses).any())
         thumbnails = places.thumbnails  # a map's stay in its file, which is not read here
-        is_map = isinstance(places, PlaceMap)
+        is_map = isinstance(places, Map)
         message.has_thumbnails = bool(len(thumbnails)) if is_map else any(thumbnails)
     return message
 

@@ -11,7 +11,7 @@ import numpy as np
 from rclpy.duration import Duration
 from rclpy.node import Node
 from stavpr_ros.errors import UnavailableError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.method import Status
 from stavpr_ros.pipeline import NodeSettings
@@ -54,7 +54,7 @@ class Navigation(Publishers):
         if settings.publish_initialpose:
             self._initial_pose = self._make(PoseWithCovarianceStamped, 'initialpose')
         self._unmatched = settings.pipeline.sequence.length  # images since the last match
-        self._places: PlaceMap | None = None
+        self._places: Map | None = None
 
     @property
     def sends_transform(self) -> bool:

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage
 from stavpr_msgs.msg import PlaceCandidates
 from stavpr_ros.errors import MapFileError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.method import Candidate
 from stavpr_ros.pipeline import ImageResult, NodeSettings
@@ -49,7 +49,7 @@ class SubgoalPublisher(Publishers):
             self._send(self._image, image)
 
 
-def place_ahead(places: PlaceMap, index: int, distance: float, direction: int = 1) -> int:
+def place_ahead(places: Map, index: int, distance: float, direction: int = 1) -> int:
     """
     Return the first place at least so far ahead on the route, or the last one of its session.
 
@@ -71,7 +71,7 @@ def place_ahead(places: PlaceMap, index: int, distance: float, direction: int = 
     return ahead
 
 
-def thumbnail_of_width(places: PlaceMap, index: int, width: int) -> bytes:
+def thumbnail_of_width(places: Map, index: int, width: int) -> bytes:
     """
     Return the thumbnail of a place as JPEG, empty = none.
 

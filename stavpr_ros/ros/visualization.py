@@ -14,7 +14,7 @@ from rclpy.event_handler import PublisherEventCallbacks, UnsupportedEventTypeErr
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline.operations import Operation
@@ -60,7 +60,7 @@ class Visualization(Publishers):
         self.frame = ''
         self._poses: deque[PoseStamped] = deque(maxlen=KEPT)
         self._lines: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=KEPT)
-        self._map: PlaceMap | None = None  # of the poses and lines; None = the route
+        self._map: Map | None = None  # of the poses and lines; None = the route
         self._correction: np.ndarray | None = None  # from the odometry to the map, (4, 4)
 
     @property

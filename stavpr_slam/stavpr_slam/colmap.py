@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.output_file import atomic_folder
@@ -22,7 +22,7 @@ ALL = 1000.0  # images per second of a video: all of them
 
 
 def export(
-    place_map: PlaceMap,
+    place_map: Map,
     folder: str,
     images: Sequence[str] = (),
     topic: str | None = None,
@@ -33,7 +33,7 @@ def export(
     Write a folder of a map: ``images/``, ``pairs.txt``, and with poses and a camera ``sparse/``.
 
     Each line of ``pairs.txt`` has a query and a place: successive places of a session, places that
-    earlier sessions show as well (:attr:`PlaceMap.same_as`), and loop closures. ``sparse`` is a
+    earlier sessions show as well (:attr:`Map.same_as`), and loop closures. ``sparse`` is a
     text model of COLMAP without points, in meters and the frame of the map.
 
     :param images: folder of images or bag of each session, from which the images are taken, in
@@ -79,7 +79,7 @@ def _name(place: int) -> str:
 
 
 def _images(
-    place_map: PlaceMap, paths: Sequence[str], topic: str | None, camera: str | None
+    place_map: Map, paths: Sequence[str], topic: str | None, camera: str | None
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield places and their images, RGB (h, w, 3)."""
     if not paths:
@@ -102,7 +102,7 @@ def _images(
                 yield known, frame.image
 
 
-def _pairs(place_map: PlaceMap, closures: str) -> set[tuple[int, int]]:
+def _pairs(place_map: Map, closures: str) -> set[tuple[int, int]]:
     """Return pairs of places, the later one first."""
     n, index, same_as = len(place_map), place_map.session_index, place_map.same_as
     session = np.zeros(n, int) if index is None else index
@@ -136,7 +136,7 @@ def read_closures(path: str) -> list[tuple[int, int]]:
 
 
 def _model(
-    place_map: PlaceMap, camera: Camera, posed: list[int], sizes: dict[int, tuple[int, int]]
+    place_map: Map, camera: Camera, posed: list[int], sizes: dict[int, tuple[int, int]]
 ) -> dict[str, list[str]]:
     """Return the files of a text model by their names; COLMAP, doc/format.rst."""
     numbers = {size: i for i, size in enumerate(sorted({sizes[place] for place in posed}), 1)}

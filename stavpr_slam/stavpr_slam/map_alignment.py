@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_slam.pose_graph import align_maps
 
 
-def align(place_map: PlaceMap, reference: PlaceMap) -> PlaceMap:
+def align(place_map: Map, reference: Map) -> Map:
     """
     Return a map in the frame of another, by the places that are recognized on it.
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import build_map, descriptor_map, merge_maps, PlaceMap
+from stavpr_ros.mapping import build_map, descriptor_map, Map, merge_maps
 from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.verification import GeometricSettings
 from stavpr_ros.pipeline import Pipeline, PipelineSettings
@@ -65,12 +65,12 @@ def poses_at(positions: Any) -> np.ndarray:
     return poses
 
 
-def map_of(images: list[np.ndarray], poses: np.ndarray | None = None) -> PlaceMap:
+def map_of(images: list[np.ndarray], poses: np.ndarray | None = None) -> Map:
     frames = [Frame(image, (i + 1) * SECOND, f'{i}') for i, image in enumerate(images)]
     return build_map(frames, FeatureExtractor('gradient'), poses, progress=False)
 
 
-def route_map(has_poses: bool = False) -> PlaceMap:
+def route_map(has_poses: bool = False) -> Map:
     return map_of(views(range(PLACES)), poses_at(range(PLACES)) if has_poses else None)
 
 
@@ -83,7 +83,7 @@ class Drive:
     :param images: of the drive, a second apart; poses: of the camera, (m, 7), or None.
     """
 
-    places: PlaceMap | None
+    places: Map | None
     images: list[np.ndarray]
     settings: dict[str, Any] = field(default_factory=dict)
     poses: np.ndarray | None = None

@@ -10,7 +10,7 @@ from fixtures import route_images
 import numpy as np
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import build_map, PlaceMap, save_map, Session
+from stavpr_ros.mapping import build_map, Map, save_map, Session
 from stavpr_ros.mapping.place_map import ErrorRisks
 from stavpr_ros.prepare import prepared_map
 from stavpr_ros.sources.frame import Frame
@@ -19,7 +19,7 @@ VERSION2 = Path(__file__).parents[1] / 'data' / 'version2'
 PLACES = 24
 
 
-def example_map(projection: int | None = None) -> PlaceMap:
+def example_map(projection: int | None = None) -> Map:
     """Return a map of 24 places in two sessions, 32 dimensions or those of a projection."""
     extractor = FeatureExtractor(
         'gradient', GradientSettings(32, cell=8, orientations=4, logarithm=False), 2, projection

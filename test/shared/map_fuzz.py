@@ -10,7 +10,7 @@ import struct
 
 from map_files import array_of, parts_of, tensor, version2
 import numpy as np
-from stavpr_ros.mapping import load_map, open_map, PlaceMap, verify_map
+from stavpr_ros.mapping import load_map, Map, open_map, verify_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
 PIECES = (
@@ -33,7 +33,7 @@ VALUES = (
 )  # fmt: skip
 
 
-def use(place_map: PlaceMap) -> None:
+def use(place_map: Map) -> None:
     """Use everything that is in a map, as the node does."""
     n = len(place_map)
     for i in range(n):

@@ -4,7 +4,7 @@
 
 import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 
 
 def route_strips(seed, places, dimension=24):
@@ -26,7 +26,7 @@ def features_of(strips, noise=0.0, seed=0):
 def map_of(features, poses=None, **parts):
     """Return a map of features."""
     n = len(features)
-    return PlaceMap(features, None, np.zeros(n, np.int64), ('',) * n, poses, **parts)
+    return Map(features, None, np.zeros(n, np.int64), ('',) * n, poses, **parts)
 
 
 def recognize_all(recognizer, features):

@@ -22,7 +22,7 @@ from stavpr_ros.parameters import BY_NAME, default
 
 if TYPE_CHECKING:
     from stavpr_lab.demonstration.recordings import LoopTraverse, TraversePair
-    from stavpr_ros.mapping import PlaceMap
+    from stavpr_ros.mapping import Map
 
 EXCLUDE_PLACES, GEOMETRIC_CHECK = default('exclude_places'), 'sift'  # defaults with --loop
 SYNTHETIC = 'synthetic'
@@ -166,7 +166,7 @@ def _skip(error: StavprError) -> None:
     _print(f'   skipped: {error}')
 
 
-def _require_all(place_map: 'PlaceMap', images: int) -> None:
+def _require_all(place_map: 'Map', images: int) -> None:
     """Reject a ground truth by number where images were skipped."""
     if len(place_map) != images:
         raise SourceError(
@@ -237,7 +237,7 @@ def _limit(arguments: argparse.Namespace, threshold: float | None) -> dict[str, 
     return {'mode': 'paper', 'threshold': threshold}
 
 
-def _threshold(place_map: 'PlaceMap', arguments: argparse.Namespace) -> float:
+def _threshold(place_map: 'Map', arguments: argparse.Namespace) -> float:
     """Return the distance below which a window is matched."""
     from stavpr_ros.maintenance.threshold import suggest_threshold
 

@@ -20,7 +20,7 @@ from stavpr_ros.commands.feature_options import kind_options, make_extractor
 from stavpr_ros.errors import left_out, SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import AUTO
-from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, PlaceMap, select_places
+from stavpr_ros.mapping import build_map, descriptor_map, is_map, load_map, Map, select_places
 from stavpr_ros.mapping.builder import fit_value_range
 from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.parameters import default
@@ -49,9 +49,9 @@ class Sequences:
     :param odometry: poses of the query's images by odometry, (N, 7); None = unknown.
     """
 
-    reference: PlaceMap | None
-    query: PlaceMap
-    unknown: PlaceMap | None
+    reference: Map | None
+    query: Map
+    unknown: Map | None
     drive: Drive
     tolerance: int
     title: str
@@ -138,11 +138,11 @@ class _Loader:
     def __init__(self, arguments: argparse.Namespace) -> None:
         self._arguments = arguments
         self._extractor: FeatureExtractor | None = None
-        self._saved: PlaceMap | None = None
+        self._saved: Map | None = None
         self.times: dict[str, float] = {}
         self.left_out: Counter[str] = Counter()
 
-    def load(self, name: str, path: str) -> PlaceMap:
+    def load(self, name: str, path: str) -> Map:
         """Open a folder, a video, a bag, a saved map or descriptors."""
         if is_saved_map(path) or is_descriptors(path):
             crop = 'crop_map' if name == 'map' else 'crop_query'
@@ -161,7 +161,7 @@ class _Loader:
         self.left_out.update(getattr(source, 'left_out', {}))
         return extracted
 
-    def extract(self, name: str, source: FrameSource) -> PlaceMap:
+    def extract(self, name: str, source: FrameSource) -> Map:
         """Extract the features of a source, cropped as the options state."""
         args, extractor = self._arguments, self._chosen()
         fit_value_range(source, extractor)
@@ -173,7 +173,7 @@ class _Loader:
         self.times[f'describing_{name}_ms_per_image'] = milliseconds / len(extracted)
         return extracted
 
-    def _read(self, path: str) -> PlaceMap:
+    def _read(self, path: str) -> Map:
         """Read descriptors; the map's and the query's must be comparable."""
         args = self._arguments
         names = 'features', 'strips', 'projection'
@@ -196,7 +196,7 @@ class _Loader:
         self._saved = first or place_map
         return place_map
 
-    def _load_map(self, path: str) -> PlaceMap:
+    def _load_map(self, path: str) -> Map:
         """Load a saved map, and refuse options that contradict its features."""
         place_map = load_map(path)
         args = self._arguments
@@ -250,7 +250,7 @@ def _of_dataset(arguments: argparse.Namespace, loader: _Loader) -> Sequences:
 
 
 def _of_paths(
-    arguments: argparse.Namespace, opened: dict[str, PlaceMap], times: dict[str, float]
+    arguments: argparse.Namespace, opened: dict[str, Map], times: dict[str, float]
 ) -> Sequences:
     reference, query = opened.get('map'), opened['query']
     tolerance = arguments.tolerance
@@ -284,7 +284,7 @@ def _name(path: str) -> str:
 
 
 def _ground_truth(
-    arguments: argparse.Namespace, query: PlaceMap, reference: PlaceMap, tolerance: int
+    arguments: argparse.Namespace, query: Map, reference: Map, tolerance: int
 ) -> GroundTruth:
     N, n = len(query), len(reference)
     if arguments.truth is None:
@@ -302,9 +302,7 @@ def _ground_truth(
     return truth.widened(tolerance)
 
 
-def poses_of(
-    path: str | None, place_map: PlaceMap, name: str, degrees: float | None
-) -> np.ndarray:
+def poses_of(path: str | None, place_map: Map, name: str, degrees: float | None) -> np.ndarray:
     """Return the poses of an input, from a file or from the saved map."""
     if path is None:
         if place_map.poses is None or not place_map.has_poses:

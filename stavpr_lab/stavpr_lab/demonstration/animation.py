@@ -15,7 +15,7 @@ import sys
 import cv2
 import numpy as np
 from PIL import Image
-from stavpr_ros.mapping import load_map, PlaceMap
+from stavpr_ros.mapping import load_map, Map
 from stavpr_ros.pipeline.overlay import match_image
 from stavpr_ros.sources import open_source
 
@@ -26,7 +26,7 @@ QUALITY = 40  # of WebP
 
 
 def draw(
-    image: np.ndarray, record: dict[str, object], place_map: PlaceMap, ahead: float = 0.0
+    image: np.ndarray, record: dict[str, object], place_map: Map, ahead: float = 0.0
 ) -> np.ndarray:
     """
     Draw an image of the query beside the newest place of its match.

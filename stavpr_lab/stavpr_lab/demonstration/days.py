@@ -21,7 +21,7 @@ from stavpr_lab.demonstration.street.traverses import EPOCH
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.upkeep import update_map
-from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.mapping import build_map, Map
 from stavpr_ros.mapping.versions import Version
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
@@ -51,7 +51,7 @@ class Day:
     changes: tuple[str, ...]
 
 
-def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
+def drive_of(days: Days, day: int, positions: dict[int, float]) -> Map:
     """
     Return the drive of a day as a map of all its images.
 
@@ -64,7 +64,7 @@ def drive_of(days: Days, day: int, positions: dict[int, float]) -> PlaceMap:
 
 
 def measure(
-    place_map: PlaceMap, drive: PlaceMap, positions: dict[int, float], precision: str = 'float32'
+    place_map: Map, drive: Map, positions: dict[int, float], precision: str = 'float32'
 ) -> tuple[float, int]:
     """Return the share of the images that are rightly matched, and the number of wrong ones."""
     recognizer = PlaceRecognizer(place_map, RecognizerSettings(), precision=precision)

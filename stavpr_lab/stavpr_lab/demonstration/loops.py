@@ -14,7 +14,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.plots import MatchPair, Outcome
 from stavpr_lab.evaluation.records import IN_WINDOW
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import evenly
 
@@ -117,7 +117,7 @@ def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
     return sorted(selection)
 
 
-def _pairs(result: LoopResult, place_map: PlaceMap) -> list[MatchPair]:
+def _pairs(result: LoopResult, place_map: Map) -> list[MatchPair]:
     correct = result.are_correct(result.closures)
     pairs: list[MatchPair] = []
     for i in choose_closures(len(result.closures), correct):
@@ -131,7 +131,7 @@ def _pairs(result: LoopResult, place_map: PlaceMap) -> list[MatchPair]:
     return pairs
 
 
-def _compared_distances(result: LoopResult, place_map: PlaceMap) -> np.ndarray | None:
+def _compared_distances(result: LoopResult, place_map: Map) -> np.ndarray | None:
     """Return the distances of every image to those it is compared with, NaN elsewhere, (N, N)."""
     if result.N > LARGEST:
         return None
@@ -172,7 +172,7 @@ def _draw_traverse(
         handle.set(markersize=10, alpha=1)
 
 
-def draw_loops(result: LoopResult, place_map: PlaceMap, title: str, folder: Path) -> Path:
+def draw_loops(result: LoopResult, place_map: Map, title: str, folder: Path) -> Path:
     """
     Draw the page ``loop.png``: the traverse against its own past, and closures.
 

@@ -13,7 +13,7 @@ from stavpr_lab.evaluation import plots
 from stavpr_lab.evaluation.plots import COLORS, MatchPair, MEANING, Outcome
 from stavpr_lab.evaluation.records import TraverseEvaluation
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
 SHOWN = 6  # pairs of images: two rows of three
@@ -21,8 +21,8 @@ SHOWN = 6  # pairs of images: two rows of three
 
 def draw_result(
     result: TraverseEvaluation,
-    query: PlaceMap,
-    place_map: PlaceMap,
+    query: Map,
+    place_map: Map,
     threshold: float,
     title: str,
     path: Path,
@@ -58,7 +58,7 @@ def choose_images(outcomes: np.ndarray) -> list[int]:
 
 
 def _pair(
-    result: TraverseEvaluation, image: int, outcome: Outcome, query: PlaceMap, place_map: PlaceMap
+    result: TraverseEvaluation, image: int, outcome: Outcome, query: Map, place_map: Map
 ) -> MatchPair:
     left = query.thumbnail(image)
     if left is None:

@@ -39,7 +39,7 @@ from stavpr_nav.follower import FollowerSettings, RouteFollower, TaughtRun
 from stavpr_nav.observation import Observation
 from stavpr_ros import Localizer
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, PlaceMap
+from stavpr_ros.mapping import build_map, Map
 from stavpr_ros.progress import Progress
 from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.sources.frame import Frame
@@ -119,7 +119,7 @@ class Taught:
     """
 
     world: RingWorld
-    place_map: PlaceMap
+    place_map: Map
     run: TaughtRun
     poses: np.ndarray
 

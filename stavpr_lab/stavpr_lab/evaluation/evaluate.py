@@ -29,7 +29,7 @@ from stavpr_lab.evaluation.metrics import (
 )
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import Match, PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.loop_closer import LoopCloser
 from stavpr_ros.progress import Progress
@@ -264,7 +264,7 @@ def recognize_traverse(
 
 
 def evaluate_on_map(
-    place_map: PlaceMap,
+    place_map: Map,
     query: LocalFeatures,
     ground_truth: GroundTruth,
     settings: RecognizerSettings,

@@ -15,7 +15,7 @@ from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import evaluate_ranking, Ranking
 from stavpr_lab.evaluation.seqslam import match_differences, match_lines, SeqSlamSettings
 from stavpr_ros.features import LocalFeatures
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.method.settings import MODES
 
@@ -170,7 +170,7 @@ def match_sequences(
 
 
 def evaluate_protocol(
-    place_map: PlaceMap,
+    place_map: Map,
     query: LocalFeatures,
     truths: Mapping[int, GroundTruth],
     settings: RecognizerSettings | None = None,
@@ -200,7 +200,7 @@ def evaluate_protocol(
 
 
 def _recognized(
-    place_map: PlaceMap,
+    place_map: Map,
     query: LocalFeatures,
     settings: RecognizerSettings,
     lengths: Sequence[int],

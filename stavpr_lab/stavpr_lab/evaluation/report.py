@@ -13,7 +13,7 @@ from stavpr_lab.evaluation.evaluate import Evaluation, WindowDistances
 from stavpr_lab.evaluation.metrics import accepted_counts, ConfusionCounts
 from stavpr_lab.evaluation.protocol import error_rate_and_recall, Estimate
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 
 METRICS = ('sequence', 'sequence_without_ends', 'single', 'single_without_ends')
 
@@ -34,8 +34,8 @@ class Report:
     """
 
     evaluation: Evaluation
-    query: PlaceMap
-    reference: PlaceMap
+    query: Map
+    reference: Map
     title: str
     settings: dict[str, Any]
     times: dict[str, float]

@@ -19,7 +19,7 @@ from stavpr_lab.evaluation.plots import Box, COLORS, SEQUENCE
 from stavpr_lab.evaluation.protocol import text
 from stavpr_lab.evaluation.report import jsonable, METRICS, Report
 from stavpr_lab.evaluation.verdict import verdict_of
-from stavpr_ros.mapping import PlaceMap
+from stavpr_ros.mapping import Map
 from stavpr_ros.prepare.centering import evenly
 
 TEMPLATE = 'report.html.jinja'
@@ -127,7 +127,7 @@ def _decision(report: Report, image: int) -> dict[str, Any]:
     }
 
 
-def _image(place_map: PlaceMap, place: int) -> str:
+def _image(place_map: Map, place: int) -> str:
     """Return a small image of a place as a data URL; empty where there is none."""
     if place < 0 or not place_map.thumbnails:
         return ''

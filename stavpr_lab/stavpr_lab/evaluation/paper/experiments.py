@@ -18,7 +18,7 @@ from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.errors import SettingsError, SourceError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.registry import backbone_class
-from stavpr_ros.mapping import build_map, descriptor_map, PlaceMap
+from stavpr_ros.mapping import build_map, descriptor_map, Map
 from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.method.settings import ROBUST, RobustOptions
 import torch
@@ -183,7 +183,7 @@ class DatasetExperiment:
         self._inputs = inputs or BaselineInputs()
         self._dataset, self._kind, self._backbone = dataset, kind, backbone
         self._mode, self._device = mode, device
-        self._features: dict[tuple[int, int | None], tuple[PlaceMap, PlaceMap]] = {}
+        self._features: dict[tuple[int, int | None], tuple[Map, Map]] = {}
 
     def evaluate(self, configuration: Configuration) -> Metrics | None:
         """Return the metrics of one configuration; None without the inputs of its baseline."""
@@ -253,7 +253,7 @@ class DatasetExperiment:
         places, scores = seqslam(first, second, settings)
         return evaluate_ranking(Ranking(places[:, None], scores), self._dataset.ground_truth)
 
-    def _maps(self, configuration: Configuration) -> tuple[PlaceMap, PlaceMap]:
+    def _maps(self, configuration: Configuration) -> tuple[Map, Map]:
         """Return the features of map and query."""
         key = (configuration.strips, configuration.projection)
         if key not in self._features:
