@@ -14,12 +14,12 @@ import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
-    'lines of stavpr_ros': 30_859,
+    'lines of stavpr_ros': 30_860,
     'lines of stavpr_fleet': 1_195,
     'lines of stavpr_slam': 4_378,
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_197,
-    'lines of the method (prepare, method)': 5_637,
+    'lines of the method (prepare, method)': 5_638,
     'lines of all tests': 33_099,
     'lines of benchmarks and tools': 8_950,
     'lines of docs and README': 3_994,

@@ -202,7 +202,8 @@ class ImageChange:
         :meth:`excess`, it compares each image with the one before alone, and the map with itself
         around the path.
 
-        :param first, last: places of the ends of the path; images: newest ones that are on it.
+        :param first: place at the start of the path; last: at its end.
+        :param images: newest ones that are on it.
         :returns: 0 to ``MOST_CREEP``: noise is no motion; 0 as long as no change is known.
         """
         changes = [each[0] for each in self._of_window][-images:]
