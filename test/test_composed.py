@@ -114,7 +114,7 @@ def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
 
 def test_shutdown_of_ros_before_the_node_saves_the_map(make_node, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
-    path = tmp_path / 'route.stavpr'
+    path, before = tmp_path / 'route.stavpr', set(threading.enumerate())
     node = activated(make_node(operation='mapping', save_path=str(path), queue_size=100))
     enqueue(node, route[:20])
     while not len(node.runtime.pipeline.places):
@@ -122,7 +122,8 @@ def test_shutdown_of_ros_before_the_node_saves_the_map(make_node, context, route
     rclpy.shutdown(context=context)
     node.destroy_node()
     assert 0 < len(load_map(path)) <= 20
-    assert not [thread for thread in threading.enumerate() if thread.name == 'recognition']
+    left = set(threading.enumerate()) - before
+    assert not [thread for thread in left if thread.name == 'recognition']
 
 
 def test_operation_of_the_service_lasts_until_the_next_configuration(make_node, map_file):
