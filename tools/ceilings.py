@@ -20,7 +20,7 @@ CEILINGS = {
     'lines of stavpr_nav': 1_628,
     'lines of stavpr_lab': 12_197,
     'lines of the method (prepare, method)': 5_638,
-    'lines of all tests': 33_099,
+    'lines of all tests': 33_100,
     'lines of benchmarks and tools': 8_950,
     'lines of docs and README': 3_994,
     'parameters of the node': 51,
