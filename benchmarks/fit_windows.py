@@ -77,7 +77,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
     rows: list[tuple[float, ...]] = []
     shown: list[Any] = []
     state = {'image': -1, 'early': -1}
-    show, match, newest = window._show, window.match, window.match_newest
+    show, assess, match, newest = window._show, window.assess, window.match, window.match_newest
 
     def quantities(of: Any) -> tuple[float, ...]:
         q = of.quantities
@@ -102,8 +102,11 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
             rows.append((state['image'], *about, kind, *quantities(which), path.probability))
         return result
 
-    def matched() -> Any:
+    def assessed() -> None:
         shown.clear()
+        assess()
+
+    def matched() -> Any:
         return noted(match(), False)
 
     def early() -> Any:
@@ -115,7 +118,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         shown.append(show(*arguments))
         return shown[-1]
 
-    vars(window).update(_show=keep, match=matched, match_newest=early)
+    vars(window).update(_show=keep, assess=assessed, match=matched, match_newest=early)
     for i, stamp in enumerate(drive.stamps.tolist()):
         state['image'] = i
         recognizer.update(drive.features[i : i + 1], stamp)

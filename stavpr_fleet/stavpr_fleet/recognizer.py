@@ -184,7 +184,7 @@ class FleetRecognizer(SequenceRecognizer):
         self._require_one_image(features, 'the map', self._city.dimension)
         strips = self._centering.next_query(features.strips[:, 0])
         row = self._matcher.distances(strips, features.weights[:, 0])
-        sampled, change = row[: self._sampled][self._learned.distinct(self._sampled)], 1.0
+        sampled, change = row[: self._sampled][self._learned.distinct(slice(self._sampled))], 1.0
         if self._images:
             change = change_between(strips, self._images[-1].strips)
         self._centering.note_standstill(change < self._learned.standstill)
@@ -338,14 +338,15 @@ class FleetRecognizer(SequenceRecognizer):
         sequence = self._settings.sequence
         window = FilterWindow(sequence, len(places), layout, constant=self._constant, model=model)
         if self._cells is not None:
-            rows = self._sampled + self._order
+            rows, names_of = self._sampled + self._order, layout.names_of
             window.cells = CellAgreement(
                 self._cells,
-                lambda columns: self._strips[:, rows[layout.pass_before(columns)]],
+                lambda columns: self._strips[:, rows[np.searchsorted(places, names_of(columns))]],
                 sequence.length,
             )
         window.recent = self._filter_window.recent  # the drive goes on
-        window.change.copy_statistics(self._learned, self._from_before[self._order])
+        from_before = layout.changes_from_before(self._from_before[self._order])
+        window.change.copy_statistics(self._learned, from_before)
         self._window = self._filter_window = window
         for image in self._images:
             self._push(image)

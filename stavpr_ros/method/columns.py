@@ -6,15 +6,14 @@ Columns of the filter's states: places, with a gap between two sessions.
 Columns of a gap have infinite distances, and a state that enters one leaves the map, so that no
 path continues from one session into another. A place and the place of an earlier session with the
 same view (:attr:`stavpr_ros.mapping.Map.same_as`) are one position: their probabilities add
-up, and neither is the second best of the other.
+up, and neither is the second best of the other. A position is numbered by the column of its first
+place.
 
-A place in a direction is a **pass**: n passes along the map have the numbers of their places, and
-n passes against it follow, from the last place to the first, so that the camera always moves on to
-the next pass. The two passes of a place are one position with one distance. Between
-two sessions of passes is a gap, too::
+Where the camera may move against the map, its places follow once more, from the last one to the
+first, so that it always moves on to the next column. The two columns of a place are one position
+with one distance::
 
     place      0 1 2 ... n-1     |  gap  |  n-1 ... 2 1 0
-    pass       0 1 2 ... n-1     |       |  n   ...   2n-1
 
 On a closed route, whose last c places show the same as its first c, the first places follow the
 last one again, so that a path goes on over the seam. Once all of a window's path is there, the
@@ -50,9 +49,9 @@ class ColumnLayout:
     :param against: the camera may move against the map, too; not without places.
     :param repeated: first places of a closed route of one session that follow its last one.
 
-    ``starts`` are the first places of the sessions, ``firsts`` their first passes, ``columns`` the
-    columns of the passes, None where each is the column of its number, and ``gaps`` the columns
-    between.
+    ``starts`` are the first places of the sessions, ``columns`` the columns of the places along
+    the map and, behind these, of the others, None where each place is the column of its number,
+    and ``gaps`` the columns between.
     ``lap`` is the number of places of a closed route's lap, 0 of another route.
     """
 
@@ -64,48 +63,45 @@ class ColumnLayout:
         against: bool = False,
         repeated: int = 0,
     ) -> None:
-        self.starts = self.firsts = firsts
-        self.nms_radius, self.lap, self.gaps = nms_radius, 0, NO_PLACES
+        self.starts, self.nms_radius, self.lap, self.gaps = firsts, nms_radius, 0, NO_PLACES
         self.columns: np.ndarray | None = None
         if len(firsts) == 1 and not against and not repeated:
             return
-        n = len(same_as)
+        n = self._n = len(same_as)
         self.lap = n - int(same_as[-1]) - 1 if repeated else 0
-        seam_places = np.arange(n, n + repeated) - self.lap
-        self._places = np.append(np.arange(n), seam_places)  # of each pass
-        self._along = len(self._places)
+        places = np.append(np.arange(n), np.arange(n, n + repeated) - self.lap)
+        self._along = len(places)
         if against:
-            self._places = np.append(self._places, n - 1 - self._places)
+            places = np.append(places, n - 1 - places)
             ends = np.append(firsts[1:], n)[::-1]
-            self.firsts = np.append(firsts, self._along + n - ends)
-        passes = len(self._places)
+            firsts = np.append(firsts, self._along + n - ends)
         gap = max(math.ceil(max(MODEL.speeds)) + 1, nms_radius) + 1
-        self.columns = np.arange(passes) + gap * np.repeat(
-            np.arange(len(self.firsts)), np.diff(self.firsts, append=passes)
-        )
-        self._width = int(self.columns[-1]) + 1
-        self._same_as = same_as
-        self._shared = np.arange(self._width)  # column where the position's probability is summed
-        self._positions = self._shared[self.columns] = self.columns[same_as[self._places]]
+        runs = np.repeat(np.arange(len(firsts)), np.diff(firsts, append=len(places)))
+        self.columns = np.arange(len(places)) + gap * runs
+        self._firsts, self._width = self.columns[firsts], int(self.columns[-1]) + 1
         self.gaps = np.setdiff1d(np.arange(self._width), self.columns)
-        self._place_of_column = np.full(self._width, n)  # n in a gap
-        self._place_of_column[self.columns] = self._places
+        # of each column; in a gap, the place before it, and a position far from all
+        before = self.columns.searchsorted(np.arange(self._width), 'right') - 1
+        self._places = places[before]
+        self._positions = np.full(self._width, -2 * self._width)
+        self._positions[self.columns] = self.columns[same_as[places]]
+        self._same_as = same_as
 
-    def passes(self, places: int) -> int:
-        """Return the number of passes of so many places."""
-        return places if self.columns is None else len(self._places)
+    def changes_from_before(self, changes: np.ndarray) -> np.ndarray:
+        """
+        Return the change of each column from the one before, (width,); 1 where nothing is.
 
-    def changes_of_passes(self, changes: np.ndarray) -> np.ndarray:
-        """Return changes from the places 1, 2, ... before (L, n) as changes of passes."""
+        :param changes: of each place from the place before, (n,).
+        """
         if self.columns is None:
             return changes
-        changes, n, first = changes[:, self._places], len(self._same_as), self._along
-        for apart, row in enumerate(changes, 1):
-            if self.lap:
-                row[n : n + apart] = row[n + apart]  # over the seam: as behind it
-            # against the map, they are from the other place
-            row[first + apart :] = row[first : row.shape[0] - apart].copy()
-        return changes
+        is_along = np.arange(self._width) <= self.columns[self._along - 1]
+        later = np.minimum(self._places + 1, self._n - 1)
+        out: np.ndarray = changes[np.where(is_along, self._places, later)]
+        for first in self._firsts if self.lap else ():  # over the seam: as behind it
+            out[first + self._n] = out[first + self._n + 1]
+        out[self._firsts], out[self.gaps] = 1, 1
+        return out
 
     def width(self, places: int) -> int:
         """Return the number of columns of so many places."""
@@ -115,39 +111,32 @@ class ColumnLayout:
         """Return distances to places (n,) as distances to columns, +inf in gaps."""
         if self.columns is None:
             return row
-        out: np.ndarray = np.append(row, row.dtype.type(np.inf)).take(self._place_of_column)
+        out: np.ndarray = row[self._places]
+        out[self.gaps] = np.inf
         return out
 
     def to_places(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the columns that are places, passed along the map, (n,)."""
-        return values if self.columns is None else values[self.columns[: len(self._same_as)]]
+        """Return the values of the columns of the places along the map, (n,)."""
+        return values if self.columns is None else values[self.along(self._n)]
+
+    def along(self, places: int) -> 'slice | np.ndarray':
+        """Return the columns of all places, passed along the map, as an index."""
+        return slice(places) if self.columns is None else self.columns[:places]
 
     def sums_of_places(self, values: np.ndarray) -> np.ndarray:
         """Return the sums of the values of each place's columns, (n,)."""
-        if self.columns is None:
-            return values
-        return np.bincount(self._places, values[self.columns], len(self._same_as))
+        return values if self.columns is None else np.bincount(self._places, values, self._n)
 
-    def to_passes(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of the columns that are passes."""
-        return values if self.columns is None else values[self.columns]
-
-    def columns_of(self, passes: np.ndarray) -> np.ndarray:
-        """Return the columns of passes; those along the map have the numbers of their places."""
-        return passes if self.columns is None else self.columns[passes]
-
-    def pass_before(self, columns: np.ndarray) -> np.ndarray:
-        """Return the pass of each column; in a gap, the pass before it."""
-        if self.columns is None:
-            return columns
-        return self.columns.searchsorted(columns, 'right') - 1
+    def columns_of(self, places: np.ndarray) -> np.ndarray:
+        """Return the columns of places, passed along the map."""
+        return places if self.columns is None else self.columns[places]
 
     def names_of(self, columns: np.ndarray) -> np.ndarray:
-        """Return the places of columns as matches number them."""
-        return columns if self.columns is None else self._places[self.pass_before(columns)]
+        """Return the places of columns as matches number them; in a gap, the place before it."""
+        return columns if self.columns is None else self._places[columns]
 
     def direction_of(self, column: int) -> int:
-        """Return 1 of a pass along the map, -1 of one against it."""
+        """Return 1 of a column passed along the map, -1 of one against it."""
         return 1 if self.columns is None or column <= self.columns[self._along - 1] else -1
 
     def repeated(self, path: np.ndarray) -> slice:
@@ -159,8 +148,8 @@ class ColumnLayout:
         """
         if self.columns is None or not self.lap:
             return slice(0, 0)
-        firsts, n = self.columns[self.firsts], len(self._same_as)
-        first = int(firsts[np.searchsorted(firsts, path[0], 'right') - 1])  # of its direction
+        run = np.searchsorted(self._firsts, path[0], 'right') - 1  # of its direction
+        first, n = int(self._firsts[run]), self._n
         return slice(first + n, first + self._along) if path[0] >= first + n else slice(0, 0)
 
     def session_of(self, place: int) -> tuple[int, int]:
@@ -168,7 +157,7 @@ class ColumnLayout:
         if self.columns is None:
             return 0, sys.maxsize
         session = int(np.searchsorted(self.starts, place, 'right'))
-        ends = [*self.starts.tolist(), len(self._same_as)]
+        ends = [*self.starts.tolist(), self._n]
         return ends[session - 1], ends[session]
 
     def positions(self, places: np.ndarray | int) -> np.ndarray:
@@ -179,8 +168,7 @@ class ColumnLayout:
         """Return the columns of positions near a column's, as first ones and ends, (m, 2)."""
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
-        own = self._positions[self.pass_before(np.array(column))]
-        near = self.columns[self._apart(self._positions, own) <= radius]
+        near = np.flatnonzero(self._apart(self._positions, self._positions[column]) <= radius)
         ends = np.flatnonzero(np.diff(near) > 1)
         return np.stack([near[np.append(0, ends + 1)], near[np.append(ends, -1)] + 1], axis=1)
 
@@ -200,7 +188,7 @@ class ColumnLayout:
         own = sums_near(columns, probabilities)
         if self.columns is None:
             return own, int(columns[np.argmax(own)])
-        positions = self._shared[columns]
+        positions = self._positions[columns]
         shifts = (-self.lap, 0, self.lap) if self.lap else (0,)
         around = np.concatenate([positions + shift for shift in shifts])
         order = np.argsort(around, kind='stable')

@@ -229,7 +229,7 @@ class DeviceFilterWindow(FilterWindow):
     def _z(self, row: torch.Tensor) -> torch.Tensor:
         if self._row_columns is None:  # the map has been learned
             n = len(row)
-            counted = self.change.distinct(n)
+            counted = self.change.distinct(self.layout.along(n))
             self._row_columns = RowColumns(counted, self.layout, n, self._device)
         return self._row_columns(row)
 

@@ -219,6 +219,7 @@ class SequenceRecognizer(ABC):
         self._motion.trajectory.append(odometry_xy)
         fill, shown = len(window.images), WindowMatch()
         if fill == window.length:
+            window.assess()
             shown = window.match()
             match, run = self._decide(shown.path, self._limits)
         else:
@@ -349,7 +350,7 @@ class PlaceRecognizer(SequenceRecognizer):
         self._is_small = numbers * (1 if precision == 'int8' else 4) < SMALL_MAP
         if isinstance(self._window, FilterWindow):
             layout = self._window.layout
-            self._window.change.learn(layout.changes_of_passes(prepared.changes), layout.firsts)
+            self._window.change.learn(prepared.changes, layout.starts, layout.changes_from_before)
             if cells is not None:
                 of_places, names_of = self._matcher.strips_of, layout.names_of
                 is_plain = layout.columns is None  # columns are places

@@ -210,9 +210,10 @@ class LoopCloser(SequenceRecognizer):
 
         It is a backward pass over the window. Windows without a match have none of it either.
         """
-        if self.window_fill < self._window.length:
+        if self.window_fill < self._window.length or not match.accepted:
             return []
-        path = self._window.match_oldest(match.accepted).path
+        self._window.note_match()
+        path = self._window.match_oldest().path
         status, reason = self._limits.decide(path.distance, path.probability)
         if status is not Status.MATCH:
             return []

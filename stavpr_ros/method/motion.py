@@ -10,6 +10,7 @@ than a path on the map.
 """
 
 from collections import deque
+from collections.abc import Callable
 import math
 
 import numpy as np
@@ -44,23 +45,29 @@ class ImageChange:
     ``curve`` is the mean change of places 0, 1, ... ``MAX_LAG`` apart while the camera moves, 1
     where none is known; ``standstill`` the change below which a camera is at rest.
 
-    :param places: places that there is room for.
+    :param columns: columns of places that there is room for.
     :param length: images in the window of the query.
     """
 
-    def __init__(self, places: int, length: int) -> None:
+    def __init__(self, columns: int, length: int) -> None:
         self._length = length
         self._sums, self._counts = np.zeros(MAX_LAG + 1), np.zeros(MAX_LAG + 1)
-        self._from_before = np.ones(places, np.float32)  # change of each place from the one before
+        self._from_before = np.ones(columns, np.float32)  # of each column from the one before
         self._update_curve()
         self.reset()
 
-    def learn(self, changes: np.ndarray, firsts: np.ndarray | tuple[int, ...] = (0,)) -> None:
+    def learn(
+        self,
+        changes: np.ndarray,
+        firsts: np.ndarray | tuple[int, ...] = (0,),
+        to_columns: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    ) -> None:
         """
         Learn from the changes of all places of a map.
 
         :param changes: of each place from the places 1 to L = ``MAX_LAG`` before, (L, n).
         :param firsts: first place of each session.
+        :param to_columns: :meth:`.columns.ColumnLayout.changes_from_before`.
         """
         n = changes.shape[1]
         if not n:
@@ -73,8 +80,9 @@ class ImageChange:
             moving[: apart - 1] = False
             self._sums[apart] = changes[apart - 1, moving].sum(dtype=np.float64)
             self._counts[apart] = np.count_nonzero(moving)
-        self._from_before[1:] = changes[0, 1:]
-        self._from_before[list(firsts)] = 1
+        from_before = changes[0].copy()
+        from_before[list(firsts)] = 1
+        self._from_before[:] = to_columns(from_before)
         self._update_curve()
 
     def learn_newest(self, latest: np.ndarray, n: int) -> None:
@@ -100,15 +108,15 @@ class ImageChange:
         """
         Use the statistics of a sample of these places' map.
 
-        :param from_before: change of each place from the one before, (n,), float32.
+        :param from_before: change of each column from the one before, (m,), float32.
         """
         self._sums, self._counts = learned._sums, learned._counts
         self._from_before = from_before
         self._update_curve()
 
-    def grow(self, places: int) -> None:
+    def grow(self, columns: int) -> None:
         """Make room for more places."""
-        more = np.ones(places - len(self._from_before), np.float32)
+        more = np.ones(columns - len(self._from_before), np.float32)
         self._from_before = np.append(self._from_before, more)
 
     def evict(self, count: int) -> None:
@@ -131,7 +139,7 @@ class ImageChange:
         """
         Whether equal images are expected where the camera is: places of the map are equal there.
 
-        :param by_place: probability of each place, (n,).
+        :param by_place: probability of each column, (n,).
         """
         n = len(by_place)
         equal = self._from_before[:n] < 2 * self.standstill
@@ -170,11 +178,11 @@ class ImageChange:
         """Whether an image equals the one before up to noise: at rest, or in the dark."""
         return bool(change < self.standstill)
 
-    def distinct(self, n: int) -> np.ndarray:
-        """Return which of n places count, (n,), bool: of a standstill one; all if few would."""
-        distinct = ~(self._from_before[:n] < self.standstill)
+    def distinct(self, columns: slice | np.ndarray) -> np.ndarray:
+        """Return which columns count, (n,), bool: of a standstill one; all if few would."""
+        distinct = ~(self._from_before[columns] < self.standstill)
         has_few = np.count_nonzero(distinct) < MIN_DISTINCT
-        return np.ones(n, bool) if has_few else distinct
+        return np.ones_like(distinct) if has_few else distinct
 
     def weight(self, change: float) -> float:
         """Return the weight of an image by its change: equal images add nothing."""
@@ -202,7 +210,7 @@ class ImageChange:
         :meth:`excess`, it compares each image with the one before alone, and the map with itself
         around the path.
 
-        :param first: place at the start of the path; last: at its end.
+        :param first: column at the start of the path; last: at its end.
         :param images: newest ones that are on it.
         :returns: 0 to ``MOST_CREEP``: noise is no motion; 0 as long as no change is known.
         """

@@ -90,9 +90,12 @@ class QueryWindow(ABC):
         self._end += 1
         self.images = self._images[self._end - before - 1 : self._end]
 
+    def assess(self) -> None:  # noqa: B027 -- mode paper notes nothing
+        """Note what the window shows, once it is full: before :meth:`match`, once an image."""
+
     @abstractmethod
     def match(self) -> WindowMatch:
-        """Return the match of the images in the window, in mode paper of a full one."""
+        """Return the match of the images in the window, full and assessed."""
 
     def match_newest(self) -> WindowMatch:
         """
@@ -103,13 +106,15 @@ class QueryWindow(ABC):
         """
         return WindowMatch()
 
-    def match_oldest(self, is_matched: bool) -> WindowMatch:
+    def note_match(self) -> None:
+        """Note that the middle image has a match."""
+        self.images['is_matched'][(len(self.images) - 1) // 2] = True
+
+    def match_oldest(self) -> WindowMatch:
         """
         Return the match of the oldest image by the whole window, where it had none as the middle.
 
-        :param is_matched: whether the window itself is matched.
-        :returns: without a sequence where the oldest image had a match, or the window has none,
-            and in mode paper.
+        :returns: without a sequence where the oldest image had a match, and in mode paper.
         """
         return WindowMatch()
 
@@ -176,7 +181,7 @@ class FilterWindow(QueryWindow):
         super().__init__(length, layout)
         self._is_route = is_route
         self.filter: Filter = self.filter_class(width, length, model, layout.gaps)
-        self.change = ImageChange(layout.passes(places), length)
+        self.change = ImageChange(width, length)
         self._constant, self.recent = constant, RecentWindows()
         self.cells: CellAgreement | None = None
         self._means = PlaceMeans()
@@ -219,7 +224,8 @@ class FilterWindow(QueryWindow):
 
     def _z(self, row: Any) -> Any:
         """Return distances to the places as z of the columns."""
-        around, counted = AROUND * self._is_route, self.change.distinct(len(row))
+        around = AROUND * self._is_route
+        counted = self.change.distinct(self.layout.along(len(row)))
         return self.layout.to_columns(z_normalized(row, around, counted, self.layout.starts))
 
     def newest_row(self) -> np.ndarray:
@@ -252,8 +258,7 @@ class FilterWindow(QueryWindow):
         self.is_standstill = self.change.is_standstill(change)
         moved = not self.filter.count or not self.is_standstill
         if not moved:
-            by_pass = self.layout.to_passes(self.filter.by_place())[: self.known]
-            moved = self.change.is_dark_stretch(by_pass)
+            moved = self.change.is_dark_stretch(self.filter.by_place()[: self.known])
         if moved:
             self.filter.update(z, self.change.weight(change))
             if self.cells is not None:
@@ -261,23 +266,33 @@ class FilterWindow(QueryWindow):
             self._shown = self._latest = None
         self._append(stamp, change, self.filter.count - 1)
 
+    def assess(self) -> None:
+        """See :meth:`QueryWindow.assess`; a camera at rest shows nothing new."""
+        if not self.known:
+            return
+        if self._shown is None:
+            self._shown = self._show(min(self.filter.count, self.length))
+            self.recent.add(self._shown.own)
+        path = self._shown.path
+        # with the images before the window from which the filter follows states
+        before = (path[-1] - path[0]) * SPACING // self.length + CLOSE
+        self._repeated = self.layout.repeated(path - before)
+        if self._latest is None and self._middle == self.filter.count - 1:
+            self._latest = self._show((len(path) + 1) // 2)
+
+    @property
+    def _middle(self) -> int:
+        """Number of the middle image."""
+        return int(self.images['number'][(len(self.images) - 1) // 2])
+
     def match(self) -> WindowMatch:
         """Return the match of the middle image; of a camera at rest, as before it stopped."""
-        if not self.known:
-            return WindowMatch()
         if (shown := self._shown) is None:
-            shown = self._shown = self._show(min(self.filter.count, self.length))
-            self.recent.add(shown.own)
-        # with the images before the window from which the filter follows states
-        before = (shown.path[-1] - shown.path[0]) * SPACING // self.length + CLOSE
-        self._repeated = self.layout.repeated(shown.path - before)
-        middle = int(self.images['number'][(len(self.images) - 1) // 2])
-        if middle == self.filter.count - 1:  # no later image shows its place: nor do early ones
-            if self._latest is None:
-                self._latest = self._show((len(shown.path) + 1) // 2)
+            return WindowMatch()
+        if self._latest is not None:  # no later image shows its place: nor do early ones
             least = min(shown.probability, self._latest.probability)
             shown = shown._replace(probability=least)
-        return self._match(shown, self.images, middle)
+        return self._match(shown, self.images, self._middle)
 
     def match_newest(self) -> WindowMatch:
         """Return the match of the newest images: :meth:`QueryWindow.match_newest`."""
@@ -293,10 +308,9 @@ class FilterWindow(QueryWindow):
         middle = int(images['number'][(len(images) - 1) // 2])
         return self._match(shown, images, middle)
 
-    def match_oldest(self, is_matched: bool) -> WindowMatch:
+    def match_oldest(self) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
-        self.images['is_matched'][(len(self.images) - 1) // 2] = is_matched
-        if self.images['is_matched'][0] or not is_matched:
+        if self.images['is_matched'][0]:
             return WindowMatch()
         oldest = int(self.images['number'][0])
         count = self.filter.count - oldest
@@ -338,8 +352,7 @@ class FilterWindow(QueryWindow):
         elsewhere, competitor = self.filter.best_straight(steps, slice(0, self.known), near)
         lead = max(score - max(elsewhere, 0.0), 0.0)
         cells = 0.0 if self.cells is None else self.cells.lead(path, competitor)
-        first, last = self.layout.pass_before(path[[0, -1]]).tolist()
-        creep = self.change.creep(first, last, l)
+        creep = self.change.creep(int(path[0]), int(path[-1]), l)
         return quantities._replace(lead=lead, images=l, cells=cells, creep=creep)
 
     def _nothing(self, l: int, position: int) -> Shown:
