@@ -20,7 +20,7 @@ from typing import Any
 
 from data import data_folder
 import numpy as np
-from results import commit, cpu_model, RESULTS, table, write_json
+from results import commit, cpu_model, RESULTS, table, write_json, write_section
 from scipy.signal import lfilter
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -45,7 +45,7 @@ CASES = {  # map, query, tolerance, speed of the query
     'nordland_vary': ('nordland_64x32/winter', 'nordland_64x32/summer', 3, 'vary'),
 }
 PAGE = RESULTS / 'performance.md'
-BEGIN, END = '<!-- written by benchmarks/city.py -->', '<!-- end -->'
+WRITTEN_BY = 'benchmarks/city.py'
 
 
 class HalfFeatures(LocalFeatures):
@@ -201,14 +201,7 @@ def write_page(results: list[dict[str, Any]], page: Path) -> None:
     results = sorted(
         results, key=lambda one: (one['places'], cases.index(one['case']), one['dimension'])
     )
-    written_between(page, BEGIN, END, lines(results))
-
-
-def written_between(page: Path, begin: str, end: str, content: list[str]) -> None:
-    """Replace the text between two marks of a page."""
-    before, rest = page.read_text(encoding='utf-8').split(begin)
-    text = '\n'.join(['', '', *content]).rstrip()
-    page.write_text(f'{before}{begin}{text}\n\n{end}{rest.split(end)[1]}', encoding='utf-8')
+    write_section(page, WRITTEN_BY, lines(results))
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page benchmarks/results/off_map.md from the rows that off_map.py measures."""
+"""The section of benchmarks/results/robust_mode.md by the rows that off_map.py measures."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any

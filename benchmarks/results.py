@@ -175,6 +175,14 @@ def write_lines(path: Path, lines: Sequence[str]) -> None:
     path.write_text('\n'.join(lines).rstrip() + '\n', encoding='utf-8')
 
 
+def write_section(page: Path, command: str, lines: Sequence[str]) -> None:
+    """Replace what a command has written on a page, up to the mark of its end."""
+    begin, end = f'<!-- written by {command} -->', '<!-- end -->'
+    before, rest = page.read_text(encoding='utf-8').split(begin)
+    text, behind = '\n'.join(lines).strip(), rest.split(end, 1)[1]
+    page.write_text(f'{before}{begin}\n\n{text}\n\n{end}{behind}', encoding='utf-8')
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Return the lines of a Markdown table, followed by an empty one."""
     lines = ['| ' + ' | '.join(cells) + ' |' for cells in (head, *rows)]

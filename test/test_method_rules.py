@@ -205,7 +205,8 @@ RULES = [
     Rule('STRETCH', put(motion, STRETCH=1), lambda: resting(
         3.0, KNOWN[:, np.r_[:76, 75:PLACES]]), 1, 0),
     Rule('distinct', put(ImageChange, distinct=lambda change, at: change._from_before[at] > -1),
-         lambda: matched(STAGE, 8.5, known=KNOWN[:, np.r_[:70, np.full(1500, 70), 70:PLACES]]), 0.3, 0.15),
+         lambda: matched(STAGE, 8.5, known=KNOWN[:, np.r_[:70, np.full(1500, 70), 70:PLACES]]),
+         0.3, 0.15),
     Rule('line', in_kernel(path, 'centered_place', LINE=0), lambda: places_off(
         np.rint(np.arange(20, 140, 1.5)).astype(int), 3.0, False), 0.1, 0.25),
     Rule('ON_LINE', in_kernel(path, 'centered_place', ON_LINE=1e9),
