@@ -53,7 +53,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
             required = row.default is dataclasses.MISSING
             example = '' if required else row.default
             default_text = 'required' if required else str(example).strip('()') or 'none'
-            text = f'{row.metadata["help"]} ({default_text})'.replace('%', '%%')
+            text = f'{row.metadata.get("help", "")} ({default_text})'.replace('%', '%%')
             for group, words in ((parser, argparse.SUPPRESS), (group_of_kind, text)):
                 group.add_argument(
                     _option(kind, row.name),

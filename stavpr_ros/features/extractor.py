@@ -309,7 +309,7 @@ class FeatureExtractor:
     def needed_size(self, thumbnail_width: int) -> tuple[int, int] | None:
         """Return the rows and columns of an image that have an effect; None = all."""
         backbone = self.settings.backbone
-        if backbone.resize != 'area':  # bilinear features are of single pixels
+        if getattr(backbone, 'resize', '') != 'area':  # bilinear features are of single pixels
             return None
         return backbone.size, max(backbone.size, thumbnail_width)
 

@@ -1,0 +1,53 @@
+# Copyright 2026 The stavpr_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A kind of features of another package: a plain dataclass and a class with feature_maps."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+from stavpr_ros.commands import build_map
+from stavpr_ros.features import registry
+from stavpr_ros.mapping import load_map, Map
+
+
+@dataclass(frozen=True)
+class PlainSettings:
+    """Settings without a help, and none of those that other kinds have."""
+
+    side: int = 28
+
+
+class Plain:
+    """Thumbnails, in gray."""
+
+    def __init__(self, settings: PlainSettings, device: str) -> None:
+        self.settings = settings
+
+    def feature_maps(self, images):
+        side = self.settings.side
+        grays = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+        return np.stack([cv2.resize(gray, (side, side)) for gray in grays])[:, None] / 255.0
+
+
+@pytest.fixture(autouse=True)
+def plain_kind(monkeypatch):
+    kind = registry.Kind(PlainSettings, f'{__name__}:Plain')
+    monkeypatch.setitem(registry.KINDS, 'plain', kind)
+
+
+def test_kind_of_a_plain_dataclass_makes_a_map_and_has_options(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    images, path = tmp_path / 'images', tmp_path / 'route.stavpr'
+    images.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(images / f'{i}.png'), rng.integers(0, 255, (48, 64, 3), np.uint8))
+    route = Map.from_images(images, 'plain')
+    assert (len(route), route.features.dimension) == (3, 28 * 4)
+    words = ['--input', str(images), '--output', str(path), '--features', 'plain']
+    assert build_map.main([*words, '--plain-side', '14']) == 0
+    assert load_map(path).settings.backbone == PlainSettings(14)
+    with pytest.raises(SystemExit):
+        build_map.main(['--help-features'])
+    assert '--plain-side' in capsys.readouterr().out
