@@ -27,7 +27,7 @@ import numpy as np
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
-from stavpr_ros.prepare.blocks import converted
+from stavpr_ros.prepare.blocks import convert_features
 from stavpr_ros.prepare.centering import MeanCentering
 from stavpr_ros.prepare.prepared_map import PreparedMap
 import torch
@@ -95,7 +95,7 @@ def recognizer_of(
     """Return a recognizer that uses the features as they are: their centering takes minutes."""
 
     def prepared(*_: Any) -> PreparedMap:
-        used = converted(places, rounds=True) if precision == 'int8' else places
+        used = convert_features(places, rounds=True) if precision == 'int8' else places
         few = places[: min(len(places), 2000)]
         centering = MeanCentering(few, True, True) if mode == 'robust' else None
         return PreparedMap(used, centering, np.ones((5, len(places)), np.float32))

@@ -77,7 +77,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
     rows: list[tuple[float, ...]] = []
     shown: list[Any] = []
     state = {'image': -1, 'early': -1}
-    show, assess, match, newest = window._show, window.assess, window.match, window.match_newest
+    show, assess, match, newest = window._assess, window.assess, window.match, window.match_newest
 
     def quantities(of: Any) -> tuple[float, ...]:
         q = of.quantities
@@ -94,10 +94,10 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
             rest, place = not is_early and middle == window.filter.count - 1, path.place
             about = image, place, float(is_early)
             if rest and any(
-                window._shown is each for each in shown
+                window._view is each for each in shown
             ):  # it counts as a recent one, but is not the match
-                rows.append((-1, *about, NEW, *quantities(window._shown), 0.0))
-            which = window._latest if rest else shown[-1] if shown else window._shown
+                rows.append((-1, *about, NEW, *quantities(window._view), 0.0))
+            which = window._by_half if rest else shown[-1] if shown else window._view
             kind = REST if rest else NEW if shown else REPEATED
             rows.append((state['image'], *about, kind, *quantities(which), path.probability))
         return result
@@ -118,7 +118,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         shown.append(show(*arguments))
         return shown[-1]
 
-    vars(window).update(_show=keep, assess=assessed, match=matched, match_newest=early)
+    vars(window).update(_assess=keep, assess=assessed, match=matched, match_newest=early)
     for i, stamp in enumerate(drive.stamps.tolist()):
         state['image'] = i
         recognizer.update(drive.features[i : i + 1], stamp)

@@ -102,13 +102,15 @@ def test_expected_change_below_one_place_is_that_of_a_denser_map(step):
     strips = decaying_strips(300, 0.6)
     dense, sparse = learned(strips), learned(strips[:, ::step])
     places = np.arange(4)
-    found = [expected_change(each / step, *sparse._extended) for each in places]
+    found = [expected_change(each / step, *sparse._curve_with_tail) for each in places]
     np.testing.assert_allclose(found, dense.curve[places], atol=0.03)
 
 
 def test_expected_change_is_the_curve_at_whole_places_and_never_decreases():
     change = learned(drive_strips(300))
-    found = [expected_change(places, *change._extended) for places in np.linspace(0, 30, 301)]
+    found = [
+        expected_change(places, *change._curve_with_tail) for places in np.linspace(0, 30, 301)
+    ]
     np.testing.assert_allclose(found[: 10 * MAX_LAG + 1 : 10], change.curve)
     assert (np.diff(found) >= 0).all()
 

@@ -18,7 +18,7 @@ from stavpr_ros.alignment.cpu import int8
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.prepare.blocks import converted
+from stavpr_ros.prepare.blocks import convert_features
 from stavpr_ros.prepare.matcher import make_matcher
 
 TILE = int8.TILE
@@ -80,7 +80,7 @@ def test_strip_distances_equal_oracle_bit_for_bit(W, n, d, seed):
 def test_vectors_equal_single_strips_bit_for_bit(n, d):
     """The kernel of one vector an image, and that of strips."""
     reference, queries = random_strips(1, n, d), random_strips(1, 2, d, seed=10)
-    held = converted(features_of(reference), rounds=True).strips
+    held = convert_features(features_of(reference), rounds=True).strips
     out = np.empty((2, n), np.float32)
     int8.cosine_distances(held.kernel_arguments(), int8.tiled(queries), out)
     for x in range(2):
@@ -141,7 +141,7 @@ def test_features_rounded_in_blocks_equal_those_rounded_at_once():
     features = features_of(random_strips(3, 600, 10))
     at_once = int8.Int8Strips(3, 600, 10)
     at_once[:, :] = features.strips
-    held = converted(features, rounds=True)
+    held = convert_features(features, rounds=True)
     np.testing.assert_array_equal(held.strips.values, at_once.values)
     np.testing.assert_array_equal(held.strips.reciprocals, at_once.reciprocals)
     assert held.strips.values.nbytes < 1.25 * 3 * 600 * 10  # whole quads: 12 for 10 dimensions

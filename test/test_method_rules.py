@@ -55,13 +55,13 @@ def in_kernel(module, name, **values):
 
 def without_half(patch):
     """Let the probability of a camera at rest be of the whole window alone."""
-    show, half = FilterWindow._show, (LENGTH + 1) // 2
+    show, half = FilterWindow._assess, (LENGTH + 1) // 2
 
     def shown(self, l, position=None):
         found = show(self, l, position)
         return found._replace(probability=1.0) if (l, position) == (half, None) else found
 
-    patch.setattr(FilterWindow, '_show', shown)
+    patch.setattr(FilterWindow, '_assess', shown)
 
 
 def alike(share, first=0, end=PLACES):

@@ -409,7 +409,7 @@ def test_geometric_check_in_mode_robust_weighs_doubtful_matches(map_file, route,
     result = process(pipeline, noisy[:LENGTH])[-1]
     assert 0.1 < plain.match.probability < 0.99
     assert result.match.inliers >= 8
-    expected = GeometricEvidence().updated(plain.match.probability, least == 8)
+    expected = GeometricEvidence().update_probability(plain.match.probability, least == 8)
     assert result.match.probability == pytest.approx(expected)
     assert result.match.status is (Status.MATCH if least == 8 else Status.NO_MATCH)
     assert bool(result.match.reason) == (least != 8)

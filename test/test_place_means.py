@@ -27,18 +27,18 @@ def test_means_are_weighted_ones_of_earlier_rows_with_unknown_places_as_the_last
     means = PlaceMeans()
     for i, row in enumerate(rows):
         counted = rows[: max(0, i - DELAY)]
-        less = means.subtracted(row, False)
+        less = means.correct(row, False)
         np.testing.assert_allclose(less, row - expected_means(counted, len(row)), atol=1e-5)
 
 
 def test_places_that_are_excluded_count_as_mean_0():
     means = PlaceMeans()
     for _ in range(10):
-        means.subtracted(np.array([np.inf, 1.0], np.float32), False)
-    less = means.subtracted(np.array([2.0, 2.0], np.float32), False)
+        means.correct(np.array([np.inf, 1.0], np.float32), False)
+    less = means.correct(np.array([2.0, 2.0], np.float32), False)
     assert less[0] == 2
     assert less[1] < 2
-    assert means.subtracted(np.array([np.inf, 1.0], np.float32), False)[0] == np.inf
+    assert means.correct(np.array([np.inf, 1.0], np.float32), False)[0] == np.inf
 
 
 def test_evicted_places_take_their_means_with_them():
@@ -46,14 +46,14 @@ def test_evicted_places_take_their_means_with_them():
     rows = rng.normal(0, 1, (30, 40)).astype(np.float32)
     whole, evicted = PlaceMeans(), PlaceMeans()
     for row in rows:
-        whole.subtracted(row, False)
-        evicted.subtracted(row, False)
+        whole.correct(row, False)
+        evicted.correct(row, False)
     evicted.evict(7)
     for row in rows:
-        kept = evicted.subtracted(row[7:], False)
-        np.testing.assert_array_equal(kept, whole.subtracted(row, False)[7:])
+        kept = evicted.correct(row[7:], False)
+        np.testing.assert_array_equal(kept, whole.correct(row, False)[7:])
     evicted.evict(33)
-    assert len(evicted.subtracted(np.empty(0, np.float32), False)) == 0
+    assert len(evicted.correct(np.empty(0, np.float32), False)) == 0
 
 
 def drive(strips, noise=0.3):
@@ -87,7 +87,7 @@ def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(mo
     assert len(places) > 265
     assert np.mean(np.abs(off - np.median(off)) <= 4) > 0.95
     assert probable(drive(strips, noise=1.0)) <= 3
-    monkeypatch.setattr(PlaceMeans, 'subtracted', lambda self, z, is_standstill: z)
+    monkeypatch.setattr(PlaceMeans, 'correct', lambda self, z, is_standstill: z)
     assert probable(drive(strips, noise=1.0)) > 8
 
 

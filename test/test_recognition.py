@@ -285,7 +285,7 @@ def test_whitening_equals_equation_in_numpy():
     rng = np.random.default_rng(0)
     strips = rng.normal(size=(2, 30, 6)) * [3, 2, 1, 1, 0.5, 0.1] @ rng.normal(size=(6, 6))
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
-    whitening = Whitening.learned(strips.astype(np.float32))
+    whitening = Whitening.learn(strips.astype(np.float32))
     some = rng.normal(size=(2, 4, 6))
     for j in range(2):
         values, directions = np.linalg.eigh(strips[j].T @ strips[j])

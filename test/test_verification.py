@@ -190,8 +190,8 @@ def test_evidence_is_the_share_of_certain_matches_that_pass(passing, right):
     """Where none passes, as by night, a failed check is next to no evidence."""
     evidence = GeometricEvidence()
     for i in range(30):
-        assert evidence.updated(0.999, i < passing) == 0.999
+        assert evidence.update_probability(0.999, i < passing) == 0.999
     odds = (1 - right) / 0.9 if passing else 1.0
-    assert evidence.updated(0.5, False) == pytest.approx(odds / (1 + odds))
+    assert evidence.update_probability(0.5, False) == pytest.approx(odds / (1 + odds))
     odds = max(right, 0.3) / 0.1
-    assert evidence.updated(0.5, True) == pytest.approx(odds / (1 + odds))
+    assert evidence.update_probability(0.5, True) == pytest.approx(odds / (1 + odds))

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from stavpr_ros.errors import FleetError
 from stavpr_ros.mapping import Map, select_places, Session
-from stavpr_ros.prepare.blocks import converted_blocks
+from stavpr_ros.prepare.blocks import convert_blocks
 from stavpr_ros.prepare.centering import evenly, MeanCentering, normalize
 
 RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places
@@ -129,6 +129,6 @@ def map_vectors(place_map: Map, index: MapIndex) -> np.ndarray:
     """Return the vectors of all places, (n, D), float32; features are read block by block."""
     centering = index.centering()
     vectors = np.empty((len(place_map), index.dimension), np.float32)
-    for places, block in converted_blocks(place_map.features, centering.places):
+    for places, block in convert_blocks(place_map.features, centering.places):
         vectors[places] = place_vectors(block.strips)
     return vectors

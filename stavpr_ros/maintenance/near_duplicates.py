@@ -9,7 +9,7 @@ import numpy as np
 from stavpr_ros.alignment.cpu.dot import change_between
 from stavpr_ros.mapping import Map, select_places
 from stavpr_ros.method.model import STANDSTILL
-from stavpr_ros.prepare.blocks import converted_blocks, PlaceChanges
+from stavpr_ros.prepare.blocks import convert_blocks, PlaceChanges
 from stavpr_ros.prepare.centering import MeanCentering
 from stavpr_ros.progress import Progress
 
@@ -51,7 +51,7 @@ def _centered(
 ) -> Iterator[tuple[slice, np.ndarray]]:
     """Yield the centered features of each block, (W, m, d); a terminal shows the progress."""
     with Progress(total=len(place_map), desc=text, unit='place') as bar:
-        for places, block in converted_blocks(place_map.features, centering.places):
+        for places, block in convert_blocks(place_map.features, centering.places):
             yield places, block.strips
             bar.update(places.stop - places.start)
 

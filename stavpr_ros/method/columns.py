@@ -17,7 +17,7 @@ with one distance::
 
 On a closed route, whose last c places show the same as its first c, the first places follow the
 last one again, so that a path goes on over the seam. Once all of a window's path is there, the
-states of these columns are moved one lap back (:meth:`ColumnLayout.repeated`)::
+states of these columns are moved one lap back (:meth:`ColumnLayout.seam_columns`)::
 
     place      0 1 ... c-1 ... n-c ... n-1 c c+1 ...
                                |<- shows 0 ... c-1
@@ -139,7 +139,7 @@ class ColumnLayout:
         """Return 1 of a column passed along the map, -1 of one against it."""
         return 1 if self.columns is None or column <= self.columns[self._along - 1] else -1
 
-    def repeated(self, path: np.ndarray) -> slice:
+    def seam_columns(self, path: np.ndarray) -> slice:
         """
         Return the columns that repeat those a lap before them, where all of a path is there.
 
@@ -177,7 +177,7 @@ class ColumnLayout:
         apart = np.abs(positions - position)
         return np.minimum(apart, np.abs(self.lap - apart)) if self.lap else apart
 
-    def merged(self, columns: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, int]:
+    def merge(self, columns: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, int]:
         """
         Let columns of positions within ``CLOSE`` of each other add up.
 

@@ -91,7 +91,7 @@ class DevicePlaceFilter(PlaceFilter):
     def _advance(self, z: torch.Tensor, image: Image, scale: float) -> None:
         s, alpha = self.model, image.weight
         if self.count % SPACING == 1:
-            self._keep(self._free.pop().copy_(self._now), scale)
+            self._take_snapshot(self._free.pop().copy_(self._now), scale)
         self._row[: len(z)], self._row[len(z) :] = z, torch.inf
         slope, offset = alpha * s.level, alpha * s.level**2 / 2
         self._sent.numpy[:] = self.count % self._rows, slope, offset, image.entering, scale
@@ -114,7 +114,7 @@ class DevicePlaceFilter(PlaceFilter):
         came.masked_fill_(~valid, 0)
         torch.mul(came, torch.where(valid, likelihoods, 0), out=self._now)
         torch.sum(self._now, dim=0, out=self._sums)
-        totals = [each.sum(dtype=torch.float64) for each in (came.sum(dim=0), self._sums)]
+        totals = [sums.sum(dtype=torch.float64) for sums in (came.sum(dim=0), self._sums)]
         masses = pad(self._sums, (0, -n % BLOCK)).view(-1, BLOCK).sum(dim=1)
         top, blocks = masses.topk(self._blocks)
         torch.cat([torch.stack(totals), top.double(), BLOCK * blocks.double()], out=self._out)

@@ -148,7 +148,7 @@ class Image(NamedTuple):
     blocks: np.ndarray
 
 
-class Kept(NamedTuple):
+class Snapshot(NamedTuple):
     """States after an image, (V, width), not normalized, the factor, and its number."""
 
     states: Any
@@ -177,9 +177,9 @@ class PlaceFilter(Filter):
         checks.require_ascending('gaps', gaps, columns)
         self.model, self.length, self._gaps = model, length, gaps
         self._steps = model.steps() * F(1 - model.leave)
-        self._rows, kept = length + SPACING - 1, (length - 2) // SPACING + 2
-        self._buffers = kept + 2
-        self._kept: deque[Kept] = deque(maxlen=kept)
+        self._rows, snapshots = length + SPACING - 1, (length - 2) // SPACING + 2
+        self._buffers = snapshots + 2
+        self._snapshots: deque[Snapshot] = deque(maxlen=snapshots)
         self._images: deque[Image] = deque(maxlen=self._rows)
         self._allocate(columns)
         self.reset()
@@ -211,8 +211,8 @@ class PlaceFilter(Filter):
     def reset(self) -> None:
         """Forget where the camera was."""
         self._read()
-        self._free += [each.states for each in self._kept]
-        self._kept.clear()
+        self._free += [snapshot.states for snapshot in self._snapshots]
+        self._snapshots.clear()
         self._images.clear()
         self._now[:], self._sums[:] = 0, 0
         self._off, self.count = 1.0, 0
@@ -246,18 +246,18 @@ class PlaceFilter(Filter):
             image.entering, scale, self._now, self._sums,
         )  # fmt: skip
         if self.count % SPACING == 1:
-            self._keep(before, scale)
+            self._take_snapshot(before, scale)
         else:
             self._free.append(before)
         scale = self._normalize(arrived, on_map)
         blocks = probable_blocks(self._sums[:n], scale)
         self._images.append(image._replace(scale=scale, blocks=blocks))
 
-    def _keep(self, states: Any, scale: float) -> None:
+    def _take_snapshot(self, states: Any, scale: float) -> None:
         """Keep the states after the newest image."""
-        if len(self._kept) == self._kept.maxlen:
-            self._free.append(self._kept.popleft().states)
-        self._kept.append(Kept(states, scale, self.count - 1))
+        if len(self._snapshots) == self._snapshots.maxlen:
+            self._free.append(self._snapshots.popleft().states)
+        self._snapshots.append(Snapshot(states, scale, self.count - 1))
 
     def _normalize(self, arrived: float, on_map: float) -> float:
         """Return 1 / c, by the probabilities that arrived on the map and their sum times L."""
@@ -292,18 +292,19 @@ class PlaceFilter(Filter):
         self._require_images(images)
         self._read()
         s, newest = self.model, self._images[-1]
-        kept = Kept(self._now, newest.scale, self.count - 1)
-        for each in self._kept if images > 1 else ():
-            if each.number <= self.count - images:
-                kept = each
-        later = self.count - 1 - kept.number
-        numbers = np.array([each[:4] for each in list(self._images)[len(self._images) - later :]])
+        since = Snapshot(self._now, newest.scale, self.count - 1)
+        for snapshot in self._snapshots if images > 1 else ():
+            if snapshot.number <= self.count - images:
+                since = snapshot
+        later = self.count - 1 - since.number
+        latest = list(self._images)[len(self._images) - later :]
+        numbers = np.array([image[:4] for image in latest])
         starts = np.concatenate([newest.blocks, self._images[-1 - images // 2].blocks])
         bounds = regions(np.sort(starts), (self.length - 1) * s.reach, self._width)
         columns, parts = [NO_PLACES], [np.empty((images, 0))]
         for low, end in bounds:
             columns.append(np.arange(low, end))
-            states = self._on_host(kept.states[:, low:end]) * np.float64(kept.scale)
+            states = self._on_host(since.states[:, low:end]) * np.float64(since.scale)
             z = self._on_host(self._z[:, low:end][self._ring(later)])
             is_end = low == 0, end == self._width
             parts.append(smooth(
@@ -344,7 +345,8 @@ class PlaceFilter(Filter):
         checks.require_whole('count', count, len(y), 'columns')
         self._read()
         first, end = columns.start, columns.stop
-        for states in (self._now, self._sums[None], *(each.states for each in self._kept)):
+        snapshots = [snapshot.states for snapshot in self._snapshots]
+        for states in (self._now, self._sums[None], *snapshots):
             states[:, first - count : end - count] += states[:, columns]
             states[:, columns] = 0
         for i, image in enumerate(self._images):
@@ -374,9 +376,9 @@ class PlaceFilter(Filter):
         self._allocate(width)
         self._now[:, :m], self._sums[:m] = now[:, first:], sums[first:]
         self._z[:, :m], self._z[:, m:] = z[:, first:], np.inf
-        for i, kept in enumerate(self._kept):
-            self._kept[i] = kept._replace(states=self._free.pop())
-            self._kept[i].states[:, :m] = kept.states[:, first:]
+        for i, snapshot in enumerate(self._snapshots):
+            self._snapshots[i] = snapshot._replace(states=self._free.pop())
+            self._snapshots[i].states[:, :m] = snapshot.states[:, first:]
 
 
 # ------------------------------------------------ kernels
@@ -417,7 +419,7 @@ def advance(states, z, slope, offset, most, steps, change, entering, scale, new,
     for part in nb.prange(parts):
         first = part * PART
         m = min(PART, width - first)
-        moved = _moved(states, steps, first, m)
+        moved = _step(states, steps, first, m)
         likelihoods, valid = np.empty(m, F), np.empty(m, F)
         for i in range(m):
             value = z[first + i]
@@ -470,7 +472,7 @@ def regions(starts: np.ndarray, below: int, width: int) -> list[tuple[int, int]]
 
 
 @kernel
-def _mixed(states, change):  # type: ignore[no-untyped-def]
+def _change_speed(states, change):  # type: ignore[no-untyped-def]
     """Return states (V, m) with the speed changed to a neighboring one; the ends stay."""
     mixed, last = np.empty_like(states), len(states) - 1
     for v in range(len(states)):
@@ -481,7 +483,7 @@ def _mixed(states, change):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _moved(states, steps, first, m):  # type: ignore[no-untyped-def]
+def _step(states, steps, first, m):  # type: ignore[no-untyped-def]
     """Return what states (V, width) become by their speeds, at m columns from ``first`` on."""
     (V, width), moved = states.shape, np.zeros((len(states), m), states.dtype)
     for v in range(V):
@@ -496,7 +498,7 @@ def _moved(states, steps, first, m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _moved_back(messages, steps, least, outside):  # type: ignore[no-untyped-def]
+def _step_back(messages, steps, least, outside):  # type: ignore[no-untyped-def]
     """Return the mean of messages (V, m) that states meet, ``outside`` at both ends, + least."""
     (V, m), out = messages.shape, np.full(messages.shape, least)
     lowest, highest = outside
@@ -532,7 +534,7 @@ def _forward(states, z, numbers, level, most, steps, change, images):  # type: i
         for y in range(m):
             factor = scale if z[image, y] < np.inf else 0.0
             likelihoods[image, y] = power(slope * min(z[image, y], most) - offset, 8) * factor
-        states = _mixed(_moved(states, steps, 0, m), change)
+        states = _change_speed(_step(states, steps, 0, m), change)
         for v in range(V):
             for y in range(m):
                 states[v, y] = (states[v, y] + entering) * likelihoods[image, y]
@@ -570,11 +572,11 @@ def smooth(states, z, numbers, level, most, steps, change, leave, enter, is_end,
                 weighed[v, y] *= likelihoods[row, y]
                 sums[y] += weighed[v, y]
         total = sums.sum()
-        mixed = _mixed(weighed, change)
+        mixed = _change_speed(weighed, change)
         for y in range(m):
             if not z[row, y] < np.inf:
                 mixed[:, y] = off
         outside = off * is_end[0], off * is_end[1]
-        messages = _moved_back(mixed, steps, leave * off, outside)
+        messages = _step_back(mixed, steps, leave * off, outside)
         off = (1 - enter) * off + enter * total / numbers[row, 3]
     return out

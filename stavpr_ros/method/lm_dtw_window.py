@@ -62,7 +62,7 @@ class LmDtwWindow(QueryWindow):
         self._append(stamp)
         newest, m = self._rows[self._end - 1], len(row)
         newest[:m], newest[m : self._width] = row, np.inf
-        self.known = max(self.known, m)
+        self.size = max(self.size, m)
 
     def newest_row(self) -> np.ndarray:
         """See :meth:`QueryWindow.newest_row`."""
@@ -75,7 +75,7 @@ class LmDtwWindow(QueryWindow):
     def reset(self) -> None:
         """Drop all images."""
         super().reset()
-        self._rows[:], self.known = np.inf, 0
+        self._rows[:], self.size = np.inf, 0
 
     def grow(self, places: int) -> None:
         """Make room for more places; in the rows of the window they are +inf."""
@@ -92,11 +92,11 @@ class LmDtwWindow(QueryWindow):
         remaining = self._width - count
         self._rows[:, :remaining] = self._rows[:, count : self._width].copy()
         self._rows[:, remaining : self._width] = np.inf
-        self.known = max(0, self.known - count)
+        self.size = max(0, self.size - count)
 
     def match(self) -> WindowMatch:
         """See :meth:`QueryWindow.match`."""
-        n, k, first = self.known, self._k, self.first
+        n, k, first = self.size, self._k, self.first
         # columns behind the known ones are +inf, as the padding that the kernel needs
         rows = self._rows[self._end - self.length : self._end, : padded_width(n, k)]
         window = np.ascontiguousarray(rows)

@@ -46,7 +46,7 @@ from stavpr_ros.method.relative_motion import (
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.method.window import FilterWindow, QueryWindow
 from stavpr_ros.method.windows import time_note, window_of
-from stavpr_ros.prepare.blocks import converted_blocks
+from stavpr_ros.prepare.blocks import convert_blocks
 from stavpr_ros.prepare.matcher import make_matcher
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.threads import one_thread
@@ -229,7 +229,7 @@ class SequenceRecognizer(ABC):
         if match.status is not Status.MATCH:
             newest = window.match_newest()
             if newest.path.place >= 0:
-                early, run = self._decide(newest.path, self._limits.raised(EARLY))
+                early, run = self._decide(newest.path, self._limits.with_min_probability(EARLY))
                 runs.append(run)
                 match, shown = (early, newest) if early.accepted else (match, shown)
         # of the first match that images accept; the other one is no other image
@@ -332,7 +332,7 @@ class PlaceRecognizer(SequenceRecognizer):
         )
         if not isinstance(features, StoredFeatures):  # these are checked whenever they are read
             features.require_fit(place_map.settings, 'the map', features.dimension)
-            for _ in converted_blocks(features, partial(require_finite, where='the map')):
+            for _ in convert_blocks(features, partial(require_finite, where='the map')):
                 pass
         self._dimension = features.dimension
         is_vertical = settings.applied_spatial.vertical  # cells are made of float32 strips
@@ -354,7 +354,7 @@ class PlaceRecognizer(SequenceRecognizer):
             if cells is not None:
                 of_places, names_of = self._matcher.strips_of, layout.names_of
                 is_plain = layout.columns is None  # columns are places
-                strips_of = of_places if is_plain else lambda each: of_places(names_of(each))
+                strips_of = of_places if is_plain else lambda columns: of_places(names_of(columns))
                 self._window.cells = CellAgreement(cells, strips_of, settings.sequence.length)
         # of the start, for the log: statistics that were learned again, an error rate that is not
         # kept, and the time of several sessions

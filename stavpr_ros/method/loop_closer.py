@@ -83,7 +83,7 @@ class PathConfirmation:
                 reason='its path is not confirmed yet',
             )
         # places of the others have been evicted
-        late = tuple(each for each in self._waiting if each.path.pairs[:, 1].min() >= first)
+        late = tuple(m for m in self._waiting if m.path.pairs[:, 1].min() >= first)
         self._waiting.clear()
         return replace(match, late=late)
 

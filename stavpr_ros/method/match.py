@@ -126,7 +126,7 @@ class Limits(NamedTuple):
     threshold: float = math.nan
     probability: float = math.nan
 
-    def raised(self, probability: float) -> 'Limits':
+    def with_min_probability(self, probability: float) -> 'Limits':
         """Return these limits, the probability not below another one."""
         return Limits(1 - probability, probability) if probability > self.probability else self
 

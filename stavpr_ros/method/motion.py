@@ -133,7 +133,7 @@ class ImageChange:
         ratio = min(similarity[-1] / similarity[-2], 1) if similarity[-2] > 0 else 0.0
         further = self.curve[-1] + similarity[-1] * (1 - ratio ** np.arange(1, FURTHER))
         decay = float(-np.log(np.clip(similarity[1], MIN_SIMILARITY, 1)))
-        self._extended = np.append(self.curve, further), decay
+        self._curve_with_tail = np.append(self.curve, further), decay
 
     def is_dark_stretch(self, by_place: np.ndarray) -> bool:
         """
@@ -154,8 +154,8 @@ class ImageChange:
         """Forget the query."""
         # the latest images that moved, newest first, and the changes of those of the window from
         # the images 1, 2, 3 before
-        self._moving: deque[np.ndarray] = deque(maxlen=COMPARED + 1)
-        self._of_window: deque[list[float]] = deque(maxlen=self._length)
+        self._recent_strips: deque[np.ndarray] = deque(maxlen=COMPARED + 1)
+        self._window_changes: deque[list[float]] = deque(maxlen=self._length)
         self._last: np.ndarray | None = None
 
     def next_query(self, strips: np.ndarray) -> float:
@@ -163,10 +163,12 @@ class ImageChange:
         change = 1.0 if self._last is None else change_between(strips, self._last)
         self._last = strips
         if not self.is_standstill(change):
-            self._moving.appendleft(strips)
-            if len(self._moving) > COMPARED:
-                apart = [change_between(strips, each) for each in list(self._moving)[2:]]
-                self._of_window.append([change, *apart])
+            self._recent_strips.appendleft(strips)
+            if len(self._recent_strips) > COMPARED:
+                apart = [
+                    change_between(strips, earlier) for earlier in list(self._recent_strips)[2:]
+                ]
+                self._window_changes.append([change, *apart])
         return change
 
     def recenter_query(self, strips: np.ndarray) -> None:
@@ -199,8 +201,8 @@ class ImageChange:
 
         :param speed: of the path of the window, places per image, at least 0.
         """
-        changes = np.array(self._of_window).reshape(-1, COMPARED)
-        return _excess(speed, changes, *self._extended)
+        changes = np.array(self._window_changes).reshape(-1, COMPARED)
+        return _excess(speed, changes, *self._curve_with_tail)
 
     def creep(self, first: int, last: int, images: int) -> float:
         """
@@ -214,11 +216,11 @@ class ImageChange:
         :param images: newest ones that are on it.
         :returns: 0 to ``MOST_CREEP``: noise is no motion; 0 as long as no change is known.
         """
-        changes = [each[0] for each in self._of_window][-images:]
+        changes = [lags[0] for lags in self._window_changes][-images:]
         around = self._from_before[max(first - CLOSE, 0) : last + CLOSE + 1]
         if not changes or not (around < 1).any():
             return 0.0
-        expected = expected_change((last - first) / max(images - 1, 1), *self._extended)
+        expected = expected_change((last - first) / max(images - 1, 1), *self._curve_with_tail)
         local = float(around[around < 1].mean())
         local = max(math.log((local + OFFSET) / (self.curve[1] + OFFSET)), LEAST_LOCAL)
         change = sum(changes) / len(changes)

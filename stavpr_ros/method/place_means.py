@@ -29,7 +29,7 @@ class PlaceMeans:
         self._count = 0.0  # sum of the weights
         self._latest: deque[np.ndarray] = deque()  # rows that do not count yet, oldest first
 
-    def subtracted(self, z: np.ndarray, is_standstill: bool) -> np.ndarray:
+    def correct(self, z: np.ndarray, is_standstill: bool) -> np.ndarray:
         """
         Return the z of an image less the means of its places, and count an earlier image.
 
@@ -37,8 +37,8 @@ class PlaceMeans:
         :param is_standstill: the image equals the one before: it does not count.
         """
         if len(z) > len(self._sums):
-            self._sums = _extended(self._sums, len(z))
-        less: np.ndarray = z - self._sums[: len(z)] / np.float32(self._count + MEAN_PRIOR)
+            self._sums = _pad_with_last(self._sums, len(z))
+        corrected: np.ndarray = z - self._sums[: len(z)] / np.float32(self._count + MEAN_PRIOR)
         if len(z) and not is_standstill:
             compared = np.isfinite(z)
             self._latest.append(np.where(compared, np.maximum(z, NEAREST), np.float32(0)))
@@ -46,8 +46,8 @@ class PlaceMeans:
             decay = np.float32(1 - 1 / MEAN_IMAGES)
             self._count = self._count * float(decay) + 1
             self._sums *= decay
-            self._sums += _extended(self._latest.popleft(), len(self._sums))
-        return less
+            self._sums += _pad_with_last(self._latest.popleft(), len(self._sums))
+        return corrected
 
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
@@ -55,7 +55,7 @@ class PlaceMeans:
         self._latest = deque(row[count:] for row in self._latest if len(row) > count)
 
 
-def _extended(values: np.ndarray, places: int) -> np.ndarray:
+def _pad_with_last(values: np.ndarray, places: int) -> np.ndarray:
     """Return values (n,) for so many places; those beyond n are as the last one, 0 without any."""
     last = values[-1:] if len(values) else np.zeros(1, np.float32)
     return np.append(values, np.repeat(last, places - len(values)))

@@ -97,19 +97,19 @@ class PlaceVerifier:
             thumbnail = places.thumbnail(place)
             if thumbnail is None:
                 return None
-            self._known[place] = self._detected(self._small_gray(thumbnail, f'place {place}'))
+            self._known[place] = self._detect(self._small_gray(thumbnail, f'place {place}'))
             if len(self._known) > CACHED:
                 self._known.popitem(last=False)
         self._known.move_to_end(place)
         gray = self._small_gray(query, 'query')
         # compared by content: a caller may use the memory of an image again for the next
         if self._query is None or not np.array_equal(self._query[0], gray):
-            self._query = gray, self._detected(gray)
+            self._query = gray, self._detect(gray)
         mine, theirs = self._query[1], self._known[place]
         pairs = mutual_matches(mine.descriptors, theirs.descriptors, RATIO)
         if len(pairs[0]) < MIN_MATCHES:
             return 0
-        return _explained(mine.points[pairs[0]], theirs.points[pairs[1]])
+        return _count_explained(mine.points[pairs[0]], theirs.points[pairs[1]])
 
     def _small_gray(self, image: np.ndarray, name: str) -> np.ndarray:
         """Return an image at the common width, (h, w) uint8."""
@@ -120,7 +120,7 @@ class PlaceVerifier:
             cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=interpolation
         )
 
-    def _detected(self, gray: np.ndarray) -> Keypoints:
+    def _detect(self, gray: np.ndarray) -> Keypoints:
         nothing = Keypoints(np.empty((0, 2), np.float32), np.empty((0, 0), np.uint8))
         if len(gray) < LOWEST:
             return nothing
@@ -145,7 +145,7 @@ def mutual_matches(
         return none, none
     limit = ratio**2
     if mine.dtype == np.uint8:  # the square of the distance of bits is Hamming's
-        bits = (np.unpackbits(each, axis=1).astype(np.float32) for each in (mine, theirs))
+        bits = (np.unpackbits(points, axis=1).astype(np.float32) for points in (mine, theirs))
         (mine, theirs), limit = bits, ratio
     # squares of L2 by one product: exact: SIFT's are whole numbers below 2**24
     squares = mine @ theirs.T
@@ -181,7 +181,7 @@ class GeometricEvidence:
         self._certain += 1
         return self._certain % EACH == 1
 
-    def updated(self, probability: float, passed: bool) -> float:
+    def update_probability(self, probability: float, passed: bool) -> float:
         """Return the probability of a match whose pair has passed the check, or not."""
         if probability >= CERTAIN:
             self._passed += passed
@@ -208,7 +208,7 @@ class GeometricCheck:
         """Forget the passes of earlier matches."""
         self._evidence = GeometricEvidence()
 
-    def checked(
+    def check(
         self,
         match: Match,
         places: Map | GrowingMap,
@@ -233,7 +233,7 @@ class GeometricCheck:
             return match
         least = self.settings.min_inliers
         if is_weighed:
-            probability = self._evidence.updated(match.probability, inliers >= least)
+            probability = self._evidence.update_probability(match.probability, inliers >= least)
             return match.with_probability(probability, inliers)
         if inliers >= least:
             return replace(match, inliers=inliers)
@@ -243,7 +243,7 @@ class GeometricCheck:
         return replace(match, inliers=inliers, status=Status.NO_MATCH, reason=reason)
 
 
-def _explained(points: np.ndarray, others: np.ndarray) -> int:
+def _count_explained(points: np.ndarray, others: np.ndarray) -> int:
     """Count matches that the best fundamental matrix explains; also of a flat scene."""
     try:
         _, mask = cv2.findFundamentalMat(

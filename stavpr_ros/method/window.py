@@ -53,12 +53,13 @@ class QueryWindow(ABC):
     :param layout: of the places in columns.
 
     ``images`` are those in the window, oldest first, (m,), ``WINDOW_IMAGE``; ``is_standstill`` is
-    whether the newest one equals the one before, up to noise; False without a filter.
+    whether the newest one equals the one before, up to noise; False without a filter. ``first`` is
+    the number of the first place, ``size`` the number of columns that have distances.
     """
 
     def __init__(self, length: int, layout: ColumnLayout) -> None:
         self.length, self.layout = length, layout
-        self.first = self.known = 0
+        self.first = self.size = 0
         self.is_standstill = False
         # one behind the other; at the end, the window moves to the front
         self._images, self._end = np.empty(2 * length, WINDOW_IMAGE), 0
@@ -127,7 +128,7 @@ class QueryWindow(ABC):
         self.first += count
 
 
-class Shown(NamedTuple):
+class View(NamedTuple):
     """
     What the newest l images that moved show.
 
@@ -186,19 +187,19 @@ class FilterWindow(QueryWindow):
         self.cells: CellAgreement | None = None
         self._means = PlaceMeans()
         self._width, self._newest = width, NOT_COMPARED
-        self._shown: Shown | None = None  # by the latest images that moved
-        self._latest: Shown | None = None  # by half of them
-        self._repeated = slice(0, 0)  # columns that the latest path is in, beyond a lap
+        self._view: View | None = None  # by the latest images that moved
+        self._by_half: View | None = None  # by half of them
+        self._seam = slice(0, 0)  # columns that the latest path is in, beyond a lap
 
     def reset(self) -> None:
         """Drop all images."""
         super().reset()
         self.filter.reset()
         self.change.reset()
-        self._shown = self._latest = None
-        self.recent, self.known = RecentWindows(), 0
+        self._view = self._by_half = None
+        self.recent, self.size = RecentWindows(), 0
         self._newest = NOT_COMPARED
-        self._repeated, self._means = slice(0, 0), PlaceMeans()
+        self._seam, self._means = slice(0, 0), PlaceMeans()
         if self.cells is not None:
             self.cells.reset()
 
@@ -211,7 +212,7 @@ class FilterWindow(QueryWindow):
     def evict(self, count: int) -> None:
         """Drop the oldest places; the others move up."""
         super().evict(count)
-        self.known, self._shown = max(0, self.known - count), None
+        self.size, self._view = max(0, self.size - count), None
         for part in (self.filter, self.change, self._means):
             part.evict(count)
 
@@ -219,7 +220,7 @@ class FilterWindow(QueryWindow):
         """See :meth:`QueryWindow.push`."""
         row, change = self._z(row), self.change.next_query(strips)
         if self._is_route:
-            row = self._means.subtracted(row, self.change.is_standstill(change))
+            row = self._means.correct(row, self.change.is_standstill(change))
         self.add(row, stamp, change, strips)
 
     def _z(self, row: Any) -> Any:
@@ -251,34 +252,34 @@ class FilterWindow(QueryWindow):
         :param z: z-normalized distances to the columns, (m,), float32.
         :param change: from the image before.
         """
-        self._newest, self.known = z, max(self.known, len(z))
-        if self._repeated.stop:
-            self.filter.move_back(self._repeated, self.layout.lap)
-            self._repeated = slice(0, 0)
+        self._newest, self.size = z, max(self.size, len(z))
+        if self._seam.stop:
+            self.filter.move_back(self._seam, self.layout.lap)
+            self._seam = slice(0, 0)
         self.is_standstill = self.change.is_standstill(change)
         moved = not self.filter.count or not self.is_standstill
         if not moved:
-            moved = self.change.is_dark_stretch(self.filter.by_place()[: self.known])
+            moved = self.change.is_dark_stretch(self.filter.by_place()[: self.size])
         if moved:
             self.filter.update(z, self.change.weight(change))
             if self.cells is not None:
                 self.cells.push(strips)
-            self._shown = self._latest = None
+            self._view = self._by_half = None
         self._append(stamp, change, self.filter.count - 1)
 
     def assess(self) -> None:
         """See :meth:`QueryWindow.assess`; a camera at rest shows nothing new."""
-        if not self.known:
+        if not self.size:
             return
-        if self._shown is None:
-            self._shown = self._show(min(self.filter.count, self.length))
-            self.recent.add(self._shown.own)
-        path = self._shown.path
+        if self._view is None:
+            self._view = self._assess(min(self.filter.count, self.length))
+            self.recent.add(self._view.own)
+        path = self._view.path
         # with the images before the window from which the filter follows states
         before = (path[-1] - path[0]) * SPACING // self.length + CLOSE
-        self._repeated = self.layout.repeated(path - before)
-        if self._latest is None and self._middle == self.filter.count - 1:
-            self._latest = self._show((len(path) + 1) // 2)
+        self._seam = self.layout.seam_columns(path - before)
+        if self._by_half is None and self._middle == self.filter.count - 1:
+            self._by_half = self._assess((len(path) + 1) // 2)
 
     @property
     def _middle(self) -> int:
@@ -287,26 +288,26 @@ class FilterWindow(QueryWindow):
 
     def match(self) -> WindowMatch:
         """Return the match of the middle image; of a camera at rest, as before it stopped."""
-        if (shown := self._shown) is None:
+        if (view := self._view) is None:
             return WindowMatch()
-        if self._latest is not None:  # no later image shows its place: nor do early ones
-            least = min(shown.probability, self._latest.probability)
-            shown = shown._replace(probability=least)
-        return self._match(shown, self.images, self._middle)
+        if self._by_half is not None:  # no later image shows its place: nor do early ones
+            least = min(view.probability, self._by_half.probability)
+            view = view._replace(probability=least)
+        return self._match(view, self.images, self._middle)
 
     def match_newest(self) -> WindowMatch:
         """Return the match of the newest images: :meth:`QueryWindow.match_newest`."""
-        if self._is_route or not self.known:
+        if self._is_route or not self.size:
             return WindowMatch()
         count = min(self.filter.count, self.length)
         on_map = self.filter.beliefs(count).probabilities.sum(axis=1) > ON_MAP
         since = count if on_map.all() else int(np.argmin(on_map[::-1]))
         if since < MIN_IMAGES or (since == count == self.length):
             return WindowMatch()
-        shown, numbers = self._show(since), self.images['number']
+        view, numbers = self._assess(since), self.images['number']
         images = self.images[numbers > numbers[-1] - since]
         middle = int(images['number'][(len(images) - 1) // 2])
-        return self._match(shown, images, middle)
+        return self._match(view, images, middle)
 
     def match_oldest(self) -> WindowMatch:
         """See :meth:`QueryWindow.match_oldest`."""
@@ -314,17 +315,17 @@ class FilterWindow(QueryWindow):
             return WindowMatch()
         oldest = int(self.images['number'][0])
         count = self.filter.count - oldest
-        return self._match(self._show(count, 0), self.images, oldest)
+        return self._match(self._assess(count, 0), self.images, oldest)
 
-    def _show(self, l: int, position: int | None = None) -> Shown:
+    def _assess(self, l: int, position: int | None = None) -> View:
         """Return what the newest l images that moved show."""
         position = (l - 1) // 2 if position is None else position
         columns, of_images = self.filter.beliefs(l)
-        columns = columns[: columns.searchsorted(self.known)]
+        columns = columns[: columns.searchsorted(self.size)]
         of_images = of_images[:, : len(columns)]
         if not of_images[position].any():
             return self._nothing(l, position)
-        probabilities, at = self.layout.merged(columns, of_images[position])
+        probabilities, at = self.layout.merge(columns, of_images[position])
         belief = float(probabilities.max())
         place = centered_place(columns, of_images, position, at)
         path = follow(columns, of_images, position, round(place))
@@ -335,13 +336,13 @@ class FilterWindow(QueryWindow):
         if l == self.length:
             excess = self.change.excess(max(float(path[-1] - path[0]) / (l - 1), 0.0))
         quantities = Quantities(belief, unevenness(path, z), excess)
-        quantities = self._compared(quantities, path, position)
+        quantities = self._compare(quantities, path, position)
         own = quantities.own(self._constant)
         # most of a route passes no earlier place: its windows say nothing about the next one
         probability = probability_of(own, 0.5 if self._is_route else self.recent.share)
-        return Shown(path, position, quantities, own, probability, columns, probabilities, shares)
+        return View(path, position, quantities, own, probability, columns, probabilities, shares)
 
-    def _compared(self, quantities: Quantities, path: np.ndarray, position: int) -> Quantities:
+    def _compare(self, quantities: Quantities, path: np.ndarray, position: int) -> Quantities:
         """Return quantities with those that compare the path with straight ones elsewhere."""
         l, at = len(path), int(path[position])
         steps = np.rint(np.outer(STRAIGHT, np.arange(l) - position)).astype(np.int64)
@@ -349,34 +350,34 @@ class FilterWindow(QueryWindow):
         score, _ = self.filter.best_straight(steps, here, near[:0])
         if self._is_route:  # the camera may have passed there several times
             return quantities._replace(lead=max(score, 0.0), images=ROUTE_IMAGES)
-        elsewhere, competitor = self.filter.best_straight(steps, slice(0, self.known), near)
+        elsewhere, competitor = self.filter.best_straight(steps, slice(0, self.size), near)
         lead = max(score - max(elsewhere, 0.0), 0.0)
         cells = 0.0 if self.cells is None else self.cells.lead(path, competitor)
         creep = self.change.creep(int(path[0]), int(path[-1]), l)
         return quantities._replace(lead=lead, images=l, cells=cells, creep=creep)
 
-    def _nothing(self, l: int, position: int) -> Shown:
+    def _nothing(self, l: int, position: int) -> View:
         """Return what images show that are probably off the map: the most probable place now."""
-        path = np.full(l, int(np.argmax(self.filter.by_place()[: self.known])))
+        path = np.full(l, int(np.argmax(self.filter.by_place()[: self.size])))
         nothing = np.empty(0)
         columns, none = nothing.astype(int), Quantities(0.0)
-        return Shown(path, position, none, -math.inf, 0.0, columns, nothing, np.ones(l))
+        return View(path, position, none, -math.inf, 0.0, columns, nothing, np.ones(l))
 
-    def _match(self, shown: Shown, images: np.ndarray, number: int) -> WindowMatch:
+    def _match(self, view: View, images: np.ndarray, number: int) -> WindowMatch:
         """
         Return the match of an image.
 
         :param images: of the window that are matched; number: of the image among these.
         """
-        first, oldest = self.first, self.filter.count - len(shown.path)
+        first, oldest = self.first, self.filter.count - len(view.path)
         numbers, row = images['number'] - oldest, number - oldest
-        columns, shares = shown.path[numbers], shown.shares[numbers]
-        peak = float(shown.probabilities.max(initial=0.0))
-        certain = shown.probability * float(shown.shares[row])
+        columns, shares = view.path[numbers], view.shares[numbers]
+        peak = float(view.probabilities.max(initial=0.0))
+        certain = view.probability * float(view.shares[row])
         shares = shares if certain > 0 else shares[:0]
-        place = int(shown.path[row])
+        place = int(view.path[row])
         share = certain / peak if peak > certain else 1.0  # no place is above the match
-        second, probability = self._second_best(shown, place)
+        second, probability = self._second_best(view, place)
         probability *= share
         pairs = np.empty((len(images), 2), np.int32)
         pairs[:, 0], pairs[:, 1] = np.arange(len(images)), columns + first
@@ -389,29 +390,29 @@ class FilterWindow(QueryWindow):
             second + first if probability > 0 else -1,
             1 - probability if probability > 0 else float('nan'),
         )
-        sequences = partial(self._sequences, shown, share, self.known, first)
+        sequences = partial(self._sequences, view, share, self.size, first)
         return self.layout.in_places(WindowMatch(path, sequences))
 
-    def _second_best(self, shown: Shown, place: int) -> tuple[int, float]:
+    def _second_best(self, view: View, place: int) -> tuple[int, float]:
         """Return the most probable column elsewhere, and its probability, 0 if none."""
-        now, is_near = self.filter.by_place()[: self.known], np.zeros(self.known, bool)
-        now[shown.candidates] = 0
+        now, is_near = self.filter.by_place()[: self.size], np.zeros(self.size, bool)
+        now[view.candidates] = 0
         for low, end in self.layout.around(place, self.layout.nms_radius).tolist():
             near = slice(max(low, 0), max(end, 0))
             now[near], is_near[near] = 0, True
-        elsewhere = ~is_near[shown.candidates]
+        elsewhere = ~is_near[view.candidates]
         second = int(np.argmax(now))
         probability = float(now[second]) * NEGLIGIBLE
         if elsewhere.any():
-            best = int(np.argmax(np.where(elsewhere, shown.probabilities, -1)))
-            if shown.probabilities[best] >= probability:
-                second, probability = int(shown.candidates[best]), float(shown.probabilities[best])
+            best = int(np.argmax(np.where(elsewhere, view.probabilities, -1)))
+            if view.probabilities[best] >= probability:
+                second, probability = int(view.candidates[best]), float(view.probabilities[best])
         return second, probability
 
-    def _sequences(self, shown: Shown, share: float, n: int, first: int) -> WindowSequences:
+    def _sequences(self, view: View, share: float, n: int, first: int) -> WindowSequences:
         """Return all places; improbable ones have a share of their probability now."""
         probabilities = self.filter.by_place()[:n] * np.float64(NEGLIGIBLE)
-        probabilities[shown.candidates] = shown.probabilities
+        probabilities[view.candidates] = view.probabilities
         probabilities *= share
         costs = np.where(probabilities > 0, 1 - probabilities, np.inf)
         return WindowSequences(costs, np.arange(first, first + n), probabilities)

@@ -353,8 +353,8 @@ class Operation(ABC):
         if check is None or places is None:
             return match
         is_weighed = self.reference is not None and not math.isnan(match.probability)
-        late = [check.checked(each, places, self._query(each), False) for each in match.late]
-        match = check.checked(match, places, self._query(match), is_weighed)
+        late = [check.check(each, places, self._query(each), False) for each in match.late]
+        match = check.check(match, places, self._query(match), is_weighed)
         return replace(match, late=tuple(each for each in late if each.accepted))
 
     def _query(self, match: Match) -> np.ndarray | None:

@@ -36,7 +36,7 @@ class Int8Features(LocalFeatures):
     def __post_init__(self) -> None: ...
 
 
-def converted_blocks(
+def convert_blocks(
     features: LocalFeatures, convert: Callable[[LocalFeatures], Block]
 ) -> Iterator[tuple[slice, Block]]:
     """Yield the converted blocks, in their order."""
@@ -58,7 +58,7 @@ def converted_blocks(
             yield first, future.result()
 
 
-def converted(
+def convert_features(
     features: LocalFeatures,
     convert: Callable[[np.ndarray], np.ndarray] = lambda strips: strips,
     visit: Callable[[np.ndarray], None] = lambda strips: None,
@@ -72,7 +72,7 @@ def converted(
     """
     shape = *features.weights.shape, features.dimension
     strips: Any = Int8Strips(*shape) if rounds else aligned_empty(shape)
-    for places, block in converted_blocks(features, lambda block: convert(block.strips)):
+    for places, block in convert_blocks(features, lambda block: convert(block.strips)):
         visit(block)
         strips[:, places] = block
     kind = Int8Features if rounds else LocalFeatures

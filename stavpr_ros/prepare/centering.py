@@ -17,7 +17,12 @@ from stavpr_ros.checks import require_shape
 from stavpr_ros.compilation import reassociating_kernel
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.mapping.stored_features import MapStatistics
-from stavpr_ros.prepare.blocks import change_weights, converted, converted_blocks, PlaceChanges
+from stavpr_ros.prepare.blocks import (
+    change_weights,
+    convert_blocks,
+    convert_features,
+    PlaceChanges,
+)
 
 PRIOR = 20  # images that the map's mean counts for in the query's, and at most a standstill
 RANK = 64  # directions that whitening shrinks, at most
@@ -52,7 +57,7 @@ class Whitening:
         self._inverse = (1 / gains - 1).astype(np.float32)
 
     @staticmethod
-    def learned(strips: np.ndarray) -> 'Whitening':
+    def learn(strips: np.ndarray) -> 'Whitening':
         """Learn from unit-norm features of places, (W, m, d), m > 0."""
         learned = [_principal_directions(strip) for strip in strips]  # one by one: less memory
         directions, gains = zip(*learned, strict=True)
@@ -60,13 +65,13 @@ class Whitening:
 
     def __call__(self, strips: np.ndarray) -> np.ndarray:
         """Return features (W, n, d) with the directions shrunk, of less than unit norm."""
-        return self._scaled(strips, self.change)
+        return self._scale(strips, self.change)
 
     def inverse(self, strips: np.ndarray) -> np.ndarray:
         """Return the features that became these."""
-        return self._scaled(strips, self._inverse)
+        return self._scale(strips, self._inverse)
 
-    def _scaled(self, strips: np.ndarray, change: np.ndarray) -> np.ndarray:
+    def _scale(self, strips: np.ndarray, change: np.ndarray) -> np.ndarray:
         parts = strips @ self.directions.transpose(0, 2, 1)
         parts *= change
         scaled: np.ndarray = parts @ self.directions
@@ -117,18 +122,18 @@ class MeanCentering:
     def _learn(self, features: LocalFeatures, whitening: bool) -> None:
         total = np.zeros((len(features.weights), features.dimension))
         changes = PlaceChanges(len(features), 1)
-        for _, strips in converted_blocks(features, lambda block: block.strips):
+        for _, strips in convert_blocks(features, lambda block: block.strips):
             changes.add(strips)
             total += strips.sum(axis=1, dtype=np.float64)
         weights = change_weights(changes.changes[0])
         if weights.min(initial=1) < 1:
-            for places, strips in converted_blocks(features, lambda block: block.strips):
+            for places, strips in convert_blocks(features, lambda block: block.strips):
                 total -= (strips * (1 - weights[places])[:, None]).sum(axis=1)
         mean = total / max(weights.sum(), 1) * self._centering
         self.mean = mean.astype(np.float32)  # (W, d)
         if whitening and len(features):
             centered = self.places(features[evenly_weighted(weights, SAMPLE)]).strips
-            self.whitening = Whitening.learned(centered)
+            self.whitening = Whitening.learn(centered)
 
     def reset(self) -> None:
         """Drop the images of the query."""
@@ -145,12 +150,12 @@ class MeanCentering:
         """
         Return features of the map, or of single images, less the map's mean, whitened.
 
-        :param visit, rounds: see :func:`stavpr_ros.prepare.blocks.converted`.
+        :param visit, rounds: see :func:`stavpr_ros.prepare.blocks.convert_features`.
         """
-        convert = partial(self._converted, mean=self.mean)
-        return converted(features, convert, visit, rounds)
+        convert = partial(self._convert, mean=self.mean)
+        return convert_features(features, convert, visit, rounds)
 
-    def _converted(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    def _convert(self, strips: np.ndarray, mean: np.ndarray) -> np.ndarray:
         W, m, d = strips.shape
         if m == 1:
             directions, change = np.empty((W, 0, d), np.float32), np.empty((W, 1, 0), np.float32)
@@ -177,7 +182,7 @@ class MeanCentering:
             self._sum = self._sum + strips
             self._count += 1
         mean = (self._sum / self._count).astype(np.float32)
-        return self._converted(strips[:, None], mean)[:, 0]
+        return self._convert(strips[:, None], mean)[:, 0]
 
     def note_standstill(self, is_standing: bool) -> None:
         """

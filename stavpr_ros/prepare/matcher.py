@@ -14,7 +14,7 @@ from stavpr_ros.devices import choose_backend
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import LocalFeatures
 from stavpr_ros.memory import aligned_empty, is_aligned
-from stavpr_ros.prepare.blocks import converted, Int8Features
+from stavpr_ros.prepare.blocks import convert_features, Int8Features
 from stavpr_ros.prepare.centering import normalize
 from stavpr_ros.prepare.route_features import RouteStrips
 
@@ -56,7 +56,7 @@ def make_matcher(
     if precision == 'int8' and spatial.vertical:
         raise SettingsError("precision 'int8' has no vertical alignment: take float32")
     if precision == 'int8' and not isinstance(features, Int8Features):
-        features = converted(features, rounds=True)
+        features = convert_features(features, rounds=True)
     device = choose_backend(backend)
     if isinstance(device, str):
         return CpuMatcher(features, spatial)

@@ -16,8 +16,8 @@ from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.map_container import errors_of
 from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.prepare.blocks import (
-    converted,
-    converted_blocks,
+    convert_blocks,
+    convert_features,
     Int8Features,
     MAX_LAG,
     PlaceChanges,
@@ -74,7 +74,7 @@ def prepare_map(
     elif centering is not None:
         prepared = centering.places(features, changes.add, rounds)
     elif rounds:
-        prepared = converted(features, visit=changes.add, rounds=True)
+        prepared = convert_features(features, visit=changes.add, rounds=True)
     else:  # those of a map in memory are not copied
         prepared = whole = features[:]
         changes.add(whole.strips)
@@ -135,7 +135,7 @@ def statistics_of_map(place_map: Map, storage: str = '') -> MapStatistics | None
             return statistics
     features = _AsStored(features, storage or stored)
     centering, changes = MeanCentering(features), PlaceChanges(len(features), MAX_LAG)
-    for _, strips in converted_blocks(features, lambda block: centering.places(block).strips):
+    for _, strips in convert_blocks(features, lambda block: centering.places(block).strips):
         changes.add(strips)
     assert centering.whitening is not None
     whitening = centering.whitening

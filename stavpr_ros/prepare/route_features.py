@@ -109,7 +109,7 @@ class RouteFeatures:
         """
         n = self.count
         if n and (self._centering or self._whitens):
-            strips = self._centered(slice(n))
+            strips = self._center(slice(n))
             for j in range(len(strips)):
                 strips[j] += self.mean[j] * (self._norms[j, :n, None] > 0)
         else:
@@ -123,10 +123,10 @@ class RouteFeatures:
         if grows:
             self._grow(strips.shape[2])
             self._cells = features.cells
-        newest = self._whitened(strips)
+        newest = self._whiten(strips)
         norms: np.ndarray = np.asarray(strips.any(axis=2), np.float32)
         if self._centering or self._whitens:
-            newest, norms = _moved(newest, norms, -self._whitened(self.mean[:, None]))
+            newest, norms = _shift_means(newest, norms, -self._whiten(self.mean[:, None]))
         here = slice(self.count, self.count + 1)
         self.strips[:, here], self._norms[:, here] = newest, norms
         self.latest = np.concatenate([self.latest[:, 1 - LATEST :], newest], axis=1)
@@ -147,7 +147,7 @@ class RouteFeatures:
             self._learn(0)
             self._next_mean = int(self.count * GROWTH) + 1
         if settles:
-            self.strips = rounded_strips(self.strips, self.count)
+            self.strips = round_strips(self.strips, self.count)
             self._is_settled, self._since_mean = True, 0
         return grows
 
@@ -170,10 +170,10 @@ class RouteFeatures:
         move_up(self._norms, count, self.count)
         self.count = remaining
 
-    def _whitened(self, strips: np.ndarray) -> np.ndarray:
+    def _whiten(self, strips: np.ndarray) -> np.ndarray:
         return self._whitening(strips) if self._whitening else strips
 
-    def _centered(self, places: slice | np.ndarray) -> np.ndarray:
+    def _center(self, places: slice | np.ndarray) -> np.ndarray:
         """Return features less the mean, not whitened, of their own norm, (W, m, d)."""
         strips = self.strips[:, places] * self._norms[:, places, None]
         return self._whitening.inverse(strips) if self._whitening else strips
@@ -187,10 +187,10 @@ class RouteFeatures:
             self._sum, self.mean = np.zeros((W, d)), np.zeros((W, d), np.float32)
             self.strips = self.latest = np.empty((W, 0, d), np.float32)
         if isinstance(self.strips, np.ndarray):
-            self.strips = grown(self.strips, room)
+            self.strips = with_room(self.strips, room)
         else:
             self.strips.grow(room)
-        self._norms, self._weights = grown(self._norms, room), grown(self._weights, room)
+        self._norms, self._weights = with_room(self._norms, room), with_room(self._weights, room)
         self._changes = np.append(self._changes, np.zeros(room - n, np.float32))
 
     def _total(self, weights: np.ndarray) -> np.ndarray:
@@ -215,14 +215,14 @@ class RouteFeatures:
             less = np.append(np.zeros(first), 1 - weights)
             total = self._sum - self._total(less) if less.any() else self._sum
             mean = (total / weights.sum()).astype(np.float32)
-        self._shift(first, self._whitened((self.mean - mean)[:, None]))
+        self._shift(first, self._whiten((self.mean - mean)[:, None]))
         self.mean, self._since_mean = mean, 0
         if self._whitens and self.count <= SETTLED and not self._is_settled:
             sample = evenly_weighted(weights, SAMPLE)
-            whitening = Whitening.learned(unit_norm(self._centered(sample)))
+            whitening = Whitening.learn(unit_norm(self._center(sample)))
             for low in range(0, self.count, AT_ONCE):
                 places = slice(low, min(low + AT_ONCE, self.count))
-                strips, norms = whitening(self._centered(places)), self._norms[:, places]
+                strips, norms = whitening(self._center(places)), self._norms[:, places]
                 norms[:] = norms_of(strips).clip(1e-12) * (norms > 0)
                 self.strips[:, places] = unit_norm(strips)
             self._whitening = whitening
@@ -239,11 +239,11 @@ class RouteFeatures:
         for low in range(0, self.count, AT_ONCE):
             places = slice(low, min(low + AT_ONCE, self.count))
             source = slice(places.start + first, places.stop + first)
-            moved = _moved(self.strips[:, source], self._norms[:, source], change)
+            moved = _shift_means(self.strips[:, source], self._norms[:, source], change)
             self.strips[:, places], self._norms[:, places] = moved
 
 
-def _moved(
+def _shift_means(
     strips: np.ndarray, norms: np.ndarray, change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
@@ -260,7 +260,7 @@ def _moved(
     return moved, (length * alive)[..., 0]
 
 
-def grown(values: np.ndarray, room: int) -> np.ndarray:
+def with_room(values: np.ndarray, room: int) -> np.ndarray:
     """Return (W, n, ...) with room for more places; memory that is not used is not touched."""
     W, n, *rest = values.shape
     out = aligned_empty((W, room, *rest), values.dtype)
@@ -275,7 +275,7 @@ def move_up(values: np.ndarray, count: int, last: int) -> None:
         values[:, first - count : end - count] = values[:, first:end]
 
 
-def rounded_strips(strips: RouteStrips, count: int) -> Int8Route:
+def round_strips(strips: RouteStrips, count: int) -> Int8Route:
     """Return float32 strips (W, room, d), of which ``count`` places are known, in int8."""
     rounded = Int8Route(*strips.shape)
     for low in range(0, count, AT_ONCE):
