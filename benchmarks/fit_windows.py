@@ -42,7 +42,7 @@ REPLAYED = (
 )  # fmt: skip
 RECORDED = (
     'speeds', 'level', 'weight', 'most', 'change', 'spread', 'leave', 'enter', 'start',
-    'STANDSTILL', 'MOST_CHANGE', 'LEAST_CHANGE', 'OFFSET', 'LEAST_LOCAL', 'MOST_CREEP',
+    'STANDSTILL', 'MAX_CHANGE', 'MIN_CHANGE', 'OFFSET', 'MIN_LOCAL', 'MAX_CREEP',
     'LOOK_AHEAD', 'STRETCH', 'DARK_PROBABILITY', 'CLOSE', 'LINE', 'ON_LINE', 'MAX_STEP', 'APART',
     'STRAIGHT', 'EVEN', 'EVEN_SHARE', 'BLOCKS', 'NEGLIGIBLE', 'FAR',
 )  # fmt: skip

@@ -195,9 +195,9 @@ RULES = [
     Rule('level', model(level=-5.0), lambda: matched(STAGE, 8.0), 0.5, 0.3),
     Rule('alpha by change', put(ImageChange, weight=lambda *_: 1.0), lambda: matched(
         crawling(np.where(abs(IMAGES - 105) < 4, alike(0.8), OTHER)[:, 90:120], 5), 0), 0, 0.25),
-    Rule('MOST_CHANGE', put(motion, MOST_CHANGE=1e9), lambda: matched(
+    Rule('MAX_CHANGE', put(motion, MAX_CHANGE=1e9), lambda: matched(
         KNOWN[:, :60], 3.0, known=crawling(KNOWN[:, :60], 4)), 0.7, 0.5),
-    Rule('LEAST_CHANGE', put(motion, LEAST_CHANGE=0.0), lambda: matched(
+    Rule('MIN_CHANGE', put(motion, MIN_CHANGE=0.0), lambda: matched(
         np.hstack([KNOWN[:, 20:80], crawling(KNOWN[:, 120:132], 3)]), 0.0, 60), 0.7, 0.6),
     Rule('STANDSTILL', put(motion, STANDSTILL=0.0), lambda: resting(6.0), 1, 0.8),
     Rule('dark stretch', put(motion, DARK_PROBABILITY=2.0), tunnel, 0.55, 0.45),

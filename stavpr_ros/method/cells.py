@@ -110,7 +110,7 @@ def agreeing(image: np.ndarray, place: np.ndarray) -> int:
         j = nearest[i]
         if back[j] == i and abs(j // SIDE - i // SIDE) <= 1:
             counts[SIDE + j % SIDE - i % SIDE] += 1
-    most = 0
+    best = 0
     for shift in range(SIDE - MAX_SHIFT, SIDE + MAX_SHIFT + 1):
-        most = max(most, counts[shift - 1] + counts[shift] + counts[shift + 1])
-    return most
+        best = max(best, counts[shift - 1] + counts[shift] + counts[shift + 1])
+    return best

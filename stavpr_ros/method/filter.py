@@ -320,10 +320,10 @@ class PlaceFilter(Filter):
         checks.require_shape('steps', steps, 'S images', 'int64')
         self._require_images(steps.shape[1])
         checks.require_shape('excluded', excluded, 'k 2', 'int64')
-        least, most = min(steps[-1, 0], 0), max(steps[-1, -1], 0)
-        if steps.min() < least or steps.max() > most:
+        lowest, highest = min(steps[-1, 0], 0), max(steps[-1, -1], 0)
+        if steps.min() < lowest or steps.max() > highest:
             raise InputError(
-                f'steps {steps.min()} to {steps.max()}: expected {least} to {most}, from the '
+                f'steps {steps.min()} to {steps.max()}: expected {lowest} to {highest}, from the '
                 'first image to the last one of the last row, the largest speed'
             )
         low, end = max(span.start, 0), min(span.stop, self._width)
@@ -498,9 +498,9 @@ def _step(states, steps, first, m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _step_back(messages, steps, least, outside):  # type: ignore[no-untyped-def]
-    """Return the mean of messages (V, m) that states meet, ``outside`` at both ends, + least."""
-    (V, m), out = messages.shape, np.full(messages.shape, least)
+def _step_back(messages, steps, minimum, outside):  # type: ignore[no-untyped-def]
+    """Return the mean of messages (V, m) that states meet, ``outside`` at both ends, + minimum."""
+    (V, m), out = messages.shape, np.full(messages.shape, minimum)
     lowest, highest = outside
     for v in range(V):
         for s in range(steps.shape[1]):

@@ -77,10 +77,10 @@ MODEL = Model()
 # ------------------------------------------------ image change, over that of neighbors
 
 STANDSTILL = 0.1  # below which the camera is at rest
-MOST_CHANGE, LEAST_CHANGE = 2.0, 0.2  # limits of the weight of an image by its change
+MAX_CHANGE, MIN_CHANGE = 2.0, 0.2  # limits of the weight of an image by its change
 OFFSET = 0.02  # added to changes before the logarithm: noise between equal views
-LEAST_LOCAL = -0.5  # logarithm of the change of neighbors around a path over the mean, at least
-MOST_CREEP = 1.0  # logarithm
+MIN_LOCAL = -0.5  # logarithm of the change of neighbors around a path over the mean, at least
+MAX_CREEP = 1.0  # logarithm
 LOOK_AHEAD = 8  # places within which an unlit stretch may begin
 STRETCH = 4  # places in a row, at least, equal each to the one before: an unlit stretch
 DARK_PROBABILITY = 0.3  # of such places, above which equal images are no standstill

@@ -19,11 +19,11 @@ from stavpr_ros.compilation import kernel
 from stavpr_ros.method.model import (
     CLOSE,
     DARK_PROBABILITY,
-    LEAST_CHANGE,
-    LEAST_LOCAL,
     LOOK_AHEAD,
-    MOST_CHANGE,
-    MOST_CREEP,
+    MAX_CHANGE,
+    MAX_CREEP,
+    MIN_CHANGE,
+    MIN_LOCAL,
     OFFSET,
     STANDSTILL,
     STRETCH,
@@ -189,7 +189,7 @@ class ImageChange:
     def weight(self, change: float) -> float:
         """Return the weight of an image by its change: equal images add nothing."""
         relative = change / max(float(self.curve[1]), 1e-6)
-        return min(MOST_CHANGE, max(LEAST_CHANGE, relative))
+        return min(MAX_CHANGE, max(MIN_CHANGE, relative))
 
     def excess(self, speed: float) -> float:
         """
@@ -214,7 +214,7 @@ class ImageChange:
 
         :param first: column at the start of the path; last: at its end.
         :param images: newest ones that are on it.
-        :returns: 0 to ``MOST_CREEP``: noise is no motion; 0 as long as no change is known.
+        :returns: 0 to ``MAX_CREEP``: noise is no motion; 0 as long as no change is known.
         """
         changes = [lags[0] for lags in self._window_changes][-images:]
         around = self._from_before[max(first - CLOSE, 0) : last + CLOSE + 1]
@@ -222,10 +222,10 @@ class ImageChange:
             return 0.0
         expected = expected_change((last - first) / max(images - 1, 1), *self._curve_with_tail)
         local = float(around[around < 1].mean())
-        local = max(math.log((local + OFFSET) / (self.curve[1] + OFFSET)), LEAST_LOCAL)
+        local = max(math.log((local + OFFSET) / (self.curve[1] + OFFSET)), MIN_LOCAL)
         change = sum(changes) / len(changes)
         creep = math.log((change + OFFSET) / (expected + OFFSET)) - local
-        return min(max(creep, 0.0), MOST_CREEP)
+        return min(max(creep, 0.0), MAX_CREEP)
 
 
 # ------------------------------------------------ kernels

@@ -49,7 +49,7 @@ def centered_place(
     low = np.searchsorted(columns, at - LINE * MAX_STEP)
     high = np.searchsorted(columns, at + LINE * MAX_STEP, 'right')
     for i in range(first, end):
-        best, most = at, -1.0
+        best, highest = at, -1.0
         for j in range(low, high):
             if i == position and columns[j] != at:
                 continue
@@ -59,8 +59,8 @@ def centered_place(
             while k < high and columns[k] <= columns[j] + CLOSE:
                 total += probabilities[i, k]
                 k += 1
-            if total > most:
-                best, most = columns[j], total
+            if total > highest:
+                best, highest = columns[j], total
         total, weighed = 0.0, 0.0
         for j in range(low, high):
             if abs(columns[j] - best) <= CLOSE:
@@ -95,12 +95,12 @@ def follow(
     for direction in (1, -1):
         for i in range(position + direction, l if direction > 0 else -1, direction):
             before = path[i - direction]
-            path[i], most = before, 0.0
+            path[i], highest = before, 0.0
             for step in range(MAX_STEP + 1):
                 y = before + direction * step
                 at = np.searchsorted(columns, y)
-                if at < len(columns) and columns[at] == y and probabilities[i, at] > most:
-                    path[i], most = y, probabilities[i, at]
+                if at < len(columns) and columns[at] == y and probabilities[i, at] > highest:
+                    path[i], highest = y, probabilities[i, at]
     return path
 
 
@@ -134,8 +134,8 @@ def best_straight(memory, rows, low, end, steps, excluded):  # type: ignore[no-u
 
 
 @kernel
-def _least_of_three(row, first, out):  # type: ignore[no-untyped-def]
-    """Write the z of columns from ``first`` on, each the least of three, ``FAR`` where none is."""
+def _lowest_of_three(row, first, out):  # type: ignore[no-untyped-def]
+    """Write the lowest z of three columns around each from ``first`` on, ``FAR`` without any."""
     stop = first + len(out)
     out[:] = row[first:stop]
     for side, other in ((out[1:], row[first : stop - 1]), (out[:-1], row[first + 1 : stop])):
@@ -151,7 +151,7 @@ def _least_of_three(row, first, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def _best_of_part(memory, rows, low, end, is_first, steps, excluded):  # type: ignore[no-untyped-def]
-    """Return the least sum of z of the paths of columns, its column and its speed."""
+    """Return the lowest sum of z of the paths of columns, its column and its speed."""
     images, n, far = len(rows), memory.shape[1], F(FAR)
     before, behind = max(-steps[-1, 0], 0), max(steps[-1, -1], 0)  # of the largest speed
     width = before + (end - low + CHUNK - 1) // CHUNK * CHUNK + behind
@@ -161,7 +161,7 @@ def _best_of_part(memory, rows, low, end, is_first, steps, excluded):  # type: i
     for i in range(images):
         row, own = memory[rows[i]], near[i]
         own[: first - low + before] = own[stop - low + before :] = far
-        _least_of_three(row, first, own[first - low + before : stop - low + before])
+        _lowest_of_three(row, first, own[first - low + before : stop - low + before])
     best, place, speed = INF, -1, 0
     for start in range(low, end, CHUNK):
         first, stop = max(start - before, 0), min(start + CHUNK + behind, n)
@@ -182,10 +182,10 @@ def _best_of_part(memory, rows, low, end, is_first, steps, excluded):  # type: i
             sums[end - start :] = INF
             for i in range(len(excluded)):
                 sums[max(excluded[i, 0] - start, 0) : max(excluded[i, 1] - start, 0)] = INF
-            least = splat(INF)
+            lowest = splat(INF)
             for x in range(0, CHUNK, LANES):
-                least = select(load(sums, x) < least, load(sums, x), least)
-            store(lanes, 0, least)
+                lowest = select(load(sums, x) < lowest, load(sums, x), lowest)
+            store(lanes, 0, lowest)
             if lanes.min() < best:
                 place, speed = start + int(sums.argmin()), v
                 best = sums[place - start]

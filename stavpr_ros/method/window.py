@@ -291,8 +291,8 @@ class FilterWindow(QueryWindow):
         if (view := self._view) is None:
             return WindowMatch()
         if self._by_half is not None:  # no later image shows its place: nor do early ones
-            least = min(view.probability, self._by_half.probability)
-            view = view._replace(probability=least)
+            probability = min(view.probability, self._by_half.probability)
+            view = view._replace(probability=probability)
         return self._match(view, self.images, self._middle)
 
     def match_newest(self) -> WindowMatch:
