@@ -1,10 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Accuracy table: precision, recall and F1 of both modes on the data sets, and its comparison.
+Accuracy table: precision, recall and F1 of both modes on the data sets.
 
-``make accuracy``, ``make accuracy ARGS=--quick``; ``--compare OLD.json`` exits with 1 if a value
-is worse. Data sets and columns: benchmarks/README.md.
+``make accuracy``, ``make accuracy ARGS=--quick``. Data sets and columns: benchmarks/README.md.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,10 +37,6 @@ MODES = ('paper', 'robust')
 FEATURES = {'g': 'gradient', 'o': 'SqueezeNet 1.1, fire6/concat_1'}
 NETWORK = 'squeezenet1_1_imagenet/squeezenet_fp16.onnx'
 EXCLUDED = 20  # latest images in the hallway loop, as its ground truth has them
-# of --compare; the other numbers (thresholds, counts) have no better and worse
-HIGHER_IS_BETTER = ('f1', 'precision', 'recall', 'average_precision')
-AT_BEST = ('precision', 'recall')  # at the best F1 threshold, either may fall while F1 rises
-LOWER_IS_BETTER = ('matched',)
 Results = dict[str, dict[str, Any]]
 
 
@@ -212,46 +207,6 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, dict[str, Any]]]:
             yield from evaluate_case(case, feature, making)
 
 
-def changes(old: Results, new: Results) -> tuple[list[str], bool]:
-    """
-    Compare the rows that both tables have, to the last digit.
-
-    :returns: a line for each value that changed, and whether any of them is worse.
-    """
-    lines, worse = [], False
-    for key in old.keys() & new.keys():
-        before, after = _flat(old[key]), _flat(new[key])
-        for name in before.keys() | after.keys():
-            a, b = before.get(name), after.get(name)
-            if a == b:
-                continue
-            verdict = 'changed'
-            if a is not None and (b is None or _is_worse(name, a, b)):
-                verdict, worse = 'WORSE', True
-            lines.append(f'{verdict}: {key} {name}: {a} -> {b}')
-    return sorted(lines), worse
-
-
-def _flat(values: dict[str, Any]) -> dict[str, float]:
-    """Return nested numbers by dotted names."""
-    flat = {}
-    for name, value in values.items():
-        if isinstance(value, dict):
-            flat |= {f'{name}.{inner}': number for inner, number in _flat(value).items()}
-        else:
-            flat[name] = value
-    return flat
-
-
-def _is_worse(name: str, before: float, after: float) -> bool:
-    group, _, value = name.rpartition('.')
-    if value in LOWER_IS_BETTER:
-        return after > before
-    if group != 'at_default' and value in AT_BEST:
-        return False
-    return (value in HIGHER_IS_BETTER or value.startswith('recall_at_')) and after < before
-
-
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the table."""
     lines = []
@@ -274,10 +229,7 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = options_parser(__doc__, 'gradient features, without Nordland and tower')
-    compared = 'table to compare with; 1 if worse'
-    parser.add_argument('--compare', type=Path, metavar='OLD', help=compared)
     options = parser.parse_args(arguments)
-    old = json.loads(options.compare.read_text())['results'] if options.compare else None
     about, began, results = environment(named_commit=options.commit), time.perf_counter(), {}
     for key, values in measure(data_folder(), options.quick):
         results[key] = values
@@ -286,13 +238,7 @@ def main(arguments: list[str] | None = None) -> int:
     write_json(path, about | {'results': results})
     write_lines(path.with_suffix('.md'), markdown(about, results))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its .md')
-    if old is None:
-        return 0
-    lines, worse = changes(old, results)
-    print(*(lines or ['no value changed']), sep='\n')
-    missing = len(old.keys() - results.keys())
-    print(f'compared {len(old) - missing} rows; {missing} were not measured here')
-    return 1 if worse else 0
+    return 0
 
 
 if __name__ == '__main__':

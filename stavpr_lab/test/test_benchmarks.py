@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks, end to end on tiny sizes: matching, comparison, outcomes."""
+"""The benchmarks, end to end on tiny sizes: matching, outcomes."""
 # ruff: noqa: E402  (the modules of the benchmarks lie beside their commands, not in a package)
 
 import ast
@@ -17,7 +17,6 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
-import accuracy
 from lower_bounds import Peaks
 import matching
 import off_map
@@ -49,25 +48,6 @@ def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
     text = path.with_suffix('.md').read_text()
     assert text.index('A frame in mode robust') < text.index('## All stages')
     assert cv2.imread(str(path.with_suffix('.png'))).shape[1] > 1000
-
-
-@pytest.mark.parametrize(
-    ('group', 'name', 'before', 'after', 'worse'),
-    [
-        ('sequence', 'f1', 0.9, 0.8, True),
-        ('sequence', 'f1', 0.8, 0.9, False),
-        ('sequence', 'precision', 0.9, 0.8, False),  # at the best F1
-        ('at_default', 'precision', 0.9, 0.8, True),
-        ('unknown', 'matched', 3, 4, True),
-    ],
-)
-def test_changes_of_value_are_listed_and_classified(group, name, before, after, worse):
-    old, new = ({'a': {group: {name: value, 'queries': 5}}} for value in (before, after))
-    lines, found = accuracy.changes(old | {'b': {}}, new)
-    assert lines == [f'{"WORSE" if worse else "changed"}: a {group}.{name}: {before} -> {after}']
-    assert found is worse
-    assert accuracy.changes(old, old) == ([], False)
-    assert accuracy.changes(old, {'a': {}})[1]  # a value is gone
 
 
 def test_outcome_counts_right_wrong_and_unseen_matches():
