@@ -6,15 +6,9 @@ Speed of two checkouts, the same frames in turn, A B A B, and the ratio pair by 
 ``python benchmarks/compare.py CHECKOUT --answers`` compares every bit of the golden streams that
 each checkout has, test/shared/golden.py.
 
-``python benchmarks/compare.py CHECKOUT [--driver FILE]`` times this checkout (A) and another
-one (B). Each runs in a process of its own that imports the package from its checkout and sleeps
-while the other is timed. A driver adapts a checkout with other names: a Python file with a
-function
-
-    make_frame(strips, weights, mode, precision) -> call
-
-of a map's strips (W, n, d) and weights (W, n), numpy arrays; ``call(strips, weights)`` updates the
-recognizer with one image, strips (W, 1, d).
+``python benchmarks/compare.py CHECKOUT`` times this checkout (A) and another one (B). Each runs
+in a process of its own that imports the package from its checkout and sleeps while the other is
+timed.
 """
 
 import argparse
@@ -23,7 +17,6 @@ from itertools import cycle, product
 import json
 import os
 from pathlib import Path
-import runpy
 import statistics
 import subprocess
 import sys
@@ -35,12 +28,16 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS, LENGTH, QUERIES = 7, 20, 1000
-GRADIENT = 224  # dimensions of features whose cells are compared
+DIMENSIONS = 224  # of features whose cells are compared
 SHOWN = 5  # differences of a stream
 
 
 def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: str) -> Any:
-    """Driver of this checkout, see the module's docstring."""
+    """
+    Return a call that updates a recognizer with one image, strips (W, 1, d) and weights (W, 1).
+
+    :param strips, weights: of the map, shapes (W, n, d) and (W, n), float32.
+    """
     from stavpr_ros.features import FeatureSettings, LocalFeatures
     from stavpr_ros.mapping import descriptor_map
     from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
@@ -48,8 +45,7 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
     def features(strips: np.ndarray, weights: np.ndarray) -> LocalFeatures:
         return LocalFeatures(strips, weights, settings)
 
-    kind = 'gradient' if strips.shape[2] == GRADIENT else 'synthetic'
-    settings = FeatureSettings(kind, None)
+    settings = FeatureSettings('gradient', None)
     place_map = descriptor_map(features(strips, weights))
     limit = {'threshold': 1.0} if mode == 'paper' else {'min_probability': 1e-9}
     recognizer = PlaceRecognizer(
@@ -59,28 +55,27 @@ def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: st
     return lambda strips, weights: recognizer.update(features(strips, weights))
 
 
-def random_strips(n: int, d: int, seed: int, mean: float | np.ndarray = 0.0) -> np.ndarray:
+def random_strips(n: int, seed: int, mean: float | np.ndarray = 0.0) -> np.ndarray:
     """Draw unit-norm features, shape (W, n, d), float32, half of them ``mean``."""
-    strips = np.random.default_rng(seed).standard_normal((STRIPS, n, d), np.float32)
-    strips = strips * np.float32(d**-0.5) + mean
+    strips = np.random.default_rng(seed).standard_normal((STRIPS, n, DIMENSIONS), np.float32)
+    strips = strips * np.float32(DIMENSIONS**-0.5) + mean
     strips /= np.linalg.norm(strips, axis=2, keepdims=True)
     return strips
 
 
-def serve(driver: str) -> None:
+def serve() -> None:
     """Serve one checkout: read requests, one JSON line each; write the seconds of the frames."""
     from stavpr_ros.threads import wait_passively
 
     wait_passively()
-    make = runpy.run_path(driver)['make_frame'] if driver else make_frame
     for line in sys.stdin:
         request = json.loads(line)
         if 'frames' not in request:
-            n, d, seed = request['n'], request['d'], request['seed']
+            n = request['n']
             weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
-            strips, count = random_strips(n, d, seed), min(n, QUERIES)
-            drive = random_strips(count, d, seed + 1, strips[:, :count])  # along the map
-            call = make(strips, weights, request['mode'], request['precision'])
+            strips, count = random_strips(n, 0), min(n, QUERIES)
+            drive = random_strips(count, 1, strips[:, :count])  # along the map
+            call = make_frame(strips, weights, request['mode'], request['precision'])
             following = cycle(np.split(drive, count, axis=1))
             request['frames'] = LENGTH
         seconds = []
@@ -95,8 +90,8 @@ def serve(driver: str) -> None:
 class Checkout:
     """The process of one checkout."""
 
-    def __init__(self, folder: Path, driver: str = '') -> None:
-        command = [sys.executable, __file__, str(folder), '--serve', '--driver', driver]
+    def __init__(self, folder: Path) -> None:
+        command = [sys.executable, __file__, str(folder), '--serve']
         environment = os.environ | {'PYTHONPATH': str(folder)}
         self._process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -189,31 +184,26 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('checkout', type=Path, help='folder of the other checkout')
     parser.add_argument('--answers', action='store_true', help='compare these, and no times')
-    parser.add_argument('--driver', default='', help='Python file that adapts the other checkout')
     parser.add_argument(
         '--sizes', type=int, nargs='+', default=[2_000, 20_000], metavar='N', help='places'
     )
-    parser.add_argument('--dimensions', type=int, default=GRADIENT, metavar='D')
     parser.add_argument('--precisions', nargs='+', default=['float32', 'int8'], metavar='DTYPE')
     parser.add_argument('--rounds', type=int, default=15, help='pairs of runs (%(default)s)')
     parser.add_argument('--frames', type=int, default=20, help='frames of each run (%(default)s)')
     parser.add_argument('--allowed', type=float, default=1.05, help='largest ratio (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--output', type=Path, help='write the results to this JSON file as well')
     parser.add_argument('--serve', action='store_true', help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.serve:
-        serve(options.driver)
+        serve()
         return 0
     if options.answers:
         return compare_answers(options.checkout.resolve())
-    this, other = Checkout(ROOT), Checkout(options.checkout.resolve(), options.driver)
+    this, other = Checkout(ROOT), Checkout(options.checkout.resolve())
     results = []
     head = ('mode', 'n', 'precision', 'this ms', 'other ms', 'ratio')
     print('{:8}{:>9} {:10}{:>9}{:>10}{:>7}  quartiles'.format(*head))
     for mode, n, precision in product(('robust', 'paper'), options.sizes, options.precisions):
         case = {'mode': mode, 'n': n, 'precision': precision}
-        case |= {'d': options.dimensions, 'seed': options.seed}
         result = compare(this, other, case, options.rounds, options.frames)
         low, high = result['ratio_quartiles']
         print(
@@ -224,11 +214,6 @@ def main(arguments: list[str] | None = None) -> int:
         results.append(result)
     this.close()
     other.close()
-    if options.output:
-        from results import environment, write_json
-
-        document = environment() | {'other': str(options.checkout.name), 'results': results}
-        write_json(options.output, document)
     return 1 if any(result['ratio'] > options.allowed for result in results) else 0
 
 

@@ -8,7 +8,7 @@ benchmarks/results/. Rows: benchmarks/README.md.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 import sys
 import time
@@ -46,7 +46,6 @@ from stavpr_lab.evaluation.metrics import (
     published_matches,
     sweep,
 )
-from stavpr_ros.alignment.settings import SpatialSettings, STRATEGIES
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import build_map, Map, select_places
@@ -451,10 +450,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command."""
     parser = options_parser(__doc__, 'gradient features, coarser steps; to off_map-quick')
     parser.add_argument('--features', nargs='+', choices=tuple(KINDS), help='default: all')
-    parser.add_argument('--strategy', choices=STRATEGIES, default='rigid', help='%(default)s')
     options = parser.parse_args(arguments)
-    global SETTINGS  # noqa: PLW0603  (one for all functions of this command)
-    SETTINGS = replace(SETTINGS, spatial=SpatialSettings(options.strategy))
     about, began = environment(named_commit=options.commit), time.perf_counter()
     steps = COARSER if options.quick else 1
     features = options.features or (['g'] if options.quick else list(KINDS))

@@ -11,7 +11,7 @@ from timing import best_seconds
 
 SIDE = 4096  # of the large matrix product
 PIECES = 256  # of an array that threads read
-READ_MB = {'cpu': 1024, 'cuda': 8192}
+READ_MB = 1024
 
 
 def reader(threads: int) -> Callable[[np.ndarray], float]:
@@ -38,39 +38,27 @@ def read_bandwidth(megabytes: int, threads: int, seconds: float) -> float:
     """Return the bytes per second that this number of cores reads from memory."""
     x = np.ones(megabytes * 2**20 // 4, np.float32)
     read = reader(threads)
-    return x.nbytes / best_seconds(lambda: read(x), 'cpu', seconds)
+    return x.nbytes / best_seconds(lambda: read(x), seconds)
 
 
-def device_read_bandwidth(megabytes: int, seconds: float) -> float:
-    """Return the bytes per second that a GPU reads: the faster of torch's sum and maximum."""
-    import torch
-
-    free = torch.cuda.mem_get_info()[0]
-    x = torch.ones(min(megabytes * 2**20, free // 4) // 4, device='cuda')
-    best = min(best_seconds(call, 'cuda', seconds / 2) for call in (x.sum, x.amax))
-    return x.numel() * 4 / best
-
-
-def matrix_rate(device: str, side: int, seconds: float) -> float:
+def matrix_rate(side: int, seconds: float) -> float:
     """Return the operations per second of torch's product of two random square matrices."""
     import torch
 
-    left, right = torch.randn(2, side, side, device=device)
+    left, right = torch.randn(2, side, side)
     call = partial(torch.mm, left, right, out=torch.empty_like(left))
-    return 2 * side**3 / best_seconds(call, device, seconds)
+    return 2 * side**3 / best_seconds(call, seconds)
 
 
-def measure_peaks(device: str, seconds: float) -> Peaks:
+def measure_peaks(seconds: float) -> Peaks:
     """
-    Measure all peaks of a device; the best run counts: a bound must lie below every measurement.
+    Measure all peaks; the best run counts: a bound must lie below every measurement.
 
     :param seconds: duration of each measurement.
     """
     # not every library is at its best with the larger matrix
-    rate = max(matrix_rate(device, side, seconds) for side in (SIDE, SIDE // 2))
-    if device == 'cuda':
-        return Peaks(device_read_bandwidth(READ_MB[device], seconds), rate)
+    rate = max(matrix_rate(side, seconds) for side in (SIDE, SIDE // 2))
     import numba as nb
 
     threads = {1, nb.get_num_threads()}
-    return Peaks(max(read_bandwidth(READ_MB[device], n, seconds) for n in threads), rate)
+    return Peaks(max(read_bandwidth(READ_MB, n, seconds) for n in threads), rate)

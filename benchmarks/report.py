@@ -25,14 +25,14 @@ OUTCOME = {True: 'reached', False: '**not reached**', None: 'not measured'}
 CELLS, BOUND = 'cells per second', 'over the lower bound'
 PRODUCT, READ = 'torch float32', READING  # peers: the time over theirs is wanted
 TARGETS = {  # stage, mode, n, d in float32: value or peer, least or most
-    ('cpu', 'lm_dtw', 'paper', 20_000, 0): ((CELLS, 2.5e9), ('prange', 8), ('librosa', 100)),
-    ('cpu', 'lm_dtw', 'paper', 100_000, 0): ((CELLS, 2.5e9), ('prange', 8), ('librosa', 100)),
-    ('cpu', 'distance_matrix', '', 2_000, 512): ((PRODUCT, 1.25),),
-    ('cpu', 'distance_matrix', '', 20_000, 512): ((PRODUCT, 1.25),),
-    ('cpu', 'frame', 'robust', 20_000, 224): ((READ, 1.5),),
-    ('cpu', 'frame', 'robust', 20_000, 512): ((READ, 1.5),),
-    ('cpu', 'frame', 'robust', 100_000, 224): ((READ, 1.5),),
-    ('cpu', 'frame', 'paper', 20_000, 512): ((BOUND, 1.5),),
+    ('lm_dtw', 'paper', 20_000, 0): ((CELLS, 2.5e9), ('prange', 8), ('librosa', 100)),
+    ('lm_dtw', 'paper', 100_000, 0): ((CELLS, 2.5e9), ('prange', 8), ('librosa', 100)),
+    ('distance_matrix', '', 2_000, 512): ((PRODUCT, 1.25),),
+    ('distance_matrix', '', 20_000, 512): ((PRODUCT, 1.25),),
+    ('frame', 'robust', 20_000, 224): ((READ, 1.5),),
+    ('frame', 'robust', 20_000, 512): ((READ, 1.5),),
+    ('frame', 'robust', 100_000, 224): ((READ, 1.5),),
+    ('frame', 'paper', 20_000, 512): ((BOUND, 1.5),),
 }
 AT_LEAST = (CELLS, 'prange', 'librosa')
 
@@ -59,13 +59,13 @@ def stage_times(rows: Sequence[Row], frame: Row) -> list[float]:
     return [parts.get(stage, 0.0) for stage in ROBUST_STAGES]
 
 
-def targets(rows: Sequence[Row], device: str) -> list[dict[str, Any]]:
-    """Return the targets of a device: sizes, name, value, limit, and whether it is reached."""
+def targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return the targets: sizes, name, value, limit, and whether it is reached."""
     results = []
-    for (of_device, stage, mode, n, d), limits in TARGETS.items():
+    for (stage, mode, n, d), limits in TARGETS.items():
         own = [r for r in rows if (r.stage, r.mode, r.n, r.d) == (stage, mode, n, d)]
         row = next((r for r in own if r.precision == 'float32'), None)
-        for name, limit in limits if of_device == device else ():
+        for name, limit in limits:
             value, least = value_of(row, name) if row else None, name in AT_LEAST
             reached = None if value is None else value >= limit if least else value <= limit
             sizes = {'stage': stage, 'mode': mode, 'n': n, 'd': d, 'name': name, 'value': value}
@@ -75,13 +75,13 @@ def targets(rows: Sequence[Row], device: str) -> list[dict[str, Any]]:
 
 def report(about: dict[str, Any], run: Run, memory: Sequence[Memory]) -> list[str]:
     """Return the lines of the report."""
-    machine, rows = about['machine'], run.rows
+    rows = run.rows
     pairs = [(row, peer) for row in rows for peer in row.peers]
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, trim_blocks=True)
     environment.filters |= {'seconds': seconds_text, 'number': number_text}
     template = environment.from_string(TEMPLATE.read_text(encoding='utf-8'))
     page = template.render(
-        heading=heading(f'Matching on {machine.get("gpu") or machine["cpu"]}', about),
+        heading=heading(f'Matching on {about["machine"]["cpu"]}', about),
         run=run,
         stages=ROBUST_STAGES,
         frames=[row for row in rows if (row.stage, row.mode) == ('frame', 'robust')],
@@ -89,7 +89,7 @@ def report(about: dict[str, Any], run: Run, memory: Sequence[Memory]) -> list[st
         value_of=value_of,
         memory=memory,
         memory_limit=TARGET,
-        targets=targets(rows, run.device),
+        targets=targets(rows),
         pairs=pairs,
         whole=[peer['ratio'] for _, peer in pairs if not peer['partial']],
     )

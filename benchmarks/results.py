@@ -97,7 +97,7 @@ def versions() -> dict[str, str]:
     return packages
 
 
-def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
+def environment(named_commit: str = '') -> dict[str, Any]:
     """Return machine, versions, commit and date of a run, for a call before it begins."""
     import numba
     from stavpr_ros.simd import LANES
@@ -115,8 +115,6 @@ def environment(device: str = 'cpu', named_commit: str = '') -> dict[str, Any]:
         'omp_wait_policy': os.environ.get('OMP_WAIT_POLICY', ''),
         'load_before': round(os.getloadavg()[0], 2),
     }
-    if device == 'cuda':
-        machine |= {'gpu': torch.cuda.get_device_name(), 'cuda': torch.version.cuda}
     return {
         'commit': named_commit or commit(),
         'date': datetime.datetime.now(datetime.UTC).isoformat(timespec='seconds'),
@@ -149,8 +147,8 @@ def heading(title: str, about: dict[str, Any]) -> list[str]:
 
 
 def file_name(machine: dict[str, Any]) -> str:
-    """Return the name of a machine for file names, on a CPU with the vectors of the kernels."""
-    name = machine.get('gpu') or '{cpu} {cores} cores {vector_bits} bit'.format(**machine)
+    """Return the name of a machine for file names, with the vectors of the kernels."""
+    name = '{cpu} {cores} cores {vector_bits} bit'.format(**machine)
     return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
 
 

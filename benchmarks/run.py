@@ -34,12 +34,10 @@ class Run:
     """
     Measures and collects.
 
-    :param device: ``cpu`` or ``cuda``.
     :param seconds: duration of the measurement of one stage and its peers.
     :param skipped: stages and peers that are left out: name, n, d, reason.
     """
 
-    device: str
     peaks: Peaks
     seconds: float = 0.5
     rows: list[Row] = field(default_factory=list)
@@ -67,7 +65,7 @@ class Run:
         :param cells: of a recursion, which it updates.
         """
         self._bar.set_description(f'{stage} {mode} n={size[0]:,} d={size[1]} {precision}')
-        jobs = {'': timed(call, self.device)} | {peer.name: peer.job for peer in peers}
+        jobs = {'': timed(call)} | {peer.name: peer.job for peer in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
         times = tuple(

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The stages of matching, measured on windows of distances and on maps of features."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 import gc
@@ -39,7 +39,7 @@ from stavpr_ros.method.model import APART, MODEL, STRAIGHT
 from stavpr_ros.pipeline import LoadedMap, Pipeline, PipelineSettings
 from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import MeanCentering, normalize, z_normalized
-from stavpr_ros.prepare.matcher import make_matcher
+from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
 from stavpr_ros.sources.frame import ImageRecord
 from timing import best_seconds, timed
 import torch
@@ -50,27 +50,28 @@ NMS_RADIUS = RecognizerSettings.nms_radius
 STRIPS = 7
 FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
+MAX_MEMORY = 12e9  # bytes that a map and its peers may take
 LIBROSA_STARTS, ENDS_CHECKED = 500, 3
 PROJECTED, DRIVEN = 64, 1000  # dimensions of `process`, images of the drives
 SEARCHES = {'faiss': 'faiss', 'usearch': 'bench'}  # package: its requirements
 Call = Callable[[], Any]
 
 
-def memory_problem(n: int, d: int, device: str, limit: float) -> str:
+def memory_problem(n: int, d: int) -> str:
     """Return why a map does not fit into memory; empty if it fits."""
     # features, the recognizer's copy, a peer's copy, blocks of strip distances
     size = 4 * n * d * STRIPS * 3.5 + 2 * 4 * FRAMES * STRIPS**2 * min(n, MATRIX_PLACES)
-    limit = min(limit, 0.9 * free_bytes(device))
+    limit = min(MAX_MEMORY, 0.9 * free_bytes())
     return '' if size <= limit else f'needs {size / 1e9:.1f} GB, {limit / 1e9:.1f} GB may be used'
 
 
 # ------------------------------------------------ on windows of distances, mode robust
 
 
-def robust_stages(run: Run, n: int, seed: int) -> None:
+def robust_stages(run: Run, n: int) -> None:
     """Measure the stages of mode robust that follow the image distances."""
     add = partial(run.measure, size=(n, 0), mode='robust')
-    rows, images = make_window(SEQUENCE.length, n, seed), np.arange(SEQUENCE.length)
+    rows, images = make_window(SEQUENCE.length, n), np.arange(SEQUENCE.length)
     path = np.minimum(n // 2 + images, n - 1)
     rows[images, path] = 0.1  # of right places
     sizes, z = Sizes(n, l=SEQUENCE.length), [z_normalized(row) for row in rows]
@@ -89,14 +90,14 @@ def robust_stages(run: Run, n: int, seed: int) -> None:
     add('filter_update', call=update, works=[bounds.filter_update(sizes)], cells=states)
 
 
-def cell_stage(run: Run, places: LocalFeatures, seed: int) -> None:
+def cell_stage(run: Run, places: LocalFeatures) -> None:
     """Measure cells of an image that moves along the map, and whose competitor is another one."""
     _, cells = evidence_of(places.settings.kind, STRIPS, places.dimension)
     if cells is None:
         return
     n, length = len(places), SEQUENCE.length
     agreement = CellAgreement(cells, lambda columns: places.strips[:, columns], length)
-    numbers, rng = count(), np.random.default_rng(seed)
+    numbers, rng = count(), np.random.default_rng(0)
 
     def compare() -> None:
         path = (next(numbers) + np.arange(length)) % n
@@ -112,10 +113,10 @@ def cell_stage(run: Run, places: LocalFeatures, seed: int) -> None:
 # ------------------------------------------------ on windows of distances, mode paper
 
 
-def paper_stages(run: Run, n: int, seed: int) -> None:
+def paper_stages(run: Run, n: int) -> None:
     """Measure the stages of mode paper that follow the image distances."""
     add = partial(run.measure, size=(n, 0), mode='paper')
-    window = make_window(SEQUENCE.length, n, seed)
+    window = make_window(SEQUENCE.length, n)
     padded = np.full((SEQUENCE.length, padded_width(n, SEQUENCE.k)), np.inf, np.float32)
     padded[:, :n] = window
     sizes = Sizes(n, 0, l=SEQUENCE.length, k=SEQUENCE.k)
@@ -179,17 +180,17 @@ def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
 # ------------------------------------------------ on maps of features
 
 
-def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: int) -> None:
+def feature_stages(run: Run, n: int, d: int) -> None:
     """Measure the stages that read features, and whole frames in both modes."""
-    places = make_features(n, d, STRIPS, seed)
-    queries = make_features(FRAMES, d, STRIPS, seed + 1)
+    places = make_features(n, d, STRIPS, 0)
+    queries = make_features(FRAMES, d, STRIPS, 1)
     sizes, size = Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), (n, d)
     centered = partial(MeanCentering(places).next_query, queries.strips[:, 0])
     run.measure('mean_centering', size, centered, [bounds.mean_centering(sizes)], mode='robust')
-    cell_stage(run, places, seed)
-    for precision in precisions:
+    cell_stage(run, places)
+    for precision in PRECISIONS:
         peers = references(run, places, queries[:1], precision)
-        matcher = make_matcher(places, SPATIAL, run.device, precision)
+        matcher = make_matcher(places, SPATIAL, 'cpu', precision)
         first = np.ascontiguousarray(queries.strips[:, 0])
         call = partial(matcher.distances, first, queries.weights[:, 0])
         works = [bounds.product(sizes, precision), bounds.spatial_alignment(sizes)]
@@ -198,23 +199,21 @@ def feature_stages(run: Run, n: int, d: int, precisions: Sequence[str], seed: in
             call = partial(matcher.distance_matrix, queries.strips, queries.weights)
             works = [bounds.product(sizes, precision, FRAMES)]
             works += [bounds.spatial_alignment(sizes, FRAMES)]
-            many = [product(run, places, queries)]
+            many = [product(places, queries)]
             run.measure('distance_matrix', size, call, works, many, precision)
         del matcher, call
         for mode in MODES:
-            call = frame(places, mode, precision, run.device, seed)
+            call = frame(places, mode, precision)
             works = frame_works(sizes, mode, precision)
             # of mode paper, the product is the larger part of the work
-            beside = peers if mode == 'paper' else map_reading(sizes, precision, run.device)
+            beside = peers if mode == 'paper' else map_reading(sizes, precision)
             run.measure('frame', size, call, works, beside, precision, mode)
             del call
             gc.collect()
 
 
-def map_reading(sizes: Sizes, precision: str, device: str) -> list[Peer]:
-    """Return the reading of as many bytes as the map has, as a peer; none on a GPU."""
-    if device != 'cpu':
-        return []
+def map_reading(sizes: Sizes, precision: str) -> list[Peer]:
+    """Return the reading of as many bytes as the map has, as a peer."""
     content = np.ones(sizes.W * sizes.n * sizes.d * ITEM_BYTES[precision] // 4, np.float32)
     call = partial(reader(nb.get_num_threads()), content)
     return [Peer(READING, timed(call), 'as many bytes read once, on all cores', partial=True)]
@@ -229,15 +228,15 @@ def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
     return [*works, bounds.straight_paths(sizes, len(STRAIGHT))]
 
 
-def city_stages(run: Run, n: int, d: int, seed: int) -> None:
-    """Measure the image distances of a map in int8, on a CPU."""
+def city_stages(run: Run, n: int, d: int) -> None:
+    """Measure the image distances of a map in int8."""
     from stavpr_ros.prepare.matcher import CpuMatcher
 
     rounded = Int8Strips(STRIPS, n, d)
     for low in range(0, n, MATRIX_PLACES):
-        block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, seed + low)
+        block = make_features(min(MATRIX_PLACES, n - low), d, STRIPS, low)
         rounded[:, low:] = block.strips
-    query = make_features(1, d, STRIPS, seed)
+    query = make_features(1, d, STRIPS, 0)
     weights = np.full((STRIPS, n), STRIPS**-0.5, np.float32)
     places = Int8Features(rounded, weights, query.settings)
     matcher = CpuMatcher(places, SPATIAL)
@@ -248,7 +247,7 @@ def city_stages(run: Run, n: int, d: int, seed: int) -> None:
     run.measure('image_distances', (n, d), call, works, precision='int8')
 
 
-def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
+def process_stages(run: Run, n: int, precision: str) -> None:
     """
     Measure ``Operation.process`` of images that match, with the inputs of their edges.
 
@@ -257,8 +256,8 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
     if n < 2 * DRIVEN:
         return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVEN:,} places')
     extractor, d = FeatureExtractor('gradient', projection=PROJECTED), PROJECTED
-    images = np.random.default_rng(seed).integers(0, 256, (DRIVEN, 48, 64, 3), np.uint8)
-    driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, seed)
+    images = np.random.default_rng(0).integers(0, 256, (DRIVEN, 48, 64, 3), np.uint8)
+    driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, 0)
     strips = strips.strips
     strips *= d**0.5 * driven.strips.std(axis=1, keepdims=True)
     strips += driven.strips.mean(axis=1, keepdims=True)
@@ -271,7 +270,7 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
     poses[:, 0], poses[:, 6] = np.arange(n), 1
     names = ('',) * n
     place_map = Map(features, extractor.projection, np.zeros(n, np.int64), names, poses)
-    pipeline = Pipeline(PipelineSettings(backend=run.device, precision=precision))
+    pipeline = Pipeline(PipelineSettings(backend='cpu', precision=precision))
     pipeline.change(loaded=LoadedMap('', place_map, extractor))
     following, accepted = cycle(range(DRIVEN)), {0.5: 0, 1.0: 0}
 
@@ -285,7 +284,7 @@ def process_stages(run: Run, n: int, precision: str, seed: int) -> None:
 
     for _ in range(2 * SEQUENCE.length):
         process(0.5)
-    job = timed(partial(process, 1.0), run.device)
+    job = timed(partial(process, 1.0))
     peer = Peer('without matches', job, 'the same, but no image matches', partial=True)
     works = frame_works(Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), 'robust', precision)
     run.measure('process', (n, d), partial(process, 0.5), works, [peer], precision, 'robust')
@@ -296,18 +295,18 @@ def references(
     run: Run, places: LocalFeatures, query: LocalFeatures, precision: str
 ) -> list[Peer]:
     """Return the peers of one image's distances: torch's product, a search for the nearest."""
-    stages = [product(run, places, query)]
-    if run.device == 'cpu':
-        images, image = (
-            each.strips.transpose(1, 0, 2).reshape(len(each), -1) for each in (places, query)
-        )
-        search = faiss_peer if precision == 'float32' else usearch_peer
-        try:
-            stages.append(search(images, image))
-        except ImportError as error:
-            name = str(error.name).split('.', maxsplit=1)[0]
-            run.skip(name, 0, 0, f'not installed (requirements/{SEARCHES[name]}.txt)')
-    return stages
+    peers = [product(places, query)]
+    images, image = (
+        features.strips.transpose(1, 0, 2).reshape(len(features), -1)
+        for features in (places, query)
+    )
+    search = faiss_peer if precision == 'float32' else usearch_peer
+    try:
+        peers.append(search(images, image))
+    except ImportError as error:
+        name = str(error.name).split('.', maxsplit=1)[0]
+        run.skip(name, 0, 0, f'not installed (requirements/{SEARCHES[name]}.txt)')
+    return peers
 
 
 def faiss_peer(images: np.ndarray, image: np.ndarray) -> Peer:
@@ -333,7 +332,7 @@ def usearch_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     return Peer('usearch int8', timed(call), note, partial=True)
 
 
-def product(run: Run, places: LocalFeatures, queries: LocalFeatures) -> Peer:
+def product(places: LocalFeatures, queries: LocalFeatures) -> Peer:
     """
     Return torch's product of queries with the map in float32, in its faster orientation.
 
@@ -342,25 +341,25 @@ def product(run: Run, places: LocalFeatures, queries: LocalFeatures) -> Peer:
     """
     d = places.dimension
     strips, rows = (
-        torch.from_numpy(np.ascontiguousarray(each.reshape(-1, d))).to(run.device)
+        torch.from_numpy(np.ascontiguousarray(each.reshape(-1, d)))
         for each in (places.strips, queries.strips.transpose(1, 0, 2))
     )
-    out = torch.empty(len(rows) * len(strips), device=strips.device)
+    out = torch.empty(len(rows) * len(strips))
     wide, tall = out.view(len(rows), -1), out.view(len(strips), -1)
     forms: dict[str, Call] = {
         'queries @ map.T': lambda: torch.mm(rows, strips.T, out=wide),
         'map @ queries.T': lambda: torch.mm(strips, rows.T, out=tall),
     }
-    form = min(forms, key=lambda name: best_seconds(forms[name], run.device, 0))
+    form = min(forms, key=lambda name: best_seconds(forms[name], 0))
     note = f'{form}, all pairs of strips, no alignment'
-    return Peer('torch float32', timed(forms[form], run.device), note, partial=True)
+    return Peer('torch float32', timed(forms[form]), note, partial=True)
 
 
-def frame(places: LocalFeatures, mode: str, precision: str, device: str, seed: int) -> Call:
+def frame(places: LocalFeatures, mode: str, precision: str) -> Call:
     """Return a call that updates a recognizer, on the map, its window full, with an image."""
     settings = RecognizerSettings(1.0 if mode == 'paper' else None, mode=mode)
-    recognizer = PlaceRecognizer(descriptor_map(places), settings, device, precision)
-    queries = along(places, min(len(places), DRIVEN), seed)
+    recognizer = PlaceRecognizer(descriptor_map(places), settings, precision=precision)
+    queries = along(places, min(len(places), DRIVEN))
     following = cycle([queries[i : i + 1] for i in range(len(queries))])
     for _ in range(SEQUENCE.length):
         recognizer.update(next(following))

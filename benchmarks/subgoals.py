@@ -71,29 +71,20 @@ def main() -> None:
         place_map = build_map(open_source(paths[0]), FeatureExtractor('gradient'), progress=False)
         queries = extract_features(open_source(paths[1]), place_map.extractor())
         vectors = [
-            np.concatenate(each.strips.astype(np.float64), axis=1)
-            for each in (place_map.features, queries)
+            np.concatenate(features.strips.astype(np.float64), axis=1)
+            for features in (place_map.features, queries)
         ]
         mean = vectors[0].mean(axis=0)
-        a, b = (each - mean for each in vectors)
-        a, b = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (a, b))
+        a, b = (v - mean for v in vectors)
+        a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (a, b))
         distances = np.sqrt(np.maximum(0, 2 - 2 * b @ a.T))
-        for method, places in (
-            ('nearest image', distances.argmin(axis=1)),
-            ("PlaceNav's filter", placenav(distances)),
-            (
-                'ours',
-                np.array(
-                    [
-                        *ours(
-                            PlaceRecognizer(place_map, RecognizerSettings(mode='robust')),
-                            queries,
-                            len(queries),
-                        )
-                    ]
-                ),
-            ),
-        ):
+        recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='robust'))
+        methods = {
+            'nearest image': distances.argmin(axis=1),
+            "PlaceNav's filter": placenav(distances),
+            'ours': np.array(list(ours(recognizer, queries, len(queries)))),
+        }
+        for method, places in methods.items():
             print(f'| {name} | {method} | {numbers(places)} |')
 
 

@@ -25,20 +25,12 @@ class Timing:
     runs: int
 
 
-def timed(call: Callable[[], Any], device: str = 'cpu') -> Job:
-    """Return a job that measures a call by the wall clock, results on the device complete."""
-
-    def wait() -> None:
-        if device == 'cuda':
-            import torch
-
-            torch.cuda.synchronize()
+def timed(call: Callable[[], Any]) -> Job:
+    """Return a job that measures a call by the wall clock."""
 
     def job() -> float:
-        wait()
         began = time.perf_counter()
         call()
-        wait()
         return time.perf_counter() - began
 
     return job
@@ -76,9 +68,9 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
     return timings
 
 
-def best_seconds(call: Callable[[], Any], device: str, seconds: float) -> float:
+def best_seconds(call: Callable[[], Any], seconds: float) -> float:
     """Return the shortest of at least three runs that fill ``seconds``, after one to warm up."""
-    job = timed(call, device)
+    job = timed(call)
     job()
     end = time.perf_counter() + seconds
     durations = [job() for _ in range(3)]
