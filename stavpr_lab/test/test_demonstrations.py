@@ -13,7 +13,7 @@ from evaluation_commands import write_images
 from map_examples import VERSION2
 import numpy as np
 from PIL import Image
-from processes import DOMAIN, SECOND
+from processes import SECOND
 import pytest
 import rclpy
 from stavpr_lab.commands import demo
@@ -215,7 +215,7 @@ def test_false_closure_is_relayed_with_the_stamps_of_its_place(default_context, 
 
 def test_fetch_graph_without_node_names_what_is_missing():
     with pytest.raises(StavprError, match=r'pose_graph: 3 closures not in 0\.3 s'):
-        fetch_graph([], 3, DOMAIN, timeout=0.3)
+        fetch_graph([], 3, timeout=0.3)
 
 
 def test_run_live_returns_why_the_node_cannot_start(tmp_path, route):

@@ -377,9 +377,8 @@ def _slam(arguments: argparse.Namespace, folder: Path) -> None:
     }
     result: list[Any] = []
 
-    def fetch(closures: list[dict[str, Any]], environment: dict[str, str]) -> None:
-        domain = int(environment['ROS_DOMAIN_ID'])
-        result.append(fetch_graph(['graph.g2o', 'optimized.tum'], len(closures), domain))
+    def fetch(closures: list[dict[str, Any]]) -> None:
+        result.append(fetch_graph(['graph.g2o', 'optimized.tum'], len(closures)))
 
     run_live(
         parameters, recording, len(drive), folder, others,

@@ -9,34 +9,27 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.errors import StavprError
+from stavpr_ros.ros.process import ros_node, spin_until
+from stavpr_ros.ros.qos import LATCHED
 from visualization_msgs.msg import MarkerArray
 
 NAME = 'pose_graph'
 
 
 def fetch_graph(
-    files: list[str], closures: int, domain: int, timeout: float = 60.0
+    files: list[str], closures: int, timeout: float = 60.0
 ) -> tuple[dict[str, str], list[np.ndarray]]:
     """
     Save a pose graph when it has received all loop closures; return its diagnostics and edges.
 
     :param files: names in its maps folder.
     :param closures: number of loop closures that it must have received.
-    :param domain: ROS domain.
     :returns: the values of the diagnostics, and x y z of the ends of the accepted and of the
         rejected edges, each of shape (m, 2, 3).
     :raises StavprError: not in time, or the node cannot save.
     """
-    context = Context()
-    rclpy.init(context=context, domain_id=domain)
-    node = rclpy.create_node('graph_client', context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
     values: dict[str, str] = {}
     markers: list[MarkerArray] = []
 
@@ -44,18 +37,16 @@ def fetch_graph(
         for status in message.status:
             if status.name == f'{NAME}: graph':
                 values.clear()
-                values.update({each.key: each.value for each in status.values})
+                values.update({row.key: row.value for row in status.values})
 
     def wait_until(done: Callable[[], bool], event: str) -> None:
         end = time.monotonic() + timeout
-        while not done():
-            executor.spin_once(timeout_sec=0.1)
-            if time.monotonic() > end:
-                raise StavprError(f'pose_graph: {event} not in {timeout:g} s')
+        spin_until(node, lambda: done() or time.monotonic() > end)
+        if not done():
+            raise StavprError(f'pose_graph: {event} not in {timeout:g} s')
 
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 10)
-    try:
+    with ros_node(lambda: rclpy.create_node('graph_client'), []) as node:
+        node.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 10)
         wait_until(lambda: int(values.get('closures', 0)) >= closures, f'{closures} closures')
         client = node.create_client(SaveMap, f'{NAME}/save')
         wait_until(client.service_is_ready, 'its services')
@@ -66,12 +57,8 @@ def fetch_graph(
             if not response.success:
                 raise StavprError(f'pose_graph: {response.message}')
         values.clear()
-        node.create_subscription(MarkerArray, f'{NAME}/edges', markers.append, latched)
+        node.create_subscription(MarkerArray, f'{NAME}/edges', markers.append, LATCHED)
         wait_until(lambda: bool(values and markers), 'diagnostics and edges')
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown(context=context)
     ends = {marker.id: marker.points for marker in markers[-1].markers}
     points = [[(p.x, p.y, p.z) for p in ends.get(i, [])] for i in (0, 1)]
-    return values, [np.array(each, float).reshape(-1, 2, 3) for each in points]
+    return values, [np.array(rows, float).reshape(-1, 2, 3) for rows in points]

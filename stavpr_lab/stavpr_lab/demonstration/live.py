@@ -72,7 +72,7 @@ def run_live(
     folder: Path,
     others: Mapping[str, list[str]] | None = None,
     replay_options: Sequence[str] = (),
-    at_end: Callable[[Records, dict[str, str]], None] = lambda closures, environment: None,
+    at_end: Callable[[Records], None] = lambda closures: None,
 ) -> tuple[Records, Records]:
     """
     Replay a query losslessly into a node and return its records.
@@ -84,7 +84,8 @@ def run_live(
         ``loop_closures.jsonl``.
     :param others: commands of further processes by their names.
     :param replay_options: further options of the command ``replay``.
-    :param at_end: called with the loop closures and the environment, while everything still runs.
+    :param at_end: called with the loop closures, in the ROS domain of all, while everything still
+        runs.
     :returns: one match per image, and the loop closures; see the command ``record``.
     :raises StavprError: a process failed; names its log.
     """
@@ -138,7 +139,7 @@ def run_live(
             grown = partial(lambda last_size: complete() or size() > last_size, size())
             wait_until(grown, END_TIMEOUT, 'the last record')
         with _applied(environment):
-            at_end(_records(closures), environment)
+            at_end(_records(closures))
     records = _records(matches)
     if len(records) != images:
         raise StavprError(f'{len(records)} matches of {images} images, see the logs in {folder}')

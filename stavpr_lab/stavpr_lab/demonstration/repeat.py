@@ -182,8 +182,8 @@ class Robot:
 class Autopilot:
     """The software on the robot: it gets images, and returns velocities."""
 
-    def __init__(self, taught: Taught, settings: FollowerSettings | None = None) -> None:
-        settings = settings or FollowerSettings(max_speed=SPEED, max_acceleration=2.0)
+    def __init__(self, taught: Taught) -> None:
+        settings = FollowerSettings(max_speed=SPEED, max_acceleration=2.0)
         self.follower = RouteFollower(taught.run, settings)
         self._map, self._offset = taught.place_map, OffsetFilter()
         self._comparison = ImageComparison()
@@ -324,7 +324,7 @@ def animate(taught: Taught, drive: Drive, images: list[np.ndarray], path: Path) 
     )  # fmt: skip
 
 
-def stops(taught: Taught, seconds: float = CHANGED + 5) -> dict[str, float]:
+def stops(taught: Taught) -> dict[str, float]:
     """Return the seconds until the robot is at rest, after the camera shows something else."""
     other = View(RingWorld(11), GOOD_LIGHT)
     dice = np.random.default_rng(0)
@@ -358,7 +358,7 @@ def stops(taught: Taught, seconds: float = CHANGED + 5) -> dict[str, float]:
         ) -> np.ndarray:
             return change(image) if time >= CHANGED else image
 
-        drive = repeat(taught, GOOD_LIGHT, seconds, begin=10, change=changed, has_operator=False)
+        drive = repeat(taught, GOOD_LIGHT, CHANGED + 5, 10, change=changed, has_operator=False)
         is_later = drive.times >= CHANGED
         at_rest = np.flatnonzero(is_later & (drive.speeds < 0.05))
         result[name] = float(drive.times[at_rest[0]] - CHANGED) if len(at_rest) else math.inf

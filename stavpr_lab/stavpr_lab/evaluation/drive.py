@@ -8,7 +8,7 @@ and their ground truth; :func:`stavpr_ros.mapping.select_places` applies them.
 :func:`cropped` changes the images themselves.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 import math
@@ -219,31 +219,24 @@ class FrameSource(Protocol):
         """Yield one image after the other."""
 
 
-class CroppedSource:
+class ChangedSource:
     """
-    A source whose images lose columns at both sides; stamps and identifiers stay.
+    A source whose images are changed; stamps and identifiers stay.
 
-    :param left, right: fractions of the width, rounded to pixels.
+    :param change: returns the new image of a frame, RGB.
     """
 
-    def __init__(self, source: FrameSource, left: float, right: float) -> None:
-        self._source, self._left, self._right = source, left, right
+    def __init__(self, source: FrameSource, change: Callable[[Frame], np.ndarray]) -> None:
+        self._source, self._change = source, change
 
     def __len__(self) -> int:
         """Return the number of images."""
         return len(self._source)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield one cropped image after the other."""
+        """Yield one changed image after the other."""
         for frame in self._source:
-            width = frame.image.shape[1]
-            first, last = _pixels(self._left * width), width - _pixels(self._right * width)
-            if first >= last:
-                raise ImageError(
-                    f'{frame.identifier} is {width} pixels wide: cropping {self._left} on the '
-                    f'left and {self._right} on the right leaves none'
-                )
-            yield replace(frame, image=np.ascontiguousarray(frame.image[:, first:last]))
+            yield replace(frame, image=self._change(frame))
 
 
 def _pixels(width: float) -> int:
@@ -263,4 +256,15 @@ def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
             f'cropping {left} on the left and {right} on the right: expected fractions >= 0, '
             'below 1 together'
         )
-    return source if left == right == 0 else CroppedSource(source, left, right)
+
+    def crop(frame: Frame) -> np.ndarray:
+        width = frame.image.shape[1]
+        first, last = _pixels(left * width), width - _pixels(right * width)
+        if first >= last:
+            raise ImageError(
+                f'{frame.identifier} is {width} pixels wide: cropping {left} on the left and '
+                f'{right} on the right leaves none'
+            )
+        return np.ascontiguousarray(frame.image[:, first:last])
+
+    return source if left == right == 0 else ChangedSource(source, crop)

@@ -172,9 +172,9 @@ class LapDrive:
         return Frame(self.laps[lap][number].image, int(self.stamps[i]), '')
 
 
-def intrinsics(size: tuple[int, int] = SIZE) -> np.ndarray:
+def intrinsics() -> np.ndarray:
     """Return the camera matrix of rendered images, without distortion, shape (3, 3)."""
-    width, height = size
+    width, height = SIZE
     focal = FOCAL * width
     return np.array([[focal, 0, width / 2 - 0.5], [0, focal, HORIZON * height - 0.5], [0, 0, 1.0]])
 

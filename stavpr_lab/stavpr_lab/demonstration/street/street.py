@@ -9,7 +9,7 @@ the renderer finds the lot at a ray without searching. Positions are (along the 
 of its center line), in meters.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from random import Random
 
@@ -64,22 +64,6 @@ class Street:
     things: np.ndarray
     seed: int
     rigid: bool = False
-
-    @cached_property
-    def reach(self) -> float:
-        """Return the meters that the tables reach; meter x is reach - x from the end."""
-        return self.lot_of.shape[1] * CELL
-
-    def backward(self) -> 'Street':
-        """Return the street as it is driven from its end to its start."""
-        lots, things = self.lots.copy(), self.things[::-1].copy()
-        lots['start'] = self.reach - lots['start'] - lots['length']
-        things['along'], things['across'] = self.reach - things['along'], -things['across']
-        rows = self.lot_of[[RIGHT, LEFT, 2 + RIGHT, 2 + LEFT], ::-1]
-        return replace(
-            self, lots=lots, lot_of=np.ascontiguousarray(rows), things=things,
-            curvature=-self.curvature[::-1],
-        )  # fmt: skip
 
     @cached_property
     def headings(self) -> np.ndarray:

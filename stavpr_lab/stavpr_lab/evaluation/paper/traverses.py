@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traverses of public data sets whose images have positions, in their published layouts."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 import csv
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from stavpr_lab.evaluation.drive import FrameSource
+from stavpr_lab.evaluation.drive import ChangedSource, FrameSource
 from stavpr_ros.errors import SourceError
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import Frame
@@ -81,34 +81,17 @@ def robotcar(folder: Path) -> PosedTraverse:
     stamps = np.array([int(file.stem) for file in images.files])
     times = np.array([int(row['timestamp']) for row in rows])
     coordinates = ([float(row[name]) for row in rows] for name in ('easting', 'northing'))
-    positions = np.stack([np.interp(stamps, times, each) for each in coordinates], axis=1)
+    positions = np.stack([np.interp(stamps, times, column) for column in coordinates], axis=1)
     numbers: list[int] = []
     for i in np.flatnonzero((stamps >= times[0]) & (stamps <= times[-1])).tolist():
         if not numbers or np.hypot(*(positions[i] - positions[numbers[-1]])) >= SPACING:
             numbers.append(i)
     images.files = [images.files[i] for i in numbers]
-    return PosedTraverse(
-        Demosaiced(images), _poses(positions[numbers]), np.ones(len(numbers), bool)
-    )
+    source = ChangedSource(images, _demosaic)
+    return PosedTraverse(source, _poses(positions[numbers]), np.ones(len(numbers), bool))
 
 
-class Demosaiced:
-    """A source of the stereo camera whose images become RGB; stamps and identifiers stay."""
-
-    def __init__(self, source: FrameSource) -> None:
-        self._source = source
-
-    def __len__(self) -> int:
-        """Return the number of images."""
-        return len(self._source)
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Yield one RGB image after the other."""
-        for frame in self._source:
-            yield replace(frame, image=_demosaiced(frame))
-
-
-def _demosaiced(frame: Frame) -> np.ndarray:
+def _demosaic(frame: Frame) -> np.ndarray:
     """Convert the Bayer pattern of the stereo camera, GBRG, to RGB; colors stay as they are."""
     image = frame.image
     is_gray = (image == image[:, :, :1]).all()
