@@ -130,8 +130,8 @@ def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[s
             for stage, (owner, name) in STAGES.items():
                 first, *rest = owner.split('.')
                 target = owners[first]
-                for each in rest:
-                    target = getattr(target, each)
+                for part in rest:
+                    target = getattr(target, part)
                 setattr(target, name, timed(stage, getattr(target, name)))
         if number in (WARM, WARM + IMAGES):
             total = times.get('all', [])[-IMAGES:]
@@ -223,15 +223,15 @@ def measure_sessions(counts: list[int]) -> list[str]:
                         shown = i - len(match.window_stamps) + 1 + match.position
                         right[number] += abs(match.place % places - shown) <= NEAR
             medians.append([1e3 * statistics.median(own) for own in times])
-        each = [statistics.median(turns) for turns in zip(*medians[SETTLED_TURNS:], strict=True)]
-        one_session = one_session or (each[0], sizes[0])
+        costs = [statistics.median(turns) for turns in zip(*medians[SETTLED_TURNS:], strict=True)]
+        one_session = one_session or (costs[0], sizes[0])
         rows.append(
             [
                 f'{precision}, {dimension} dimensions' if dimension else precision,
                 *(
                     f'{ms:.2f} ms ({ms / one_session[0]:.2f}), {size / 1e6:.1f} MB '
                     f'({size / one_session[1]:.2f}), {count / DRIVEN:.3f}'
-                    for ms, size, count in zip(each, sizes, right, strict=True)
+                    for ms, size, count in zip(costs, sizes, right, strict=True)
                 ),
             ]
         )

@@ -61,7 +61,7 @@ class Counter(TorchDispatchMode):
 
 
 def _tensors(arguments: Any) -> list[torch.Tensor]:
-    return [each for each in tree_leaves(arguments) if isinstance(each, torch.Tensor)]
+    return [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, torch.Tensor)]
 
 
 def _bytes(tensor: torch.Tensor) -> int:

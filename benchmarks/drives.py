@@ -139,7 +139,7 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
         lap, other = _first(lap), select_places(other, counted)
         sets.pairs.append((kind, kind, Pair(kind, lap, other, truth.select(counted))))
         places[kind] = lap
-    towers = sorted(each.name for each in (folder / 'tower').iterdir() if each.is_dir())
+    towers = sorted(floor.name for floor in (folder / 'tower').iterdir() if floor.is_dir())
     for half in towers[::2], towers[1::2]:
         floors = {name: read(f'tower/{name}') for name in half}
         for a, b in ((a, b) for a in half for b in half if a != b):

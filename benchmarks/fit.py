@@ -119,14 +119,14 @@ def draw(risks: Risks, path: Path) -> None:
             axes[side].vlines(x, low[rows][order], high[rows][order], **bars)
             axes[side].plot(x, rate[order], '.', color='#2358a5', ms=2)
             means[side, k] = rate.mean()
-    for each, title, mean in zip(axes, ('on the map', 'off the map'), means, strict=True):
-        each.plot(errors, errors, ':', color='#6b7078', label='as ordered')
-        each.plot(errors, mean, 'D', color='#c8402f', ms=5, label='mean of the drives')
-        each.set(xscale='log', xlabel='max_error', title=f'drives {title}', ylim=(-0.005, 1))
-        each.set_yscale('symlog', linthresh=0.01)
-        each.set_xticks(errors, [f'{error:g}' for error in errors], minor=False)
-        each.minorticks_off()
-        each.legend(fontsize=8, loc='upper left')
+    for panel, title, mean in zip(axes, ('on the map', 'off the map'), means, strict=True):
+        panel.plot(errors, errors, ':', color='#6b7078', label='as ordered')
+        panel.plot(errors, mean, 'D', color='#c8402f', ms=5, label='mean of the drives')
+        panel.set(xscale='log', xlabel='max_error', title=f'drives {title}', ylim=(-0.005, 1))
+        panel.set_yscale('symlog', linthresh=0.01)
+        panel.set_xticks(errors, [f'{error:g}' for error in errors], minor=False)
+        panel.minorticks_off()
+        panel.legend(fontsize=8, loc='upper left')
     axes[0].set_ylabel('wrong of matched')
     axes[1].set_ylabel('matched of all')
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -209,7 +209,7 @@ def _both(windows: Windows, scores: np.ndarray) -> np.ndarray:
 
 
 def _text(value: Any) -> str:
-    return ' '.join(f'{each:g}' for each in (value if isinstance(value, tuple) else (value,)))
+    return ' '.join(f'{number:g}' for number in (value if isinstance(value, tuple) else (value,)))
 
 
 FIT = """

@@ -94,7 +94,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
             rest, place = not is_early and middle == window.filter.count - 1, path.place
             about = image, place, float(is_early)
             if rest and any(
-                window._view is each for each in shown
+                window._view is earlier for earlier in shown
             ):  # it counts as a recent one, but is not the match
                 rows.append((-1, *about, NEW, *quantities(window._view), 0.0))
             which = window._by_half if rest else shown[-1] if shown else window._view
@@ -188,7 +188,7 @@ def value_of(name: str) -> Any:
 
 def _modules(name: str) -> list[dict[str, Any]]:
     modules = [vars(m) for key, m in sys.modules.items() if key.startswith('stavpr_ros.method.')]
-    return [each for each in modules if name in each]
+    return [module for module in modules if name in module]
 
 
 def set_value(name: str, value: Any) -> None:
@@ -269,7 +269,7 @@ class Windows:
                 np.full(n, number), rows[:, 0], rows[:, 3] > 0, rows[:, 4], rows[:, 5:12],
                 rows[:, 12], counted, right, has, unseen,
             ))  # fmt: skip
-        columns = [np.concatenate(each) for each in zip(*parts, strict=True)]
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return cls(feature, tuple(drives), *columns)
 
     def each(self, value: Callable[[Drive], Any]) -> np.ndarray:
@@ -318,7 +318,7 @@ class Windows:
         """Return the recall of each set in some rows, (10,), NaN where there is none."""
         rows = rows & (self.set_of >= 0)
         hits = rows & self.right & (scores > threshold)
-        counts = (np.bincount(self.set_of[each], minlength=len(SETS)) for each in (hits, rows))
+        counts = (np.bincount(self.set_of[mask], minlength=len(SETS)) for mask in (hits, rows))
         with np.errstate(invalid='ignore'):
             hits, every = counts
             return hits / every
@@ -391,8 +391,8 @@ def mean_recall(every: Sequence[Windows], values: Values, rows: Sequence[np.ndar
 def search(every: Sequence[Windows], values: Values, rows: Sequence[np.ndarray]) -> Values:
     """Return the weights of ``GRID``, with constants, of the largest mean recall in some rows."""
     grid = []
-    for each in itertools.product(*GRID.values()):
-        chosen = values | dict(zip(GRID, each, strict=True))
+    for weights in itertools.product(*GRID.values()):
+        chosen = values | dict(zip(GRID, weights, strict=True))
         for windows, own in zip(every, rows, strict=True):
             chosen[windows.feature] = constant_at(windows, chosen, own)
         grid.append(chosen)
@@ -410,7 +410,7 @@ def folds_of(every: Sequence[Windows], values: Values) -> dict[str, tuple[Values
     for group in sorted({group for drive in every[0].drives for group in drive.groups}):
         rows = without(every, group)
         chosen = search(every, values, rows)
-        before, after = (mean_recall(every, each, rows) for each in (values, chosen))
+        before, after = (mean_recall(every, numbers, rows) for numbers in (values, chosen))
         folds[group] = chosen, before, after
     return folds
 
@@ -487,9 +487,7 @@ class Risks:
         n = len(windows.drives)
 
         def counted(which: np.ndarray) -> np.ndarray:
-            return np.array(
-                [np.bincount(windows.drive[each & which], minlength=n) for each in rows]
-            )
+            return np.array([np.bincount(windows.drive[row & which], minlength=n) for row in rows])
 
         matched = counted(windows.drive >= 0)
         lengths = np.array([0 if d.truth else len(d.images) for d in windows.drives])
@@ -509,8 +507,8 @@ class Risks:
 def pooled(every: Sequence[Risks]) -> Risks:
     """Return the drives of several kinds of features as one."""
     counts = (
-        np.concatenate(each, axis=1)
-        for each in ([r.wrong for r in every], [r.matched for r in every])
+        np.concatenate(columns, axis=1)
+        for columns in ([r.wrong for r in every], [r.matched for r in every])
     )
     drives = tuple(itertools.chain.from_iterable(r.drives for r in every))
     return Risks(every[0].t, drives, *counts)

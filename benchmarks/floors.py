@@ -67,7 +67,7 @@ def main() -> None:
         of_all = drive(folder, queries), drive(folder, queries, resets=True)
         for floor, images, found, anew in zip(floors, queries, *of_all, strict=True):
             alone = drive(str(Path(folder) / f'{floor.name}.stavpr'), [images])[0]
-            sessions, after_reset = ([session for session, _ in each] for each in (found, anew))
+            sessions, after_reset = ([name for name, _ in rows] for rows in (found, anew))
             right = sessions.count(floor.name)
             row = [
                 *(len(images), len(images) - sessions.count(''), right),
@@ -77,9 +77,9 @@ def main() -> None:
                 sum(bool(session) for session, _ in alone),
             ]
             total += row
-            print(f'| {floor.name} | {" | ".join(str(each or "-") for each in row)} |')
+            print(f'| {floor.name} | {" | ".join(str(count or "-") for count in row)} |')
     total[4] = 0
-    print(f'| all | {" | ".join(str(each or "") for each in total)} |')
+    print(f'| all | {" | ".join(str(count or "") for count in total)} |')
 
 
 if __name__ == '__main__':

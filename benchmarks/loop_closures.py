@@ -43,7 +43,7 @@ def drives_twice(sets: Sets) -> Iterator[Drives]:
     for kind, group, pair in sets.pairs:
         if kind not in ('crops', 'damaged night'):
             yield Drives(pair.places, pair.query, pair.truth, (group,))
-    unrelated = [each for each in sets.negatives if each[0] != 'floors']
+    unrelated = [negative for negative in sets.negatives if negative[0] != 'floors']
     for _, groups, first, second in unrelated[::EVERY]:
         yield Drives(first, second, None, groups)
 
@@ -59,10 +59,10 @@ def closures(drives: Drives) -> np.ndarray:
     closer, counts = LoopCloser(RecognizerSettings(), EXCLUDED, route.settings), np.zeros(4, int)
     for i in range(len(route)):
         match = closer.update(route[i : i + 1], (i + 1) * 100_000_000)
-        for each, late in [(match, 0)] * match.accepted + [(late, 1) for late in match.late]:
-            image = each.first_image + each.position - len(first)
+        for closure, late in [(match, 0)] * match.accepted + [(late, 1) for late in match.late]:
+            image = closure.first_image + closure.position - len(first)
             if image >= 0:
-                counts[2 * late + (not is_right(drives.truth, image, each.place))] += 1
+                counts[2 * late + (not is_right(drives.truth, image, closure.place))] += 1
     return counts
 
 
@@ -80,7 +80,7 @@ def routes_section(sets: Sets, feature: str) -> list[str]:
 
     def measured(k: float) -> np.ndarray:
         registry.KINDS[kind] = replace(entry, route=k)
-        return np.array([closures(each) for each in drives])
+        return np.array([closures(pair) for pair in drives])
 
     by_k = {round(entry.route + step, 2): measured(entry.route + step) for step in STEPS}
     for k, counts in by_k.items():
@@ -101,13 +101,13 @@ def routes_section(sets: Sets, feature: str) -> list[str]:
 
 def _best(drives: Sequence[Drives], by_k: dict[float, Any], groups: tuple[str, ...]) -> float:
     """Return the K of the most right closures, less wrong ones, of drives without the groups."""
-    rows = [not set(each.groups) & set(groups) for each in drives]
+    rows = [not set(pair.groups) & set(groups) for pair in drives]
     score = np.array([1, -WRONG, 1, -WRONG])
     return max(by_k, key=lambda k: float((by_k[k][rows] @ score).sum()))
 
 
 def _cells(drives: Sequence[Drives], counts: np.ndarray) -> list[str]:
-    is_route = np.array([each.truth is not None for each in drives])
+    is_route = np.array([pair.truth is not None for pair in drives])
     routes, others = counts[is_route].sum(axis=0), counts[~is_route].sum(axis=0)
     pairs = routes[[0, 2]], routes[[1, 3]], others[[1, 3]]
     return [f'{on_time} + {late}' for on_time, late in pairs]

@@ -113,20 +113,20 @@ def filter_update(sizes: Sizes) -> Work:
     A likelihood takes a minimum, a product, a difference and an exponential (1). A state moves (2
     a step), changes its speed, is weighed, and counts in three sums.
     """
-    each = 4 + 2 * STEPS + SPEEDS * (MIXED + 4)
-    return Work(sizes.n * (12 + 8 * SPEEDS), sizes.n * each)
+    per_place = 4 + 2 * STEPS + SPEEDS * (MIXED + 4)
+    return Work(sizes.n * (12 + 8 * SPEEDS), sizes.n * per_place)
 
 
 def smoothing(sizes: Sizes, columns: int) -> Work:
     """Advance the states of a region again, and go back; both move, change speed, are weighed."""
-    each = 2 * (2 * STEPS + SPEEDS * (MIXED + 1)) + 3 * SPEEDS  # the belief, and the sum
-    return Work(4 * columns * (SPEEDS + sizes.l), sizes.l * columns * each)
+    per_column = 2 * (2 * STEPS + SPEEDS * (MIXED + 1)) + 3 * SPEEDS  # the belief, and the sum
+    return Work(4 * columns * (SPEEDS + sizes.l), sizes.l * columns * per_column)
 
 
 def straight_paths(sizes: Sizes, speeds: int) -> Work:
     """Read the z of a window once; the least of three, a sum for each speed, its minimum."""
-    each = 2 * sizes.l + speeds * (sizes.l + 1)
-    return Work(4 * sizes.l * sizes.n, sizes.n * each)
+    per_place = 2 * sizes.l + speeds * (sizes.l + 1)
+    return Work(4 * sizes.l * sizes.n, sizes.n * per_place)
 
 
 def cells(sizes: Sizes, cells: Cells) -> Work:
@@ -138,8 +138,8 @@ def cells(sizes: Sizes, cells: Cells) -> Work:
 def lm_dtw(sizes: Sizes) -> Work:
     """LM-DTW: the window is read once; a division and a minimum for each end."""
     l, k = sizes.l, sizes.k
-    each = (l - 1) * (k - 1) * SEQUENCE_CELL + (l + k - 2) * BORDER_CELL + 2 * k
-    return Work(4 * l * sizes.n, sizes.n * each)
+    per_place = (l - 1) * (k - 1) * SEQUENCE_CELL + (l + k - 2) * BORDER_CELL + 2 * k
+    return Work(4 * l * sizes.n, sizes.n * per_place)
 
 
 def selection(sizes: Sizes) -> Work:

@@ -119,7 +119,7 @@ class Outcome:
     def pooled(cls, outcomes: Sequence['Outcome']) -> 'Outcome':
         """Return the images of several drives as one."""
         names = cls.__dataclass_fields__
-        return cls(*(np.concatenate([getattr(each, name) for each in outcomes]) for name in names))
+        return cls(*(np.concatenate([getattr(part, name) for part in outcomes]) for name in names))
 
     def numbers(self) -> dict[str, Any]:
         """Return counts, precision and recall at the default threshold, best F1; F1 of images."""
@@ -140,8 +140,8 @@ class Outcome:
             'precision': counts.precision,
             'recall': recall,
             'rates': {rate: self._at(float(rate)) for rate in RATES},
-            'f1': max(each.f1 for each in curve),
-            'recall_at_100_precision': max(each.recall for each in curve if each.precision == 1),
+            'f1': max(c.f1 for c in curve),
+            'recall_at_100_precision': max(c.recall for c in curve if c.precision == 1),
             'unseen': int(np.count_nonzero(self.unseen & is_image)),
             'unseen_matched': int(np.count_nonzero(self.unseen & self.accepted)),
             'unseen_sure': int(np.count_nonzero(self.unseen & self.sure)),
@@ -340,9 +340,9 @@ class Measurement:
     def pair(self, pair: Pair) -> None:
         """Add the rows of a pair."""
         by_name = dict(drives(pair))
-        for name, each in by_name.items():
-            self.add('drives', name, each.numbers())
-        pooled = [each for name, each in by_name.items() if not name.endswith(LONG_STOP)]
+        for name, result in by_name.items():
+            self.add('drives', name, result.numbers())
+        pooled = [result for name, result in by_name.items() if not name.endswith(LONG_STOP)]
         if len(by_name) > 1:
             self.add('drives', f'{pair.name}/all', Outcome.pooled(pooled).numbers())
         each_third = sparse(pair)
@@ -352,9 +352,9 @@ class Measurement:
         if not pair.long:
             self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
         outcomes = list(detours(pair, self.coarser))
-        each = [one.numbers() for one in outcomes]
-        shares = [one['unseen_matched'] / one['unseen'] for one in each if one['unseen']]
-        values = Outcome.pooled(outcomes).numbers() | {'positions': len(each)}
+        numbers = [one.numbers() for one in outcomes]
+        shares = [one['unseen_matched'] / one['unseen'] for one in numbers if one['unseen']]
+        values = Outcome.pooled(outcomes).numbers() | {'positions': len(numbers)}
         self.add('detours', pair.name, values | {'worst': max(shares, default=0.0)})
         self.off_map += outcomes
         for name, counts in starts(pair, self.coarser):

@@ -79,7 +79,7 @@ def pose_row(taught: Taught, seed: int) -> str:
     poses = np.zeros((len(half), 7))
     poses[:, :2], poses[:, 5], poses[:, 6] = taught.poses[:, :2], np.sin(half), np.cos(half)
     places, results, count = replace(taught.place_map, poses=poses), [], 0
-    for left in (each for each in LEFT if abs(each) <= 0.4):
+    for left in (meters for meters in LEFT if abs(meters) <= 0.4):
         for conditions in CONDITIONS.values():
             localizer = Localizer(places)
             for k, _, _, truth, image in drive(taught, conditions, left):
@@ -102,7 +102,7 @@ def pose_row(taught: Taught, seed: int) -> str:
 
 def main() -> int:
     """Run the command."""
-    seeds = [int(each) for each in sys.argv[1:]] or SEEDS
+    seeds = [int(seed) for seed in sys.argv[1:]] or SEEDS
     total, lines, poses = len(seeds) * len(LEFT) * len(CONDITIONS) * len(WITHIN), [], []
     with Progress(total=total, unit='image') as progress:
         for seed in seeds:

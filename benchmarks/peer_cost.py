@@ -52,7 +52,7 @@ class Drive(NamedTuple):
         """Return the images of a source."""
         images, orb = [frame.image for frame in source], cv2.ORB_create(ORB_FEATURES)
         descriptors = [orb.detectAndCompute(image, None)[1] for image in images]
-        assert all(each is not None for each in descriptors)
+        assert all(d is not None for d in descriptors)
         features = FeatureExtractor('gradient').extract(images)
         return cls(features, preprocess(images, SeqSlamSettings()), descriptors)
 
@@ -84,8 +84,8 @@ class Method(NamedTuple):
 def orb_votes(places: Drive, matcher: Any, descriptors: np.ndarray) -> np.ndarray:
     """Return how many descriptors have a distinct nearest one at each place, (n,)."""
     votes = np.zeros(len(places.orb), np.int64)
-    for i, each in enumerate(places.orb):
-        pairs = matcher.knnMatch(descriptors, each, 2)
+    for i, of_place in enumerate(places.orb):
+        pairs = matcher.knnMatch(descriptors, of_place, 2)
         votes[i] = sum(a.distance < ORB_RATIO * b.distance for a, b in pairs)
     return votes
 
@@ -135,7 +135,7 @@ def methods(places: Drive, query: Drive) -> dict[str, Method]:
         f'ORB, {ORB_FEATURES} a place, brute force': Method(
             1,
             lambda i: orb_votes(places, matcher, query.orb[i]).argmax(),
-            lambda: np.array([orb_votes(places, matcher, each).argmax() for each in query.orb]),
+            lambda: np.array([orb_votes(places, matcher, d).argmax() for d in query.orb]),
         ),
         'SeqSLAM': Method(WINDOW, seqslam, seqslam_places),
         **{

@@ -122,7 +122,7 @@ def methods(
     options: Any, place_map: Map, query: Map, truth: GroundTruth
 ) -> Iterator[tuple[str, Matches]]:
     """Yield name and matches of each method."""
-    places, queries = (image_vectors(each.features) for each in (place_map, query))
+    places, queries = (image_vectors(traverse.features) for traverse in (place_map, query))
     yield from peer_methods(options, places, queries)
     for name, matches in peer_methods(options, centered(places), centered(queries)):
         yield f'{name}, centered', matches

@@ -71,7 +71,7 @@ def clean(*traverses: FrameSource) -> np.ndarray:
     """
     is_usable = np.ones(len(traverses[0]), bool)
     for source in traverses:
-        gray = np.stack([cv2.cvtColor(each.image, cv2.COLOR_RGB2GRAY) for each in source]) * 1.0
+        gray = np.stack([cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in source]) * 1.0
         is_usable &= gray.std(axis=(1, 2)) >= DARK
         is_usable[1:] &= np.abs(np.diff(gray, axis=0)).mean(axis=(1, 2)) >= STILL
     return np.flatnonzero(is_usable)

@@ -56,7 +56,7 @@ class Session:
     def part(self, images: slice) -> 'Session':
         """Return some of the images."""
         numbers = np.arange(len(self.drive))[images]
-        parts = (select_places(each, numbers) for each in (self.drive, self.mirrored))
+        parts = (select_places(drive, numbers) for drive in (self.drive, self.mirrored))
         return Session(*parts, self.position[images])
 
 
@@ -101,8 +101,8 @@ def routes(folder: Path) -> Iterator[Route]:
         source = open_source(folder / name)
         flipped = (replace(frame, image=np.fliplr(frame.image)) for frame in source)
         drive, mirrored = (
-            replace(each, stamps=(1 + np.arange(len(each))) * 10**9, same_as=None)
-            for each in (
+            replace(drive, stamps=(1 + np.arange(len(drive))) * 10**9, same_as=None)
+            for drive in (
                 build_map(images, FeatureExtractor('gradient'), progress=False)
                 for images in (source, flipped)
             )
@@ -167,10 +167,10 @@ def drive_route(route: Route, other: Map) -> list[str]:
     for order in route.orders:
         positions: dict[int, float] = {}
         drives = []
-        for number, each in enumerate(order[:-1]):
-            stamps = each.drive.stamps + number * 10**15
-            positions |= dict(zip(stamps.tolist(), each.position.tolist(), strict=True))
-            drives.append(replace(each.drive, stamps=stamps))
+        for number, session in enumerate(order[:-1]):
+            stamps = session.drive.stamps + number * 10**15
+            positions |= dict(zip(stamps.tolist(), session.position.tolist(), strict=True))
+            drives.append(replace(session.drive, stamps=stamps))
         everything = first = merge_maps([drives[0]], ['0'])
         for number, drive in enumerate(drives[1:], 1):
             everything = with_last_related(merge_maps([everything, drive], ['', str(number)]))
@@ -182,15 +182,15 @@ def drive_route(route: Route, other: Map) -> list[str]:
             updated, version, text = update(updated, drive, version, str(number))
             changes.append(text)
         maps = first, everything, updated, updated
-        for row, (each, precision) in enumerate(zip(maps, PRECISIONS, strict=True)):
-            matches, ms = measure(each, positions, order[-1], route, precision)
+        for row, (place_map, precision) in enumerate(zip(maps, PRECISIONS, strict=True)):
+            matches, ms = measure(place_map, positions, order[-1], route, precision)
             counts[row] += matches
             times[row] += ms / len(route.orders)
-            places[row] += len(each)
+            places[row] += len(place_map)
         images += len(order[-1].drive)
     recall = ' '.join(f'{right / images:.3f}' for right, _ in counts)
     took = ' '.join(f'{ms:.2f}' for ms in times)
-    wrong, sizes = (' '.join(map(str, each.tolist())) for each in (counts[:, 1], places))
+    wrong, sizes = (' '.join(map(str, column.tolist())) for column in (counts[:, 1], places))
     print(*changes, sep='\n')
     return [route.name, str(images), recall, wrong, sizes, took, f'{changed} of {poisons}']
 

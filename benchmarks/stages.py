@@ -324,8 +324,8 @@ def usearch_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     from usearch.index import MetricKind, search  # type: ignore[import-not-found]
 
     vectors, query = (
-        np.rint(each / np.abs(each).max(axis=1, keepdims=True) * 127).astype(np.int8)
-        for each in (images, image)
+        np.rint(rows / np.abs(rows).max(axis=1, keepdims=True) * 127).astype(np.int8)
+        for rows in (images, image)
     )
     call = partial(search, vectors, query, 1, MetricKind.Cos, exact=True, threads=0)
     note = 'exact search in int8, one product of whole images instead of 49 of strips'
@@ -341,8 +341,8 @@ def product(places: LocalFeatures, queries: LocalFeatures) -> Peer:
     """
     d = places.dimension
     strips, rows = (
-        torch.from_numpy(np.ascontiguousarray(each.reshape(-1, d)))
-        for each in (places.strips, queries.strips.transpose(1, 0, 2))
+        torch.from_numpy(np.ascontiguousarray(array.reshape(-1, d)))
+        for array in (places.strips, queries.strips.transpose(1, 0, 2))
     )
     out = torch.empty(len(rows) * len(strips))
     wide, tall = out.view(len(rows), -1), out.view(len(strips), -1)

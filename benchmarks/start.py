@@ -101,7 +101,7 @@ def main() -> None:
         os.environ.pop('PYTHONDONTWRITEBYTECODE', None)
         os.environ['PYTHONPYCACHEPREFIX'] = name  # as where a package manager has compiled it
         by_package = imports()
-        path, cold, built = (str(Path(name) / each) for each in ('map.stavpr', 'cold', 'built'))
+        path, cold, built = (str(Path(name) / file) for file in ('map.stavpr', 'cold', 'built'))
         make_map(Path(path))
         starts = {'cold': start(path, cold), 'warm': start(path, cold)}
         environment = {**os.environ, 'NUMBA_CACHE_DIR': built}

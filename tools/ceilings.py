@@ -55,19 +55,19 @@ def numbers_of(tree: ast.Module) -> int:
         if isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             names = (
-                each.id for t in targets for each in ast.walk(t) if isinstance(each, ast.Name)
+                part.id for t in targets for part in ast.walk(t) if isinstance(part, ast.Name)
             )
             if node.value and all(name.isupper() for name in names):
                 values.append(node.value)
         elif isinstance(node, ast.ClassDef):
-            fields = (each for each in node.body if isinstance(each, ast.AnnAssign))
-            values += [each.value for each in fields if each.value]
-    literals = (each for value in values for each in ast.walk(value))
+            fields = (field for field in node.body if isinstance(field, ast.AnnAssign))
+            values += [field.value for field in fields if field.value]
+    literals = (literal for value in values for literal in ast.walk(value))
     return sum(
-        isinstance(each, ast.Constant)
-        and type(each.value) in (int, float)
-        and each.value not in (0, 1)
-        for each in literals
+        isinstance(literal, ast.Constant)
+        and type(literal.value) in (int, float)
+        and literal.value not in (0, 1)
+        for literal in literals
     )
 
 

@@ -41,7 +41,7 @@ PARTS = {'.srv': ['/request', '/response'], '.action': ['/goal', '/result', '/fe
 def messages() -> Iterator[str]:
     """Yield every field and constant of the interfaces, without comments."""
     paths = (ROOT / 'stavpr_msgs').glob('*/*.*')
-    for path in sorted(each for each in paths if each.suffix[1:] == each.parent.name):
+    for path in sorted(file for file in paths if file.suffix[1:] == file.parent.name):
         parts = iter(PARTS.get(path.suffix, ['']))
         part = next(parts)
         for line in path.read_text(encoding='utf-8').splitlines():
@@ -88,7 +88,7 @@ def interfaces() -> Iterator[str]:
         node.trigger_activate()
         for right, role in ROLES.items():
             names = getattr(node, f'get_{role}_names_and_types_by_node')(node.get_name(), '/')
-            typed |= {f'{node.get_name()} {right} {name}': f': {each[0]}' for name, each in names}
+            typed |= {f'{node.get_name()} {right} {name}': f': {t[0]}' for name, t in names}
         node.destroy_node()
     rclpy.shutdown(context=context)
     allowed = [
@@ -185,7 +185,7 @@ def formats() -> Iterator[str]:
     from stavpr_ros import plugins
     from stavpr_ros.mapping import journal, map_version2
 
-    yield from (f'{each.FORMAT} version {each.VERSION}' for each in (journal, map_version2))
+    yield from (f'{module.FORMAT} version {module.VERSION}' for module in (journal, map_version2))
     for group in (plugins.COMMANDS, plugins.MAP_TOOLS, plugins.FEATURES, plugins.STORES):
         yield f'entry points {group}'
 

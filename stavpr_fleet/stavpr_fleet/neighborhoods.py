@@ -51,9 +51,9 @@ class Votes:
         for speed in self._speeds:
             bins = (places + np.rint(speed * ages).astype(np.int64)) // BIN
             _, firsts = np.unique(np.stack([ages, bins]), axis=1, return_index=True)
-            each, of_bin = np.unique(bins[firsts], return_inverse=True)
+            numbers, of_bin = np.unique(bins[firsts], return_inverse=True)
             sums = np.bincount(of_bin, votes[firsts])
-            for one in np.argsort(-sums, kind='stable')[:count].tolist():
-                scores[int(each[one])] = max(scores.get(int(each[one]), 0), sums[one])
+            for i in np.argsort(-sums, kind='stable')[:count].tolist():
+                scores[int(numbers[i])] = max(scores.get(int(numbers[i]), 0), sums[i])
         best = sorted(scores, key=lambda one: (-scores[one], one))[:count]
         return np.array(best, np.int64) * BIN + BIN // 2

@@ -156,7 +156,7 @@ REASONS = {'odometry ends: meters after it': 'no odometry', 'the camera ends': '
 BRIDGE = 'the bridge: other images, without a match'
 
 
-@pytest.mark.parametrize('name', [n for n, each in blind.FAILURES.items() if not is_slow(each)])
+@pytest.mark.parametrize('name', [n for n, f in blind.FAILURES.items() if not is_slow(f)])
 @pytest.mark.parametrize(('spacing', 'rate'), LIMITS)
 def test_robot_stops_within_the_stated_meters_for_good(name, spacing, rate):
     for phase in (0.0, 0.3, 0.6, 0.95):

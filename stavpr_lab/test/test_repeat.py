@@ -106,7 +106,7 @@ def test_heading_on_the_other_lane_at_dusk_in_rain():
     )
     estimator, errors = OffsetFilter(), []
     for k in range(len(along)):
-        columns = [describe_columns(each[k].image) for each in (other, taught)]
+        columns = [describe_columns(traverse[k].image) for traverse in (other, taught)]
         offset = estimator.update(*columns)
         truth = taught.camera(k)[2] - other.camera(k)[2]
         errors.append((offset.heading(FOCAL) - truth, math.atan(offset.shift / FOCAL) - truth))

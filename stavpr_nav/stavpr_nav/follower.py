@@ -126,7 +126,7 @@ class TaughtRun:
         """Return speed and turn a time (s) after a place, and whether it is the end."""
         time = self.on_lap(float(self.times[place]) + later)
         is_end = self.seam is None and time >= self.times[-1]
-        speed, turn = (np.interp(time, self.times, each) for each in (self.speeds, self.turns))
+        speed, turn = (np.interp(time, self.times, column) for column in (self.speeds, self.turns))
         return float(speed), float(turn), is_end
 
 

@@ -88,10 +88,10 @@ def taught_places(
     if not parts:
         raise InputError(
             f'no session {session!r} of the map was recorded with the velocities: it has '
-            f'{[each.id for each in sessions]}; correct the line {SESSION!r} of the run, or take '
+            f'{[s.id for s in sessions]}; correct the line {SESSION!r} of the run, or take '
             'map and run of one drive'
         )
-    is_same = [replace(each, id='') == replace(sessions[parts[0]], id='') for each in sessions]
+    is_same = [replace(entry, id='') == replace(sessions[parts[0]], id='') for entry in sessions]
     return np.flatnonzero(np.isin(index, [number for number in parts if is_same[number]]))
 
 
@@ -204,5 +204,5 @@ def _of_velocities(
     is_moving = (abs(constant) > (STILL_SPEED, STILL_TURN)).any(axis=1)
     columns = np.column_stack([constant, is_moving]) * steps[:, None]
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
-    moved, turned, moving = (np.diff(np.interp(stamps, at, each)) for each in sums.T)
+    moved, turned, moving = (np.diff(np.interp(stamps, at, column)) for column in sums.T)
     return moved, turned, moving

@@ -111,7 +111,7 @@ def _datasets(arguments: argparse.Namespace) -> 'dict[str, Dataset | SourceError
             datasets[name] = open_dataset(name, arguments.data)
         except SourceError as error:
             datasets[name] = error
-    if all(isinstance(each, SourceError) for each in datasets.values()):
+    if all(isinstance(dataset, SourceError) for dataset in datasets.values()):
         raise SourceError(f'none of the data sets {", ".join(names)} is in {arguments.data}')
     return datasets
 

@@ -132,12 +132,12 @@ def table() -> list[str]:
     ]  # fmt: skip
     for name, failure in FAILURES.items():
         cells, reasons = [], set()
-        for each in columns:
+        for column in columns:
             if is_slow(failure):
-                meters = meters_per_image(failure, *each)
+                meters = meters_per_image(failure, *column)
                 reasons = {'it goes on'}
             else:
-                drives = [drive(failure, *each, k / PHASES) for k in range(PHASES)]
+                drives = [drive(failure, *column, k / PHASES) for k in range(PHASES)]
                 meters = max(one[3] if failure.rate else one[0] for one in drives)
                 reasons |= {one[1].split(':')[0] for one in drives}
             cells.append(f'{meters:.2f} m')

@@ -99,7 +99,7 @@ def run(days: Days, count: int) -> Iterator[Day]:
         begin, low, high = days.built
         rebuilt = EPOCH + begin * DAY if number >= begin else 0
         vanished = sum(
-            each < rebuilt and low <= positions[each] < high for each in updated.stamps.tolist()
+            stamp < rebuilt and low <= positions[stamp] < high for stamp in updated.stamps.tolist()
         )
         places = tuple(map(len, (first, updated, updated)))
         yield Day(number, recall, wrong, places, vanished, changes)

@@ -136,7 +136,7 @@ def teach(world: RingWorld, begin: float = 0.0, length: float = LENGTH) -> Taugh
     """Drive along a part of the street by day, and record images and velocities."""
     along = begin + np.arange(0, length, SPEED / RATE)
     line, cells = world.center_line, np.arange(len(world.center_line)) * CELL
-    across = LANE + 0.5 * (np.array([noise(each / 17.0, 0.0, 1) for each in along]) - 0.5)
+    across = LANE + 0.5 * (np.array([noise(meters / 17.0, 0.0, 1) for meters in along]) - 0.5)
     x, y, heading = (np.interp(along, cells, column) for column in line.T)
     x, y = x + across * np.sin(heading), y - across * np.cos(heading)
     heading = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
@@ -290,8 +290,8 @@ def plot(taught: Taught, drives: dict[str, Drive], path: Path) -> None:
         over.plot(np.cumsum(drive.speeds) * STEP, drive.errors[:, 0], linewidth=1, label=name)
     above.set(xlabel='x (m)', ylabel='y (m)', aspect='equal')
     over.set(xlabel='driven (m)', ylabel='left of the taught path (m)', ylim=(-2, 2))
-    for each in (-0.5, 0.5):
-        over.axhline(each, color='0.7', linewidth=0.8)
+    for limit in (-0.5, 0.5):
+        over.axhline(limit, color='0.7', linewidth=0.8)
     above.legend()
     figure.savefig(path, dpi=100)
 

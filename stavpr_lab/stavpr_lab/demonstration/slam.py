@@ -143,8 +143,8 @@ def trajectory_errors(
         ) from error
     seconds = (stamps - stamps[0]) / SECOND
     reference, estimate = (
-        PoseTrajectory3D(each[:, :3].copy(), each[:, [6, 3, 4, 5]].copy(), seconds)
-        for each in (truth, poses)
+        PoseTrajectory3D(trajectory[:, :3].copy(), trajectory[:, [6, 3, 4, 5]].copy(), seconds)
+        for trajectory in (truth, poses)
     )
     estimate.align(reference)
     absolute = metrics.APE(metrics.PoseRelation.translation_part)
@@ -157,7 +157,7 @@ def trajectory_errors(
         [estimate.positions_xyz, estimate.orientations_quat_wxyz[:, [1, 2, 3, 0]]]
     )
     errors = [
-        float(each.get_statistic(metrics.StatisticsType.rmse)) for each in (absolute, relative)
+        float(metric.get_statistic(metrics.StatisticsType.rmse)) for metric in (absolute, relative)
     ]
     return errors[0], errors[1], aligned
 

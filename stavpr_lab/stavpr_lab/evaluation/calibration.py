@@ -90,6 +90,6 @@ def calibrate(
     levels = {
         level: accepted_counts(probabilities >= level, correct, has_match) for level in LEVELS
     }
-    best = max(counts, key=lambda each: each.f1)
-    full = max(each.recall for each in counts if each.precision == 1)
+    best = max(counts, key=lambda c: c.f1)
+    full = max(c.recall for c in counts if c.precision == 1)
     return Calibration(images, declared, right, levels, best, full)

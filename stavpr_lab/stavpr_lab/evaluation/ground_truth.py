@@ -145,7 +145,7 @@ class GroundTruth:
             raise InputError(f'{meters} meters and {degrees} degrees: expected numbers >= 0')
         with_pose = np.flatnonzero(~np.isnan(place[:, 0]))
         near = KDTree(place[with_pose, :3]).query_ball_point(query[:, :3], meters)
-        queries = np.repeat(np.arange(len(query)), [len(each) for each in near])
+        queries = np.repeat(np.arange(len(query)), [len(row) for row in near])
         places = with_pose[np.concatenate(near).astype(np.int64)]
         if degrees is not None:
             # a quaternion and its negative are the same rotation: the angle is 2 acos |<p, q>|

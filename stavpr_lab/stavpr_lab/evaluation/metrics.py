@@ -271,10 +271,10 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
             assign(ends[0], position, aligned_index(matches[ends[0]].path.pairs, position))
         for position in range(middle + 1, length):
             assign(ends[-1], position, aligned_index(matches[ends[-1]].path.pairs, position))
-    for each in chain.from_iterable(match.late for match in matches if late):
-        image = each.first_image + each.position
-        result.places[image], result.distances[image] = each.place, score_of(each)
-        result.accepted[image], result.probabilities[image] = True, each.probability
+    for late_match in chain.from_iterable(match.late for match in matches if late):
+        image = late_match.first_image + late_match.position
+        result.places[image], result.distances[image] = late_match.place, score_of(late_match)
+        result.accepted[image], result.probabilities[image] = True, late_match.probability
     return result
 
 
@@ -296,7 +296,7 @@ def published_matches(matches: Sequence[Match], length: int) -> tuple[ImageMatch
     ]
     newest = [int(match.path.pairs[-1, 0]) for _, match in early]
     images = [end - last + last // 2 for (end, _), last in zip(early, newest, strict=True)]
-    rows = [(each.place, score_of(each), True, each.probability) for _, each in early]
+    rows = [(match.place, score_of(match), True, match.probability) for _, match in early]
     columns = np.array(rows).reshape(-1, 4).T
     published = [
         np.append(getattr(of_images, name), column.astype(getattr(of_images, name).dtype))
@@ -325,13 +325,13 @@ def evaluate_ranking(
     return Metrics(
         queries=len(scores),
         with_match=int(np.count_nonzero(has_match)),
-        best=max(counts, key=lambda each: each.f1),
+        best=max(counts, key=lambda c: c.f1),
         average_precision=average_precision,
         recall_at={k: _recall_at(k, correct, has_match) for k in RANKS},
-        recall_at_full_precision=max(each.recall for each in counts if each.precision == 1),
+        recall_at_full_precision=max(c.recall for c in counts if c.precision == 1),
         sklearn_f1=sklearn_f1,
         sklearn_recall_at_full_precision=sklearn_recall,
-        curve=np.array([(each.threshold, each.precision, each.recall) for each in counts]),
+        curve=np.array([(c.threshold, c.precision, c.recall) for c in counts]),
     )
 
 

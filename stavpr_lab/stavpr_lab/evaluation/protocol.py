@@ -194,7 +194,7 @@ def evaluate_protocol(
             rankings = _recognized(place_map, query, one, lengths, backend)
         else:
             traverses = query, place_map.features
-            queries, places = (image_vectors(each, method == 'centered') for each in traverses)
+            queries, places = (image_vectors(side, method == 'centered') for side in traverses)
             rankings = match_sequences(1 - queries @ places.T, method, lengths)
         yield from evaluate_matches(method, rankings, truths)
 

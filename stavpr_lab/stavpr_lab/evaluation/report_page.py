@@ -150,8 +150,8 @@ def _data(report: Report, mistakes: list[int]) -> dict[str, Any]:
     ]
     views = [_view(report, window) for window in sample]
     pairs = _pairs(report, mistakes)
-    places = {each[name] for each in [*views, *pairs] for name in ('place', 'true')}
-    images = {each['image'] for each in [*views, *pairs]}
+    places = {entry[name] for entry in [*views, *pairs] for name in ('place', 'true')}
+    images = {entry['image'] for entry in [*views, *pairs]}
     return {
         'images': len(report.query),
         'views': views,

@@ -122,7 +122,7 @@ class SpatialReranker:
     def __init__(self, maps: torch.Tensor, settings: SsmVprSettings | None = None) -> None:
         self._settings = settings = settings or SsmVprSettings()
         self._whitening = learn_whitening(maps, settings.small, settings.small_dimension)
-        self._places = torch.stack([self._anchors(each) for each in maps])
+        self._places = torch.stack([self._anchors(feature_map) for feature_map in maps])
         self.side = maps.shape[2] - settings.small + 1
         if maps.shape[2] != maps.shape[3]:
             raise InputError(f'feature maps have shape {tuple(maps.shape)}: expected square ones')
@@ -187,7 +187,7 @@ class SsmVpr:
         settings = self.settings
         self.reranker = SpatialReranker(self.second, settings)
         self._whitening = learn_whitening(self.first, settings.large, settings.large_dimension)
-        vectors = [self._whitening(cubes(each[None], settings.large)[0]) for each in self.first]
+        vectors = [self._whitening(cubes(maps[None], settings.large)[0]) for maps in self.first]
         self._image = np.repeat(np.arange(len(vectors)), len(vectors[0]))
         self._cubes = torch.cat(vectors)
         self._answers: deque[tuple[int, float]] = deque(maxlen=settings.memory)

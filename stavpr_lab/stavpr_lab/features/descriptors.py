@@ -173,7 +173,7 @@ def _from_hdf5(file: Path, name: str) -> np.ndarray:
 
 def _chosen(file: Path, name: str, shapes: dict[str, tuple[int, ...]]) -> str:
     """Return the name of the array to read: the requested or the only possible one."""
-    able = [each for each, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 1]
+    able = [key for key, shape in shapes.items() if len(shape) in (2, 3) and min(shape) > 1]
     if not name and len(able if len(shapes) > 1 else shapes) == 1:
         return (able or list(shapes))[0]
     if name not in shapes:

@@ -271,7 +271,7 @@ class Monitor:
                 'name': status.name,
                 'level': LEVELS[min(ord(status.level), 3)],
                 'message': status.message,
-                'values': [[each.key, each.value] for each in status.values],
+                'values': [[pair.key, pair.value] for pair in status.values],
             }
             for status in message.status
             if self._full_name.strip('/') in status.name
@@ -306,7 +306,7 @@ def encode_row(row: np.ndarray) -> str:
 def for_json(value: Any) -> Any:
     """Return a value for JSON, which has no NaN and no infinity: None instead."""
     if isinstance(value, dict):
-        return {key: for_json(each) for key, each in value.items()}
+        return {key: for_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [for_json(each) for each in value]
+        return [for_json(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

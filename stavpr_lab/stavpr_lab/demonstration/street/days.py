@@ -60,7 +60,7 @@ class Days:
                     lots['seed'][lot] = int(dice.random() * 2**30)
         begin, low, high = self.built
         if day >= begin:
-            new = [each for each in other if each['kind'] == BUILDING]
+            new = [lot for lot in other if lot['kind'] == BUILDING]
             for lot in np.flatnonzero((lots['start'] >= low) & (lots['start'] < high)).tolist():
                 if lots['kind'][lot] == BUILDING:
                     own, given = lots[lot].copy(), new[lot % len(new)]
