@@ -17,7 +17,7 @@ from typing import Any
 from data import data_folder
 import numpy as np
 from results import environment, heading, options_parser, table, write_json, write_lines
-from stavpr_lab.evaluation.drive import cropped, DriveChanges, KINDS
+from stavpr_lab.evaluation.drive import crop, DriveChanges, KINDS
 from stavpr_lab.evaluation.evaluate import (
     evaluate_loop_closures,
     evaluate_on_map,
@@ -91,7 +91,7 @@ def long_cases(folder: Path, feature: str) -> Iterator[Case]:
     )
     yield Case('nordland', summer, winter, identity(3))
     if feature == 'g':
-        shifted = cropped(summer, 0, 0.3), cropped(winter, 0.1, 0)
+        shifted = crop(summer, 0, 0.3), crop(winter, 0.1, 0)
         yield Case('synth_nordland', *shifted, identity(3))
 
 
@@ -145,7 +145,7 @@ def evaluate_case(
         truth = case.truth(len(query), len(place_map))
         settings = RecognizerSettings(mode=mode)
         for warp in ('same', *KINDS) if case.warps else ('same',):
-            images = DriveChanges.named(warp, len(query)).images(len(query))
+            images = DriveChanges.from_name(warp, len(query)).images(len(query))
             evaluation = evaluate_on_map(
                 place_map, query.features[images], truth.select(images), settings
             )

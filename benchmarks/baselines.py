@@ -52,7 +52,7 @@ def prange() -> Callable[[np.ndarray, int, np.ndarray, np.ndarray], None]:
     return lm_dtw
 
 
-def accumulated(costs: np.ndarray) -> float:
+def accumulate_costs(costs: np.ndarray) -> float:
     """Return the accumulated cost of the last cell of dynamic time warping, in float64."""
     S = np.full((costs.shape[0] + 1, costs.shape[1] + 1), np.inf)
     S[0, 0] = 0

@@ -62,7 +62,7 @@ class HalfFeatures(LocalFeatures):
         return LocalFeatures(strips, weights, self.settings, self.cells)
 
 
-def simulated(real: LocalFeatures, n: int, seed: int) -> Iterator[np.ndarray]:
+def simulate_places(real: LocalFeatures, n: int, seed: int) -> Iterator[np.ndarray]:
     """Yield the strips (W, m, d) of n simulated places, block by block."""
     rng = np.random.default_rng(seed)
     W, m, d = real.strips.shape
@@ -87,7 +87,7 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
     """Return a city of n places, and the first of the real ones."""
     W, m, d = real.strips.shape
     half, low = np.empty((W, n, d), dtype=np.float16), 0
-    for strips in simulated(real, n, seed):
+    for strips in simulate_places(real, n, seed):
         half[:, low : low + strips.shape[1]] = strips
         low += strips.shape[1]
     first = int(AT * (n - m))
@@ -96,7 +96,7 @@ def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
     return HalfFeatures(half, weights, real.settings, real.cells), first
 
 
-def reduced(
+def reduce_dimensions(
     features: LocalFeatures, query: LocalFeatures, dimension: int
 ) -> tuple[Map, LocalFeatures]:
     """Return a city and a query, projected as ``map compact --pca`` does."""
@@ -148,13 +148,13 @@ def measure(
     extractor = FeatureExtractor('gradient')
     real = extract_features(open_source(folder / reference), extractor, progress=False)
     query = extract_features(open_source(folder / query_folder), extractor, progress=False)
-    indices = DriveChanges.named(speed, len(query)).images(len(query))
+    indices = DriveChanges.from_name(speed, len(query)).images(len(query))
     indices = indices[:images]
     query = query[indices]
     features, first = city(real, n, seed)
     place_map = descriptor_map(features)
     if pca:
-        place_map, query = reduced(features, query, pca)
+        place_map, query = reduce_dimensions(features, query, pca)
     if save is not None:
         save_map(place_map, save, force=True)
     return {
@@ -186,7 +186,7 @@ def lines(results: list[dict[str, Any]]) -> list[str]:
     return table(head, rows)
 
 
-def merged(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def merge_results(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Add results to a file, each case and size once, the newest last; return all."""
     before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
     of_cases = {(one['case'], one['places'], one['dimension']): one for one in (*before, *new)}
@@ -215,12 +215,12 @@ def main() -> None:
     parser.add_argument('--save-map', type=Path, help='of the last case, for soak.py --map')
     parser.add_argument('--output', type=Path, default=RESULTS / 'city.json', help='JSON file')
     arguments = parser.parse_args()
-    rows = merged(arguments.output, [])
+    rows = merge_results(arguments.output, [])
     for n in arguments.places:
         for case in arguments.cases:
             options = arguments.images, arguments.seed, arguments.pca, arguments.save_map
             one = measure(case, n, *options)
-            rows = merged(arguments.output, [one])
+            rows = merge_results(arguments.output, [one])
             print('\n'.join(lines([one])[2:3]), flush=True)
     print('\n'.join(lines(rows)))
     if arguments.output == RESULTS / 'city.json':

@@ -114,7 +114,7 @@ def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[s
     owners = {'operations': operations, 'operation': operation, 'recognizer': recognizer}
     times: dict[str, list[float]] = {}
 
-    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def time_calls(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **options: Any) -> Any:
             began = time.process_time()
             result = function(*arguments, **options)
@@ -124,7 +124,7 @@ def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[s
         return call
 
     messages = [image_message(image) for image in texture_route(VIEWS)]
-    process = timed('all', operation.process)
+    process = time_calls('all', operation.process)
     for number in range(WARM + 2 * IMAGES):
         if number == WARM + IMAGES:  # the whole is measured without the timers of the stages
             for stage, (owner, name) in STAGES.items():
@@ -132,7 +132,7 @@ def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[s
                 target = owners[first]
                 for part in rest:
                     target = getattr(target, part)
-                setattr(target, name, timed(stage, getattr(target, name)))
+                setattr(target, name, time_calls(stage, getattr(target, name)))
         if number in (WARM, WARM + IMAGES):
             total = times.get('all', [])[-IMAGES:]
         time.sleep(1 / rate if rate else 0)
@@ -140,7 +140,7 @@ def measure_stages(path: str, precision: str, threads: int, rate: int) -> dict[s
     assert recognizer is not None
     size = recognizer.places * 7 * 224 * (1 if precision == 'int8' else 4) // 4
     content, read = np.ones(size, np.float32), reader(threads)
-    call = timed('reading the map', lambda: read(content))
+    call = time_calls('reading the map', lambda: read(content))
     for _ in range(50):
         call()
     medians = {name: statistics.median(values[-IMAGES:]) for name, values in times.items()}

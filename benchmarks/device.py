@@ -94,18 +94,18 @@ def recognizer_of(
 ) -> PlaceRecognizer:
     """Return a recognizer that uses the features as they are: their centering takes minutes."""
 
-    def prepared(*_: Any) -> PreparedMap:
+    def prepare(*_: Any) -> PreparedMap:
         used = convert_features(places, rounds=True) if precision == 'int8' else places
         few = places[: min(len(places), 2000)]
         centering = MeanCentering(few, True, True) if mode == 'robust' else None
         return PreparedMap(used, centering, np.ones((5, len(places)), np.float32))
 
     settings = RecognizerSettings(0.9 if mode == 'paper' else None, mode=mode)
-    with patch('stavpr_ros.method.localizer.prepare_map', prepared):
+    with patch('stavpr_ros.method.localizer.prepare_map', prepare):
         return PlaceRecognizer(descriptor_map(places), settings, backend, precision)
 
 
-def measured(
+def measure(
     places: LocalFeatures, driven: LocalFeatures, mode: str, precision: str, backend: Any
 ) -> dict[str, Any]:
     """Measure images of one recognizer; see the module."""
@@ -158,11 +158,11 @@ def measured(
             'bytes_per_place': round(counter.bytes / len(places)),
         }
     if len(places) <= DISTINCT:
-        row |= compared(answers, recognizer_of(places, mode, precision, 'cpu'), driven)
+        row |= compare_answers(answers, recognizer_of(places, mode, precision, 'cpu'), driven)
     return row
 
 
-def compared(
+def compare_answers(
     answers: list[tuple[str, int, float]], cpu: PlaceRecognizer, driven: LocalFeatures
 ) -> dict[str, Any]:
     """Compare with the answers of the CPU to the same images."""
@@ -201,7 +201,7 @@ def main() -> int:
         for mode, precision in CASES:
             began = time.perf_counter()
             try:
-                row = measured(places, driven, mode, precision, backend)
+                row = measure(places, driven, mode, precision, backend)
             except Exception as error:  # one case of a device that fails must not hide the others
                 row = {'mode': mode, 'precision': precision, 'places': n, 'error': repr(error)}
             row['took_s'] = round(time.perf_counter() - began, 1)

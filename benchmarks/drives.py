@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from accuracy import short_cases
 import cv2
 import numpy as np
-from off_map import extracted, Pair, stretches
+from off_map import extract_map, Pair, stretches
 from sessions import LAP, path
 from stavpr_lab.evaluation.drive import Drive as ChangedDrive
 from stavpr_lab.evaluation.drive import DriveChanges
@@ -69,7 +69,7 @@ class Drive:
     use: str = 'both'
 
 
-def damaged(image: np.ndarray, damage: str) -> np.ndarray:
+def damage_image(image: np.ndarray, damage: str) -> np.ndarray:
     """Return an image of a darker, covered, rolled or wet camera, or of a narrower view."""
     h, w = image.shape[:2]
     kind, _, share = damage.partition(' ')
@@ -100,13 +100,13 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
     def read(name: str, damage: str = '', by: FeatureExtractor = making) -> Map:
         source: Any = open_source(folder / name)
         if damage:
-            source = [replace(f, image=damaged(f.image, damage)) for f in source]
-        return extracted(source, by)
+            source = [replace(f, image=damage_image(f.image, damage)) for f in source]
+        return extract_map(source, by)
 
     sets, places = Sets([], []), dict[str, Map]()
     named = {'walk_day': 'day', 'walk_night': 'night', 'walk_night_map': 'night map'}
     for case in short_cases(folder):
-        reference, query = extracted(case.places, making), extracted(case.query, making)
+        reference, query = extract_map(case.places, making), extract_map(case.query, making)
         truth = case.truth(len(query), len(reference))
         kind = {'gardens_point': 'day', 'corridor': 'corridor', **named}[case.name]
         group = 'corridor' if kind == 'corridor' else 'gardens'
@@ -171,7 +171,7 @@ def drives_of(sets: Sets, quick: bool) -> Iterator[Drive]:
     for kind, group, pair in sets.pairs:
         is_few, n = quick or kind in ('crops', 'damaged night'), len(pair.query)
         for name in CHANGES[:2] if is_few else CHANGES:
-            drive = DriveChanges.named(name, n).apply(pair.truth)
+            drive = DriveChanges.from_name(name, n).apply(pair.truth)
             if not pair.long:
                 yield _of_pair(kind, group, pair, drive, np.arange(len(drive.images)))
                 continue

@@ -18,7 +18,7 @@ from stavpr_ros.features.extractor import cut_strips, normalize
 from stavpr_ros.features.gradient import FLOOR, GradientSettings
 from stavpr_ros.mapping import small_gray
 from stavpr_ros.sources.encodings import decode_message
-from timing import timed
+from timing import timed_job
 import torch
 from torch.nn.functional import avg_pool2d, pad
 
@@ -85,7 +85,7 @@ def extraction_stages(run: Run) -> None:
     for n in (1, BATCH):
         batches = [images[i : i + n] for i in range(0, IMAGES, n)]
         call = partial(on_next, extractor.extract, cycle(batches))
-        job = timed(partial(on_next, by_torch, cycle(batches)))
+        job = timed_job(partial(on_next, by_torch, cycle(batches)))
         peer = Peer('torch operators', job, 'the same features, on all cores')
         run.measure('extraction', (n, 0), call, [Work(n * size, 0)], [peer])
 
@@ -98,7 +98,7 @@ def extraction_stages(run: Run) -> None:
     jpeg = [SimpleNamespace(format='jpeg', data=cv2.imencode('.jpg', one)[1]) for one in large]
     side = extractor.settings.backbone.size
     for kind, of_kind in (('raw', [raw_message(image) for image in large]), ('JPEG', jpeg)):
-        peer = Peer('whole image', timed(partial(on_next, features, cycle(of_kind))))
+        peer = Peer('whole image', timed_job(partial(on_next, features, cycle(of_kind))))
         call = partial(on_next, partial(features, least=(side, side)), cycle(of_kind))
         works = [Work(of_kind[0].data.nbytes, 0)]
         run.measure(f'1080p {kind} to features', (1, 0), call, works, [peer])

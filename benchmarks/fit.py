@@ -19,13 +19,13 @@ from typing import Any
 from data import data_folder
 from drives import drives_of, NEGATIVES, read_sets, SETS
 from fit_windows import (
-    achieved,
     constant_at,
+    count_matches,
     folds_of,
     half_and_double,
     late_recall,
     LIMITS,
-    pooled,
+    pool_risks,
     probability,
     recalls_left_out,
     RECORDED,
@@ -107,7 +107,7 @@ def draw(risks: Risks, path: Path) -> None:
     axes, on = figure.subplots(1, 2, sharey=True), np.array([bool(d.truth) for d in risks.drives])
     errors, means = error_rate.ERRORS, np.full((2, len(error_rate.ERRORS)), np.nan)
     for k, error in enumerate(errors):
-        wrong, matched = achieved(risks, error)
+        wrong, matched = count_matches(risks, error)
         low, high = wilson(wrong, matched)
         for side, rows in enumerate((on & (matched > 0), ~on & (matched > 0))):
             if not rows.any():
@@ -137,12 +137,12 @@ def errors_section(every: Sequence[Windows], values: Values, draws: bool) -> lis
     """Return the lines on error rates, and draw them."""
     scores = [w.scores(values) for w in every]
     t = np.linspace(-12, 12, 481)
-    risks = pooled([Risks.of(w, s, t) for w, s in zip(every, scores, strict=True)])
+    risks = pool_risks([Risks.of(w, s, t) for w, s in zip(every, scores, strict=True)])
     on, cells = np.array([bool(d.truth) for d in risks.drives]), []
     everyone = np.ones(len(on), bool)
     for error in error_rate.ERRORS:
-        at = risks.least(error, everyone)
-        (wrong, matched), x = achieved(risks, error), risks.t[at] if at < len(t) else np.inf
+        at = risks.first_row(error, everyone)
+        (wrong, matched), x = count_matches(risks, error), risks.t[at] if at < len(t) else np.inf
         rates, has = wrong / np.maximum(matched, 1), matched > 0
         low, _ = wilson(wrong, matched)
         over = [f'{np.count_nonzero(low[rows] > error)}' for rows in (on, ~on)]

@@ -61,7 +61,7 @@ Values = dict[str, float]
 # ------------------------------------------------ what windows show
 
 
-def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
+def record_drive(drive: Drive, with_early: bool = True) -> np.ndarray:
     """
     Return what each window of a drive shows, (m, 13), in order.
 
@@ -85,7 +85,7 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
         lead = np.log1p(q.images * q.lead)
         return log_odds(q.belief), q.uneven, q.excess, q.creep, lead, cells, nothing
 
-    def noted(result: Any, is_early: bool) -> Any:
+    def note(result: Any, is_early: bool) -> Any:
         path = result.path
         if path.place >= 0:
             l = len(path.pairs)
@@ -102,23 +102,23 @@ def recorded(drive: Drive, with_early: bool = True) -> np.ndarray:
             rows.append((state['image'], *about, kind, *quantities(which), path.probability))
         return result
 
-    def assessed() -> None:
+    def assess_view() -> None:
         shown.clear()
         assess()
 
     def matched() -> Any:
-        return noted(match(), False)
+        return note(match(), False)
 
     def early() -> Any:
         state['early'] = state['image']
         shown.clear()
-        return noted(newest(), True) if with_early else type(match())()
+        return note(newest(), True) if with_early else type(match())()
 
     def keep(*arguments: Any) -> Any:
         shown.append(show(*arguments))
         return shown[-1]
 
-    vars(window).update(_assess=keep, assess=assessed, match=matched, match_newest=early)
+    vars(window).update(_assess=keep, assess=assess_view, match=matched, match_newest=early)
     for i, stamp in enumerate(drive.stamps.tolist()):
         state['image'] = i
         recognizer.update(drive.features[i : i + 1], stamp)
@@ -153,7 +153,7 @@ def record(sets: Path, quick: bool, files: dict[tuple[str, Any], Path]) -> None:
         if name:  # nothing is fitted on it
             set_value(name, value)
         kept = [d if not name or d.use != 'fit' else None for d in drives]
-        rows = [recorded(d, not name) if d else np.empty((0, 13)) for d in kept]
+        rows = [record_drive(d, not name) if d else np.empty((0, 13)) for d in kept]
         to.write_bytes(pickle.dumps(rows))
         if name:
             set_value(name, before)
@@ -504,7 +504,7 @@ class Risks:
         return int(len(self.t) - np.argmin(np.append(bounds[::-1] <= error, False)))
 
 
-def pooled(every: Sequence[Risks]) -> Risks:
+def pool_risks(every: Sequence[Risks]) -> Risks:
     """Return the drives of several kinds of features as one."""
     counts = (
         np.concatenate(columns, axis=1)
@@ -514,12 +514,12 @@ def pooled(every: Sequence[Risks]) -> Risks:
     return Risks(every[0].t, drives, *counts)
 
 
-def achieved(risks: Risks, error: float) -> tuple[np.ndarray, np.ndarray]:
+def count_matches(risks: Risks, error: float) -> tuple[np.ndarray, np.ndarray]:
     """Return wrong matches and matches of each drive, with the t of drives without its groups."""
     groups = [frozenset(d.groups) for d in risks.drives]
     wrong, matched = np.zeros(len(groups)), np.zeros(len(groups))
     for fold in set(groups):
-        at = risks.least(error, np.array([not g & fold for g in groups]))
+        at = risks.first_row(error, np.array([not g & fold for g in groups]))
         own = np.array([g == fold for g in groups])
         if at < len(risks.t):
             wrong[own], matched[own] = risks.wrong[at, own], risks.matched[at, own]

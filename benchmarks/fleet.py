@@ -33,7 +33,7 @@ TOLERANCE = 2
 SETTINGS = RecognizerSettings(mode='robust')
 
 
-def generated(traverses: list[LocalFeatures], count: int, seed: int = 0) -> LocalFeatures:
+def generate_places(traverses: list[LocalFeatures], count: int, seed: int = 0) -> LocalFeatures:
     """Return the features of ``count`` generated places, see the module."""
     rng = np.random.default_rng(seed)
     W, _, d = traverses[0].strips.shape
@@ -58,7 +58,7 @@ def city(route: Map, distractors: list[Map], count: int) -> tuple[Map, int]:
     others = [one.features for one in distractors]
     extra = count - len(route) - sum(map(len, others))
     if extra > 0:
-        others.append(generated(others, extra))
+        others.append(generate_places(others, extra))
     joined = LocalFeatures.concatenate(others)
     first = len(joined) // 2
     parts = [joined[:first], route.features, joined[first:]]

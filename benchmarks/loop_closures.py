@@ -78,11 +78,11 @@ def routes_section(sets: Sets, feature: str) -> list[str]:
     drives, kind = list(drives_twice(sets)), KINDS[feature]
     entry, cells = registry.KINDS[kind], []
 
-    def measured(k: float) -> np.ndarray:
+    def measure(k: float) -> np.ndarray:
         registry.KINDS[kind] = replace(entry, route=k)
         return np.array([closures(pair) for pair in drives])
 
-    by_k = {round(entry.route + step, 2): measured(entry.route + step) for step in STEPS}
+    by_k = {round(entry.route + step, 2): measure(entry.route + step) for step in STEPS}
     for k, counts in by_k.items():
         cells.append([f'K {k}', *_cells(drives, counts)])
     left_out = np.array([by_k[_best(drives, by_k, d.groups)][i] for i, d in enumerate(drives)])
@@ -92,7 +92,7 @@ def routes_section(sets: Sets, feature: str) -> list[str]:
         values = (0.86, 0.965) if name == 'CONFIRMED' else half_and_double(name)
         for value in values:  # of a probability, half and double of the odds against it
             set_value(name, value)
-            cells.append([f'{name} {value:g}', *_cells(drives, measured(entry.route))])
+            cells.append([f'{name} {value:g}', *_cells(drives, measure(entry.route))])
         set_value(name, before)
     registry.KINDS[kind] = entry
     head = kind, 'right, on time + late', 'wrong', 'wrong on unrelated and reversed drives'

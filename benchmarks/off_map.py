@@ -209,7 +209,7 @@ def outcome(
     )
 
 
-def changed(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> Outcome:
+def drive_pair(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -> Outcome:
     """
     Drive the query of a pair otherwise than it was recorded.
 
@@ -248,14 +248,15 @@ def detours(pair: Pair, coarser: int = 1) -> Iterator[Outcome]:
     """Yield the outcome of each stretch that the map lacks."""
     for first, last in stretches(pair, coarser):
         stretch = slice(max(0, first - BEFORE), last + AFTER) if pair.long else slice(None)
-        yield changed(pair, DriveChanges(removed=((first, last),)), stretch)
+        yield drive_pair(pair, DriveChanges(removed=((first, last),)), stretch)
 
 
 def drives(pair: Pair) -> Iterator[tuple[str, Outcome]]:
     """Yield the outcome of each change of a query: all for day and night, few for the others."""
     names = CHANGES if pair.name in WARPED else CHANGES[:1]
     for name in (*names, '4.5x') if pair.long else names:
-        yield f'{pair.name}/{name}', changed(pair, DriveChanges.named(name, len(pair.query)))
+        changes = DriveChanges.from_name(name, len(pair.query))
+        yield f'{pair.name}/{name}', drive_pair(pair, changes)
 
 
 def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> int | None:
@@ -350,7 +351,7 @@ class Measurement:
         self.driven += [*pooled, each_third]
         self.add('set_calibration', pair.name, Outcome.pooled([*pooled, each_third]).calibration())
         if not pair.long:
-            self.add('reverse', pair.name, changed(pair, DriveChanges(reverse=True)).numbers())
+            self.add('reverse', pair.name, drive_pair(pair, DriveChanges(reverse=True)).numbers())
         outcomes = list(detours(pair, self.coarser))
         numbers = [one.numbers() for one in outcomes]
         shares = [one['unseen_matched'] / one['unseen'] for one in numbers if one['unseen']]
@@ -406,7 +407,7 @@ def extractor(feature: str, folder: Path) -> FeatureExtractor:
     return FeatureExtractor(KINDS[feature])
 
 
-def extracted(source: Any, making: FeatureExtractor) -> Map:
+def extract_map(source: Any, making: FeatureExtractor) -> Map:
     """Return a map of all images of a source."""
     return build_map(source, making, thumbnails=False, progress=False)
 
@@ -417,7 +418,7 @@ def pairs_of(folder: Path, feature: str, making: FeatureExtractor) -> Iterator[P
 
     def features(source: Any) -> Map:
         if id(source) not in pairs:
-            pairs[id(source)] = source, extracted(source, making)
+            pairs[id(source)] = source, extract_map(source, making)
         return pairs[id(source)][1]
 
     for case in (*short_cases(folder), *long_cases(folder, feature)):
@@ -441,7 +442,7 @@ def measure(folder: Path, features: Sequence[str], coarser: int) -> Results:
             print(f'{KINDS[feature]}: {pair.name}', file=sys.stderr)
             measurement.pair(pair)
         paths = sorted(path for path in (folder / TOWER).iterdir() if path.is_dir())
-        measurement.floors({path.name: extracted(open_source(path), making) for path in paths})
+        measurement.floors({path.name: extract_map(open_source(path), making) for path in paths})
         results |= measurement.finish()
     return results
 

@@ -175,11 +175,11 @@ def _starts(rows: dict[str, dict[str, Any]], is_gradient: bool) -> dict[str, tup
         begun = {name: row for name, row in rows.items() if name.endswith(JUMP) == is_jump}
         if begun:
             aim = f'{25 if is_gradient else 20} images'
-            cells[f'{label}: right within 30 images'] = _begun(begun), aim
+            cells[f'{label}: right within 30 images'] = _start_text(begun), aim
     return cells
 
 
-def _begun(rows: dict[str, Any]) -> str:
+def _start_text(rows: dict[str, Any]) -> str:
     """Return how many starts were right, and the images until then."""
     right, count = (sum(row[name] for row in rows.values()) for name in ('right', 'starts'))
     medians = [row['median'] for row in rows.values() if row['median']] or [0]

@@ -33,7 +33,7 @@ from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.mapping import descriptor_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.threads import limit_threads
-from timing import measure, timed
+from timing import measure, timed_job
 
 SIZES = 2_000, 20_000  # places
 WINDOW, TOLERANCE = 20, 2
@@ -167,7 +167,7 @@ def main(arguments: list[str] | None = None) -> int:
         def match(name: str, method: Method, numbers: Any = numbers) -> None:
             method.newest(next(numbers[name]) % N)
 
-        jobs = {name: timed(partial(match, name, method)) for name, method in ready.items()}
+        jobs = {name: timed_job(partial(match, name, method)) for name, method in ready.items()}
         slow = {name: job for name, job in jobs.items() if name.startswith('ORB')}
         for name, timing in {
             **measure({name: job for name, job in jobs.items() if name not in slow}, 8.0),

@@ -91,7 +91,7 @@ def seqmatch(folder: Path, places: np.ndarray, queries: np.ndarray, length: int)
     return scores.argmin(axis=0), scores.min(axis=0)
 
 
-def centered(rows: np.ndarray) -> np.ndarray:
+def center_vectors(rows: np.ndarray) -> np.ndarray:
     """Return vectors (n, D) less their mean, of unit norm, a common preparation of descriptors."""
     rows = rows - rows.mean(axis=0)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
@@ -124,7 +124,7 @@ def methods(
     """Yield name and matches of each method."""
     places, queries = (image_vectors(traverse.features) for traverse in (place_map, query))
     yield from peer_methods(options, places, queries)
-    for name, matches in peer_methods(options, centered(places), centered(queries)):
+    for name, matches in peer_methods(options, center_vectors(places), center_vectors(queries)):
         yield f'{name}, centered', matches
     for length in (10, LONGEST):
         settings = SeqSlamSettings(length=length)
@@ -183,7 +183,7 @@ def measure(options: Any) -> Iterator[tuple[str, str, str, dict[str, float]]]:
             )
             recorded = case.truth(len(query), len(place_map))
             for drive in ('same', '2x', 'vary') if case.warps else ('same',):
-                images = DriveChanges.named(drive, len(query)).images(len(query))
+                images = DriveChanges.from_name(drive, len(query)).images(len(query))
                 part, truth = select_places(query, images), recorded.select(images)
                 name = case.name if drive == 'same' else f'{case.name} {drive}'
                 for method, matches in methods(options, place_map, part, truth):

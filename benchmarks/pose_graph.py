@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 from results import commit, cpu_model
-from stavpr_lab.demonstration.simulated_odometry import drifted
+from stavpr_lab.demonstration.simulated_odometry import add_drift
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph import Closure, PoseGraph
@@ -32,7 +32,7 @@ def measure(nodes: int, timed: int, drift: float, late: int) -> tuple[np.ndarray
     radius = STEP * LAP / (2 * np.pi)
     truth = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), angle + np.pi / 2])
     dice = np.random.default_rng(1)
-    odometry = planar_poses(drifted(truth, np.ones(nodes, bool), dice, drift))
+    odometry = planar_poses(add_drift(truth, np.ones(nodes, bool), dice, drift))
     T, graph, times, waiting = matrices(planar_poses(truth)), PoseGraph(), [], []
     for i in range(nodes):
         graph.add_odometry((i + 1) * SECOND, odometry[i])

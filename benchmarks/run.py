@@ -9,7 +9,7 @@ from typing import Any
 
 from lower_bounds import bound_seconds, Peaks, Work
 from results import Row
-from timing import Job, measure, timed
+from timing import Job, measure, timed_job
 from tqdm import tqdm
 
 
@@ -65,7 +65,7 @@ class Run:
         :param cells: of a recursion, which it updates.
         """
         self._bar.set_description(f'{stage} {mode} n={size[0]:,} d={size[1]} {precision}')
-        jobs = {'': timed(call)} | {peer.name: peer.job for peer in peers}
+        jobs = {'': timed_job(call)} | {peer.name: peer.job for peer in peers}
         timings = measure(jobs, self.seconds)
         own = timings['']
         times = tuple(

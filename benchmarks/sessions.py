@@ -151,7 +151,7 @@ def measure(
     return counts, float(np.median(times))
 
 
-def poisoned(session: Session, other: Map, is_closed: bool) -> Iterator[Map]:
+def poisoned_drives(session: Session, other: Map, is_closed: bool) -> Iterator[Map]:
     """Yield drives that must not change a map: another route, mirrored, the wrong start."""
     yield other
     yield session.mirrored
@@ -176,7 +176,7 @@ def drive_route(route: Route, other: Map) -> list[str]:
             everything = with_last_related(merge_maps([everything, drive], ['', str(number)]))
         updated, version = drives[0], Version('', base_places=len(first))
         for number, drive in enumerate(drives[1:], 1):
-            for bad in poisoned(order[number], other, np.isfinite(route.period)):
+            for bad in poisoned_drives(order[number], other, np.isfinite(route.period)):
                 after, _, _ = update(updated, bad, version, 'poisoned')
                 poisons, changed = poisons + 1, changed + (len(after) != len(updated))
             updated, version, text = update(updated, drive, version, str(number))

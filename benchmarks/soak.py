@@ -139,11 +139,11 @@ def publish(
         if after is not None:
             seconds, call = after
 
-            def once() -> None:
+            def call_once() -> None:
                 node.destroy_timer(waiting)
                 call()
 
-            waiting = node.create_timer(seconds, once)
+            waiting = node.create_timer(seconds, call_once)
 
         def publish_next() -> None:
             message, now = next(messages), time.time_ns()

@@ -9,7 +9,7 @@ import gc
 from itertools import count, cycle
 from typing import Any
 
-from baselines import accumulated, prange, sample
+from baselines import accumulate_costs, prange, sample
 from data import along, free_bytes, make_features, make_window
 import lower_bounds as bounds
 from lower_bounds import ITEM_BYTES, Sizes
@@ -41,7 +41,7 @@ from stavpr_ros.prepare.blocks import Int8Features
 from stavpr_ros.prepare.centering import MeanCentering, normalize, z_normalized
 from stavpr_ros.prepare.matcher import make_matcher, PRECISIONS
 from stavpr_ros.sources.frame import ImageRecord
-from timing import best_seconds, timed
+from timing import best_seconds, timed_job
 import torch
 
 MODES = ('robust', 'paper')  # the default first
@@ -157,7 +157,7 @@ def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
     call()
     np.testing.assert_array_equal(distances, ours.distances)
     np.testing.assert_array_equal(lengths, ours.lengths)
-    return Peer('prange', timed(call), 'plain numba, all cores; the same results bit for bit')
+    return Peer('prange', timed_job(call), 'plain numba, all cores; the same results bit for bit')
 
 
 def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
@@ -171,8 +171,8 @@ def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
     costs = [window[:, start : start + k].copy() for start in starts]  # not timed
     for start, matrix in zip(starts[:ENDS_CHECKED], costs, strict=False):
         end = dtw(C=matrix, backtrack=False)[-1, -1]
-        np.testing.assert_allclose(end, accumulated(matrix), 1e-6, err_msg=f'start {start}')
-    job = timed(lambda: [dtw(C=matrix, backtrack=False) for matrix in costs])
+        np.testing.assert_allclose(end, accumulate_costs(matrix), 1e-6, err_msg=f'start {start}')
+    job = timed_job(lambda: [dtw(C=matrix, backtrack=False) for matrix in costs])
     note = 'one core; S of every cell in float64, no path length C, so neither q_m nor m; '
     return Peer('librosa', lambda: job() * n / len(starts), f'{note}{len(starts)} starts, scaled')
 
@@ -216,7 +216,7 @@ def map_reading(sizes: Sizes, precision: str) -> list[Peer]:
     """Return the reading of as many bytes as the map has, as a peer."""
     content = np.ones(sizes.W * sizes.n * sizes.d * ITEM_BYTES[precision] // 4, np.float32)
     call = partial(reader(nb.get_num_threads()), content)
-    return [Peer(READING, timed(call), 'as many bytes read once, on all cores', partial=True)]
+    return [Peer(READING, timed_job(call), 'as many bytes read once, on all cores', partial=True)]
 
 
 def frame_works(sizes: Sizes, mode: str, precision: str) -> list[bounds.Work]:
@@ -284,7 +284,7 @@ def process_stages(run: Run, n: int, precision: str) -> None:
 
     for _ in range(2 * SEQUENCE.length):
         process(0.5)
-    job = timed(partial(process, 1.0))
+    job = timed_job(partial(process, 1.0))
     peer = Peer('without matches', job, 'the same, but no image matches', partial=True)
     works = frame_works(Sizes(n, d, STRIPS, SEQUENCE.length, SEQUENCE.k), 'robust', precision)
     run.measure('process', (n, d), partial(process, 0.5), works, [peer], precision, 'robust')
@@ -316,7 +316,7 @@ def faiss_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     index = faiss.IndexFlatIP(images.shape[1])
     index.add(images)
     note = 'IndexFlatIP, one product of whole images instead of 49 of strips'
-    return Peer('faiss flat', timed(partial(index.search, image, 1)), note, partial=True)
+    return Peer('faiss flat', timed_job(partial(index.search, image, 1)), note, partial=True)
 
 
 def usearch_peer(images: np.ndarray, image: np.ndarray) -> Peer:
@@ -329,7 +329,7 @@ def usearch_peer(images: np.ndarray, image: np.ndarray) -> Peer:
     )
     call = partial(search, vectors, query, 1, MetricKind.Cos, exact=True, threads=0)
     note = 'exact search in int8, one product of whole images instead of 49 of strips'
-    return Peer('usearch int8', timed(call), note, partial=True)
+    return Peer('usearch int8', timed_job(call), note, partial=True)
 
 
 def product(places: LocalFeatures, queries: LocalFeatures) -> Peer:
@@ -352,7 +352,7 @@ def product(places: LocalFeatures, queries: LocalFeatures) -> Peer:
     }
     form = min(forms, key=lambda name: best_seconds(forms[name], 0))
     note = f'{form}, all pairs of strips, no alignment'
-    return Peer('torch float32', timed(forms[form]), note, partial=True)
+    return Peer('torch float32', timed_job(forms[form]), note, partial=True)
 
 
 def frame(places: LocalFeatures, mode: str, precision: str) -> Call:

@@ -56,13 +56,13 @@ def start(path: str, kernels: str) -> dict[str, Any]:
     from stavpr_lab.demonstration.live import executable
     from stavpr_ros.ros.process import PROFILES_VARIABLE, ros_node
 
-    def compiled() -> int:
+    def count_kernels() -> int:
         return len(list(Path(kernels).rglob('*.nbc')))
 
     os.environ['NUMBA_CACHE_DIR'] = kernels
     options = ['--ros-args', '-p', f'map_path:={path}', '--log-level', 'error']
     messages = [image_message(image) for image in texture_route(IMAGES)]
-    counts = [compiled()]
+    counts = [count_kernels()]
     with ros_node(lambda: rclpy.create_node('camera'), []) as camera:
         publisher = camera.create_publisher(Image, 'image', IMAGES)
         began = time.monotonic()
@@ -70,14 +70,14 @@ def start(path: str, kernels: str) -> dict[str, Any]:
             while not publisher.get_subscription_count():
                 time.sleep(0.01)
             wall, used = time.monotonic() - began, seconds_of(node)
-            counts.append(compiled())
+            counts.append(count_kernels())
             for message in messages:
                 now = time.time_ns()
                 message.header.stamp.sec, message.header.stamp.nanosec = divmod(now, 10**9)
                 publisher.publish(message)
                 time.sleep(1 / RATE)
             later = 1e3 * (seconds_of(node) - used) / IMAGES
-    counts.append(compiled())
+    counts.append(count_kernels())
     return {
         'wall_s': wall, 'processor_s': used, 'kernels': counts[1] - counts[0],
         'kernels_later': counts[2] - counts[1], 'image_ms': later,

@@ -25,7 +25,7 @@ class Timing:
     runs: int
 
 
-def timed(call: Callable[[], Any]) -> Job:
+def timed_job(call: Callable[[], Any]) -> Job:
     """Return a job that measures a call by the wall clock."""
 
     def job() -> float:
@@ -70,7 +70,7 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
 
 def best_seconds(call: Callable[[], Any], seconds: float) -> float:
     """Return the shortest of at least three runs that fill ``seconds``, after one to warm up."""
-    job = timed(call)
+    job = timed_job(call)
     job()
     end = time.perf_counter() + seconds
     durations = [job() for _ in range(3)]

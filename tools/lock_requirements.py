@@ -71,7 +71,7 @@ def closure(roots: list[Requirement], report: dict[str, Any]) -> set[str]:
     return {name for name, _ in visited}
 
 
-def locked(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> str:
+def lock_text(reports: dict[str, dict[str, Any]], names: dict[str, set[str]]) -> str:
     """Return the lines of a lock file: packages by name, of each Python version (3.11, ...)."""
     hashes_of: dict[tuple[str, str], dict[str, str]] = {}  # hash by Python version
     for version, report in reports.items():
@@ -99,13 +99,13 @@ def main(pythons: list[str]) -> None:
     base = {version: closure(requirements(*BASE), report) for version, report in reports.items()}
     folder = FOLDER / 'locked'
     folder.mkdir(exist_ok=True)
-    (folder / 'base.txt').write_text(locked(reports, base), encoding='utf-8')
+    (folder / 'base.txt').write_text(lock_text(reports, base), encoding='utf-8')
     for extra in LOCKED_EXTRAS:
         added = {
             version: closure(requirements(extra), report) - base[version]
             for version, report in reports.items()
         }
-        (folder / f'{extra}.txt').write_text(locked(reports, added), encoding='utf-8')
+        (folder / f'{extra}.txt').write_text(lock_text(reports, added), encoding='utf-8')
 
 
 if __name__ == '__main__':

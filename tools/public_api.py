@@ -151,7 +151,7 @@ def is_of(value: Any, module: str) -> bool:
     return callable(value) and getattr(value, '__module__', '').startswith(module)
 
 
-def described(name: str, value: Any) -> Iterator[str]:
+def describe(name: str, value: Any) -> Iterator[str]:
     """Yield a function or constant, or a class with its public members."""
     if not inspect.isclass(value):
         yield name + (signature(value) if inspect.isfunction(value) else '')
@@ -177,7 +177,7 @@ def library() -> Iterator[str]:
         own = [word for word, value in vars(module).items() if is_of(value, module.__name__)]
         for word in getattr(module, '__all__', own):
             if not word.startswith('_'):
-                yield from described(f'{module.__name__}.{word}', getattr(module, word))
+                yield from describe(f'{module.__name__}.{word}', getattr(module, word))
 
 
 def formats() -> Iterator[str]:

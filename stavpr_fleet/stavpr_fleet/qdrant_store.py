@@ -154,7 +154,7 @@ class EdgePoints:
         self._edge, self._folder = qdrant_edge, Path(folder)
         self._shard: Any = None
 
-    def _opened(self) -> Any:
+    def _open(self) -> Any:
         if self._shard is None:
             if not (self._folder / 'edge_config.json').is_file():
                 raise FleetError(
@@ -198,12 +198,12 @@ class EdgePoints:
             edge.QueryRequest(limit=count, query=edge.Query.Nearest(vector.tolist()))
             for vector in vectors
         ]
-        responses = self._call(self._opened().query_batch, edge.QueryBatchRequest(requests))
+        responses = self._call(self._open().query_batch, edge.QueryBatchRequest(requests))
         return [[point.id for point in one] for one in responses]
 
     def payloads(self, ids: list[int]) -> dict[int, dict[str, Any]]:
         """See :class:`Points`."""
-        records = self._call(self._opened().retrieve, ids, True, False)
+        records = self._call(self._open().retrieve, ids, True, False)
         return {point.id: point.payload for point in records}
 
 

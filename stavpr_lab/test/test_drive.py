@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from scores import truth_matrix
-from stavpr_lab.evaluation.drive import cropped, DriveChanges, INTERVAL
+from stavpr_lab.evaluation.drive import crop, DriveChanges, INTERVAL
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import SettingsError
 
@@ -147,4 +147,4 @@ def test_changes_out_of_range_raise(changes, message):
 )
 def test_cropped_by_invalid_fractions_raises(fractions):
     with pytest.raises(SettingsError, match='fractions >= 0'):
-        cropped([], *fractions)
+        crop([], *fractions)

@@ -15,7 +15,7 @@ from stavpr_lab.commands import evaluate, evaluate_calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.metrics import ImageMatches
-from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks, PROBABILITIES
+from stavpr_lab.evaluation.risk_control import add_risks, make_drives, measure_risks, PROBABILITIES
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.mapping import build_map, load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import ErrorRisks
@@ -42,19 +42,19 @@ def test_risks_of_two_blocks_by_hand():
     """Above .9 the only match of the first block at double speed is wrong: 1, and so below."""
     truth = GroundTruth.identity(5, 5)
     recorded = driven(truth, [0, 4, 2, 3, -1], [0.9, 0.5, 0.3, NAN, NAN])
-    risks = measured_risks([recorded], 2, 'x')
+    risks = measure_risks([recorded], 2, 'x')
     assert (risks.units, risks.method) == (2, 'x')
     assert [risk_at(risks, p) for p in (0.15, 0.4, 0.6, 0.95)] == [0.5, 0.5, 0, 0]
     double = driven(truth, [3, 2, 4], [0.99, 0.95, 0.99], speed=2)
-    risks = measured_risks([recorded, double], 2, 'x')
+    risks = measure_risks([recorded, double], 2, 'x')
     assert [risk_at(risks, p) for p in (0.15, 0.95, 0.995)] == [1, 1, 0]
     early = driven(truth, [0, 4, 2, 3, -1, 2], [0.9, 0.5, 0.3, NAN, NAN, 0.96])
-    assert risk_at(measured_risks([early], 2, 'x'), 0.95) == 1
+    assert risk_at(measure_risks([early], 2, 'x'), 0.95) == 1
 
 
 def test_risk_of_a_block_off_the_map_is_the_share_of_matched_images():
     truth = GroundTruth.from_pairs([0, 1], [0, 1], 4, 4)
-    risks = measured_risks([driven(truth, [0, 1, 3, -1], [0.9, 0.9, 0.6, NAN])], 2, 'x')
+    risks = measure_risks([driven(truth, [0, 1, 3, -1], [0.9, 0.9, 0.6, NAN])], 2, 'x')
     assert [risk_at(risks, p) for p in (0.5, 0.7)] == [0.5, 0]
 
 
@@ -67,33 +67,31 @@ def test_images_beside_a_removed_stretch_do_not_count():
         recorded = driven(truth, np.arange(40), np.full(40, 0.9))
         matched = np.where(places < 0, NAN, 0.9)
         detour = driven(truth, places, matched, removed=((10, 30),))
-        assert measured_risks([recorded, detour], 40, 'x').risks[0] == pytest.approx(
-            risk, abs=1e-6
-        )
+        assert measure_risks([recorded, detour], 40, 'x').risks[0] == pytest.approx(risk, abs=1e-6)
 
 
 def test_made_drives_leave_each_place_out_once():
     truth = GroundTruth.identity(130, 130)
-    *drives, first, second, third = made_drives(truth, 40)
+    *drives, first, second, third = make_drives(truth, 40)
     assert [len(drive.images) for drive in drives][:3] == [130, 260, 65]
     assert not any(drive.removed for drive in drives)
     assert first.removed == ((0, 40), (120, 130))
     kept = np.bincount(np.concatenate([drive.places for drive in (first, second, third)]))
     assert kept.tolist() == [2] * 130
-    assert not any(drive.removed for drive in made_drives(GroundTruth.identity(40, 40), 40))
+    assert not any(drive.removed for drive in make_drives(GroundTruth.identity(40, 40), 40))
 
 
 def test_joined_risks_add_blocks_and_count_what_was_not_measured_as_wrong():
     one = ErrorRisks('x', 4, (0.2, 0.5, 0.9), (2.0, 1.0, 0.0))
     other = ErrorRisks('x', 3, (0.4, 0.6), (1.5, 0.5))
-    assert joined(one, other) == ErrorRisks('x', 7, (0.2, 0.5, 0.9), (5.0, 2.5, 0.5))
+    assert add_risks(one, other) == ErrorRisks('x', 7, (0.2, 0.5, 0.9), (5.0, 2.5, 0.5))
 
 
 def wrong_blocks(declared):
     """Return the risks of blocks of one image each, which is matched wrongly."""
     count = len(declared)
     truth = GroundTruth.identity(count + 1, count + 1).select(np.arange(count))
-    return measured_risks([driven(truth, np.full(count, count), declared)], 1, 'x')
+    return measure_risks([driven(truth, np.full(count, count), declared)], 1, 'x')
 
 
 @pytest.mark.parametrize(('blocks', 'rate'), [(10, 0.1), (30, 0.2)])
@@ -195,9 +193,9 @@ def test_calibration_that_fails_leaves_the_map_as_it_is(command, monkeypatch, tr
 
     def replaced(*arguments):
         save_map(other, path, force=True)
-        return measured_risks(*arguments)
+        return measure_risks(*arguments)
 
-    monkeypatch.setattr(evaluate_calibrate, 'measured_risks', replaced)
+    monkeypatch.setattr(evaluate_calibrate, 'measure_risks', replaced)
     code, _, errors = run('--calibrate')
     assert (code, 'was replaced meanwhile' in errors) == (2, True), errors
     assert (open_map(path).threshold, open_map(path).error_risks) == (0.5, None)

@@ -47,7 +47,7 @@ def test_gardens_point_at_every_speed_is_recognized(traverses):
     assert f1 >= 0.99
     assert precision >= 0.95
     for kind in ('2x', '0.5x', 'vary', 'stop'):
-        indices = DriveChanges.named(kind, 200).images(200)
+        indices = DriveChanges.from_name(kind, 200).images(200)
         f1, precision = evaluated(reference, query[indices], truth.select(indices))
         print(f'Gardens Point {kind}: F1 {f1:.4f}, precision {precision:.4f}')
         assert f1 >= 0.95

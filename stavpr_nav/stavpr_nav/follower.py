@@ -254,7 +254,7 @@ class RouteFollower:
             self._stamp = self._stamp if step > 0 else -math.inf
             step = 0.0
         self._count(step)
-        self._last = self._limited(self._wanted(now), step)
+        self._last = self._limit_command(self._target_velocities(now), step)
         if self._last.reason:
             self.evidence.rest(self._now)
         return self._last
@@ -285,7 +285,7 @@ class RouteFollower:
             return 'the newest image is not of the route'
         return 'waiting for more images of the route' if self._successive < FIRST else ''
 
-    def _wanted(self, now: float) -> Command:
+    def _target_velocities(self, now: float) -> Command:
         """Return the velocities without limits of the acceleration."""
         settings, newest = self._settings, self._newest
         if reason := self._stop_reason(now):
@@ -329,7 +329,7 @@ class RouteFollower:
         added = np.array([path_speed(last.speed, last.turn) * step, moved, done])
         self._totals.append((self._time, self._now + added))
 
-    def _limited(self, wanted: Command, step: float) -> Command:
+    def _limit_command(self, wanted: Command, step: float) -> Command:
         """Limit velocities and accelerations, but no stop."""
         settings = self._settings
         if wanted.reason:

@@ -15,7 +15,7 @@ from stavpr_lab.commands.evaluate_sequences import (
 )
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import published_matches
-from stavpr_lab.evaluation.risk_control import joined, made_drives, measured_risks
+from stavpr_lab.evaluation.risk_control import add_risks, make_drives, measure_risks
 from stavpr_ros.commands.program import say
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import open_map, select_places
@@ -66,19 +66,19 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
         say(f'{sequences.title}: this recording is in the calibration already, which stays')
         return
     block, driven = WINDOWS * settings.sequence.length, []
-    drives = list(made_drives(sequences.drive.truth, block))
+    drives = list(make_drives(sequences.drive.truth, block))
     for drive in Progress(drives, desc='calibrating', unit='drive'):
         places = select_places(reference, drive.places) if drive.removed else reference
         recognizer = PlaceRecognizer(places, settings, arguments.backend, arguments.precision)
         matches = recognize_all(recognizer, features[drive.images])
         driven.append((drive, *published_matches(matches, settings.sequence.length)))
-    risks = measured_risks(driven, block, key)
+    risks = measure_risks(driven, block, key)
     risks = replace(risks, recordings=(recording,))
     say(
         f'{sequences.title}: {risks.units} blocks of {block} images, as recorded, at other speeds '
         'and with detours'
     )
-    risks = risks if before is None else joined(risks, before)
+    risks = risks if before is None else add_risks(risks, before)
     _print(risks)
     say(f'calibration in {path}, id {_store(path, version, reference.map_id, risks)}')
 

@@ -11,7 +11,7 @@ import time
 from typing import Any
 
 import numpy as np
-from stavpr_lab.evaluation.drive import cropped, Drive, DriveChanges, FrameSource
+from stavpr_lab.evaluation.drive import crop, Drive, DriveChanges, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.paper.datasets import open_dataset
 from stavpr_lab.features.descriptors import is_descriptors, read_descriptors, require_comparable
@@ -80,7 +80,7 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
         sequences = _of_paths(arguments, opened, loader.times)
     if unread := left_out(loader.left_out):
         print(unread, file=sys.stderr)
-    return _changed(sequences, arguments)
+    return _change_drive(sequences, arguments)
 
 
 def recognizer_settings(arguments: argparse.Namespace) -> RecognizerSettings:
@@ -145,10 +145,10 @@ class _Loader:
     def load(self, name: str, path: str) -> Map:
         """Open a folder, a video, a bag, a saved map or descriptors."""
         if is_saved_map(path) or is_descriptors(path):
-            crop = 'crop_map' if name == 'map' else 'crop_query'
-            if getattr(self._arguments, crop):
+            option = 'crop_map' if name == 'map' else 'crop_query'
+            if getattr(self._arguments, option):
                 raise SettingsError(
-                    f'--{crop.replace("_", "-")}: {path} is a saved map or an array, which has '
+                    f'--{option.replace("_", "-")}: {path} is a saved map or an array, which has '
                     'no images'
                 )
             return self._read(path) if is_descriptors(path) else self._load_map(path)
@@ -166,7 +166,7 @@ class _Loader:
         args, extractor = self._arguments, self._chosen()
         fit_value_range(source, extractor)
         # unknown places are cropped as the query is
-        source = cropped(source, *((0, args.crop_map) if name == 'map' else (args.crop_query, 0)))
+        source = crop(source, *((0, args.crop_map) if name == 'map' else (args.crop_query, 0)))
         began = time.perf_counter()
         extracted = build_map(source, extractor)
         milliseconds = (time.perf_counter() - began) * 1e3
@@ -318,10 +318,10 @@ def poses_of(path: str | None, place_map: Map, name: str, degrees: float | None)
     return poses
 
 
-def _changed(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
+def _change_drive(sequences: Sequences, arguments: argparse.Namespace) -> Sequences:
     """Drive the query as the options want it, on a map without the places that they remove."""
     query, reference = sequences.query, sequences.reference
-    warp = DriveChanges.named(arguments.speed or 'same', len(query))
+    warp = DriveChanges.from_name(arguments.speed or 'same', len(query))
     changes = replace(
         warp,
         removed=tuple(arguments.remove_from_map),

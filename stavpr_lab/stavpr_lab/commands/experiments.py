@@ -198,7 +198,7 @@ def _reason(name: str, dataset: 'Dataset', column: 'Configuration') -> str:
     )
 
 
-def _published(
+def _published_rows(
     dataset: str, columns: 'tuple[Configuration, ...]'
 ) -> dict[str, list[float | None]]:
     """Return the published F1 of the columns, by backbone; None where the paper has none."""
@@ -263,7 +263,7 @@ def _run(arguments: argparse.Namespace) -> None:
             label = f'{name}, {dataset.criterion}'
         rows.append([label, arguments.features, *map(_number, cells)])
         results.append({'dataset': name, 'features': arguments.features, 'results': numbers})
-        published_rows = _published(name, columns) if metric == 'f1' else {}
+        published_rows = _published_rows(name, columns) if metric == 'f1' else {}
         for backbone, published in published_rows.items():
             rows.append(['', f'published, {backbone}', *map(_number, published)])
             scores = dict(zip([column.name for column in columns], published, strict=True))

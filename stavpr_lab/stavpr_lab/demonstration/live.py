@@ -138,7 +138,7 @@ def run_live(
         while not complete():  # a slow processor still completes loop closures
             grown = partial(lambda last_size: complete() or size() > last_size, size())
             wait_until(grown, END_TIMEOUT, 'the last record')
-        with _applied(environment):
+        with _apply_environment(environment):
             at_end(_records(closures))
     records = _records(matches)
     if len(records) != images:
@@ -147,7 +147,7 @@ def run_live(
 
 
 @contextmanager
-def _applied(environment: dict[str, str]) -> Iterator[None]:
+def _apply_environment(environment: dict[str, str]) -> Iterator[None]:
     """Give this process an environment while the block runs."""
     own = dict(os.environ)
     os.environ.clear()

@@ -351,14 +351,14 @@ def stops(taught: Taught) -> dict[str, float]:
     for name, change in changes.items():
         shown.clear()
 
-        def changed(
+        def switch(
             image: np.ndarray,
             time: float,
             change: Callable[[np.ndarray], np.ndarray] = change,
         ) -> np.ndarray:
             return change(image) if time >= CHANGED else image
 
-        drive = repeat(taught, GOOD_LIGHT, CHANGED + 5, 10, change=changed, has_operator=False)
+        drive = repeat(taught, GOOD_LIGHT, CHANGED + 5, 10, change=switch, has_operator=False)
         is_later = drive.times >= CHANGED
         at_rest = np.flatnonzero(is_later & (drive.speeds < 0.05))
         result[name] = float(drive.times[at_rest[0]] - CHANGED) if len(at_rest) else math.inf

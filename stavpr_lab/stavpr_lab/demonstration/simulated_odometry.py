@@ -14,7 +14,7 @@ SCALE_NOISE, HEADING_NOISE, HEADING_BIAS, SCALE_BIAS = (
 )
 
 
-def drifted(
+def add_drift(
     truth: np.ndarray, moved: np.ndarray, dice: np.random.Generator, drift: float
 ) -> np.ndarray:
     """

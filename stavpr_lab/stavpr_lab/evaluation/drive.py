@@ -5,7 +5,7 @@ A recorded query driven differently: faster, with stops, dropped images, backwar
 
 A :class:`Drive` is the indices of the images that are shown and of the places that the map keeps,
 and their ground truth; :func:`stavpr_ros.mapping.select_places` applies them.
-:func:`cropped` changes the images themselves.
+:func:`crop` changes the images themselves.
 """
 
 from collections.abc import Callable, Iterator
@@ -82,7 +82,7 @@ class DriveChanges:
             )
 
     @classmethod
-    def named(cls, name: str, n: int) -> Self:
+    def from_name(cls, name: str, n: int) -> Self:
         """
         Return the changes that a row or an option names, for a query of n images.
 
@@ -243,7 +243,7 @@ def _pixels(width: float) -> int:
     return math.floor(width + 0.5)
 
 
-def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
+def crop(source: FrameSource, left: float, right: float) -> FrameSource:
     """
     Crop every image of a source.
 
@@ -257,7 +257,7 @@ def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
             'below 1 together'
         )
 
-    def crop(frame: Frame) -> np.ndarray:
+    def cut(frame: Frame) -> np.ndarray:
         width = frame.image.shape[1]
         first, last = _pixels(left * width), width - _pixels(right * width)
         if first >= last:
@@ -267,4 +267,4 @@ def cropped(source: FrameSource, left: float, right: float) -> FrameSource:
             )
         return np.ascontiguousarray(frame.image[:, first:last])
 
-    return source if left == right == 0 else ChangedSource(source, crop)
+    return source if left == right == 0 else ChangedSource(source, cut)

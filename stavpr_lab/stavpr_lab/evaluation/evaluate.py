@@ -255,7 +255,7 @@ def recognize_traverse(
             if i % interval == 0 or image in shown:
                 windows.append(_window_distances(image, i, length, rows, match.path.pairs))
     matched, published = image_matches(matches, length, late), published_matches(matches, length)
-    ranked = np.stack([_ranked(*pair) for pair in zip(matched.places, candidates, strict=True)])
+    ranked = np.stack([_rank(*pair) for pair in zip(matched.places, candidates, strict=True)])
     sequence, distances = Ranking(ranked, matched.distances), (tuple(windows), reduced.result())
     return TraverseResults(
         sequence, single, seconds, *distances, matched.accepted, matched.probabilities, published,
@@ -367,7 +367,7 @@ def evaluate_traverse(
     return Evaluation(results, ground_truth, length, *metrics, unknown)
 
 
-def _ranked(place: int, candidates: np.ndarray) -> np.ndarray:
+def _rank(place: int, candidates: np.ndarray) -> np.ndarray:
     """Return the matched place followed by the other candidates, shape (K,); -1 = no further."""
     others = candidates[(candidates != place) & (candidates >= 0)]
     ranked = np.full(len(candidates), -1, np.int64)

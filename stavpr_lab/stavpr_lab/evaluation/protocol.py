@@ -191,7 +191,7 @@ def evaluate_protocol(
     for method in methods:
         if method in MODES:
             one = replace(settings or RecognizerSettings(), mode=method)
-            rankings = _recognized(place_map, query, one, lengths, backend)
+            rankings = _recognize(place_map, query, one, lengths, backend)
         else:
             traverses = query, place_map.features
             queries, places = (image_vectors(side, method == 'centered') for side in traverses)
@@ -199,7 +199,7 @@ def evaluate_protocol(
         yield from evaluate_matches(method, rankings, truths)
 
 
-def _recognized(
+def _recognize(
     place_map: Map,
     query: LocalFeatures,
     settings: RecognizerSettings,

@@ -82,15 +82,15 @@ class Report:
     @cached_property
     def counts(self) -> ConfusionCounts:
         """Return the counts of :attr:`accepted`, of the images whose truth is known."""
-        return accepted_counts(*self._compared)
+        return accepted_counts(*self._compared_columns)
 
     @cached_property
     def estimates(self) -> tuple[Estimate, Estimate]:
         """Return error rate and recall of :attr:`accepted`, with 95 % intervals."""
-        return error_rate_and_recall(*self._compared)
+        return error_rate_and_recall(*self._compared_columns)
 
     @cached_property
-    def _compared(self) -> list[np.ndarray]:
+    def _compared_columns(self) -> list[np.ndarray]:
         """Return accepted, correct and in the map, of the images whose truth is known."""
         truth = self.evaluation.ground_truth
         columns = self.accepted, self.evaluation.correct, truth.has_match
@@ -117,7 +117,7 @@ class Report:
         truth = self.evaluation.ground_truth.select(images)
         wrong = truth.is_stated & ~truth.accepts(matches.places)
         return decision | {
-            'images_with_truth': len(self._compared[0]),
+            'images_with_truth': len(self._compared_columns[0]),
             'matched_with_truth': counts.accepted,
             'early_wrong': int(np.count_nonzero(wrong[early])),
             'wrongly_matched': counts.false_positives,

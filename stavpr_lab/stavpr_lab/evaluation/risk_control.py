@@ -24,7 +24,7 @@ DETOURS = 3  # drives, each without every third stretch of the map, of as many p
 PROBABILITIES = np.round(1 / (1 + np.exp(-np.linspace(-1, 7, 65))), 4)
 
 
-def made_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
+def make_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
     """
     Yield the drives that are made of a recorded query.
 
@@ -32,14 +32,14 @@ def made_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
     :param block: images of a block.
     """
     for name in KINDS:
-        yield DriveChanges.named(name, truth.N).apply(truth)
+        yield DriveChanges.from_name(name, truth.N).apply(truth)
     for number in range(min(DETOURS, truth.n // block) if truth.n > block else 0):
         firsts = range(number * block, truth.n, DETOURS * block)
         removed = tuple((first, min(first + block, truth.n)) for first in firsts)
         yield DriveChanges(removed=removed).apply(truth)
 
 
-def measured_risks(
+def measure_risks(
     driven: Iterable[tuple[Drive, ImageMatches, np.ndarray]], block: int, method: str
 ) -> ErrorRisks:
     """
@@ -73,7 +73,7 @@ def measured_risks(
     return ErrorRisks(method, units, tuple(PROBABILITIES.tolist()), tuple(risks.round(6).tolist()))
 
 
-def joined(one: ErrorRisks, other: ErrorRisks) -> ErrorRisks:
+def add_risks(one: ErrorRisks, other: ErrorRisks) -> ErrorRisks:
     """Return the risks of the blocks of two queries, at the probabilities of the first one."""
     at = np.searchsorted(other.probabilities, one.probabilities, 'right')
     # below the least probability of the other one, each of its blocks may be wrong

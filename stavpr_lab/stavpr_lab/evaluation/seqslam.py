@@ -125,10 +125,10 @@ def preprocess(images: Iterable[np.ndarray], settings: SeqSlamSettings) -> np.nd
 
     :returns: shape (images, height * width), float32; a patch of one gray level is 0.
     """
-    return np.stack([_normalized(image, settings) for image in images])
+    return np.stack([_normalize_patches(image, settings) for image in images])
 
 
-def _normalized(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
+def _normalize_patches(image: np.ndarray, settings: SeqSlamSettings) -> np.ndarray:
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     shrinks = gray.shape[0] >= settings.height and gray.shape[1] >= settings.width
     method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

@@ -195,7 +195,7 @@ def export_network(outputs: Chosen, size: int) -> Exported:
     reasons = []
     for batch, step in ((2, CHECKED), (1, 1)):  # recorded with two images; else with one
         try:
-            content = _recorded(outputs, images[:batch], alone=step == 1)
+            content = _record(outputs, images[:batch], alone=step == 1)
             difference = _difference(content, images.numpy(), references, step)
         except Exception as error:  # of the network, the recorder and the runtime
             reasons.append(last_line(error))
@@ -210,7 +210,7 @@ def export_network(outputs: Chosen, size: int) -> Exported:
     )
 
 
-def _recorded(outputs: Chosen, images: torch.Tensor, alone: bool) -> bytes:
+def _record(outputs: Chosen, images: torch.Tensor, alone: bool) -> bytes:
     onnx, _ = import_onnx()
     batched = {name: {0: 'batch'} for name in ('image', *outputs.names)}
     with (

@@ -165,9 +165,9 @@ def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], 
     wrong = f'{name} is no file of weights of {type(network).__name__}'
     missing, unknown = sorted(expected.keys() - weights), sorted(weights.keys() - expected)
     if missing:
-        raise UnavailableError(f'{wrong}: it lacks {_listed(missing)}')
+        raise UnavailableError(f'{wrong}: it lacks {_summary(missing)}')
     if unknown:
-        raise UnavailableError(f'{wrong}: it has {_listed(unknown)}, unknown to the network')
+        raise UnavailableError(f'{wrong}: it has {_summary(unknown)}, unknown to the network')
     floats: dict[str, torch.Tensor] = {}
     for key, value in weights.items():
         if value.shape != expected[key].shape:
@@ -187,5 +187,5 @@ def load_parameters(network: nn.Module, parameters: Mapping[str, torch.Tensor], 
     network.load_state_dict(floats | counters, assign=True)
 
 
-def _listed(names: list[str]) -> str:
+def _summary(names: list[str]) -> str:
     return repr(names[0]) + (f' and {len(names) - 1} more' if len(names) > 1 else '')

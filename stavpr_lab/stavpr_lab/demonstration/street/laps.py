@@ -12,7 +12,7 @@ from functools import cached_property
 from math import pi
 
 import numpy as np
-from stavpr_lab.demonstration.simulated_odometry import drifted, relative_poses
+from stavpr_lab.demonstration.simulated_odometry import add_drift, relative_poses
 from stavpr_lab.demonstration.street.rendering import EYE, FOCAL, HORIZON
 from stavpr_lab.demonstration.street.street import CELL, Street, VIEW
 from stavpr_lab.demonstration.street.traverses import (
@@ -212,7 +212,7 @@ def drive_laps(
     stamps = EPOCH + np.arange(len(truth), dtype=np.int64) * round(1e9 / RATE)
     is_driven = np.ones(len(truth), bool)
     is_driven[CARRIED.start] = not carried
-    odometry = drifted(truth, is_driven, np.random.default_rng([seed, draw]), drift)
+    odometry = add_drift(truth, is_driven, np.random.default_rng([seed, draw]), drift)
     for number in range(1, sessions):
         own = session == number
         odometry[own] = relative_poses(odometry[own][0], odometry[own])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 import re
 
-from stavpr_lab.evaluation.drive import cropped, FrameSource
+from stavpr_lab.evaluation.drive import crop, FrameSource
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_lab.evaluation.ground_truth_files import ARRAYS, TEXT
 from stavpr_lab.evaluation.paper.traverses import msls, read_traverse, Reader, robotcar, utm_names
@@ -143,7 +143,7 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
             file = _ground_truth_file(name, folder, len(query), len(places))
             ground_truth = GroundTruth.from_file(file, len(query), len(places), tolerance)
     if name.startswith(SYNTH):
-        places, query = cropped(places, 0, CROP_MAP), cropped(query, CROP_QUERY, 0)
+        places, query = crop(places, 0, CROP_MAP), crop(query, CROP_QUERY, 0)
     return Dataset(places, query, ground_truth, tolerance)
 
 

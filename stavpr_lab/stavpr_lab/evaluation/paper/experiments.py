@@ -133,11 +133,11 @@ def sweep_configurations(
         if whole and not float(value).is_integer():
             raise SettingsError(f'{parameter} = {value} must be a whole number')
         title = f'{parameter} = {value:g}'
-        result.append(_changed(Configuration(f'{parameter}_{value:g}', title), parameter, value))
+        result.append(_vary(Configuration(f'{parameter}_{value:g}', title), parameter, value))
     return tuple(result)
 
 
-def _changed(plain: Configuration, parameter: str, value: float) -> Configuration:
+def _vary(plain: Configuration, parameter: str, value: float) -> Configuration:
     if parameter == 'W':
         return replace(plain, strips=int(value))
     if parameter == 'l':
