@@ -29,7 +29,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS, LENGTH, QUERIES = 7, 20, 1000
 DIMENSIONS = 224  # of features whose cells are compared
-SHOWN = 5  # differences of a stream
+MAX_LINES = 5  # differences of a stream
 
 
 def make_frame(strips: np.ndarray, weights: np.ndarray, mode: str, precision: str) -> Any:
@@ -172,7 +172,7 @@ def compare_answers(other: Path) -> int:
     for name in ours.keys() & theirs.keys():
         lines = list(differences(ours[name], theirs[name]))
         count = f'{len(lines):,} values DIFFER' if lines else 'equal'
-        print(f'{name}, {len(ours[name])} images: {count}', *lines[:SHOWN], sep='\n  ')
+        print(f'{name}, {len(ours[name])} images: {count}', *lines[:MAX_LINES], sep='\n  ')
     for name in sorted(ours.keys() ^ theirs.keys()):
         print(f'{name}: in one checkout only')
     same = (json.dumps(ours[name]) == json.dumps(theirs[name]) for name in ours.keys() & theirs)

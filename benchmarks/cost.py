@@ -37,7 +37,7 @@ from soak import (
 
 WARM, IMAGES, VIEWS = 60, 400, 200  # images of a stage's median, after the first; different ones
 TURN, SETTLED_TURNS = 50, 4  # images of each map in turn, and turns before times count
-DRIVEN, NEAR, FEWER = 700, 3, 128  # images on sessions, places from the right one, dimensions
+DRIVE, NEAR, DIMENSIONS = 700, 3, 128  # images on sessions, places from the right one, dimensions
 PACE = 30  # images per second of stages that find their caches cold
 SETTLED = 5.0  # seconds after the first image, before times count
 SUBSCRIBER = """
@@ -195,7 +195,7 @@ def measure_sessions(counts: list[int]) -> list[str]:
         return replace(route, features=replace(route.features, strips=strips))
 
     raw, rows, one_session = drive(1000).features, [], ()
-    for precision, dimension in (('float32', 0), ('int8', 0), ('int8', FEWER)):
+    for precision, dimension in (('float32', 0), ('int8', 0), ('int8', DIMENSIONS)):
         recognizers, queries, sizes, medians = [], [], [], []
         for count in counts:
             one = merge_maps([drive(seed) for seed in range(count)], list(map(str, range(count))))
@@ -211,7 +211,7 @@ def measure_sessions(counts: list[int]) -> list[str]:
             queries.append(query)
             sizes.append(len(one) * one.settings.strips * one.dimension * ITEM_BYTES[precision])
         right = [0] * len(counts)
-        for first in range(0, DRIVEN, TURN):
+        for first in range(0, DRIVE, TURN):
             times: list[list[float]] = [[] for _ in counts]
             for number, recognizer in enumerate(recognizers):
                 for i in range(first, first + TURN):
@@ -230,7 +230,7 @@ def measure_sessions(counts: list[int]) -> list[str]:
                 f'{precision}, {dimension} dimensions' if dimension else precision,
                 *(
                     f'{ms:.2f} ms ({ms / one_session[0]:.2f}), {size / 1e6:.1f} MB '
-                    f'({size / one_session[1]:.2f}), {count / DRIVEN:.3f}'
+                    f'({size / one_session[1]:.2f}), {count / DRIVE:.3f}'
                     for ms, size, count in zip(costs, sizes, right, strict=True)
                 ),
             ]

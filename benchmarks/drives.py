@@ -30,7 +30,7 @@ from stavpr_ros.sources import open_source
 CHANGES = 'same', 'drop 0.3', '0.5x', '2x', '3x'  # the first two of damaged drives, and --quick
 HALF = 450  # images of a half of Nordland that are shown
 DETOURS = 6  # stretches that the map lacks, a pair
-MOST = 400  # places of a map of the track, of an unrelated route
+MAX_PLACES = 400  # places of a map of the track, of an unrelated route
 SETS = (
     'day', 'crops', 'night', 'night map', 'damaged night', 'corridor', 'summer map', 'winter map',
     'office', 'track',
@@ -134,7 +134,7 @@ def read_sets(folder: Path, making: FeatureExtractor, gradient: FeatureExtractor
         around = around % n if end else np.clip(around, 0, n - 1)
         queries = np.repeat(np.arange(len(other)), len(off))
         truth = GroundTruth.from_pairs(queries, around.ravel(), len(other), n)
-        truth = truth.on_places(np.arange(min(n, MOST)))
+        truth = truth.on_places(np.arange(min(n, MAX_PLACES)))
         counted = np.flatnonzero(truth.has_match)[:: 1 if end else 2]
         lap, other = _first(lap), select_places(other, counted)
         sets.pairs.append((kind, kind, Pair(kind, lap, other, truth.select(counted))))
@@ -163,7 +163,7 @@ def _cut(places: Map, end: int | None) -> Map:
 
 
 def _first(places: Map) -> Map:
-    return _cut(places, MOST)
+    return _cut(places, MAX_PLACES)
 
 
 def drives_of(sets: Sets, quick: bool) -> Iterator[Drive]:
@@ -190,7 +190,7 @@ def drives_of(sets: Sets, quick: bool) -> Iterator[Drive]:
             use = 'both' if not pair.long else 'fit' if first < n // 2 else 'decide'
             yield _of_pair(kind, group, pair, drive, shown, use)
     for kind, groups, places, query in sets.negatives[:: 2 if quick else 1]:
-        images = np.arange(min(len(query), MOST))
+        images = np.arange(min(len(query), MAX_PLACES))
         stamps = (images + 1) * 100_000_000
         yield Drive(kind, groups, places, query.features[images], stamps, images)
 

@@ -22,7 +22,7 @@ from stavpr_ros.mapping import Map
 from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.method.loop_closer import LoopCloser
 
-FIRST, SECOND = 900, 450  # images of a drive, at most
+MAX_FIRST, MAX_SECOND = 900, 450  # images of a drive, at most
 EXCLUDED, EVERY = 30, 3  # latest places that are no closures; of the negatives that are driven
 STEPS = -0.6, -0.3, 0.0, 0.3, 0.6  # of K
 NUMBERS = 'CONFIRMED', 'ROUTE_IMAGES'
@@ -50,7 +50,7 @@ def drives_twice(sets: Sets) -> Iterator[Drives]:
 
 def closures(drives: Drives) -> np.ndarray:
     """Return how many closures of the second drive are right and wrong, on time and late, (4,)."""
-    first, second = drives.first.features[:FIRST], drives.second.features[:SECOND]
+    first, second = drives.first.features[:MAX_FIRST], drives.second.features[:MAX_SECOND]
     strips, weights = (
         np.concatenate([getattr(part, name)[:] for part in (first, second)], axis=1)
         for name in ('strips', 'weights')

@@ -56,11 +56,11 @@ from stavpr_ros.sources import open_source
 
 SETTINGS = RecognizerSettings(mode='robust')
 LONG = 1000  # places from which a route is driven only around the removed stretch
-SHORTEST, LONGEST = 20, 40  # places of a removed stretch
+MIN_STRETCH, MAX_STRETCH = 20, 40  # places of a removed stretch
 LONG_STRETCHES = 100  # of a long route, at random; others have one at each place
 STRETCHES = (
-    f'stretches have {SHORTEST} to {LONGEST} places, at random, and begin at {{step}} place '
-    f'(Nordland: {{long}} random ones)'
+    f'stretches have {MIN_STRETCH} to {MAX_STRETCH} places, at random, and begin at {{step}} '
+    'place (Nordland: {long} random ones)'
 )
 STEP, LONG_STEP = 10, 100  # places from one start to the next
 BEFORE, AFTER = 80, 60  # images driven around the removed stretch of a long route
@@ -69,7 +69,7 @@ START_IMAGES, SMALL_MAP = 30, 40
 TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
 SETS = (*WARPED, 'corridor', 'nordland')
-STANDING = 200  # places of a standstill in a map
+REST_PLACES = 200  # places of a standstill in a map
 SPARSE = 3  # places of the route a place of a sparse map
 LONG_STOP = 'stop 1000'  # not pooled: so many images of one probability
 CHANGES = ('same', '0.5x', 'varying', '2x', '3x', 'stop 30', 'stop 100', 'drop 0.3', LONG_STOP)
@@ -237,10 +237,10 @@ def sparse(pair: Pair) -> Outcome:
 def stretches(pair: Pair, coarser: int = 1) -> list[tuple[int, int]]:
     """Return first place and end of each stretch that is removed, of random lengths."""
     n, rng = len(pair.places), np.random.default_rng(0)
-    firsts = np.arange(n - SHORTEST + 1)
+    firsts = np.arange(n - MIN_STRETCH + 1)
     if pair.long:
         firsts = np.sort(rng.choice(firsts, LONG_STRETCHES, replace=False))
-    lasts = np.minimum(firsts + rng.integers(SHORTEST, LONGEST + 1, len(firsts)), n)
+    lasts = np.minimum(firsts + rng.integers(MIN_STRETCH, MAX_STRETCH + 1, len(firsts)), n)
     return list(zip(firsts[::coarser].tolist(), lasts[::coarser].tolist(), strict=True))
 
 
@@ -315,9 +315,9 @@ def start_numbers(counts: Sequence[int | None]) -> dict[str, Any]:
 
 
 def with_standstill(place_map: Map) -> Map:
-    """Return a map whose camera stood for ``STANDING`` places more in its middle."""
+    """Return a map whose camera stood for ``REST_PLACES`` places more in its middle."""
     n = len(place_map)
-    return select_places(place_map, np.sort(np.append(np.arange(n), np.full(STANDING, n // 2))))
+    return select_places(place_map, np.sort(np.append(np.arange(n), np.full(REST_PLACES, n // 2))))
 
 
 @dataclass

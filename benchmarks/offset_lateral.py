@@ -30,7 +30,7 @@ from std_msgs.msg import Header
 
 SEEDS = (7, 21, 33)
 LEFT = (-1.0, -0.4, -0.2, 0.0, 0.2, 0.4, 1.0, 2.0)  # meters from the path
-WITHIN, SWAY, TURNED = range(10, 110), 0.15, math.radians(3)
+WITHIN, SWAY, MAX_ANGLE = range(10, 110), 0.15, math.radians(3)
 
 
 Image = tuple[int, float, float, np.ndarray, np.ndarray]
@@ -41,7 +41,7 @@ def drive(taught: Taught, conditions: Conditions, left: float) -> Iterator[Image
     view = View(taught.world, conditions)
     for k in WITHIN:
         x, y, heading = taught.poses[k]
-        beside, turn = left + SWAY * math.sin(k / 7), TURNED * math.sin(k / 5)
+        beside, turn = left + SWAY * math.sin(k / 7), MAX_ANGLE * math.sin(k / 5)
         pose = x - beside * math.sin(heading), y + beside * math.cos(heading), heading + turn
         yield k, beside, turn, np.array(pose), view.image(np.array(pose), k)
 

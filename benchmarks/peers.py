@@ -31,8 +31,8 @@ from stavpr_ros.method import RecognizerSettings
 from stavpr_ros.sources import open_source
 import torch
 
-LONGEST = 20  # images in a window, our default; seqNet has 5, pySeqSLAM 10
-MARGIN = LONGEST // 2  # first and last images, in the middle of no window: not counted
+LENGTH = 20  # images in a window, our default; seqNet has 5, pySeqSLAM 10
+MARGIN = LENGTH // 2  # first and last images, in the middle of no window: not counted
 PLACES = 300  # of Nordland: seqNet takes a millisecond for each pair of windows of 20 images
 PROJECTION = 64  # dimensions of a strip of the network, for the same reason
 Matches = tuple[np.ndarray, np.ndarray]  # place of each image, and its distance
@@ -111,10 +111,10 @@ def peer_methods(
     S = places @ queries.T
     best = load(options.vpr_tutorial / 'matching/matching.py').best_match_per_query(S)
     yield 'VPR_Tutorial, single images', (best.argmax(axis=0), -S.max(axis=0))
-    for length in (5, LONGEST):
+    for length in (5, LENGTH):
         yield f'seqNet seqMatch, l = {length}', seqmatch(options.seqnet, places, queries, length)
     D = differences(places, queries)
-    for length in (10, LONGEST):
+    for length in (10, LENGTH):
         yield f'pySeqSLAM, l = {length}', pyseqslam(options.pyseqslam, D, length)
 
 
@@ -126,7 +126,7 @@ def methods(
     yield from peer_methods(options, places, queries)
     for name, matches in peer_methods(options, center_vectors(places), center_vectors(queries)):
         yield f'{name}, centered', matches
-    for length in (10, LONGEST):
+    for length in (10, LENGTH):
         settings = SeqSlamSettings(length=length)
         yield (
             f'ours, SeqSLAM, l = {length}',

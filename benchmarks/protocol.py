@@ -48,7 +48,7 @@ CASES = {  # map and query; image i shows place i
 }
 DARK = 8.0  # standard deviation of the gray levels, below which an image shows nothing
 STILL = 2.0  # mean change of the gray levels since the image before, below which a camera rests
-FEW = (5, 20)  # images of sequences of SqueezeNet on Nordland, 0.1 s an image and length
+SHORT_LENGTHS = (5, 20)  # images of sequences of SqueezeNet on Nordland, 0.1 s an image and length
 PATCHES = 'p'
 LABELS = FEATURES | {PATCHES: 'patches of SeqSLAM'}
 # of results/evaluation.md: data set, tolerance, images
@@ -122,7 +122,7 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[Row]]]:
             if long:
                 variants[f'{name}_clean'] = clean(*sources)
             for variant, indices in variants.items():
-                recalls = rows(paths, indices, making, FEW if costly else LENGTHS)
+                recalls = rows(paths, indices, making, SHORT_LENGTHS if costly else LENGTHS)
                 yield f'{variant}/{feature}', [asdict(row) for row in recalls]
 
 

@@ -52,7 +52,7 @@ FRAMES = 20  # of the distance matrix
 MATRIX_PLACES = 20_000  # most places of the distance matrix
 MAX_MEMORY = 12e9  # bytes that a map and its peers may take
 LIBROSA_STARTS, ENDS_CHECKED = 500, 3
-PROJECTED, DRIVEN = 64, 1000  # dimensions of `process`, images of the drives
+PROJECTED, DRIVE_IMAGES = 64, 1000  # dimensions of `process`, images of the drives
 SEARCHES = {'faiss': 'faiss', 'usearch': 'bench'}  # package: its requirements
 Call = Callable[[], Any]
 
@@ -253,16 +253,16 @@ def process_stages(run: Run, n: int, precision: str) -> None:
 
     The peer processes images of the same drive that do not match, as no probability is enough.
     """
-    if n < 2 * DRIVEN:
-        return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVEN:,} places')
+    if n < 2 * DRIVE_IMAGES:
+        return run.skip('process', n, PROJECTED, f'fewer than {2 * DRIVE_IMAGES:,} places')
     extractor, d = FeatureExtractor('gradient', projection=PROJECTED), PROJECTED
-    images = np.random.default_rng(0).integers(0, 256, (DRIVEN, 48, 64, 3), np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (DRIVE_IMAGES, 48, 64, 3), np.uint8)
     driven, strips = extractor.extract(list(images)), make_features(n, d, STRIPS, 0)
     strips = strips.strips
     strips *= d**0.5 * driven.strips.std(axis=1, keepdims=True)
     strips += driven.strips.mean(axis=1, keepdims=True)
     normalize(strips)
-    strips[:, (n - DRIVEN) // 2 :][:, :DRIVEN] = driven.strips
+    strips[:, (n - DRIVE_IMAGES) // 2 :][:, :DRIVE_IMAGES] = driven.strips
     features = LocalFeatures(
         strips, np.full((STRIPS, n), STRIPS**-0.5, np.float32), extractor.settings
     )
@@ -272,7 +272,7 @@ def process_stages(run: Run, n: int, precision: str) -> None:
     place_map = Map(features, extractor.projection, np.zeros(n, np.int64), names, poses)
     pipeline = Pipeline(PipelineSettings(backend='cpu', precision=precision))
     pipeline.change(loaded=LoadedMap('', place_map, extractor))
-    following, accepted = cycle(range(DRIVEN)), {0.5: 0, 1.0: 0}
+    following, accepted = cycle(range(DRIVE_IMAGES)), {0.5: 0, 1.0: 0}
 
     def process(min_probability: float) -> None:
         limit = min(min_probability, 1 - 1e-9)
@@ -359,7 +359,7 @@ def frame(places: LocalFeatures, mode: str, precision: str) -> Call:
     """Return a call that updates a recognizer, on the map, its window full, with an image."""
     settings = RecognizerSettings(1.0 if mode == 'paper' else None, mode=mode)
     recognizer = PlaceRecognizer(descriptor_map(places), settings, precision=precision)
-    queries = along(places, min(len(places), DRIVEN))
+    queries = along(places, min(len(places), DRIVE_IMAGES))
     following = cycle([queries[i : i + 1] for i in range(len(queries))])
     for _ in range(SEQUENCE.length):
         recognizer.update(next(following))

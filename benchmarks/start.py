@@ -25,7 +25,7 @@ from results import table
 from soak import about, image_message, make_map, texture_route
 
 RATE, IMAGES = 10.0, 30  # images per second, and how many after the node has subscribed
-KEPT = 5  # packages of the table of imports
+PACKAGES = 5  # packages of the table of imports
 LINE = re.compile(r'import time:\s*(\d+) \|\s*\d+ \|\s*(\w+)')
 MESSAGES = re.compile(r'rclpy|rosidl|rpyutils|ament|launch|\w+_(msgs|srvs|interfaces)')
 
@@ -38,7 +38,7 @@ def imports() -> dict[str, float]:
     times: Counter[str] = Counter()
     for microseconds, package in LINE.findall(log):
         times['rclpy, messages' if MESSAGES.fullmatch(package) else package] += int(microseconds)
-    largest = dict(times.most_common(KEPT)) | {'stavpr_ros': times['stavpr_ros']}
+    largest = dict(times.most_common(PACKAGES)) | {'stavpr_ros': times['stavpr_ros']}
     largest |= {'all': times.total()}
     return {name: value / 1e3 for name, value in largest.items()}
 

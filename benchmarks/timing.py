@@ -12,7 +12,7 @@ from typing import Any
 Job = Callable[[], float]  # runs once and returns the seconds that it took
 
 MIN_RUNS, MAX_RUNS = 7, 101  # runs of a measurement
-SLOW_S, FEWEST_SLOW = 1.0, 3  # fewer runs where one round takes more than SLOW_S
+SLOW_S, MIN_SLOW_RUNS = 1.0, 3  # fewer runs where one round takes more than SLOW_S
 SHORT_S = 0.01
 
 
@@ -57,7 +57,7 @@ def measure(jobs: Mapping[str, Job], seconds: float = 0.5) -> dict[str, Timing]:
         round_s += last
     rounds = max(MIN_RUNS, min(MAX_RUNS, math.ceil(seconds / max(round_s, 1e-9))))
     seconds_of: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(FEWEST_SLOW if round_s > SLOW_S else rounds):
+    for _ in range(MIN_SLOW_RUNS if round_s > SLOW_S else rounds):
         for name, job in jobs.items():
             first = job()
             seconds_of[name].append(job() if first < SHORT_S else first)

@@ -13,10 +13,10 @@ from stavpr_fleet.store import map_vectors, MapIndex
 from stavpr_ros.errors import FleetError, OutputTakenError, UnavailableError
 from stavpr_ros.mapping import Map, open_map, save_map, select_places
 
-EXACT = 4096  # places up to which all vectors are compared
-REDUCED = 128  # dimensions that larger maps' vectors are reduced to
-PROBED = 32  # lists of such an index that a query is compared with
-TRAINED = 50_000  # most places that an index is trained with
+MAX_EXACT = 4096  # places up to which all vectors are compared
+PCA_DIMENSIONS = 128  # dimensions that larger maps' vectors are reduced to
+PROBES = 32  # lists of such an index that a query is compared with
+TRAINING_PLACES = 50_000  # most places that an index is trained with
 
 
 def _faiss() -> Any:
@@ -56,8 +56,8 @@ class FaissStore:
             ) from error
         if self._index.ntotal != len(self._map) or self._index.d != self.index.dimension:
             raise FleetError(f'{file} is not the index of the map {path}: delete and upload again')
-        if len(self._map) > EXACT:
-            faiss.extract_index_ivf(self._index).nprobe = PROBED
+        if len(self._map) > MAX_EXACT:
+            faiss.extract_index_ivf(self._index).nprobe = PROBES
 
     def nearest(self, vectors: np.ndarray, count: int) -> np.ndarray:
         """See :class:`stavpr_fleet.store.PlaceStore`."""
@@ -86,11 +86,11 @@ def upload_to_faiss(place_map: Map, path: str, force: bool = False) -> None:
     vectors = map_vectors(place_map, MapIndex.of(place_map))
     n, dimension = vectors.shape
     kind = 'Flat'
-    if n > EXACT:
-        reduced = f'PCA{REDUCED},' if dimension > REDUCED else ''
+    if n > MAX_EXACT:
+        reduced = f'PCA{PCA_DIMENSIONS},' if dimension > PCA_DIMENSIONS else ''
         kind = f'{reduced}IVF{math.isqrt(n)},SQ8'
     index = faiss.index_factory(dimension, kind, faiss.METRIC_INNER_PRODUCT)
-    index.train(vectors[:: max(1, n // TRAINED)])
+    index.train(vectors[:: max(1, n // TRAINING_PLACES)])
     index.add(vectors)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix='.upload-') as folder:
         faiss.write_index(index, f'{folder}/index')

@@ -34,8 +34,8 @@ CHUNK = 32  # places that are fetched together
 CHUNKS = 128  # loaded: 4096 places
 NEIGHBORHOODS = 16  # that are looked at
 BEHIND, AHEAD = 16, 48  # places of a neighborhood before and after its middle
-EVERY = 5  # images between lookups
-NEAREST = 64  # places of an image that vote
+INTERVAL = 5  # images between lookups
+VOTERS = 64  # places of an image that vote
 HISTORY = 60  # latest images that the filter runs over again
 LIKELY = 8  # most probable places whose neighborhoods are kept
 MIN_PROBABILITY = 1e-3  # their least probability
@@ -228,7 +228,7 @@ class FleetRecognizer(SequenceRecognizer):
     def _update_neighborhoods(self) -> bool:
         """Look neighborhoods up if it is time; return whether other places are loaded."""
         if self._pending is None:
-            if len(self._order) and len(self._vectors) < EVERY:
+            if len(self._order) and len(self._vectors) < INTERVAL:
                 return False
             queries = list(self._vectors)
             self._vectors.clear()
@@ -261,7 +261,7 @@ class FleetRecognizer(SequenceRecognizer):
         """Return the neighborhoods of images; on a thread of its own, without this object's."""
         store = self._city.store
         vectors = np.concatenate([vector for _, vector in queries])
-        for (number, _), nearest in zip(queries, store.nearest(vectors, NEAREST), strict=True):
+        for (number, _), nearest in zip(queries, store.nearest(vectors, VOTERS), strict=True):
             votes.add(number, nearest)
         last = (len(self._city) - 1) // CHUNK
         candidates: dict[int, None] = {}

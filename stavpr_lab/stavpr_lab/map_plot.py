@@ -14,7 +14,7 @@ from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import evenly
 
 COMPARED = 500  # places of the matrix, at most
-SHOWN = 8  # thumbnails
+THUMBNAILS = 8  # thumbnails
 
 
 def plot_map(place_map: Map, path: Path) -> None:
@@ -80,8 +80,8 @@ def _draw_sessions(axes: Axes, place_map: Map) -> None:
 
 
 def _draw_thumbnails(figure: SubFigure, place_map: Map, columns: int) -> None:
-    places = evenly(len(place_map), SHOWN).tolist()
-    grid = figure.subplots(SHOWN // columns, columns, squeeze=False)
+    places = evenly(len(place_map), THUMBNAILS).tolist()
+    grid = figure.subplots(THUMBNAILS // columns, columns, squeeze=False)
     for axes in grid.flat:
         axes.set_axis_off()
     for axes, place in zip(grid.flat, places, strict=False):

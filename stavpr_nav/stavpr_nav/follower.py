@@ -35,17 +35,17 @@ from stavpr_nav.evidence import (
 from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError, SettingsError
 
-UNCERTAIN, CERTAIN = 0.5, 0.9  # probabilities of the slowest and of the full speed
-SLOWEST = 0.3  # share of the taught speed
-WITHOUT_OFFSET = 0.5  # share of the speed while the offset is not valid
+SLOW_PROBABILITY, FULL_PROBABILITY = 0.5, 0.9  # probabilities of the slowest and of the full speed
+MIN_SHARE = 0.3  # share of the taught speed
+NO_OFFSET_SHARE = 0.5  # share of the speed while the offset is not valid
 # Widths of the image: of the sum; of the parallax in it, for a small angle back to the path.
 MAX_STEER, MAX_APPROACH = 0.2, 0.1
 INTEGRAL, MAX_INTEGRAL = 15.0, 0.05  # D, meters; widths of the image, of summands too
 BRIDGE_SHARE = 0.5  # share of the speed without a match
 CREEP = 0.3  # m/s from a standstill to the first evidence of motion
 NO_EVIDENCE = 'no evidence of motion: press the dead-man switch again, or call ~/start'
-FALL, MEMORY = 0.3, 10  # share of the recent similarity that is dissimilar; images of its mean
-FIRST = 3  # successive confirmed images, from which on the robot moves
+MIN_RATIO, MEMORY = 0.3, 10  # of the similarity to its recent mean; images of the mean
+MIN_IMAGES = 3  # successive confirmed images, from which on the robot moves
 HISTORY = 200  # latest commands, to know how far the robot is since an image was taken
 
 
@@ -235,7 +235,7 @@ class RouteFollower:
             return False
         similarity, before = observation.offset.similarity, self._similarity
         self._similarity += (similarity - before) / MEMORY if before else similarity
-        return similarity < FALL * before
+        return similarity < MIN_RATIO * before
 
     def halt(self, now: float, reason: str) -> Command:
         """Halt for now; the robot accelerates from rest afterwards."""
@@ -283,7 +283,7 @@ class RouteFollower:
             return 'not localized on the route'
         if self._confirmed < self._received:
             return 'the newest image is not of the route'
-        return 'waiting for more images of the route' if self._successive < FIRST else ''
+        return 'waiting for more images of the route' if self._successive < MIN_IMAGES else ''
 
     def _target_velocities(self, now: float) -> Command:
         """Return the velocities without limits of the acceleration."""
@@ -297,9 +297,9 @@ class RouteFollower:
         speed, turn, is_end = self._taught.at(newest.place, since)
         if is_end or (self.end is not None and times[newest.place] + since >= times[self.end]):
             return Command(0.0, 0.0, 'end of the route')
-        share = (self._probability - UNCERTAIN) / (CERTAIN - UNCERTAIN)
-        share = BRIDGE_SHARE if math.isnan(share) else min(max(share, SLOWEST), 1.0)
-        share *= 1 if offset.is_valid else WITHOUT_OFFSET
+        share = (self._probability - SLOW_PROBABILITY) / (FULL_PROBABILITY - SLOW_PROBABILITY)
+        share = BRIDGE_SHARE if math.isnan(share) else min(max(share, MIN_SHARE), 1.0)
+        share *= 1 if offset.is_valid else NO_OFFSET_SHARE
         most = settings.max_speed if self.evidence.is_fresh else min(CREEP, settings.max_speed)
         share = min(share, most / max(abs(speed), 1e-9))
         speed, turn = share * speed, share * turn

@@ -27,7 +27,7 @@ from stavpr_ros.units import SECOND
 
 COLUMNS = ['stamp', 'speed', 'turn']
 STILL_SPEED, STILL_TURN = 0.02, 0.02  # m/s and rad/s; below both, the robot is at rest
-STANDING = 1e-3  # seconds between two places that are left of a time at rest
+REST_SECONDS = 1e-3  # seconds between two places that are left of a time at rest
 MAX_GAP = 1.0  # seconds without a velocity that are bridged
 MARGIN = 2.0  # seconds before the first and after the last velocity in which places may be
 SESSION = '# session: '  # begins the line that names the session of a run
@@ -145,12 +145,12 @@ def taught_run(
         moved, turned, moving = _of_velocities(velocities, stamps)
     if not (moving > 0).any():
         raise InputError('the robot is at rest in the whole taught run')
-    seconds = np.maximum(moving, STANDING)
+    seconds = np.maximum(moving, REST_SECONDS)
     speeds, turns = moved / seconds, turned / seconds
     # where the robot was at rest, the velocities are the next ones
-    following = np.where(moving > STANDING, np.arange(len(moving)), len(moving))
+    following = np.where(moving > REST_SECONDS, np.arange(len(moving)), len(moving))
     following = np.minimum.accumulate(following[::-1])[::-1]
-    following[following == len(moving)] = np.flatnonzero(moving > STANDING)[-1]
+    following[following == len(moving)] = np.flatnonzero(moving > REST_SECONDS)[-1]
     following = np.append(following, following[-1])
     times = np.concatenate([[0.0], np.cumsum(seconds)])
     seam = None

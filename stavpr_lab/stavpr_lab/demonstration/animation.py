@@ -19,7 +19,7 @@ from stavpr_ros.mapping import load_map, Map
 from stavpr_ros.pipeline.overlay import match_image
 from stavpr_ros.sources import open_source
 
-EVERY = 5  # images per drawn one
+INTERVAL = 5  # images per drawn one
 MILLISECONDS = 120  # of each
 SIZE = (240, 180)  # pixels of the query, and of the place beside it
 QUALITY = 40  # of WebP
@@ -67,7 +67,7 @@ def write_animation(folder: Path, path: Path, ahead: float = 0.0) -> None:
         for i, (frame, line) in enumerate(
             zip(open_source(folder / 'second_traverse'), records, strict=True)
         )
-        if i % EVERY == 0
+        if i % INTERVAL == 0
     ]
     frames[0].save(
         path,

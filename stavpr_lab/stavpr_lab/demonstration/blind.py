@@ -24,7 +24,7 @@ SPEED, STEP, LATENCY, BRAKING = 1.0, 0.01, 0.05, 5.0  # m/s, seconds, seconds, m
 CONTROL, ODOMETRY = 5, 2  # steps between two commands, and between two odometry messages
 PHASES = 20
 BEFORE, AFTER = 12.0, 30.0  # meters before, seconds after the failure
-LIKE = Offset(0.0, 0.01, 0.0, 1e6, 0.6)  # of an image of its place
+SIMILAR = Offset(0.0, 0.01, 0.0, 1e6, 0.6)  # of an image of its place
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def drive(
             swing = failure.swing * (round(now * rate) % 2) if is_failed else 0
             place = shown - swing if has_place else driver.expected_place(failure.is_new)
             waiting.append((now + LATENCY, Observation(
-                now, place, 0.99 if has_place else math.nan, LIKE if place >= 0 else None,
+                now, place, 0.99 if has_place else math.nan, SIMILAR if place >= 0 else None,
                 is_good or failure.is_new,
             )))  # fmt: skip
         while waiting and waiting[0][0] <= now:

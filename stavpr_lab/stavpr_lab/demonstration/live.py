@@ -27,8 +27,8 @@ POLL_SECONDS = 0.05
 # Of DDS: the port at which the first participant of domain 0 is discovered, and ports of a domain
 FIRST_PORT, PORTS, DOMAINS = 7410, 250, range(1, 102)
 SETTINGS_OF_ROS = 'ROS_', 'RMW_', 'RCUTILS_', 'FASTRTPS_', 'FASTDDS_', 'CYCLONEDDS_', 'ZENOH_'
-KEPT = 'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_LOG_DIR', 'ROS_HOME'
-REFUSED = 'cannot configure: '  # in the log of the node
+SAFE = 'ROS_DISTRO', 'ROS_VERSION', 'ROS_PYTHON_VERSION', 'ROS_LOG_DIR', 'ROS_HOME'
+REFUSAL = 'cannot configure: '  # in the log of the node
 
 Process = subprocess.Popen[bytes]
 Records = list[dict[str, Any]]
@@ -60,7 +60,7 @@ def free_domain() -> int:
 
 def private_domain() -> dict[str, str]:
     """Return an environment with a ROS domain of its own, without the user's settings of ROS."""
-    names = [name for name in os.environ if name in KEPT or not name.startswith(SETTINGS_OF_ROS)]
+    names = [name for name in os.environ if name in SAFE or not name.startswith(SETTINGS_OF_ROS)]
     own = {'ROS_DOMAIN_ID': str(free_domain()), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     return {name: os.environ[name] for name in names} | own
 
@@ -207,7 +207,7 @@ def _wait_until(
 
 def _refusal(log: Path) -> str:
     """Return why the node, which then waits for another try, could not be configured; or ''."""
-    _, _, rest = log.read_text().partition(REFUSED)
+    _, _, rest = log.read_text().partition(REFUSAL)
     return rest.partition('\n')[0] if '\n' in rest else ''
 
 

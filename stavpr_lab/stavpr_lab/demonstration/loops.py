@@ -18,8 +18,8 @@ from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import evenly
 
-SHOWN = 8  # pairs of images
-LARGEST = 4000  # images of a traverse whose distances are drawn
+MAX_PAIRS = 8  # pairs of images
+MAX_IMAGES = 4000  # images of a traverse whose distances are drawn
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,9 @@ def choose_closures(count: int, correct: np.ndarray | None) -> list[int]:
     good = np.arange(count) if correct is None else np.flatnonzero(correct)
     bad = np.setdiff1d(np.arange(count), good)
     selection: set[int] = set()
-    for indices, most in ((bad, SHOWN if not len(good) else SHOWN // 4), (good, SHOWN)):
-        room = min(most, SHOWN - len(selection))
+    max_bad = MAX_PAIRS // 4 if len(good) else MAX_PAIRS
+    for indices, limit in ((bad, max_bad), (good, MAX_PAIRS)):
+        room = min(limit, MAX_PAIRS - len(selection))
         selection |= set(indices[evenly(len(indices), room)].tolist())
     return sorted(selection)
 
@@ -133,7 +134,7 @@ def _pairs(result: LoopResult, place_map: Map) -> list[MatchPair]:
 
 def _compared_distances(result: LoopResult, place_map: Map) -> np.ndarray | None:
     """Return the distances of every image to those it is compared with, NaN elsewhere, (N, N)."""
-    if result.N > LARGEST:
+    if result.N > MAX_IMAGES:
         return None
     recognizer = PlaceRecognizer(place_map, RecognizerSettings(mode='paper'))
     index = np.arange(result.N)

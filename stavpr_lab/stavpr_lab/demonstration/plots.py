@@ -16,7 +16,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 
-SHOWN = 6  # pairs of images: two rows of three
+MAX_PAIRS = 6  # pairs of images: two rows of three
 
 
 def draw_result(
@@ -50,11 +50,11 @@ def choose_images(outcomes: np.ndarray) -> list[int]:
     groups = [np.flatnonzero(outcomes == kind) for kind in kinds]
     selection = [int(same[len(same) // 2]) for same in groups]
     common = groups[counts.argmax()]
-    while len(selection) < min(SHOWN, len(outcomes)):
+    while len(selection) < min(MAX_PAIRS, len(outcomes)):
         others = np.array([0, len(outcomes), *selection])
         gaps = np.abs(common[:, None] - others).min(axis=1)
         selection.append(int(common[gaps.argmax()]))
-    return sorted(set(selection))[:SHOWN]
+    return sorted(set(selection))[:MAX_PAIRS]
 
 
 def _pair(

@@ -47,7 +47,7 @@ from tqdm import tqdm
 
 RATE, SPEED = 5.0, 2.5  # images per second; m/s of the taught run
 STEP = 0.05  # seconds of the simulation, and of the control
-LATENCY, LOST = 0.15, 0.05  # seconds until an image is processed; share of images that are lost
+LATENCY, LOSS = 0.15, 0.05  # seconds until an image is processed; share of images that are lost
 SLIP, SLIP_TURN = 0.05, 0.05  # deviations of the wheels' slip, shares; constant over seconds
 CONVERGENCE = 20.0  # meters at the start that are not counted
 OPERATOR_DELAY = 1.0  # seconds until the operator lets a robot go on that stopped without evidence
@@ -72,9 +72,9 @@ LAPS = [
     Lap('dusk', -0.01, 1), Lap('rain', -0.01, -1), Lap('day', 0.02, 1), Lap('dusk', 0.0, -1),
     Lap('rain', 0.0, 1), Lap('day', 0.0, -1),
 ]  # fmt: skip
-TURNED = math.radians(10)  # at the start, away from the path
-CHANGED = 15.0  # seconds until the image changes in the drives that have to stop
-EVERY, MILLISECONDS, QUALITY = 5, 150, 40  # images per drawn one; time of each; of WebP
+START_ANGLE = math.radians(10)  # at the start, away from the path
+CHANGE_TIME = 15.0  # seconds until the image changes in the drives that have to stop
+INTERVAL, MILLISECONDS, QUALITY = 5, 150, 40  # images per drawn one; time of each; of WebP
 
 
 class View(Traverse):
@@ -234,7 +234,7 @@ class Drive:
 
 def repeat(
     taught: Taught, conditions: Conditions, seconds: float, begin: int = 0,
-    left: float = 1.0, turned: float = TURNED, seed: int = 0, pull: float = 0.01,
+    left: float = 1.0, turned: float = START_ANGLE, seed: int = 0, pull: float = 0.01,
     change: Callable[[np.ndarray, float], np.ndarray] = lambda image, time: image,
     world: RingWorld | None = None, has_operator: bool = True,
 ) -> Drive:  # fmt: skip
@@ -259,7 +259,7 @@ def repeat(
     rows, reasons, presses, blocked_at = [], [], 0, math.inf
     for k in range(round(seconds / STEP)):
         time = k * STEP
-        if k % round(1 / RATE / STEP) == 0 and dice.random() >= LOST:
+        if k % round(1 / RATE / STEP) == 0 and dice.random() >= LOSS:
             image = change(view.image(robot.pose, k), time)
             waiting.append((time + LATENCY, pilot.process(image, time)))
         while waiting and waiting[0][0] <= time:
@@ -303,7 +303,7 @@ def animate(taught: Taught, drive: Drive, images: list[np.ndarray], path: Path) 
     from PIL import Image
 
     frames = []
-    for number in range(0, len(images), EVERY):
+    for number in range(0, len(images), INTERVAL):
         step = min(len(drive.times) - 1, number * len(drive.times) // len(images))
         figure = Figure(figsize=(7, 2.6), layout='constrained')
         camera, above = figure.subplots(1, 2)
@@ -356,12 +356,12 @@ def stops(taught: Taught) -> dict[str, float]:
             time: float,
             change: Callable[[np.ndarray], np.ndarray] = change,
         ) -> np.ndarray:
-            return change(image) if time >= CHANGED else image
+            return change(image) if time >= CHANGE_TIME else image
 
-        drive = repeat(taught, GOOD_LIGHT, CHANGED + 5, 10, change=switch, has_operator=False)
-        is_later = drive.times >= CHANGED
+        drive = repeat(taught, GOOD_LIGHT, CHANGE_TIME + 5, 10, change=switch, has_operator=False)
+        is_later = drive.times >= CHANGE_TIME
         at_rest = np.flatnonzero(is_later & (drive.speeds < 0.05))
-        result[name] = float(drive.times[at_rest[0]] - CHANGED) if len(at_rest) else math.inf
+        result[name] = float(drive.times[at_rest[0]] - CHANGE_TIME) if len(at_rest) else math.inf
     return result
 
 
@@ -389,7 +389,7 @@ def main() -> None:
 
         drive = repeat(
             taught, CONDITIONS[lap.light], 2 * length / SPEED + 60, 10, lap.left,
-            math.copysign(TURNED, lap.left), seed, lap.pull, keep,
+            math.copysign(START_ANGLE, lap.left), seed, lap.pull, keep,
         )  # fmt: skip
         drives[f'{seed + 1}: {lap.light}, {lap.pull:+.2f}'] = drive
         driven = np.cumsum(drive.speeds) * STEP

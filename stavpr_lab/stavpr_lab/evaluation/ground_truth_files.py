@@ -23,7 +23,7 @@ BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and wh
 Pairs = tuple[np.ndarray, np.ndarray]
 Names = tuple[Sequence[str], Sequence[str]]
 """Of the queries and of the places."""
-LARGEST = 2**53  # whole numbers below it are exact as floating-point numbers
+MAX_WHOLE = 2**53  # whole numbers below it are exact as floating-point numbers
 
 
 def read_pairs(path: Path, N: int, n: int, names: Names = ((), ())) -> Pairs:
@@ -91,7 +91,7 @@ def _of_names(table: Table, names: Names) -> np.ndarray | None:
         for row, cell in enumerate(cells):
             if pairs[-1][row] < 0:
                 value = np.nan if is_name(cell) else float(cell or 'nan')
-                if not (abs(value) < LARGEST and value.is_integer()):
+                if not (abs(value) < MAX_WHOLE and value.is_integer()):
                     raise table.error(f'{cell!r} is the name of no image, and no whole number')
                 pairs[-1][row] = value
     return np.transpose(pairs)
@@ -104,7 +104,7 @@ def _from_text(path: Path, N: int, names: Names) -> Pairs:
         columns = _columns(table, table.names, table.width)
         rows = table.numbers(columns)
         for column, values in zip(columns, rows.T, strict=True):
-            whole = (abs(values) < LARGEST) & (values == np.floor(values))
+            whole = (abs(values) < MAX_WHOLE) & (values == np.floor(values))
             where = f'column {column + 1} has'
             if not whole.all():
                 row = int(np.argmin(whole))

@@ -22,7 +22,7 @@ from stavpr_ros.method.settings import MODES
 TOLERANCES = (0, 1, 2, 10)  # places
 LENGTHS = (1, 4, 5, 10, 20)  # images
 METHODS = ('plain', 'centered', 'seqslam', *MODES)
-BLOCK, FEWEST_BLOCKS = 40, 5  # images of a block at most, blocks of a query at least
+MAX_BLOCK, MIN_BLOCKS = 40, 5  # images of a block at most, blocks of a query at least
 INTERVAL = (0.025, 0.975)  # quantiles
 Estimate = tuple[float, ...]  # value, low and high bound of its interval
 
@@ -57,7 +57,7 @@ def block_samples(count: int, resamples: int = 1000, seed: int = 0) -> np.ndarra
     :param count: images N.
     :returns: images in blocks of successive ones, shape (resamples, N), int64.
     """
-    block = max(1, min(BLOCK, count // FEWEST_BLOCKS))
+    block = max(1, min(MAX_BLOCK, count // MIN_BLOCKS))
     size = resamples, -(-count // block), 1
     firsts = np.random.default_rng(seed).integers(count, size=size)
     return ((firsts + np.arange(block)) % count).reshape(resamples, -1)[:, :count]

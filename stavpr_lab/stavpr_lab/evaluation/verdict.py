@@ -11,7 +11,7 @@ from stavpr_ros.units import SECOND
 
 RECOGNIZED, PARTLY = 0.8, 0.1  # shares of the images, from which on a drive is called so
 TOLERABLE = 0.05  # share of wrong matches, above which they are the verdict
-GAPS, SHORTEST = 3, 5  # the longest gaps that are listed; images of one at least
+GAPS, MIN_GAP = 3, 5  # the longest gaps that are listed; images of one at least
 UNLIKELY, DOUBTFUL = 0.001, 0.05  # probabilities of a place that is not matched
 
 
@@ -96,7 +96,7 @@ def _gaps(report: Report, expected: np.ndarray) -> list[str]:
     """Return the longest runs of images without a match, in order, in words."""
     if report.reference is report.query and not report.has_truth:
         return []
-    gaps = [gap for gap in runs(~report.accepted & expected) if gap[1] - gap[0] >= SHORTEST]
+    gaps = [gap for gap in runs(~report.accepted & expected) if gap[1] - gap[0] >= MIN_GAP]
     stamps, texts = report.query.stamps, []
     for first, end in sorted(sorted(gaps, key=lambda gap: gap[0] - gap[1])[:GAPS]):
         seconds = 0.0 if stamps is None else (stamps[end - 1] - stamps[first]) / SECOND

@@ -24,7 +24,7 @@ import torch
 from torch import nn
 
 GLOBAL, MAP = 'global', 'map'
-LARGEST = 2**31  # bytes of an ONNX file: limit of its format
+MAX_BYTES = 2**31  # bytes of an ONNX file: limit of its format
 OPSET = 17
 CHECKED = 3  # random images that the file is verified on
 
@@ -181,7 +181,7 @@ def export_network(outputs: Chosen, size: int) -> Exported:
     :raises UnavailableError: it cannot be recorded, or the file computes something else.
     """
     weights = sum(value.nbytes for value in outputs.state_dict().values())
-    if weights >= LARGEST:
+    if weights >= MAX_BYTES:
         raise UnavailableError(
             f'the network has {weights / 1e9:.1f} GB of weights, the limit of an ONNX file '
             '(2 GiB): compute its descriptors with its own program, and give those'

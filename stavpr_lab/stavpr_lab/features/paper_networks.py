@@ -37,7 +37,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d, relu
 PER_PASS = 32  # images that go through a network together: bounds its memory
 
 GROWTH = 48  # channels of a layer of DenseNet161
-FIRST = 96  # channels before the first block
+STEM = 96  # channels before the first block
 BLOCKS = (6, 12, 36, 24)  # layers of each block
 LAST_LAYER = 10  # of the last block: its first normalization and ReLU give the feature maps
 OLD_NAMES = re.compile(r'(\.denselayer\d+\.(?:norm|conv))\.([12]\.)')  # from before torch 0.4
@@ -205,10 +205,10 @@ class DenseNet161(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         features: dict[str, nn.Module] = {
-            'conv0': nn.Conv2d(3, FIRST, 7, stride=2, padding=3, bias=False),
-            'norm0': nn.BatchNorm2d(FIRST),
+            'conv0': nn.Conv2d(3, STEM, 7, stride=2, padding=3, bias=False),
+            'norm0': nn.BatchNorm2d(STEM),
         }
-        channels = FIRST
+        channels = STEM
         for i, layers in enumerate(BLOCKS, start=1):
             features[f'denseblock{i}'] = DenseBlock(channels, layers)
             channels += layers * GROWTH

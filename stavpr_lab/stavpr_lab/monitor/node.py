@@ -30,7 +30,7 @@ from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.qos import LATCHED
 from std_srvs.srv import Trigger
 
-KEPT = 3000  # samples: four minutes
+MAX_SAMPLES = 3000  # samples: four minutes
 SAMPLE_SECONDS = 0.08  # least time between two samples
 POLL_SECONDS = 0.5  # for the state of the node, and whether images are needed
 ROUTE_POINTS = 1000  # of the map's route, at most
@@ -57,7 +57,7 @@ class History:
         self._changed = threading.Condition()
         self._version = 0
         self._parts: dict[str, tuple[int, Any]] = {}
-        self._samples: deque[tuple[int, dict[str, Any]]] = deque(maxlen=KEPT)
+        self._samples: deque[tuple[int, dict[str, Any]]] = deque(maxlen=MAX_SAMPLES)
         self._sample_seconds, self._last = sample_seconds, -math.inf
         self.image = b''  # the last match image, JPEG
         self.viewers = 0  # pages that are open

@@ -49,9 +49,9 @@ from std_srvs.srv import Trigger
 PARAMETERS = REPEAT
 READ_ONLY = ParameterDescriptor(read_only=True)
 PERIOD, FEEDBACK = 0.05, 4  # s of the control; its steps of one feedback
-REMEMBERED = 20  # images and matches that wait for each other
+MAX_WAITING = 20  # images and matches that wait for each other
 CLOCK_IS_STILL = 'the clock does not advance'
-SHOWN = (  # SKIPPED: no keyframe, as of a robot at rest; it is at the expected place
+STATUSES = (  # SKIPPED: no keyframe, as of a robot at rest; it is at the expected place
     PlaceMatch.WARMING_UP,
     PlaceMatch.NO_MATCH,
     PlaceMatch.MATCH,
@@ -171,7 +171,7 @@ class RepeatNode(Node):
         self._pair(self._images, message)
 
     def _on_match(self, message: PlaceMatch) -> None:
-        if message.status not in SHOWN:
+        if message.status not in STATUSES:
             return
         if message.map_id != self._map.map_id:
             self.counts['matches on another map'] += 1
@@ -192,7 +192,7 @@ class RepeatNode(Node):
                 self.counts['replaced'] += self._next is not None
                 self._next = self._images.pop(stamp), self._matches.pop(stamp)
                 self._lock.notify()
-            while len(waiting) > REMEMBERED:
+            while len(waiting) > MAX_WAITING:
                 waiting.pop(next(iter(waiting)))
 
     def _on_camera(self, message: CameraInfo) -> None:

@@ -19,7 +19,7 @@ from stavpr_lab.demonstration.street.surfaces import hash01, noise
 from stavpr_ros.compilation import kernel
 
 _LAMPS, _FOLIAGE, _SUN, _AMBIENT = 5, 8, 0, 4  # of the array of light; see rendering.py
-NEAREST = 0.9  # meters; nearer parts of a thing are not drawn
+MIN_DEPTH = 0.9  # meters; nearer parts of a thing are not drawn
 
 
 @kernel
@@ -167,9 +167,9 @@ def _draw_shadow(color, depth, u, half, z0, z1, lens):
     """Darken the ground below a car."""
     focal, horizon, yaw, eye, fine = lens
     rows, columns = depth.shape
-    if z1 < NEAREST:
+    if z1 < MIN_DEPTH:
         return
-    near = max(z0, NEAREST)
+    near = max(z0, MIN_DEPTH)
     first = int((horizon + eye * focal / z1) * fine) + 1
     last = int((horizon + eye * focal / near) * fine) + 1
     for y in range(max(0, first), min(rows, last)):
@@ -191,9 +191,9 @@ def _draw_box(color, depth, u, half, z0, z1, low, high, part, seed, lens, light)
     """Draw the visible faces of a box: the one behind, one side and the top."""
     focal, horizon, yaw, eye, fine = lens
     rows, columns = depth.shape
-    if z1 < NEAREST + 0.2:
+    if z1 < MIN_DEPTH + 0.2:
         return
-    near = max(z0, NEAREST)
+    near = max(z0, MIN_DEPTH)
     left = min((u - half) / near, (u - half) / z1)
     right = max((u + half) / near, (u + half) / z1)
     first, last = columns / 2 + (left - yaw) * focal, columns / 2 + (right - yaw) * focal

@@ -19,7 +19,7 @@ CROP_MAP, CROP_QUERY = 0.3, 0.1  # right of every map image, left of every query
 GROUND_TRUTHS = ('groundtruth', 'gt', 'truth', 'groundtruthnew')
 DEPTH = 4  # levels of folders, the root among them
 PARENTS = ('images', 'data', 'datasets', 'test', 'trainval')  # folders of folders
-KEPT = 'cleanImageNames.txt'  # beside the traverses: names of the images that count
+LIST_FILE = 'cleanImageNames.txt'  # beside the traverses: names of the images that count
 # Parts of folder names besides the traverse: sizes, rates, kinds of files.
 NOISE = re.compile(r'\d+x\d+|\dfps|images|image|imgs|frames|gr[ae]yscale|jpg|png|test')
 
@@ -149,7 +149,7 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
 
 def _images(folder: Path) -> FolderSource:
     """Return the images of a traverse, where a list is beside it only the images that it names."""
-    images, names = FolderSource(folder), folder.parent / KEPT
+    images, names = FolderSource(folder), folder.parent / LIST_FILE
     if names.is_file():
         selection = set(names.read_text(encoding='utf-8', errors='replace').split())
         images.files = [file for file in images.files if file.name in selection]
