@@ -220,8 +220,8 @@ def measure_sessions(counts: list[int]) -> list[str]:
                     match = recognizer.update(image)
                     times[number].append(time.thread_time() - began)
                     if match.accepted:
-                        shown = i - len(match.window_stamps) + 1 + match.position
-                        right[number] += abs(match.place % places - shown) <= NEAR
+                        true_place = i - len(match.window_stamps) + 1 + match.position
+                        right[number] += abs(match.place % places - true_place) <= NEAR
             medians.append([1e3 * statistics.median(own) for own in times])
         costs = [statistics.median(turns) for turns in zip(*medians[SETTLED_TURNS:], strict=True)]
         one_session = one_session or (costs[0], sizes[0])

@@ -178,17 +178,17 @@ def drives_of(sets: Sets, quick: bool) -> Iterator[Drive]:
             for use, first in (('fit', 0), ('decide', n // 2)):
                 begin = int(np.searchsorted(drive.images, first))
                 end = int(np.searchsorted(drive.images, first + n // 2))
-                shown = np.arange(begin, min(end, begin + HALF))
-                yield _of_pair(kind, group, pair, drive, shown, use)
+                part = np.arange(begin, min(end, begin + HALF))
+                yield _of_pair(kind, group, pair, drive, part, use)
         if kind in ('crops', 'damaged night', 'track'):
             continue
         listed = stretches(pair)
         for at in np.linspace(0, len(listed) - 1, DETOURS // 2 if quick else DETOURS).astype(int):
             first, last = listed[at]
             drive = DriveChanges(removed=((first, last),)).apply(pair.truth)
-            shown = np.arange(len(drive.images))[max(0, first - 80) : last + 60]
+            part = np.arange(len(drive.images))[max(0, first - 80) : last + 60]
             use = 'both' if not pair.long else 'fit' if first < n // 2 else 'decide'
-            yield _of_pair(kind, group, pair, drive, shown, use)
+            yield _of_pair(kind, group, pair, drive, part, use)
     for kind, groups, places, query in sets.negatives[:: 2 if quick else 1]:
         images = np.arange(min(len(query), MAX_PLACES))
         stamps = (images + 1) * 100_000_000
@@ -196,12 +196,12 @@ def drives_of(sets: Sets, quick: bool) -> Iterator[Drive]:
 
 
 def _of_pair(
-    kind: str, group: str, pair: Pair, drive: ChangedDrive, shown: np.ndarray, use: str = 'both'
+    kind: str, group: str, pair: Pair, drive: ChangedDrive, part: np.ndarray, use: str = 'both'
 ) -> Drive:
     unseen, removed = None, drive.removed
     if removed:
-        unseen = np.any(drive.unseen(), axis=0)[shown]
+        unseen = np.any(drive.unseen(), axis=0)[part]
     places = select_places(pair.places, drive.places) if removed else pair.places
-    images = drive.images[shown]
-    features, truth = pair.query.features[images], drive.truth.select(shown)
-    return Drive(kind, (group,), places, features, drive.stamps[shown], images, truth, unseen, use)
+    images = drive.images[part]
+    features, truth = pair.query.features[images], drive.truth.select(part)
+    return Drive(kind, (group,), places, features, drive.stamps[part], images, truth, unseen, use)

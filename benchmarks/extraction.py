@@ -89,8 +89,8 @@ def extraction_stages(run: Run) -> None:
         peer = Peer('torch operators', job, 'the same features, on all cores')
         run.measure('extraction', (n, 0), call, [Work(n * size, 0)], [peer])
 
-    def features(message: Any, least: tuple[int, int] | None = None) -> Any:
-        image = decode_message(message, least)
+    def features(message: Any, min_size: tuple[int, int] | None = None) -> Any:
+        image = decode_message(message, min_size)
         small_gray(image)  # of the keyframes
         return extractor.extract([image])
 
@@ -99,7 +99,7 @@ def extraction_stages(run: Run) -> None:
     side = extractor.settings.backbone.size
     for kind, of_kind in (('raw', [raw_message(image) for image in large]), ('JPEG', jpeg)):
         peer = Peer('whole image', timed_job(partial(on_next, features, cycle(of_kind))))
-        call = partial(on_next, partial(features, least=(side, side)), cycle(of_kind))
+        call = partial(on_next, partial(features, min_size=(side, side)), cycle(of_kind))
         works = [Work(of_kind[0].data.nbytes, 0)]
         run.measure(f'1080p {kind} to features', (1, 0), call, works, [peer])
 

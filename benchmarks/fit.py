@@ -194,8 +194,8 @@ def numbers_section(
                     after = _both(changed, changed.scores(values))
                 worst = int(np.nanargmin(after - before))
                 change = np.nanmean(after - before, axis=1)
-                least = f'{(after - before).ravel()[worst]:+.2f} {SETS[worst % len(SETS)]}'
-                cell.append(f'{change[0]:+.3f} {change[1]:+.3f} ({least}){late}')
+                change_text = f'{(after - before).ravel()[worst]:+.2f} {SETS[worst % len(SETS)]}'
+                cell.append(f'{change[0]:+.3f} {change[1]:+.3f} ({change_text}){late}')
         cells.append(cell)
     head = [f'{KINDS[w.feature]}, {side}' for w in every for side in ('half', 'double')]
     return lines + table(['number', 'value', *head], cells)

@@ -75,7 +75,7 @@ def record_drive(drive: Drive, with_early: bool = True) -> np.ndarray:
     recognizer = PlaceRecognizer(drive.places, RecognizerSettings())
     window: Any = recognizer._window
     rows: list[tuple[float, ...]] = []
-    shown: list[Any] = []
+    entries: list[Any] = []
     state = {'image': -1, 'early': -1}
     show, assess, match, newest = window._assess, window.assess, window.match, window.match_newest
 
@@ -94,16 +94,16 @@ def record_drive(drive: Drive, with_early: bool = True) -> np.ndarray:
             rest, place = not is_early and middle == window.filter.count - 1, path.place
             about = image, place, float(is_early)
             if rest and any(
-                window._view is earlier for earlier in shown
+                window._view is earlier for earlier in entries
             ):  # it counts as a recent one, but is not the match
                 rows.append((-1, *about, NEW, *quantities(window._view), 0.0))
-            which = window._by_half if rest else shown[-1] if shown else window._view
-            kind = REST if rest else NEW if shown else REPEATED
+            which = window._by_half if rest else entries[-1] if entries else window._view
+            kind = REST if rest else NEW if entries else REPEATED
             rows.append((state['image'], *about, kind, *quantities(which), path.probability))
         return result
 
     def assess_view() -> None:
-        shown.clear()
+        entries.clear()
         assess()
 
     def matched() -> Any:
@@ -111,12 +111,12 @@ def record_drive(drive: Drive, with_early: bool = True) -> np.ndarray:
 
     def early() -> Any:
         state['early'] = state['image']
-        shown.clear()
+        entries.clear()
         return note(newest(), True) if with_early else type(match())()
 
     def keep(*arguments: Any) -> Any:
-        shown.append(show(*arguments))
-        return shown[-1]
+        entries.append(show(*arguments))
+        return entries[-1]
 
     vars(window).update(_assess=keep, assess=assess_view, match=matched, match_newest=early)
     for i, stamp in enumerate(drive.stamps.tolist()):
@@ -152,8 +152,8 @@ def record(sets: Path, quick: bool, files: dict[tuple[str, Any], Path]) -> None:
         began, before = time.perf_counter(), value_of(name) if name else None
         if name:  # nothing is fitted on it
             set_value(name, value)
-        kept = [d if not name or d.use != 'fit' else None for d in drives]
-        rows = [record_drive(d, not name) if d else np.empty((0, 13)) for d in kept]
+        selection = [d if not name or d.use != 'fit' else None for d in drives]
+        rows = [record_drive(d, not name) if d else np.empty((0, 13)) for d in selection]
         to.write_bytes(pickle.dumps(rows))
         if name:
             set_value(name, before)
@@ -251,10 +251,10 @@ class Windows:
             rows = shown_rows
             images = _counted(drive.images) if len(rows) else np.empty(0, int)
             whole = np.flatnonzero((rows[:, 3] == 0) & (rows[:, 0] >= 0))
-            shown, first = np.unique(rows[whole, 1], return_index=True)
+            middles, first = np.unique(rows[whole, 1], return_index=True)
             counted = np.zeros(len(rows), bool)
-            counted[whole[first]] = np.isin(shown, images)
-            missing = np.setdiff1d(images, shown)
+            counted[whole[first]] = np.isin(middles, images)
+            missing = np.setdiff1d(images, middles)
             more = np.zeros((len(missing), 13))
             more[:, 0], more[:, 1], more[:, 2], more[:, 4], more[:, 11] = -1, missing, -1, NEW, 1
             rows, counted = np.append(rows, more, axis=0), np.append(counted, missing >= 0)
@@ -339,14 +339,14 @@ def _counted(images: np.ndarray) -> np.ndarray:
 def scores_of(x, drive, early, kind, constant, numbers):  # type: ignore[no-untyped-def]
     """Return the log odds of windows as :mod:`stavpr_ros.method.evidence` has them."""
     out, newest, likely, count = np.empty(len(x)), -np.inf, 0.5, 0.0
-    w_belief, w_lead, w_cells, w_recent, certain, w_uneven, most, w_excess = numbers[:8]
+    w_belief, w_lead, w_cells, w_recent, certain, w_uneven, limit, w_excess = numbers[:8]
     last, w_creep = numbers[8], numbers[9]
     for i in range(len(x)):
         if i == 0 or drive[i] != drive[i - 1]:
             newest, likely, count = -np.inf, 0.5, 1.0
         belief, uneven, excess, creep, lead, cells, nothing = x[i]
         odds = max(min(belief, certain), -certain)
-        odds = max(odds - w_uneven * uneven - w_excess * min(max(excess - most, 0.0), 1.0), -9.21)
+        odds = max(odds - w_uneven * uneven - w_excess * min(max(excess - limit, 0.0), 1.0), -9.21)
         own = constant + w_belief * odds + w_lead * lead + w_cells * cells - w_creep * creep
         if nothing:
             own = -np.inf

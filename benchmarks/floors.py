@@ -35,9 +35,9 @@ def drive(
     pipeline.change(loaded=read_map(path, pipeline.settings))
     places, stamp = pipeline.operation.reference, 0
     assert places is not None
-    found: list[list[tuple[str, str]]] = []
+    results: list[list[tuple[str, str]]] = []
     for images in floors:
-        found.append([])
+        results.append([])
         if resets:
             pipeline.operation.reset()
         for image in images:
@@ -45,8 +45,8 @@ def drive(
             result = pipeline.operation.process(ImageRecord.of_image(image, 0), stamp)
             best = int(np.argmax(result.session_probabilities or (0.0,)))
             session = places.place(result.match.place).session if result.match.accepted else ''
-            found[-1].append((session, places.sessions[best].id if places.sessions else ''))
-    return found
+            results[-1].append((session, places.sessions[best].id if places.sessions else ''))
+    return results
 
 
 def main() -> None:
@@ -65,13 +65,13 @@ def main() -> None:
             save_map(merge_maps([place_map], [floor.name]), Path(folder) / f'{floor.name}.stavpr')
             queries.append([frame.image for frame in frames[::2]])
         of_all = drive(folder, queries), drive(folder, queries, resets=True)
-        for floor, images, found, anew in zip(floors, queries, *of_all, strict=True):
+        for floor, images, results, resets in zip(floors, queries, *of_all, strict=True):
             alone = drive(str(Path(folder) / f'{floor.name}.stavpr'), [images])[0]
-            sessions, after_reset = ([name for name, _ in rows] for rows in (found, anew))
+            sessions, after_reset = ([name for name, _ in rows] for rows in (results, resets))
             right = sessions.count(floor.name)
             row = [
                 *(len(images), len(images) - sessions.count(''), right),
-                sum(best == floor.name for _, best in found),
+                sum(best == floor.name for _, best in results),
                 sessions.index(floor.name) + 1 if right else 0,
                 *(len(images) - after_reset.count(''), after_reset.count(floor.name)),
                 sum(bool(session) for session, _ in alone),

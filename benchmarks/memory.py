@@ -85,8 +85,8 @@ class Synthetic:
         generators = [
             np.random.default_rng(int.from_bytes(i.tobytes()[:8], 'little')) for i in images
         ]
-        drawn = [g.standard_normal((self.settings.d, 1, STRIPS), np.float32) for g in generators]
-        return np.stack(drawn)
+        maps = [g.standard_normal((self.settings.d, 1, STRIPS), np.float32) for g in generators]
+        return np.stack(maps)
 
 
 def measure_memory(operation: str, mode: str, precision: str, n: int = 0, d: int = 0) -> Memory:

@@ -172,10 +172,10 @@ def _starts(rows: dict[str, dict[str, Any]], is_gradient: bool) -> dict[str, tup
         label = 'first right match by night; on the map of the night: median'
         cells[label] = f'{"; ".join(medians)} images', '' if is_gradient else '<= 6 images'
     for label, is_jump in (('start in the middle', False), (JUMP, True)):
-        begun = {name: row for name, row in rows.items() if name.endswith(JUMP) == is_jump}
-        if begun:
+        group = {name: row for name, row in rows.items() if name.endswith(JUMP) == is_jump}
+        if group:
             aim = f'{25 if is_gradient else 20} images'
-            cells[f'{label}: right within 30 images'] = _start_text(begun), aim
+            cells[f'{label}: right within 30 images'] = _start_text(group), aim
     return cells
 
 

@@ -156,9 +156,9 @@ def main(arguments: list[str] | None = None) -> int:
     N, about = len(query.features), environment(named_commit=options.commit)
     truth, rows = identity(TOLERANCE)(N, len(places.features)), {}
     for name, method in methods(places, query).items():
-        found = method.places()[:, None]
+        matches = method.places()[:, None]
         counted = slice(WINDOW // 2, N - WINDOW // 2)  # in the middle of a window
-        right = float(truth.accepts(np.maximum(found, 0))[counted].mean())
+        right = float(truth.accepts(np.maximum(matches, 0))[counted].mean())
         rows[name] = {'method': name, 'images': method.images, 'right': round(right, 3)}
     for n in SIZES[:1] if options.quick else SIZES:
         ready = methods(places.repeated(n, np.random.default_rng(0)), query)

@@ -66,10 +66,10 @@ def targets(rows: Sequence[Row]) -> list[dict[str, Any]]:
         own = [r for r in rows if (r.stage, r.mode, r.n, r.d) == (stage, mode, n, d)]
         row = next((r for r in own if r.precision == 'float32'), None)
         for name, limit in limits:
-            value, least = value_of(row, name) if row else None, name in AT_LEAST
-            reached = None if value is None else value >= limit if least else value <= limit
+            value, is_min = value_of(row, name) if row else None, name in AT_LEAST
+            reached = None if value is None else value >= limit if is_min else value <= limit
             sizes = {'stage': stage, 'mode': mode, 'n': n, 'd': d, 'name': name, 'value': value}
-            results.append({**sizes, 'least': least, 'limit': limit, 'outcome': OUTCOME[reached]})
+            results.append({**sizes, 'least': is_min, 'limit': limit, 'outcome': OUTCOME[reached]})
     return results
 
 

@@ -69,9 +69,9 @@ def _draw_sessions(axes: Axes, place_map: Map) -> None:
     axes.set_title('places by session; gray: of an earlier session', fontsize=10.5, loc='left')
     runs = _runs(place_map)
     for row, (_, places) in enumerate(runs):
-        shown = places if place_map.same_as is None else place_map.same_as[places]
+        originals = places if place_map.same_as is None else place_map.same_as[places]
         axes.plot(places, np.full(len(places), row), '|', ms=9, color=f'C{row % 10}')
-        earlier = shown[shown != places]
+        earlier = originals[originals != places]
         axes.plot(earlier, np.full(len(earlier), row), '|', ms=9, color=QUIET)
     names = [f'{name}, {len(places)} places' for name, places in runs]
     axes.set_yticks(range(len(runs)), names, fontsize=8)

@@ -300,8 +300,8 @@ class RouteFollower:
         share = (self._probability - SLOW_PROBABILITY) / (FULL_PROBABILITY - SLOW_PROBABILITY)
         share = BRIDGE_SHARE if math.isnan(share) else min(max(share, MIN_SHARE), 1.0)
         share *= 1 if offset.is_valid else NO_OFFSET_SHARE
-        most = settings.max_speed if self.evidence.is_fresh else min(CREEP, settings.max_speed)
-        share = min(share, most / max(abs(speed), 1e-9))
+        limit = settings.max_speed if self.evidence.is_fresh else min(CREEP, settings.max_speed)
+        share = min(share, limit / max(abs(speed), 1e-9))
         speed, turn = share * speed, share * turn
         self._steer = 0.0
         if offset.is_valid:
@@ -329,20 +329,20 @@ class RouteFollower:
         added = np.array([path_speed(last.speed, last.turn) * step, moved, done])
         self._totals.append((self._time, self._now + added))
 
-    def _limit_command(self, wanted: Command, step: float) -> Command:
+    def _limit_command(self, target: Command, step: float) -> Command:
         """Limit velocities and accelerations, but no stop."""
         settings = self._settings
-        if wanted.reason:
-            return wanted
+        if target.reason:
+            return target
         faster = settings.max_acceleration * step
-        speed = min(max(wanted.speed, self._last.speed - faster), self._last.speed + faster)
+        speed = min(max(target.speed, self._last.speed - faster), self._last.speed + faster)
         turning = settings.max_turn_acceleration * step
-        turn = min(max(wanted.turn, self._last.turn - turning), self._last.turn + turning)
+        turn = min(max(target.turn, self._last.turn - turning), self._last.turn + turning)
         turn = _limit(turn, settings.max_turn)
         added = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
         self._integral = _limit(self._integral + added, MAX_INTEGRAL)
         return Command(speed, turn)
 
 
-def _limit(value: float, most: float) -> float:
-    return min(max(value, -most), most)
+def _limit(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)

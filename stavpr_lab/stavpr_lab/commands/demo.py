@@ -82,8 +82,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--tolerance', type=int, default=3, help=tolerance)
     add_parameter(parser, 'sequence_length', 'images in the window (%(default)s)', metavar='L')
     add_parameter(parser, 'mode', 'of the node (%(default)s)')
-    least = 'of the node, mode robust: matches have a greater probability (%(default)g)'
-    add_parameter(parser, 'min_probability', least, metavar='P')
+    probability = 'of the node, mode robust: matches have a greater probability (%(default)g)'
+    add_parameter(parser, 'min_probability', probability, metavar='P')
     limit = 'of the node, mode paper (estimated from the first traverse)'
     add('--threshold', type=float, metavar='DISTANCE', help=limit)
     exclude = f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})'
@@ -111,10 +111,10 @@ def _parser() -> argparse.ArgumentParser:
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Reject options that contradict each other."""
     _check_limits(parser, arguments)
-    for name, least in (('tolerance', 0), ('exclude_places', 1), ('sequence_length', 2)):
+    for name, minimum in (('tolerance', 0), ('exclude_places', 1), ('sequence_length', 2)):
         value = getattr(arguments, name)
-        if value is not None and value < least:
-            parser.error(f'--{name.replace("_", "-")} {value} must be at least {least}')
+        if value is not None and value < minimum:
+            parser.error(f'--{name.replace("_", "-")} {value} must be at least {minimum}')
     truth = arguments.truth
     if arguments.slam is not None:
         _check_slam(parser, arguments)
@@ -147,9 +147,9 @@ def _check_slam(parser: argparse.ArgumentParser, arguments: argparse.Namespace) 
 
 
 def _check_limits(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    least, threshold = arguments.min_probability, arguments.threshold
-    if not 0 < least < 1:
-        parser.error(f'--min-probability {least} must be above 0 and below 1')
+    probability, threshold = arguments.min_probability, arguments.threshold
+    if not 0 < probability < 1:
+        parser.error(f'--min-probability {probability} must be above 0 and below 1')
     if threshold is None:
         return
     if arguments.mode != 'paper':

@@ -184,8 +184,8 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('method')
     mode = 'paper: as published; robust: with mitigations of failure modes (%(default)s)'
     add_parameter(group, 'mode', mode)
-    least = 'mode robust: matches have a greater probability (%(default)g)'
-    add_parameter(group, 'min_probability', least, metavar='P')
+    probability = 'mode robust: matches have a greater probability (%(default)g)'
+    add_parameter(group, 'min_probability', probability, metavar='P')
     rate = 'mode robust: rate of wrong matches that chooses --min-probability; 0 = off'
     add_parameter(group, 'max_error', rate, metavar='E')
     against = 'mode robust: both: the camera may move against the map (%(default)s)'

@@ -86,14 +86,14 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
 def _print(risks: ErrorRisks) -> None:
     """Print the probability that each error rate chooses, and where the map does not keep it."""
     print(f'{"max_error":>9}  matched above')
-    least = risks.bounds[-1]
+    bound = risks.bounds[-1]
     for rate in ERRORS.tolist():
         count = math.ceil(1 / rate - 1e-9) - 1
         why = f'{count} blocks are needed' if count > risks.units else 'too many wrong matches'
-        note = '' if least <= rate else f'not calibrated: {why}'
+        note = '' if bound <= rate else f'not calibrated: {why}'
         print(f'{rate:9g}  {least_probability(rate, risks):<13.4g}  {note}'.rstrip())
     print(
-        f'{risks.units} blocks in all keep {least:.3g} at least; where not calibrated, the '
+        f'{risks.units} blocks in all keep {bound:.3g} at least; where not calibrated, the '
         'stricter of the built-in table and the mean of the blocks applies'
     )
 

@@ -88,7 +88,7 @@ def drive(
     waiting: deque[tuple[float, Observation]] = deque()
     x = speed = commanded = failed = evidence = next_image = 0.0
     failed_at = stopped_at = math.inf
-    best = shown = k = 0
+    best = camera_place = k = 0
     while (now := k * STEP) <= min(failed_at + AFTER, 60):
         if failed_at == math.inf and x >= BEFORE + phase * spacing:
             failed_at, failed = now, commanded
@@ -97,11 +97,11 @@ def drive(
             is_good = not is_failed or failure.rate > 0
             has_place = not is_failed or failure.is_matched
             next_image += 1 / (failure.rate if is_failed and failure.rate else rate)
-            shown = int(x / spacing + 1e-9) if is_good else shown
-            if shown > best and stopped_at == math.inf:
-                best, evidence = shown, commanded
+            camera_place = int(x / spacing + 1e-9) if is_good else camera_place
+            if camera_place > best and stopped_at == math.inf:
+                best, evidence = camera_place, commanded
             swing = failure.swing * (round(now * rate) % 2) if is_failed else 0
-            place = shown - swing if has_place else driver.expected_place(failure.is_new)
+            place = camera_place - swing if has_place else driver.expected_place(failure.is_new)
             waiting.append((now + LATENCY, Observation(
                 now, place, 0.99 if has_place else math.nan, SIMILAR if place >= 0 else None,
                 is_good or failure.is_new,

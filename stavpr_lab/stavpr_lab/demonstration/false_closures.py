@@ -48,10 +48,10 @@ def main() -> None:
     parser.add_argument('--share', type=float, required=True)
     parser.add_argument('--coherent', action='store_true')
     parser.add_argument('--seed', type=int, default=0)
-    given = parser.parse_args(own_arguments(sys.argv[1:]))
+    options = parser.parse_args(own_arguments(sys.argv[1:]))
     try:
         with ros_node(
-            lambda: FalseClosures(given.share, given.coherent, given.seed), sys.argv[1:]
+            lambda: FalseClosures(options.share, options.coherent, options.seed), sys.argv[1:]
         ) as node:
             spin_until(node)
     except KeyboardInterrupt:

@@ -23,14 +23,14 @@ class FalsePlaces:
         self._dice = np.random.default_rng(seed)
         self._number, self._shift = 0, 0
 
-    def place(self, place: int, known: Iterable[int]) -> int:
-        """Return the place of the next closure: its own, or a wrong one of the known places."""
-        known = sorted(known)
+    def place(self, place: int, candidates: Iterable[int]) -> int:
+        """Return the place of the next closure: its own, or a wrong one of the candidates."""
+        candidates = sorted(candidates)
         if self._number % (RUN if self._coherent else 1) == 0:
             wrong = self._dice.random() < self._share
-            away = [index for index in known if abs(index - place) > NEAR]
+            away = [index for index in candidates if abs(index - place) > NEAR]
             self._shift = int(self._dice.choice(away)) - place if wrong and away else 0
         self._number += 1
         if not self._shift:
             return place
-        return min(known, key=lambda index: abs(index - place - self._shift))
+        return min(candidates, key=lambda index: abs(index - place - self._shift))

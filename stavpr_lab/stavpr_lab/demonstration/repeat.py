@@ -328,19 +328,19 @@ def stops(taught: Taught) -> dict[str, float]:
     """Return the seconds until the robot is at rest, after the camera shows something else."""
     other = View(RingWorld(11), GOOD_LIGHT)
     dice = np.random.default_rng(0)
-    shown: list[np.ndarray] = []
+    images: list[np.ndarray] = []
 
     def cover(image: np.ndarray) -> np.ndarray:
         return dice.normal(15, 3, image.shape).clip(0, 255).astype(np.uint8)
 
     def replace_route(_: np.ndarray) -> np.ndarray:
-        x, y, heading = other._line[round(SPEED / RATE / CELL * len(shown))]
-        shown.append(other.image(np.array([x, y - LANE, heading]), len(shown)))
-        return shown[-1]
+        x, y, heading = other._line[round(SPEED / RATE / CELL * len(images))]
+        images.append(other.image(np.array([x, y - LANE, heading]), len(images)))
+        return images[-1]
 
     def freeze(image: np.ndarray) -> np.ndarray:
-        shown.append(image)
-        return shown[0]
+        images.append(image)
+        return images[0]
 
     changes: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         'is covered': cover,
@@ -349,7 +349,7 @@ def stops(taught: Taught) -> dict[str, float]:
     }
     result = {}
     for name, change in changes.items():
-        shown.clear()
+        images.clear()
 
         def switch(
             image: np.ndarray,

@@ -63,8 +63,8 @@ class Days:
             new = [lot for lot in other if lot['kind'] == BUILDING]
             for lot in np.flatnonzero((lots['start'] >= low) & (lots['start'] < high)).tolist():
                 if lots['kind'][lot] == BUILDING:
-                    own, given = lots[lot].copy(), new[lot % len(new)]
-                    lots[lot] = given
+                    own, replacement = lots[lot].copy(), new[lot % len(new)]
+                    lots[lot] = replacement
                     for name in ('start', 'length'):
                         lots[name][lot] = own[name]
         return replace(street, lots=lots)

@@ -87,8 +87,8 @@ def _closed_curvature(seed: int, cells: int) -> np.ndarray:
     dice = np.random.default_rng(seed + 991)
     angle = np.linspace(0, 2 * pi, 20_001)
     radius = np.ones_like(angle)
-    for waves, most in ((2, 0.22), (3, 0.08)):
-        radius += dice.uniform(0.4, 1) * most * np.cos(waves * angle + dice.uniform(0, 2 * pi))
+    for waves, share in ((2, 0.22), (3, 0.08)):
+        radius += dice.uniform(0.4, 1) * share * np.cos(waves * angle + dice.uniform(0, 2 * pi))
     points = radius * np.exp(1j * angle)
     length = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points)))])
     tangents = np.unwrap(np.angle(np.gradient(points, angle)))
