@@ -45,7 +45,7 @@ class Case:
     """
     A query on a map.
 
-    :param name: of the case in the table.
+    :param name: name of the case in the table.
     :param places, query: images of the map and of the query.
     :param truth: function of the numbers of queries and places.
     :param warps: also at other speeds of the query.

@@ -38,7 +38,7 @@ def make_features(n: int, d: int, W: int, seed: int) -> LocalFeatures:
 
 
 def along(places: LocalFeatures, images: int) -> LocalFeatures:
-    """Return the features of a drive: those of the first places, and as much noise."""
+    """Return the features of a drive: the first places, and as much noise."""
     strips = places.strips[:, :images].copy()
     rng, d = np.random.default_rng(0), places.dimension
     strips += rng.standard_normal(strips.shape, np.float32) * np.float32(d**-0.5)

@@ -8,7 +8,7 @@ Time, kernels and bytes of an image on a device of torch, beside the answers of 
 
 Features are random, 7 strips of 224 dimensions. An image is ``recognizer.update()``, the result on
 the host. Times are of the wall clock, in ms: quartiles over 60 images. Kernels and their time are
-those of torch's profiler. Operations and their bytes are counted as torch dispatches them: what
+from torch's profiler. Operations and their bytes are counted as torch dispatches them: what
 each reads and writes, as if nothing stayed in a cache.
 """
 

@@ -54,7 +54,7 @@ WEIGHTS = 'BELIEF', 'LEAD', 'CELLS', 'CREEP', 'RECENT'
 LATE = 150  # images off the map
 ELSEWHERE = np.array([-5.0, 0, 0, 0, 0, 0, 0])  # what their windows show
 REPEATED, NEW, REST = 0.0, 1.0, 2.0
-Z = 1.96  # of intervals at 95 %
+Z = 1.96  # half width of intervals at 95 %, in deviations
 Values = dict[str, float]
 
 

@@ -24,7 +24,7 @@ from stavpr_ros.method.loop_closer import LoopCloser
 
 MAX_FIRST, MAX_SECOND = 900, 450  # images of a drive, at most
 EXCLUDED, EVERY = 30, 3  # latest places that are no closures; of the negatives that are driven
-STEPS = -0.6, -0.3, 0.0, 0.3, 0.6  # of K
+STEPS = -0.6, -0.3, 0.0, 0.3, 0.6  # changes of K
 NUMBERS = 'CONFIRMED', 'ROUTE_IMAGES'
 WRONG = 20.0
 

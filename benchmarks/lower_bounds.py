@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Lower bounds: the least time of a stage, from its bytes, operations and the machine's peaks."""
+"""Lower bounds: minimum time of a stage, by its bytes, operations and the machine's peaks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -130,7 +130,7 @@ def straight_paths(sizes: Sizes, speeds: int) -> Work:
 
 
 def cells(sizes: Sizes, cells: Cells) -> Work:
-    """Compare the cells of images with those of a competitor's places, all pairs."""
+    """Compare the cells of images with the cells of a competitor's places, all pairs."""
     C = cells.channels * cells.rows * cells.columns // SIDE
     return Work(4 * FEW * sizes.W * sizes.d, 2 * FEW * (SIDE * sizes.W) ** 2 * C)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SIZES = (2_000, 20_000, 100_000, 1_000_000)
 CITY = 200_000  # from here on, mode robust is measured in int8 alone
 QUICK_LIMIT = 20_000  # most places of --quick
-DIMENSIONS = (224, 512)  # of the gradient features, and of projected ones
+DIMENSIONS = (224, 512)  # gradient features, and projected ones
 GRAPH = ROOT / 'docs' / 'performance.png'
 BUSY = 0.5  # load average above which results are not repeatable
 

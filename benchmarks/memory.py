@@ -46,7 +46,7 @@ class Memory:
     """
     One measurement.
 
-    :param feature_bytes: of n places in the precision in which they are kept.
+    :param feature_bytes: bytes of n places in their precision.
     :param resident_bytes: growth of the resident set.
     """
 

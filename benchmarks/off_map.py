@@ -64,7 +64,7 @@ STRETCHES = (
 )
 STEP, LONG_STEP = 10, 100  # places from one start to the next
 BEFORE, AFTER = 80, 60  # images driven around the removed stretch of a long route
-COARSER = 4  # of --quick: so many times coarser steps, every fourth pair of floors
+COARSER = 4  # --quick: so many times coarser steps, every fourth pair of floors
 START_IMAGES, SMALL_MAP = 30, 40
 TOWER = 'tower'
 WARPED = (DAY, 'walk_day', NIGHT, 'walk_night_map')
@@ -100,7 +100,7 @@ class Outcome:
     :param correct: the match is right.
     :param has_match: the place is in the map.
     :param unseen: the place was removed from the map.
-    :param early: by the newest images alone.
+    :param early: the match is of the newest images alone.
     """
 
     accepted: np.ndarray
@@ -191,10 +191,10 @@ def outcome(
     """
     Drive a query on a map.
 
-    :param features: of N images.
-    :param truth: of the same images.
+    :param features: features of N images.
+    :param truth: ground truth of the same images.
     :param unseen: images whose place was removed; None = none was.
-    :param stamps: of the images, ns; None = unknown.
+    :param stamps: stamps of the images, ns; None = unknown.
     """
     length = SETTINGS.sequence.length
     matches, images = published_matches(matches_of(place_map, features, stamps), length)
@@ -213,7 +213,7 @@ def drive_pair(pair: Pair, changes: DriveChanges, images: slice = slice(None)) -
     """
     Drive the query of a pair otherwise than it was recorded.
 
-    :param images: of the changed drive that are shown.
+    :param images: images of the changed drive that are shown.
     """
     drive = changes.apply(pair.truth)
     indices = np.arange(len(drive.images))[images]
@@ -263,8 +263,8 @@ def first_right(matches: Sequence[Match], truth: GroundTruth, length: int) -> in
     """
     Return how many images it took until a match was right; None = none was.
 
-    :param truth: of the images.
-    :param length: of a window whose images are not counted by stamps.
+    :param truth: ground truth of the images.
+    :param length: images of a window without stamps.
     """
     for count, match in enumerate(matches, 1):
         window = len(match.window_stamps) or length

@@ -9,8 +9,8 @@ from lower_bounds import Peaks
 import numpy as np
 from timing import best_seconds
 
-SIDE = 4096  # of the large matrix product
-PIECES = 256  # of an array that threads read
+SIDE = 4096  # side of the large matrix product
+PIECES = 256  # pieces of an array that threads read
 READ_MB = 1024
 
 

@@ -71,9 +71,9 @@ class Method(NamedTuple):
     """
     A method, ready to match the images of a drive.
 
-    :param images: that one match takes.
+    :param images: number of images that one match takes.
     :param newest: matches the i-th image, as a robot does it, which has seen those before.
-    :param places: of all images of the drive, (N,).
+    :param places: returns the places of all images of the drive, (N,).
     """
 
     images: int

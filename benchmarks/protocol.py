@@ -89,7 +89,7 @@ def rows(
     """
     Yield the numbers of all methods on a map and a query, in which image i shows place i.
 
-    :param paths: of the map and of the query.
+    :param paths: folders of the map and of the query.
     :param indices: the images of both that are used, shape (K,), int64.
     :param making: the extractor of each mode; empty for SeqSLAM on its own patches.
     """

@@ -20,7 +20,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / 'benchmarks' / 'results'
 PACKAGES = ('numpy', 'torch', 'numba', 'opencv-python-headless', 'onnxruntime')
-# that decide how fast the kernels and torch's products are
+# flags that decide how fast the kernels and torch's products are
 INSTRUCTION_SETS = re.compile(r'sse4_2|avx\w*|fma|f16c|amx_\w+|asimd\w*|sve\w*|bf16|fphp')
 READING = 'reading the map'  # a peer
 UNITS = ((1.0, 's'), (1e-3, 'ms'), (1e-6, 'µs'))
@@ -35,10 +35,10 @@ class Row:
     :param mode: ``robust``, ``paper``, or empty for a stage of both modes.
     :param n: places.
     :param d: dimensions of a local feature; 0 for a stage that reads no features.
-    :param precision: of the map, or of the arithmetic.
+    :param precision: type of the map, or of the arithmetic.
     :param median_s, spread_s: median and interquartile range, seconds.
     :param runs: number of runs.
-    :param lower_bound_s: least time on this machine; 0 = none known.
+    :param lower_bound_s: minimum time on this machine; 0 = none known.
     :param peers: the fields of each :class:`run.Peer` but its job, its median_s and spread_s from
         the same interleaved run, and the ratio of its median to the stage's.
     :param extra: further values by name.

@@ -62,7 +62,7 @@ class Run:
 
         :param size: places n, dimensions d (0 for a stage that reads no features).
         :param works: for its lower bound.
-        :param cells: of a recursion, which it updates.
+        :param cells: cells of a recursion that it updates.
         """
         self._bar.set_description(f'{stage} {mode} n={size[0]:,} d={size[1]} {precision}')
         jobs = {'': timed_job(call)} | {peer.name: peer.job for peer in peers}

@@ -46,7 +46,7 @@ class Session:
     All images of a session.
 
     :param mirrored: the same images, left and right exchanged.
-    :param position: of each image along the route, in images of one session, (N,).
+    :param position: position of each image along the route, in images of one session, (N,).
     """
 
     drive: Map

@@ -111,7 +111,8 @@ def publish(
     """
     Publish images at ``arguments.rate`` for ``arguments.seconds``.
 
-    :param names: of the nodes that subscribe, and others: subscribers that publish nothing.
+    :param names: names of the nodes that subscribe.
+    :param others: number of subscribers that publish nothing.
     :param after: called once, so many seconds after the first image.
     :returns: figures of each node; images per second.
     """

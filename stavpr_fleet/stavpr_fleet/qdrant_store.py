@@ -60,7 +60,7 @@ class ServerPoints:
     """
     Points of a Qdrant server, by its REST interface.
 
-    :param url: of the server; its API key is taken from the variable ``QDRANT_API_KEY``.
+    :param url: address of the server; its API key is taken from the variable ``QDRANT_API_KEY``.
     :param collection: name.
     """
 

@@ -32,7 +32,7 @@ from stavpr_ros.threads import call_on_thread
 
 CHUNK = 32  # places that are fetched together
 CHUNKS = 128  # loaded: 4096 places
-NEIGHBORHOODS = 16  # that are looked at
+NEIGHBORHOODS = 16  # stretches of the map that are compared
 BEHIND, AHEAD = 16, 48  # places of a neighborhood before and after its middle
 INTERVAL = 5  # images between lookups
 VOTERS = 64  # places of an image that vote
@@ -78,7 +78,7 @@ class _Image:
 
     :param strips, weights: centered features, (W, d) and (W,).
     :param change: from the one before.
-    :param mean, deviation: of its distances to the sample.
+    :param mean, deviation: mean and deviation of its distances to the sample.
     :param z: normalized distances to the places in the loaded chunks, by slot.
     """
 

@@ -18,7 +18,7 @@ from stavpr_ros.prepare.blocks import convert_blocks
 from stavpr_ros.prepare.centering import evenly, MeanCentering, normalize
 
 RUNS, RUN = 256, 8  # the sample of a map: so many runs of so many neighboring places
-GROUPS = 3  # of strips in a place's vector
+GROUPS = 3  # groups of strips in a place's vector
 MAX_PLACES = 2**31 - 1
 
 
@@ -30,9 +30,9 @@ class MapIndex:
     :param places: number n of places.
     :param firsts: first place of every run of one session's places, ascending, int64; the first
         one is 0.
-    :param sessions: of each run; empty = the map has none.
+    :param sessions: session of each run; empty = the map has none.
     :param sample: the places :func:`sample_places` of the map, with its settings and projection.
-    :param map_id: of the map.
+    :param map_id: identifier of the map.
     """
 
     places: int
@@ -91,7 +91,7 @@ class PlaceStore(Protocol):
         """
         Return the places whose vectors are nearest, nearest first.
 
-        :param vectors: of images, (Q, D), float32, unit norm.
+        :param vectors: vectors of images, (Q, D), float32, unit norm.
         :returns: shape (Q, count), int64; -1 behind the last.
         :raises FleetError: the store cannot be reached, or its data is damaged.
         """

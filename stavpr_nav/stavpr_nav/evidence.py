@@ -24,9 +24,9 @@ BRIDGE_TIME = 6.0  # seconds of the taught run without a match, of images that c
 SLIP = 1.2  # meters that are commanded per meter to the next place, of wheels that slip
 MIN_JITTER, MAX_JITTER = 0.5, 1.5  # meters, of matches against the commanded ones, that count
 MEMORY = 10  # latest new places whose jitter counts
-PERIODS = 1.25  # of images, after this distance or the next place
+PERIODS = 1.25  # periods of the images, after this distance or the next place
 CELLS = (16, 12)  # columns and rows of the gray levels that are compared
-EQUAL_QUANTILE, EQUAL = 0.75, 0.012  # of the changes of the cells, over the contrast
+EQUAL_QUANTILE, EQUAL = 0.75, 0.012  # quantile of the cells' changes; its limit, over the contrast
 IMAGES = 5  # latest different images: a driver may repeat a ring of its buffers
 STILL_DISTANCE = 0.2  # meters that are commanded while odometry stays within MIN_MOTION
 MIN_MOTION = 0.02  # meters
@@ -63,7 +63,7 @@ class ImageComparison:
 
 class MotionEvidence:
     """
-    Whether matches show the motion that is commanded.
+    Decides whether matches show the motion that is commanded.
 
     :param meters: from the first place to each, shape (n,).
     :param seam: the place that the last one of a closed route shows; None = the route is open.
@@ -84,7 +84,7 @@ class MotionEvidence:
         """
         Begin anew at a standstill.
 
-        :param totals: as of :meth:`take`.
+        :param totals: see :meth:`take`.
         :param place: where the robot is; -1 = unknown, at the first match.
         """
         self.is_missing = False
@@ -92,7 +92,7 @@ class MotionEvidence:
         self._matched, self._place = np.zeros(len(self._meters), bool), -1
         self._totals, self._changed = totals, totals[0]
         self.bridge, self.is_changed = 0.0, True
-        # by how much the latest new places are ahead of the commanded meters, but for a constant
+        # lead of the latest new places over the commanded meters, up to a constant
         self._ahead: deque[float] = deque([0.0], MEMORY)
         if place >= 0:
             self._mark(place, totals)
@@ -127,7 +127,7 @@ class MotionEvidence:
 
     def is_due(self, totals: np.ndarray, speed: float, delay: float = 0.0) -> bool:
         """
-        Return whether there should have been evidence; totals, speed: as of :meth:`take`.
+        Return whether there should have been evidence; totals, speed: see :meth:`take`.
 
         :param delay: seconds until an image is processed.
         """
@@ -139,7 +139,7 @@ class MotionEvidence:
         return bool(driven[:2].max() > demanded and driven[2] > self.bridge)
 
     def _mark(self, place: int, totals: np.ndarray) -> None:
-        """Mark a place as matched, and those of the far half of a lap no longer."""
+        """Mark a place as matched, and unmark the places of the far half of a lap."""
         if self._place >= 0:
             step = math.remainder(self._meters[place] - self._meters[self._place], self._lap)
             self._ahead.append(self._ahead[-1] + step - (totals[0] - self._totals[0]))

@@ -55,7 +55,7 @@ class FollowerSettings:
     Settings of the control law.
 
     :param gain: radians of a turn per meter, for an offset of one width of the image.
-    :param parallax_weight: of the parallax over the shift.
+    :param parallax_weight: weight of the parallax over the shift.
     :param max_speed, max_turn: m/s, rad/s.
     :param max_acceleration, max_turn_acceleration: m/s^2, rad/s^2; a stop is not limited.
     :param max_age: seconds without an image after which the robot stops.
@@ -159,13 +159,13 @@ class RouteFollower:
         odometry: OdometryComparison | None = None,
     ) -> None:
         self._taught, self._settings = taught, settings or FollowerSettings()
-        self._newest: Observation | None = None  # of the confirmed images
+        self._newest: Observation | None = None  # the newest confirmed image
         self._received = self._confirmed = -math.inf
         self._stamp, self._delay = -math.inf, 0.0
         self._successive = 0
         self._integral = self._steer = 0.0
         self._similarity = 0.0  # mean of the latest matched images
-        self._probability = math.nan  # of the latest compared image
+        self._probability = math.nan  # place of the latest compared image
         self._last, self._time = Command(0.0, 0.0), -math.inf
         # meters that were commanded, meters of odometry and seconds of the taught run that were
         # repeated, by the time of the commands

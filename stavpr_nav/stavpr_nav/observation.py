@@ -7,20 +7,20 @@ import math
 
 from stavpr_ros.relative_pose.offset import Offset
 
-BRIDGE_SIMILARITY = 0.3  # of an image without a match to the expected place, to be confirmed
+BRIDGE_SIMILARITY = 0.3  # minimum, to the expected place, of an image without a match
 
 
 @dataclass(frozen=True)
 class Observation:
     """
-    What an image showed.
+    Result of an image.
 
-    :param stamp: when it was taken, seconds.
-    :param place: that the image shows; -1 = unknown.
-    :param probability: of the place; NaN = without a match, it is the expected place.
-    :param offset: of the image against the place; None = unknown.
-    :param is_new: it differs from the images before.
-    :param is_compared: it was compared with the map; False = skipped, as no keyframe.
+    :param stamp: when the image was taken, seconds.
+    :param place: place that the image shows; -1 = unknown.
+    :param probability: probability of the place; NaN = no match, it is the expected place.
+    :param offset: offset of the image against the place; None = unknown.
+    :param is_new: the image differs from the images before.
+    :param is_compared: the image was compared with the map; False = skipped, as no keyframe.
     """
 
     stamp: float

@@ -27,7 +27,7 @@ from stavpr_ros.units import SECOND
 
 COLUMNS = ['stamp', 'speed', 'turn']
 STILL_SPEED, STILL_TURN = 0.02, 0.02  # m/s and rad/s; below both, the robot is at rest
-REST_SECONDS = 1e-3  # seconds between two places that are left of a time at rest
+REST_SECONDS = 1e-3  # seconds between two places that remain of a time at rest
 MAX_GAP = 1.0  # seconds without a velocity that are bridged
 MARGIN = 2.0  # seconds before the first and after the last velocity in which places may be
 SESSION = '# session: '  # begins the line that names the session of a run
@@ -73,7 +73,7 @@ def taught_places(
     They are of the first session whose stamps are within the velocities, if there are any. An
     update of the map may have divided a session: its parts are ``ID``, ``ID-2`` and so on.
 
-    :param velocities: of the run, see :func:`taught_run`.
+    :param velocities: velocities of the run, see :func:`taught_run`.
     :param session: id of the session, '' = any.
     :raises InputError: the map has no such session.
     """

@@ -45,7 +45,7 @@ class Sequences:
     :param drive: these changes, and the ground truth of the query's images.
     :param tolerance: places.
     :param title: names of the inputs, a line.
-    :param times: of the extraction of features, milliseconds an image.
+    :param times: duration of the extraction of features, milliseconds an image.
     :param odometry: poses of the query's images by odometry, (N, 7); None = unknown.
     """
 

@@ -20,9 +20,9 @@ from stavpr_ros.pipeline.overlay import match_image
 from stavpr_ros.sources import open_source
 
 INTERVAL = 5  # images per drawn one
-MILLISECONDS = 120  # of each
+MILLISECONDS = 120  # an image is shown
 SIZE = (240, 180)  # pixels of the query, and of the place beside it
-QUALITY = 40  # of WebP
+QUALITY = 40  # of the WebP compression
 
 
 def draw(
@@ -32,7 +32,7 @@ def draw(
     Draw an image of the query beside the newest place of its match.
 
     :param image: RGB, uint8.
-    :param record: of the match, as the command ``record`` writes it.
+    :param record: the match, as the command ``record`` writes it.
     :param ahead: the subgoal at this distance is drawn instead of the place.
     :returns: RGB, uint8.
     """

@@ -24,7 +24,7 @@ SPEED, STEP, LATENCY, BRAKING = 1.0, 0.01, 0.05, 5.0  # m/s, seconds, seconds, m
 CONTROL, ODOMETRY = 5, 2  # steps between two commands, and between two odometry messages
 PHASES = 20
 BEFORE, AFTER = 12.0, 30.0  # meters before, seconds after the failure
-SIMILAR = Offset(0.0, 0.01, 0.0, 1e6, 0.6)  # of an image of its place
+SIMILAR = Offset(0.0, 0.01, 0.0, 1e6, 0.6)  # an image that shows its place
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Failure:
     :param is_new: the images change. :param is_matched: they have a match.
     :param swing: places between which the matches alternate.
     :param wheels: they turn; False = something blocks the robot.
-    :param odometry: of the wheels; None = it is not used.
-    :param rate: of good images that go on, Hz; 0 = none. :param images: there are images.
+    :param odometry: the odometry goes on; None = it is not used.
+    :param rate: good images per second that go on; 0 = none. :param images: there are images.
     """
 
     is_new: bool = False

@@ -38,9 +38,9 @@ class Day:
 
     :param recall: share of the images that are rightly matched.
     :param wrong: number of wrong matches.
-    :param places: of the map after the day.
+    :param places: number of places of the map after the day.
     :param vanished: places of the updated map after the day that show replaced buildings.
-    :param changes: of the update.
+    :param changes: sentences on what the update changed.
     """
 
     number: int

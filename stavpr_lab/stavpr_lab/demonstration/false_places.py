@@ -14,7 +14,7 @@ class FalsePlaces:
     """
     Chooses the closures that become wrong, and their places.
 
-    :param share: of closures that are wrong, 0 to 1.
+    :param share: share of the closures that become wrong, 0 to 1.
     :param coherent: wrong in runs that are consistent in themselves, as look-alike streets are.
     """
 

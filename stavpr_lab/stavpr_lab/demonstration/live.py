@@ -77,7 +77,7 @@ def run_live(
     """
     Replay a query losslessly into a node and return its records.
 
-    :param node_parameters: of the node, name to value.
+    :param node_parameters: parameters of the node, name to value.
     :param query: the recording to replay.
     :param images: number of its images.
     :param folder: for the logs, ``matches.jsonl``, and in operation loop_closure

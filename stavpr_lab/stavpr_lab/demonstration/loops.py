@@ -28,7 +28,7 @@ class LoopResult:
     The loop closures of N images, in numbers of images.
 
     :param closures: (query, place) of each, shape (C, 2).
-    :param distances: of each, shape (C,).
+    :param distances: distance of each, shape (C,).
     :param pairs: (later, earlier) images aligned by a closure, each once, shape (M, 2).
     :param ground_truth: None = unknown.
     :param exclude: latest places that an image was not compared with.
@@ -81,7 +81,7 @@ def read_result(
 
     :param matches: one an image, of the command ``record``; their status decides which images
         are places.
-    :param closures: of ``record --loop-closures``.
+    :param closures: records of ``record --loop-closures``.
     """
     in_window = [i for i, match in enumerate(matches) if match['status'] in IN_WINDOW]
     images = np.array(in_window, np.int64)

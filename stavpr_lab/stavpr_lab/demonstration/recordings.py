@@ -41,7 +41,7 @@ class Recording:
 
     :param topic: image topic of a bag; None = the only one, or no bag.
     :param fps: images per second that are taken of a video; None = the default, or no video.
-    :param camera: of a folder of several; None = the only one, or no folder.
+    :param camera: name of one camera of a folder with several; None = the only one, or no folder.
     """
 
     path: str
@@ -64,7 +64,7 @@ class TraversePair:
     """
     A traverse for the map and another one for the query.
 
-    :param true_places: of each query image, -1 = not in the map; None = unknown.
+    :param true_places: place of each query image, -1 = not in the map; None = unknown.
     """
 
     reference: Recording
@@ -110,7 +110,7 @@ def synthetic_loop(folder: Path, exclude: int, tolerance: int) -> LoopTraverse:
     Traverse a synthetic street twice, in the afternoon on the other lane, and write one bag.
 
     :param exclude: latest places that an image is not compared with.
-    :param tolerance: of the ground truth, images.
+    :param tolerance: tolerance of the ground truth, images.
     :raises SourceError: the bag cannot be written.
     """
     bag = folder / 'loop'
@@ -136,7 +136,7 @@ def own_recordings(
 
     :param topic: image topic of the bags, if they have several.
     :param fps: images per second that are taken of the videos.
-    :param camera: of the folders, if they have several.
+    :param camera: name of the camera of the folders, if they have several.
     :raises SettingsError: an option is for none of them.
     """
     require_video(fps, paths)
@@ -182,7 +182,7 @@ def own_loop(
 
     :param ground_truth: file of its loop closures; None = unknown.
     :param exclude: latest places that an image is not compared with.
-    :param tolerance: of the ground truth, images.
+    :param tolerance: tolerance of the ground truth, images.
     :raises StavprError: it cannot be read.
     """
     N, truth = len(recording.open()), None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from stavpr_lab.evaluation.metrics import accepted_counts, ConfusionCounts, sweep
 
-EDGES = np.arange(11) / 10  # of the bins: each includes its lower edge, the last one 1 as well
+EDGES = np.arange(11) / 10  # bins: each includes its lower edge, the last one 1 as well
 LEVELS = (0.5, 0.8, 0.9, 0.95, 0.99)  # declared probabilities from which matches are accepted
 
 

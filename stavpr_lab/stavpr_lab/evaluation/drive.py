@@ -50,7 +50,7 @@ class DriveChanges:
     :param removed: stretches (first, last) of the map, first .. last - 1, that it is made without.
     :param reverse: the last image comes first.
     :param drop: probability with which each image is left out.
-    :param seed: of the images that are left out.
+    :param seed: decides which images are left out.
     :param stops: (image, count): at this image of the recorded query, it is repeated count times.
     :param speed: recorded images per shown image: image i is floor(speed * i); below 1, images are
         repeated. ``varying``: 2 ** sin(2 pi i / 60) at image i, from 1/2 to 2.
@@ -154,7 +154,7 @@ class DriveChanges:
         """
         Return the drive of a query.
 
-        :param ground_truth: of the query and the map as they were recorded, of any origin.
+        :param ground_truth: accepted places of the query on the map, as both were recorded.
         :raises SettingsError: a change that does not fit the query or the map.
         """
         images, numbers = self._numbered_images(ground_truth.N)
@@ -170,10 +170,9 @@ class Drive:
 
     :param images: the recorded image that each one is, shape (N,), int64.
     :param places: the recorded place that each place of the map is, ascending, shape (n,), int64.
-    :param truth: of the images, in places of this map (which are numbered without gaps).
-    :param recorded: of the images, in places of the recorded map.
-    :param stamps: of the images, ns, (N,), int64: at one interval, with gaps where images are left
-        out.
+    :param truth: ground truth in places of this map (which are numbered without gaps).
+    :param recorded: ground truth in places of the recorded map.
+    :param stamps: ns, (N,), int64: one interval apart, with gaps where images are left out.
     :param removed: stretches (first, last) of the recorded map that this one lacks.
     """
 

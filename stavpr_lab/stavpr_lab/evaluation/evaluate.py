@@ -76,12 +76,12 @@ class TraverseResults:
     """
     The matches of the N images of a traverse.
 
-    :param sequence: of the windows, each for its middle image; the first and last images take
-        theirs from the paths of the outermost windows.
-    :param single: of each image alone.
+    :param sequence: places of the windows, each for its middle image; the first and last images
+        take places from the paths of the outermost windows.
+    :param single: places of each image alone.
     :param seconds: to match each image, features excluded, shape (N,).
     :param windows: distances of up to :data:`WINDOWS` windows.
-    :param distances: of all images.
+    :param distances: distances of all images.
     :param accepted: whether the recognizer accepts the window's match, shape (N,), bool.
     :param probabilities: declared for them, shape (N,); NaN = not declared.
     :param published: M >= N matches: the early ones behind these, and the image of each, (M,).
@@ -105,7 +105,7 @@ class Evaluation:
     Metrics of a traverse; without ground truth, only its results are meaningful.
 
     :param sequence_length: images in a window, l.
-    :param sequence_without_ends, single_without_ends: of the images in :attr:`centered`.
+    :param sequence_without_ends, single_without_ends: the same on the images in :attr:`centered`.
     :param unknown: results of a traverse of places that are not in the map, if there was one.
     """
 
@@ -191,8 +191,8 @@ def recognize_all(
     """
     Recognize every image of a sequence, starting with an empty window.
 
-    :param features: of N images.
-    :param stamps: of the images, ns, (N,), int64, 0 = unknown; None = of all.
+    :param features: features of N images.
+    :param stamps: stamps of the images, ns, (N,), int64, 0 = unknown; None = all are.
     :returns: N matches, one an image.
     """
     recognizer.reset()
@@ -215,14 +215,14 @@ def recognize_traverse(
     Match every image of a traverse.
 
     :param online: with an empty window.
-    :param features: of N images.
+    :param features: features of N images.
     :param places: largest number of places n that a row of distances may have.
     :param settings: the settings of ``online``.
     :param shown: images whose windows' distances are kept in any case.
     :param progress: label of the progress bar; none without.
     :param odometry: poses of the images, (N, 7), NaN = unknown; None = of all.
     :param late: late matches count for the images that had none.
-    :param stamps: of the images, ns, (N,), int64, 0 = unknown; None = of all.
+    :param stamps: stamps of the images, ns, (N,), int64, 0 = unknown; None = all are.
     """
     count, ranks = len(features), max(RANKS)
     length = settings.sequence.length
@@ -280,13 +280,13 @@ def evaluate_on_map(
     Recognize a traverse on a map and compute its metrics.
 
     :param query: features of N images.
-    :param ground_truth: of the same images.
-    :param settings: of the recognizer; only the accepted matches depend on its threshold.
+    :param ground_truth: accepted places of the same images.
+    :param settings: settings of the recognizer; only the accepted matches depend on its threshold.
     :param unknown: features of a traverse through places that are not in the map.
     :param shown: images whose windows' distances are kept in any case.
     :param backend, precision: see :class:`stavpr_ros.method.PlaceRecognizer`.
     :param odometry: poses of the query's images, (N, 7), compared with the poses of the places.
-    :param stamps: of the query's images, ns, (N,), int64, 0 = unknown; None = of all.
+    :param stamps: stamps of the query's images, ns, (N,), int64, 0 = unknown; None = all are.
     :raises InputError: fewer images than one window, or ground truth of another length.
     """
 
@@ -324,7 +324,7 @@ def evaluate_loop_closures(
     """
     Recognize a traverse on its own past and compute its metrics.
 
-    :param ground_truth: of the same images: the earlier images that are correct.
+    :param ground_truth: the earlier images that are correct for each image.
     :param exclude_places: the latest images that are not part of the map.
     :param late: late matches count for the images that had none.
     :param precision: see :class:`stavpr_ros.method.loop_closer.LoopCloser`.
@@ -349,7 +349,7 @@ def evaluate_traverse(
     """
     Compute the metrics of a traverse, with and without its first and last images.
 
-    :param ground_truth: of the same N images.
+    :param ground_truth: accepted places of the same N images.
     :param length: images in a window, l.
     :raises InputError: fewer images than one window, or ground truth of another length.
     """

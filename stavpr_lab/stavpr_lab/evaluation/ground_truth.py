@@ -15,7 +15,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.sources.folder import text_of
 
 LISTED = 10  # images that an error names
-MAX_SHARE = 0.5  # of the places, accepted for an image
+MAX_SHARE = 0.5  # share of the places that is accepted for an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class GroundTruth:
         Accept places that are near and have a similar orientation.
 
         :param queries: x y z (meters), quaternion x y z w of each query, shape (N, 7).
-        :param places: of each place, shape (n, 7); a row of NaN = unknown, never accepted.
+        :param places: the same of each place, (n, 7); a row of NaN = unknown, never accepted.
         :param meters: largest distance, >= 0.
         :param degrees: largest angle between the two orientations, >= 0; None = any.
         :raises InputError: a query without a pose, no place with one, or values that are no poses.

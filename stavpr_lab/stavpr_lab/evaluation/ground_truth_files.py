@@ -14,7 +14,7 @@ from stavpr_ros.sources.suffixes import SUFFIXES
 from stavpr_ros.sources.table import by_name, is_name, is_stamps, Table
 
 TEXT, ARRAYS = ('.csv', '.tsv', '.txt'), ('.npy', '.npz')
-NAME = 'truth'  # of the array to read from an .npz with several
+NAME = 'truth'  # name of the array to read from an .npz with several
 TRANSPOSED = 'GTsoft'  # in the files of VPR_Tutorial: shape (n, N), the tolerance included
 QUERY_WORDS = ('query', 'live', 'current')
 PLACE_WORDS = ('place', 'ref', 'map', 'database', 'historical')
@@ -22,7 +22,7 @@ BLACK, WHITE = 32, 223  # gray levels; between them an image is not black and wh
 
 Pairs = tuple[np.ndarray, np.ndarray]
 Names = tuple[Sequence[str], Sequence[str]]
-"""Of the queries and of the places."""
+"""Identifiers of the queries and of the places."""
 MAX_WHOLE = 2**53  # whole numbers below it are exact as floating-point numbers
 
 

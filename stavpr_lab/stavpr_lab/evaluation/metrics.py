@@ -175,7 +175,7 @@ def counts_at(
     """
     Count at one threshold.
 
-    :param distances: of each query's match, shape (N,); +inf or NaN = no match.
+    :param distances: distance of each query's match, shape (N,); +inf or NaN = no match.
     :param correct: the match is within the tolerance of the ground truth, shape (N,), bool.
     :param has_match: the query's place is in the map, shape (N,), bool; None = all are.
     """

@@ -55,7 +55,7 @@ AXES: dict[str, Any] = {
     'axisbelow': True,
 }
 DPI = 150
-BINS = 40  # of a histogram
+BINS = 40  # bars of a histogram
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def drive(
     :param truth: correct (query, place), shape (M, 2).
     :param places: number of places n.
     :param matched: place of each query, shape (N,).
-    :param outcomes: of each query, an :data:`Outcome`, shape (N,).
+    :param outcomes: an :data:`Outcome` for each query, shape (N,).
     :param unseen: whether the map lacks its place and those around, shape (N,), bool.
     """
     index = np.arange(len(matched))
@@ -324,7 +324,7 @@ def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: 
 def _draw_pair(axes: Axes, pair: MatchPair) -> None:
     """Draw a query with its place on the right, and the frame."""
     height, width = pair.query.shape[:2]
-    start = width * 1.03  # of the place
+    start = width * 1.03  # left edge of the place
     axes.imshow(pair.query, extent=(0, width, height, 0), interpolation='lanczos')
     if pair.place is None:
         axes.add_patch(Rectangle((start, 0), width, height, fc='#efefeb', ec='none'))
@@ -350,10 +350,10 @@ def draw_matrix(
     """
     Draw a matrix of distances with the true places and the matches.
 
-    :param distances: of each cell; a cell may be a block of several queries and places.
+    :param distances: distance of each cell; a cell may be a block of several queries and places.
     :param shape: queries N and places n.
     :param truth: whether a cell has a true place, bool; None = unknown.
-    :param label: of the true places.
+    :param label: name of the true places in the legend.
     :param matches: (query, place), shape (count, 2), by outcome.
     """
     extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
@@ -391,7 +391,7 @@ def show_distances(
     Draw distances in grays from their 0.2 % to their 99.5 % quantile, with the scale beside them.
 
     :param distances: shape (rows, columns); others than finite ones are left white.
-    :param options: of :meth:`matplotlib.axes.Axes.imshow`.
+    :param options: options of :meth:`matplotlib.axes.Axes.imshow`.
     """
     finite = distances[np.isfinite(distances)]
     low, high = np.quantile(finite, [0.002, 0.995]) if finite.size else (0.0, 1.0)

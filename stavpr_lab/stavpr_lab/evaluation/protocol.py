@@ -72,7 +72,7 @@ def error_rate_and_recall(
     Where no image has a right place, the first is the share of accepted images. What is not
     defined is NaN; samples in which it is not are left out of the interval.
 
-    :param accepted, correct, has_match: of N images, shape (N,), bool.
+    :param accepted, correct, has_match: whether an image is so, shape (N,), bool.
     """
     right, wrong, missed = accepted & correct, accepted & ~correct, ~accepted & has_match
     answered = accepted if has_match.any() else np.ones_like(accepted)
@@ -116,7 +116,7 @@ def evaluate_matches(
     Compare matches with the ground truth at each tolerance.
 
     :param rankings: length of the sequences and matches.
-    :param truths: of the same queries, by tolerance.
+    :param truths: ground truths of the same queries, by tolerance.
     """
     for length, ranking in rankings:
         for tolerance, truth in truths.items():
@@ -136,7 +136,7 @@ def image_vectors(features: LocalFeatures, centered: bool = False) -> np.ndarray
     """
     Return the weighted strips of each image as one unit-norm vector.
 
-    :param features: of N images.
+    :param features: features of N images.
     :param centered: without the mean of the N images.
     :returns: shape (N, W * d), float32; zeros for an image without features.
     """
@@ -182,9 +182,9 @@ def evaluate_protocol(
     Evaluate methods with sequences of each length, shorter than the query.
 
     :param query: features of N images.
-    :param truths: of the N images, by tolerance.
-    :param settings: of modes paper and robust, except mode and length.
-    :param methods: of :data:`METHODS`; ``centered`` subtracts the mean of each traverse.
+    :param truths: ground truths of the N images, by tolerance.
+    :param settings: settings of modes paper and robust, except mode and length.
+    :param methods: names in :data:`METHODS`; ``centered`` subtracts the mean of each traverse.
     :param backend: backend and precision of :class:`stavpr_ros.method.PlaceRecognizer`.
     :raises InputError: ground truth of another number of images.
     """

@@ -26,8 +26,8 @@ class Report:
     :param query: the query's places, with thumbnails if the report is to show them.
     :param reference: the map; the query itself for loop closures.
     :param title: names of both, a line.
-    :param settings: of the run: everything that decides the numbers.
-    :param times: of the run, by name; seconds, or milliseconds where the name has them.
+    :param settings: everything that decides the numbers of the run.
+    :param times: durations in the run, by name; seconds, or milliseconds where the name has them.
     :param drive: changes of the query, and places removed from the map.
     :param default_threshold: the mode's own, with which the recognizer ran; None = it has none.
     :param window: query image whose window is plotted; None = the worst mistake.

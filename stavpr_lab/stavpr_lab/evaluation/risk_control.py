@@ -28,7 +28,7 @@ def make_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
     """
     Yield the drives that are made of a recorded query.
 
-    :param truth: of the recorded images, in places of the whole map.
+    :param truth: ground truth of the recorded images, in places of the whole map.
     :param block: images of a block.
     """
     for name in KINDS:
@@ -50,7 +50,7 @@ def measure_risks(
     :param driven: drives of it, the first one as recorded, their matches, and the images of
         these: :func:`stavpr_lab.evaluation.metrics.published_matches`.
     :param block: images of a block; the last one also has the rest.
-    :param method: of :class:`stavpr_ros.mapping.place_map.ErrorRisks`.
+    :param method: key, see :class:`stavpr_ros.mapping.place_map.ErrorRisks`.
     """
     driven = list(driven)
     units = max(1, len(driven[0][0].images) // block)

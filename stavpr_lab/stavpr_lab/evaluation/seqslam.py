@@ -23,14 +23,13 @@ class SeqSlamSettings:
     """
     The paper's parameters.
 
-    :param width: of the small images, pixels (Rx).
-    :param height: of the small images, pixels (Ry).
+    :param width: width of the small images, pixels (Rx).
+    :param height: height of the small images, pixels (Ry).
     :param patch: side of the squares that are normalized, pixels; divides width and height.
     :param contrast_window: places around each one, half before and half after, whose differences
         normalize its own (R_window); >= 2.
     :param length: images in a window (ds), >= 1.
-    :param slowest: map images per query image (V_min), > 0.
-    :param fastest: the same (V_max), >= slowest.
+    :param slowest, fastest: map images per query image (V_min, V_max), 0 < slowest <= fastest.
     :param speed_step: between the speeds of the search (V_step), > 0.
     """
 
@@ -103,7 +102,7 @@ def match_lines(D: np.ndarray, settings: SeqSlamSettings) -> tuple[np.ndarray, n
         return places, scores
     totals = np.full((len(settings.lines), windows, n), np.inf, D.dtype)
     for total, line in zip(totals, settings.lines, strict=True):
-        starts = max(0, n - line[-1])  # those whose line ends inside the map
+        starts = max(0, n - line[-1])  # starts whose line ends inside the map
         total[:, :starts] = 0
         for position, offset in enumerate(line if starts else ()):
             total[:, :starts] += D[position : position + windows, offset : offset + starts]

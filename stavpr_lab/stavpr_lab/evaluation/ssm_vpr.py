@@ -39,7 +39,7 @@ class SsmVprSettings:
     The paper's parameters.
 
     :param large, small: cells along a side of the cubes of stage 1 and 2.
-    :param large_dimension, small_dimension: of the whitened cubes.
+    :param large_dimension, small_dimension: dimensions of the whitened cubes.
     :param neighbors: cubes of the map that a cube of the query votes for.
     :param candidates: images that stage 2 compares.
     :param memory: last answers that frame correlation uses.
@@ -82,7 +82,7 @@ class PcaWhitening:
     PCA whitening, learned from samples.
 
     :param samples: shape (m, D).
-    :param dimension: of the result, at most; fewer where the samples have fewer.
+    :param dimension: dimensions of the result, at most; fewer where the samples have fewer.
     """
 
     def __init__(self, samples: torch.Tensor, dimension: int) -> None:
@@ -116,7 +116,7 @@ class SpatialReranker:
     """
     Stage 2: how many anchors of two images are displaced equally.
 
-    :param maps: of the map's images, shape (n, C, S, S).
+    :param maps: feature maps of the map's images, shape (n, C, S, S).
     """
 
     def __init__(self, maps: torch.Tensor, settings: SsmVprSettings | None = None) -> None:

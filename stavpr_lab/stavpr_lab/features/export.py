@@ -35,7 +35,7 @@ class Exported:
     An ONNX file that was verified against the original.
 
     :param content: the file.
-    :param shapes: of each output for one image.
+    :param shapes: shape of each output for one image.
     :param difference: largest one from the original, over the largest value.
     :param batch: whether several images may be computed at once.
     """
@@ -154,7 +154,7 @@ def one_of(output: Any, which: str, name: str) -> Any:
     Return one output of a network that returns a tuple, a list or a dictionary.
 
     :param which: its number from 0, or its key; a single output has the number 0.
-    :param name: of the network.
+    :param name: name of the network.
     :raises SettingsError: there is none of this number or key.
     """
     outputs: dict[str, Any] = {'0': output}

@@ -48,7 +48,7 @@ class NetVladParameters:
     :param centers: c, shape (K, D).
     :param k_fastest: V is flattened as (D, K), not (K, D).
     :param whitening: matrix (out, K * D) and bias (out,), or None.
-    :param scale, mean, std: of the input, see :class:`BatchMaker`.
+    :param scale, mean, std: preparation of the input, see :class:`BatchMaker`.
     """
 
     convolutions: list[tuple[torch.Tensor, torch.Tensor]]
@@ -135,7 +135,7 @@ def read_parameters(file: BinaryIO, name: str) -> NetVladParameters:
     """
     Read a file of published weights.
 
-    :param name: of the file, for errors.
+    :param name: name of the file, for errors.
     :raises UnavailableError: it is no such file, or damaged.
     """
     matlab = file.read(6) == b'MATLAB'

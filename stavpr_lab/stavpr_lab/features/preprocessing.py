@@ -17,9 +17,8 @@ class BatchMaker:
 
     :param size: side of the square, pixels.
     :param resize: method, see :func:`stavpr_ros.features.extractor.resize_square`.
-    :param mean: of each channel, in the order of the network's input.
-    :param std: likewise.
-    :param dtype: of the batch, float32 or float16.
+    :param mean, std: mean and deviation of each channel, in the order of the network's input.
+    :param dtype: type of the batch, float32 or float16.
     """
 
     def __init__(

@@ -31,16 +31,16 @@ from stavpr_ros.ros.qos import LATCHED
 from std_srvs.srv import Trigger
 
 MAX_SAMPLES = 3000  # samples: four minutes
-SAMPLE_SECONDS = 0.08  # least time between two samples
+SAMPLE_SECONDS = 0.08  # minimum time between two samples
 POLL_SECONDS = 0.5  # for the state of the node, and whether images are needed
-ROUTE_POINTS = 1000  # of the map's route, at most
-COLUMN_BYTES = 8  # of ``~/distances``: a distance and its place, float32
+ROUTE_POINTS = 1000  # points of the map's route that are drawn, at most
+COLUMN_BYTES = 8  # bytes of a column of ``~/distances``: a distance and its place, float32
 TIMEOUT = 30.0  # seconds for a command: configuring loads the map
 STATUSES = (
     *('warming up', 'no match', 'match', 'invalid image'),
     *('not ready', 'dropped', 'skipped', 'mapped'),
 )
-"""By the constants of PlaceMatch; recognition.Status has them too, but imports numba."""
+"""Names of the constants of PlaceMatch; Status has them too, but imports numba."""
 LEFT_OUT = ('dropped', 'skipped')  # statuses that say nothing on the place
 WITH_ROW = {PlaceMatch.WARMING_UP, PlaceMatch.NO_MATCH, PlaceMatch.MATCH}
 LEVELS = ('ok', 'warn', 'error', 'stale')
@@ -50,7 +50,7 @@ class History:
     """
     The data of the page, each part with the number of its last change; any thread may use it.
 
-    :param sample_seconds: least time between two samples.
+    :param sample_seconds: minimum time between two samples.
     """
 
     def __init__(self, sample_seconds: float = SAMPLE_SECONDS) -> None:
@@ -120,8 +120,8 @@ class Monitor:
     """
     Subscribes to the topics of a place-recognition node and calls its services.
 
-    :param node: of this process, spun by the caller.
-    :param name: of the place-recognition node, as for ROS: relative names are in the namespace.
+    :param node: node of this process, spun by the caller.
+    :param name: name of the place-recognition node; relative names are in the namespace.
     """
 
     def __init__(self, node: Node, name: str, history: History) -> None:

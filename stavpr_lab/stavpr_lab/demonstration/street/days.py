@@ -29,9 +29,9 @@ class Days:
     """
     The days of a street.
 
-    :param seed: of the street and of its days.
+    :param seed: decides the street and its days.
     :param length: meters of the street.
-    :param images: of a drive.
+    :param images: number of images of a drive.
     :param size: width and height of the images.
     :param closed: first and last day on which a part of the road is closed, and where, meters.
     :param built: day from which on there is a row of new buildings, and where, meters.

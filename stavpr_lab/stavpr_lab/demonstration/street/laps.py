@@ -186,8 +186,8 @@ def drive_laps(
     """
     Drive the three laps.
 
-    :param seed: of the world.
-    :param draw: of the errors of the odometry.
+    :param seed: decides the world.
+    :param draw: number of the draw of the odometry's errors.
     :param drift: factor on the errors of the odometry.
     :param carried: leave out images on lap 2: the odometry misses that the robot is moved.
     :param sessions: 1, or 2: lap 3 is on the next day and its odometry starts anew.

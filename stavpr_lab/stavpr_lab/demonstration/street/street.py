@@ -52,7 +52,7 @@ class Street:
     :param lot_of: lot in each cell of the four rows, shape (4, cells), int32.
     :param curvature: curvature of the center line, positive to the right, shape (cells,), 1/meter.
     :param things: trees, lamps, signs, shape (things,), :data:`THING`.
-    :param seed: of its layout and of its ground.
+    :param seed: decides its layout and its ground.
     :param rigid: bends turn the street, so that images agree with poses; else they only move it
         sideways with depth.
     """

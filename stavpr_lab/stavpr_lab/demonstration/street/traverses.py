@@ -110,7 +110,7 @@ class Traverse:
     """
     A traverse of a world: a sequence of images, rendered on access.
 
-    :param along: of each image, meters along the street that the camera is in, shape (images,).
+    :param along: meters along the street that the camera of each image is in, shape (images,).
     :param detour: whether that is the detour, shape (images,), bool.
     :param epoch: stamp of the first image, ns.
     :param size: width and height of the images.

@@ -35,8 +35,8 @@ class Layout:
     :param tolerance: the paper's or the field's, places.
     :param paired: the same index is the ground truth where both have equally many images; else a
         file is needed.
-    :param reader: of traverses whose images have positions, which are the ground truth then.
-    :param meters, degrees: of these, the largest distance and angle to a correct place.
+    :param reader: reads traverses whose images have positions, which are the ground truth then.
+    :param meters, degrees: largest distance and angle to a correct place, by these positions.
     """
 
     folders: tuple[str, ...]
@@ -93,7 +93,7 @@ class Dataset:
 
     :param map: images of the map, in the order of the route.
     :param query: images of the query.
-    :param ground_truth: of the query's images, tolerance included.
+    :param ground_truth: accepted places of the query's images, tolerance included.
     :param tolerance: the data set's or the requested one, places.
     """
 

@@ -37,7 +37,7 @@ class Configuration:
     :param temporal: sequences; False = single images.
     :param strips: W.
     :param projection: dimensions of a random projection, None without.
-    :param mode: of the recognizer; None = as the command has it.
+    :param mode: mode of the recognizer; None = as the command has it.
     :param baseline: run that instead: ``seqslam``, with the length of the sequence settings;
         ``ssm_vpr``, with two layers of the network; ``descriptors``, single images by the arrays
         of this name.
@@ -122,7 +122,7 @@ def sweep_configurations(
     Return one configuration a value of a parameter, all others at their defaults.
 
     :param parameter: l, beta, xi, sigma or W.
-    :param values: by default the values of ``SWEEPS``.
+    :param values: values of the parameter; default: ``SWEEPS``.
     :raises SettingsError: no such parameter, or a value out of its range.
     """
     if parameter not in SWEEPS:
@@ -166,9 +166,9 @@ class DatasetExperiment:
     Evaluates configurations on one data set; features are kept, since several columns share them.
 
     :param dataset: images and ground truth.
-    :param kind, backbone: of the features, see :class:`stavpr_ros.features.FeatureExtractor`.
-    :param mode: of the recognizer, ``paper`` or ``robust``.
-    :param inputs: of the baselines.
+    :param kind, backbone: features, see :class:`stavpr_ros.features.FeatureExtractor`.
+    :param mode: mode of the recognizer, ``paper`` or ``robust``.
+    :param inputs: inputs of the baselines.
     """
 
     def __init__(
