@@ -33,6 +33,7 @@ from stavpr_nav.evidence import (
     path_speed,
 )
 from stavpr_nav.observation import Observation
+from stavpr_nav.parameters import REPEAT
 from stavpr_ros.errors import InputError, SettingsError
 
 SLOW_PROBABILITY, FULL_PROBABILITY = 0.5, 0.9  # probabilities of the slowest and of the full speed
@@ -52,27 +53,20 @@ HISTORY = 200  # latest commands, to know how far the robot is since an image wa
 @dataclass(frozen=True)
 class FollowerSettings:
     """
-    Settings of the control law.
+    Settings of the control law, whose units and sentences are in ``parameters.REPEAT``.
 
-    :param gain: radians of a turn per meter, for an offset of one width of the image.
-    :param parallax_weight: weight of the parallax over the shift.
-    :param max_speed, max_turn: m/s, rad/s.
-    :param max_acceleration, max_turn_acceleration: m/s^2, rad/s^2; a stop is not limited.
-    :param max_age: seconds without an image after which the robot stops.
-    :param max_delay: seconds since the newest image was taken, after which it stops.
-    :param max_unconfirmed: seconds without an image of the route after which it stops.
     :raises SettingsError: a number that is not above 0.
     """
 
-    gain: float = 0.9
-    parallax_weight: float = 5.0
-    max_speed: float = 1.0
-    max_turn: float = 0.5
-    max_acceleration: float = 0.5
-    max_turn_acceleration: float = 1.0
-    max_age: float = 0.5
-    max_delay: float = 1.0
-    max_unconfirmed: float = 0.5
+    gain: float = REPEAT['gain'][0]
+    parallax_weight: float = REPEAT['parallax_weight'][0]
+    max_speed: float = REPEAT['max_speed'][0]
+    max_turn: float = REPEAT['max_turn'][0]
+    max_acceleration: float = REPEAT['max_acceleration'][0]
+    max_turn_acceleration: float = REPEAT['max_turn_acceleration'][0]
+    max_age: float = REPEAT['max_age'][0]
+    max_delay: float = REPEAT['max_delay'][0]
+    max_unconfirmed: float = REPEAT['max_unconfirmed'][0]
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
