@@ -252,9 +252,9 @@ def upload_to_qdrant(place_map: Map, points: Points, force: bool = False) -> Non
     centering = index.centering()
     for low in range(0, index.places, AT_ONCE):
         places = np.arange(low, min(low + AT_ONCE, index.places))
-        selected = select_places(place_map, places)
-        vectors = place_vectors(centering.places(selected.features).strips)
-        payloads = _written_places(place_map, selected, places)
+        part = select_places(place_map, places)
+        vectors = place_vectors(centering.places(part.features).strips)
+        payloads = _written_places(place_map, part, places)
         points.upsert(list(zip(places.tolist(), vectors.tolist(), payloads, strict=True)))
     points.upsert([(INDEX_POINT, [0.0] * index.dimension, _written_index(index))])
 
@@ -295,19 +295,19 @@ def _read_index(payload: dict[str, Any]) -> MapIndex:
     )
 
 
-def _written_places(place_map: Map, selected: Map, places: np.ndarray) -> Iterator[dict[str, Any]]:
-    strips = selected.features.strips.astype(np.float16)
+def _written_places(place_map: Map, part: Map, places: np.ndarray) -> Iterator[dict[str, Any]]:
+    strips = part.features.strips.astype(np.float16)
     for i, place in enumerate(places.tolist()):
         pose, session = place_map.pose(place), place_map.session(place)
         yield {
             'index': place,
             'session': '' if session is None else session.id,
-            'stamp': int(selected.stamps[i]),
-            'id': selected.ids[i],
+            'stamp': int(part.stamps[i]),
+            'id': part.ids[i],
             'pose': None if pose is None else pose.tolist(),
             'same_as': place if place_map.same_as is None else int(place_map.same_as[place]),
             'strips': base64.b64encode(strips[:, i].tobytes()).decode(),
-            'weights': selected.features.weights[:, i].tolist(),
+            'weights': part.features.weights[:, i].tolist(),
         }
 
 

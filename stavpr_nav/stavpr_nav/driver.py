@@ -84,8 +84,8 @@ class Driver:
         self._passes = goal.laps or math.inf
         self._last_lap: float | None = None
         self._needs_deadman, self._give_up_after = needs_deadman, give_up_after
-        self._pressed = -math.inf
-        self._held = now if is_blocked else -math.inf  # when the switch was last pressed
+        self._valid_press = -math.inf
+        self._press = now if is_blocked else -math.inf  # when the switch was last pressed
         self._time = self._alive = now
         self.outcome: Outcome | None = None
         self.place, self.laps, self.distance = -1, 0, 0.0
@@ -96,13 +96,13 @@ class Driver:
 
     def press(self, now: float) -> None:
         """Count the dead-man switch as pressed; a new press ends a stop without evidence."""
-        if now - self._held > DEADMAN_AGE and now - self._time <= DEADMAN_AGE:  # not suspended
+        if now - self._press > DEADMAN_AGE and now - self._time <= DEADMAN_AGE:  # not suspended
             self.restart()
-        self._pressed = self._held = now
+        self._valid_press = self._press = now
 
     def release(self) -> None:
         """Count the dead-man switch as released."""
-        self._pressed = self._held = -math.inf
+        self._valid_press = self._press = -math.inf
 
     def restart(self) -> bool:
         """Go on after a stop without evidence of motion; return whether there was one."""
@@ -161,8 +161,8 @@ class Driver:
         if self.outcome is not None:
             return self.command
         if now - self._time > DEADMAN_AGE:  # the program or the clock has jumped: no release
-            self._held += now - self._time
-        if self._needs_deadman and not 0 <= now - self._pressed <= DEADMAN_AGE:
+            self._press += now - self._time
+        if self._needs_deadman and not 0 <= now - self._valid_press <= DEADMAN_AGE:
             reason = NO_EVIDENCE if self.is_blocked else PAUSED
             self.command, self._alive = self._follower.halt(now, reason), now
         else:

@@ -131,12 +131,12 @@ class MotionEvidence:
 
         :param delay: seconds until an image is processed.
         """
-        driven = totals - self._totals
+        since = totals - self._totals
         seconds = PERIODS * self._period + delay
         # matches that were ahead stay at a place until the robot is there
         jitter = min(max(max(self._ahead) - min(self._ahead) - MIN_JITTER, 0.0), MAX_JITTER)
-        demanded = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + jitter
-        return bool(driven[:2].max() > demanded and driven[2] > self.bridge)
+        limit = max(MIN_DISTANCE, SLIP * self._next()) + abs(speed) * seconds + jitter
+        return bool(since[:2].max() > limit and since[2] > self.bridge)
 
     def _mark(self, place: int, totals: np.ndarray) -> None:
         """Mark a place as matched, and unmark the places of the far half of a lap."""

@@ -314,14 +314,14 @@ class RouteFollower:
 
     def _count(self, step: float) -> None:
         """Count what the last command has repeated in the seconds since."""
-        moved = self._odometry.take_meters() if self._odometry is not None else 0.0
+        meters = self._odometry.take_meters() if self._odometry is not None else 0.0
         last, newest = self._last, self._newest
         if last.reason or newest is None:
             return
         taught = self._taught.at(newest.place, self._since(newest.stamp))[0]
         done = last.speed / taught * step if abs(taught) > 1e-3 else step
-        added = np.array([path_speed(last.speed, last.turn) * step, moved, done])
-        self._totals.append((self._time, self._now + added))
+        increment = np.array([path_speed(last.speed, last.turn) * step, meters, done])
+        self._totals.append((self._time, self._now + increment))
 
     def _limit_command(self, target: Command, step: float) -> Command:
         """Limit velocities and accelerations, but no stop."""
@@ -333,8 +333,8 @@ class RouteFollower:
         turning = settings.max_turn_acceleration * step
         turn = min(max(target.turn, self._last.turn - turning), self._last.turn + turning)
         turn = _limit(turn, settings.max_turn)
-        added = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
-        self._integral = _limit(self._integral + added, MAX_INTEGRAL)
+        increment = _limit(self._steer, MAX_INTEGRAL) * abs(speed) * step / INTEGRAL
+        self._integral = _limit(self._integral + increment, MAX_INTEGRAL)
         return Command(speed, turn)
 
 

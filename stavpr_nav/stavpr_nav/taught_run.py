@@ -60,8 +60,8 @@ def read_velocities(path: str | Path) -> tuple[np.ndarray, str]:
         )
     if not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
         raise InputError(f'{path}: numbers must be finite, and stamps must not decrease')
-    named = [line for line in lines if line.startswith(SESSION) and line.endswith('\n')]
-    return table, named[-1].removeprefix(SESSION).strip() if named else ''
+    names = [line for line in lines if line.startswith(SESSION) and line.endswith('\n')]
+    return table, names[-1].removeprefix(SESSION).strip() if names else ''
 
 
 def taught_places(
@@ -81,10 +81,10 @@ def taught_places(
     if index is None or len(sessions) == 1:
         return np.arange(len(place_map))
 
-    covered = np.unique(index[_is_covered(place_map.stamps / SECOND, velocities)]).tolist()
-    name = session or next((sessions[number].id for number in covered), '')
+    numbers = np.unique(index[_is_covered(place_map.stamps / SECOND, velocities)]).tolist()
+    name = session or next((sessions[number].id for number in numbers), '')
     of_name = re.compile(rf'{re.escape(name)}(-\d+)*')
-    parts = [number for number in covered if of_name.fullmatch(sessions[number].id)]
+    parts = [number for number in numbers if of_name.fullmatch(sessions[number].id)]
     if not parts:
         raise InputError(
             f'no session {session!r} of the map was recorded with the velocities: it has '
@@ -137,16 +137,16 @@ def taught_run(
     if len(stamps) < 2 or (np.diff(stamps) <= 0).any():
         raise InputError(f'{len(stamps)} places: expected two with increasing stamps')
     if velocities is None:
-        moved, turned = _of_poses(None if place_map.poses is None else place_map.poses[taught])
+        meters, radians = _of_poses(None if place_map.poses is None else place_map.poses[taught])
         seconds = np.diff(stamps)
-        is_moving = (abs(moved) > STILL_SPEED * seconds) | (abs(turned) > STILL_TURN * seconds)
+        is_moving = (abs(meters) > STILL_SPEED * seconds) | (abs(radians) > STILL_TURN * seconds)
         moving = seconds * is_moving
     else:
-        moved, turned, moving = _of_velocities(velocities, stamps)
+        meters, radians, moving = _of_velocities(velocities, stamps)
     if not (moving > 0).any():
         raise InputError('the robot is at rest in the whole taught run')
     seconds = np.maximum(moving, REST_SECONDS)
-    speeds, turns = moved / seconds, turned / seconds
+    speeds, turns = meters / seconds, radians / seconds
     # where the robot was at rest, the velocities are the next ones
     following = np.where(moving > REST_SECONDS, np.arange(len(moving)), len(moving))
     following = np.minimum.accumulate(following[::-1])[::-1]
@@ -183,10 +183,10 @@ def _of_poses(poses: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         )
     x, y, z, w = poses[:, 3:].T
     yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-    turned = np.diff(yaw)
-    heading = yaw[:-1] + turned / 2
+    radians = np.diff(yaw)
+    heading = yaw[:-1] + radians / 2
     away = np.diff(poses[:, :2], axis=0)
-    return away[:, 0] * np.cos(heading) + away[:, 1] * np.sin(heading), turned
+    return away[:, 0] * np.cos(heading) + away[:, 1] * np.sin(heading), radians
 
 
 def _of_velocities(
@@ -204,5 +204,5 @@ def _of_velocities(
     is_moving = (abs(constant) > (STILL_SPEED, STILL_TURN)).any(axis=1)
     columns = np.column_stack([constant, is_moving]) * steps[:, None]
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
-    moved, turned, moving = (np.diff(np.interp(stamps, at, column)) for column in sums.T)
-    return moved, turned, moving
+    meters, radians, moving = (np.diff(np.interp(stamps, at, column)) for column in sums.T)
+    return meters, radians, moving

@@ -296,16 +296,16 @@ def _report(arguments: argparse.Namespace) -> 'Report':
     if settings.calibration_warning:
         print(settings.calibration_warning)
     truth = sequences.drive.truth.kind
-    loaded = time.perf_counter()
+    load_end = time.perf_counter()
     evaluation = _evaluate(arguments, sequences, settings)
-    ended = time.perf_counter()
+    end = time.perf_counter()
     milliseconds = sorted(evaluation.results.seconds * 1e3)
     times = {
         **sequences.times,
-        'drives_s': loaded - began,
-        'recognition_s': ended - loaded,
+        'drives_s': load_end - began,
+        'recognition_s': end - load_end,
         'recognition_median_ms': float(milliseconds[len(milliseconds) // 2]),
-        'total_s': ended - began,
+        'total_s': end - began,
     }
     return Report(
         evaluation=evaluation,

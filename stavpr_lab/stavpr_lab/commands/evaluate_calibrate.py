@@ -65,14 +65,14 @@ def run_calibrate(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     if before is not None and recording in before.recordings:
         say(f'{sequences.title}: this recording is in the calibration already, which stays')
         return
-    block, driven = WINDOWS * settings.sequence.length, []
+    block, outcomes = WINDOWS * settings.sequence.length, []
     drives = list(make_drives(sequences.drive.truth, block))
     for drive in Progress(drives, desc='calibrating', unit='drive'):
         places = select_places(reference, drive.places) if drive.removed else reference
         recognizer = PlaceRecognizer(places, settings, arguments.backend, arguments.precision)
         matches = recognize_all(recognizer, features[drive.images])
-        driven.append((drive, *published_matches(matches, settings.sequence.length)))
-    risks = measure_risks(driven, block, key)
+        outcomes.append((drive, *published_matches(matches, settings.sequence.length)))
+    risks = measure_risks(outcomes, block, key)
     risks = replace(risks, recordings=(recording,))
     say(
         f'{sequences.title}: {risks.units} blocks of {block} images, as recorded, at other speeds '

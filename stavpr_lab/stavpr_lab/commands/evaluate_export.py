@@ -136,8 +136,8 @@ def _write_pairs(report: 'Report', files: list[list[Path]], folder: Path, force:
     """Write the best places of each window, a line a pair: query and reference."""
     root = os.path.commonpath([file.parent.absolute() for side in files for file in side])
     places, queries = ([os.path.relpath(file, root) for file in side] for side in files)
-    if spaced := [name for name in (*places, *queries) if len(name.split()) > 1]:
-        raise SourceError(f'{spaced[0]!r} has a space, which separates names in pairs.txt: rename')
+    if bad := [name for name in (*places, *queries) if len(name.split()) > 1]:
+        raise SourceError(f'{bad[0]!r} has a space, which separates names in pairs.txt: rename')
     ranked = report.evaluation.results.sequence.places
     pairs = [(queries[i], places[k]) for i, row in enumerate(ranked) for k in row[row >= 0]]
     write_output(folder / 'pairs.txt', ''.join(f'{q} {r}\n' for q, r in pairs), ANY, force)

@@ -72,12 +72,12 @@ def load_sequences(arguments: argparse.Namespace) -> Sequences:
         paths = {'map': arguments.map, 'query': arguments.query, 'unknown': arguments.unknown}
         require_video(arguments.fps, paths.values())
         # saved maps first: they decide the features of the others
-        opened = {
+        inputs = {
             name: loader.load(name, path)
             for name, path in sorted(paths.items(), key=_decides_features)
             if path is not None
         }
-        sequences = _of_paths(arguments, opened, loader.times)
+        sequences = _of_paths(arguments, inputs, loader.times)
     if unread := left_out(loader.left_out):
         print(unread, file=sys.stderr)
     return _change_drive(sequences, arguments)
@@ -206,10 +206,10 @@ class _Loader:
             return place_map
         own = {'features': place_map.settings.kind, 'strips': place_map.settings.strips}
         for name, present in own.items():
-            requested = getattr(args, name)
-            if requested not in (None, AUTO, present):
+            request = getattr(args, name)
+            if request not in (None, AUTO, present):
                 raise SettingsError(
-                    f'--{name} {requested}: the map {path} was made with {present}; leave it out'
+                    f'--{name} {request}: the map {path} was made with {present}; leave it out'
                 )
         # a map does not state where its model is
         usable = f'--{place_map.settings.kind}-model'
@@ -250,9 +250,9 @@ def _of_dataset(arguments: argparse.Namespace, loader: _Loader) -> Sequences:
 
 
 def _of_paths(
-    arguments: argparse.Namespace, opened: dict[str, Map], times: dict[str, float]
+    arguments: argparse.Namespace, inputs: dict[str, Map], times: dict[str, float]
 ) -> Sequences:
-    reference, query = opened.get('map'), opened['query']
+    reference, query = inputs.get('map'), inputs['query']
     tolerance = arguments.tolerance
     if tolerance is None:
         tolerance = IDENTITY_TOLERANCE if arguments.truth == 'identity' else 0
@@ -267,7 +267,7 @@ def _of_paths(
         title = f'{_name(arguments.query)}: loop closures'
     else:
         title = f'{_name(arguments.query)} on the map {_name(arguments.map)}'
-    unknown = opened.get('unknown')
+    unknown = inputs.get('unknown')
     drive = DriveChanges().apply(ground_truth)
     odometry = None
     if arguments.odometry is not None:
@@ -308,12 +308,12 @@ def poses_of(path: str | None, place_map: Map, name: str, degrees: float | None)
         if place_map.poses is None or not place_map.has_poses:
             raise SettingsError(f'the {name} has no poses: give --{name}-poses')
         return place_map.poses
-    poses, oriented = read_poses(Path(path), place_map.ids)
+    poses, has_orientations = read_poses(Path(path), place_map.ids)
     if len(poses) != len(place_map):
         raise SourceError(
             f'{path} has {len(poses)} poses for {len(place_map)} images: give one each'
         )
-    if degrees is not None and not oriented:
+    if degrees is not None and not has_orientations:
         raise SourceError(f'{path} has no orientations: leave --degrees out')
     return poses
 

@@ -121,24 +121,24 @@ def main(args: list[str] | None = None) -> int:
 
     def work() -> None:
         arguments = _parser().parse_args(args)
-        exported = _export(arguments)
+        result = _export(arguments)
         with atomic_output(arguments.output, ONNX, arguments.force) as file:
-            file.write(exported.content)
-        for name, shape in exported.shapes.items():
+            file.write(result.content)
+        for name, shape in result.shapes.items():
             say(f'output {name}: {shape}')
         print(
-            f'verified on random images: largest difference {exported.difference:.1e} of the '
-            f'largest value; {"batches" if exported.batch else "one image at a time"}'
+            f'verified on random images: largest difference {result.difference:.1e} of the '
+            f'largest value; {"batches" if result.batch else "one image at a time"}'
         )
-        digest = hashlib.sha256(exported.content).hexdigest()
-        size = len(exported.content) / 1e6
+        digest = hashlib.sha256(result.content).hexdigest()
+        size = len(result.content) / 1e6
         say(f'{arguments.output}: {size:.1f} MB, sha256 {digest}')
-        layer = 'global' if 'global' in exported.shapes else 'map'
+        layer = 'global' if 'global' in result.shapes else 'map'
         print(
             f'use: --features onnx --onnx-model {arguments.output} --onnx-layer {layer} '
             f'--onnx-size {arguments.size}'
         )
-        if len(exported.shapes) > 1:
+        if len(result.shapes) > 1:
             print('or, strips: --onnx-layer map')
 
     return run_program('export_model', work)

@@ -86,12 +86,12 @@ def drive(
     settings = FollowerSettings(max_acceleration=1.0)
     driver = Driver(run, Goal(start=0), 0.0, settings, odometry=odometry)
     waiting: deque[tuple[float, Observation]] = deque()
-    x = speed = commanded = failed = evidence = next_image = 0.0
+    x = speed = commanded = origin = evidence = next_image = 0.0
     failed_at = stopped_at = math.inf
     best = camera_place = k = 0
     while (now := k * STEP) <= min(failed_at + AFTER, 60):
         if failed_at == math.inf and x >= BEFORE + phase * spacing:
-            failed_at, failed = now, commanded
+            failed_at, origin = now, commanded
         is_failed = failed_at < math.inf
         if now >= next_image - 1e-9 and (failure.images or not is_failed):
             is_good = not is_failed or failure.rate > 0
@@ -119,7 +119,7 @@ def drive(
         if is_failed and speed == 0 and command.reason:
             stopped_at = min(stopped_at, commanded)
         k += 1
-    return stopped_at - evidence, command.reason, commanded - stopped_at, commanded - failed
+    return stopped_at - evidence, command.reason, commanded - stopped_at, commanded - origin
 
 
 def table() -> list[str]:

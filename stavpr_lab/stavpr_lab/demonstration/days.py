@@ -86,7 +86,7 @@ def run(days: Days, count: int) -> Iterator[Day]:
     updated, version = first, Version('', base_places=len(first))
     for number in range(1, count + 1):
         drive, maps = drive_of(days, number, positions), (first, updated, updated)
-        measured = [
+        measurements = [
             measure(one, drive, positions, precision)
             for one, precision in zip(maps, PRECISIONS, strict=True)
         ]
@@ -95,7 +95,7 @@ def run(days: Days, count: int) -> Iterator[Day]:
             changes = version.changes
         except InputError as error:
             changes = (str(error),)
-        recall, wrong = zip(*measured, strict=True)
+        recall, wrong = zip(*measurements, strict=True)
         begin, low, high = days.built
         rebuilt = EPOCH + begin * DAY if number >= begin else 0
         vanished = sum(

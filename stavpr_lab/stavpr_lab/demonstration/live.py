@@ -136,8 +136,8 @@ def run_live(
                 f'the replay ended with {player.returncode}, see above and {folder}/node.log'
             )
         while not complete():  # a slow processor still completes loop closures
-            grown = partial(lambda last_size: complete() or size() > last_size, size())
-            wait_until(grown, END_TIMEOUT, 'the last record')
+            has_grown = partial(lambda last_size: complete() or size() > last_size, size())
+            wait_until(has_grown, END_TIMEOUT, 'the last record')
         with _apply_environment(environment):
             at_end(_records(closures))
     records = _records(matches)

@@ -59,13 +59,13 @@ class LoopResult:
         correct = np.count_nonzero(right)
         precision = f', precision {correct / C:.3f}' if C else ''
         revisited = self.ground_truth.has_match
-        aligned = self.pairs[self.are_correct(self.pairs)]
-        closed = len(np.unique(aligned[:, 0]))
-        recall = f', recall {closed / revisited.sum():.3f}' if revisited.any() else ''
+        correct_pairs = self.pairs[self.are_correct(self.pairs)]
+        images = len(np.unique(correct_pairs[:, 0]))
+        recall = f', recall {images / revisited.sum():.3f}' if revisited.any() else ''
         return (
             f'{line}\n'
             f'{correct} of {C} loop closures are correct{precision}\n'
-            f'{closed} of {np.count_nonzero(revisited)} images of places passed before are in a '
+            f'{images} of {np.count_nonzero(revisited)} images of places passed before are in a '
             f'correct pair{recall}'
         )
 

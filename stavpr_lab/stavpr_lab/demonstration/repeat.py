@@ -226,8 +226,8 @@ class Drive:
 
     def within(self, meters: float, after: float = CONVERGENCE) -> float:
         """Return the share of the distance within a bound of the path, after a start."""
-        driven = np.cumsum(self.speeds) * STEP
-        part = driven > after
+        distances = np.cumsum(self.speeds) * STEP
+        part = distances > after
         weights = self.speeds[part]
         return float((weights * (abs(self.errors[part, 0]) <= meters)).sum() / weights.sum())
 
@@ -392,10 +392,10 @@ def main() -> None:
             math.copysign(START_ANGLE, lap.left), seed, lap.pull, keep,
         )  # fmt: skip
         drives[f'{seed + 1}: {lap.light}, {lap.pull:+.2f}'] = drive
-        driven = np.cumsum(drive.speeds) * STEP
-        error = drive.errors[driven > CONVERGENCE, 0]
+        meters = np.cumsum(drive.speeds) * STEP
+        error = drive.errors[meters > CONVERGENCE, 0]
         lines.append(
-            f'| {lap.light} | {lap.pull:+.2f} | {driven[-1]:.0f} m | {drive.times[-1]:.0f} s '
+            f'| {lap.light} | {lap.pull:+.2f} | {meters[-1]:.0f} m | {drive.times[-1]:.0f} s '
             f'| {(drive.speeds < 0.02).sum() * STEP:.0f} s | {drive.presses} '
             f'| {drive.within(0.5):.1%} | {drive.within(1.0):.1%} '
             f'| {abs(error).max(initial=0):.2f} m '

@@ -15,7 +15,7 @@ SCALE_NOISE, HEADING_NOISE, HEADING_BIAS, SCALE_BIAS = (
 
 
 def add_drift(
-    truth: np.ndarray, moved: np.ndarray, dice: np.random.Generator, drift: float
+    truth: np.ndarray, is_noticed: np.ndarray, dice: np.random.Generator, drift: float
 ) -> np.ndarray:
     """
     Return what an odometry with errors makes of true poses.
@@ -27,7 +27,7 @@ def add_drift(
     signs = dice.choice([-1, 1], 2)
     result = np.zeros_like(truth)
     for i in range(1, len(truth)):
-        step = relative_poses(truth[i - 1], truth[i : i + 1])[0] * moved[i]
+        step = relative_poses(truth[i - 1], truth[i : i + 1])[0] * is_noticed[i]
         length = float(np.hypot(*step[:2]))
         scale = 1 + drift * (signs[0] * SCALE_BIAS + SCALE_NOISE * dice.normal())
         turn = HEADING_NOISE * np.sqrt(length) * dice.normal() + signs[1] * HEADING_BIAS * length

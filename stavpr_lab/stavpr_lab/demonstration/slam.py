@@ -153,13 +153,13 @@ def trajectory_errors(
         metrics.PoseRelation.translation_part, RPE_METERS, metrics.Unit.meters, all_pairs=True
     )
     relative.process_data((reference, estimate))
-    aligned = np.column_stack(
+    aligned_poses = np.column_stack(
         [estimate.positions_xyz, estimate.orientations_quat_wxyz[:, [1, 2, 3, 0]]]
     )
     errors = [
         float(metric.get_statistic(metrics.StatisticsType.rmse)) for metric in (absolute, relative)
     ]
-    return errors[0], errors[1], aligned
+    return errors[0], errors[1], aligned_poses
 
 
 def write_result(

@@ -35,9 +35,9 @@ class Calibration:
     @property
     def expected_error(self) -> float:
         """Mean distance of declared probability and share of correct matches, over the images."""
-        filled = self.images > 0
-        gaps = np.abs(self.declared - self.right)[filled]
-        return float(np.average(gaps, weights=self.images[filled]))
+        has_images = self.images > 0
+        gaps = np.abs(self.declared - self.right)[has_images]
+        return float(np.average(gaps, weights=self.images[has_images]))
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers for a JSON file."""

@@ -127,15 +127,15 @@ def _from_text(path: Path, N: int, names: Names) -> Pairs:
 def _load(path: Path) -> np.ndarray:
     try:
         require_regular(path)
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        with loaded:
-            names = loaded.files
+        content = np.load(path, allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            return content
+        with content:
+            names = content.files
             if TRANSPOSED in names:
-                return loaded[TRANSPOSED].T
+                return content[TRANSPOSED].T
             if len(names) == 1 or NAME in names:
-                array = loaded[names[0] if len(names) == 1 else NAME]
+                array = content[names[0] if len(names) == 1 else NAME]
                 if isinstance(array, np.ndarray):  # other files are returned as bytes
                     return array
     except Exception as error:  # damage raises errors of any type, of NumPy, zipfile and tokenize

@@ -252,8 +252,8 @@ def image_matches(matches: Sequence[Match], length: int, late: bool = False) -> 
     """
     result = ImageMatches.none(len(matches))
     middle = (length - 1) // 2
-    found_at = (end for end, match in enumerate(matches) if match.path.place >= 0)
-    ends = [end for end in found_at if is_full(matches[end], length)]
+    match_ends = (end for end, match in enumerate(matches) if match.path.place >= 0)
+    ends = [end for end in match_ends if is_full(matches[end], length)]
 
     def assign(end: int, position: int, place: int) -> None:
         image = end - (length - 1) + position
@@ -298,11 +298,11 @@ def published_matches(matches: Sequence[Match], length: int) -> tuple[ImageMatch
     images = [end - last + last // 2 for (end, _), last in zip(early, newest, strict=True)]
     rows = [(match.place, score_of(match), True, match.probability) for _, match in early]
     columns = np.array(rows).reshape(-1, 4).T
-    published = [
+    both = [
         np.append(getattr(of_images, name), column.astype(getattr(of_images, name).dtype))
         for name, column in zip(ImageMatches.__dataclass_fields__, columns, strict=True)
     ]
-    return ImageMatches(*published), np.append(np.arange(len(matches)), images).astype(np.int64)
+    return ImageMatches(*both), np.append(np.arange(len(matches)), images).astype(np.int64)
 
 
 def evaluate_ranking(
@@ -314,10 +314,10 @@ def evaluate_ranking(
     :param images: the queries that count, of those whose truth is known; all by default.
     :raises InputError: no queries are left.
     """
-    counted = np.arange(len(ranking))[images]
-    counted = counted[ground_truth.is_stated[counted]]
-    correct = ground_truth.accepts(ranking.places)[counted]
-    has_match, scores = ground_truth.has_match[counted], ranking.scores[counted]
+    queries = np.arange(len(ranking))[images]
+    queries = queries[ground_truth.is_stated[queries]]
+    correct = ground_truth.accepts(ranking.places)[queries]
+    has_match, scores = ground_truth.has_match[queries], ranking.scores[queries]
     if not len(scores):
         raise InputError(f'{images} of {len(ranking)} queries leaves no queries to evaluate')
     counts = sweep(scores, correct[:, 0], has_match)

@@ -88,8 +88,8 @@ def outcomes(
     """
     if correct is None or in_map is None:
         return np.where(accepted, 'match', 'no match')
-    matched = np.where(correct, 'right', 'wrong')
-    return np.where(accepted, matched, np.where(in_map, 'no match', 'unseen'))
+    verdicts = np.where(correct, 'right', 'wrong')
+    return np.where(accepted, verdicts, np.where(in_map, 'no match', 'unseen'))
 
 
 def reduced_matrix(
@@ -229,18 +229,18 @@ def drive(
 
 def reliability(path: Path, calibration: Calibration) -> None:
     """Draw the share of correct matches over their declared probability, and their numbers."""
-    filled = calibration.images > 0
+    has_images = calibration.images > 0
     with page(path, 5.2, 5.6) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
         above.plot([0, 1], [0, 1], color=QUIET, lw=1.2, ls=(0, (5, 3)), label='as declared')
-        points = calibration.declared[filled], calibration.right[filled]
+        points = calibration.declared[has_images], calibration.right[has_images]
         label = f'expected error {calibration.expected_error:.3f}'
         above.plot(*points, '-o', color=SEQUENCE, lw=1.8, ms=6, clip_on=False, label=label)
         above.set(ylabel='share of correct matches', xlim=(0, 1), ylim=(0, 1))
         above.grid(color=GRID, lw=0.7)
         legend_above(above, 2)
-        width = 1 / len(filled)
-        starts = np.arange(len(filled)) * width
+        width = 1 / len(has_images)
+        starts = np.arange(len(has_images)) * width
         below.bar(starts, calibration.images, 0.9 * width, align='edge', color=SEQUENCE_INNER)
         below.set(xlabel='declared probability', ylabel='images')
         below.locator_params(axis='y', integer=True, nbins=4)

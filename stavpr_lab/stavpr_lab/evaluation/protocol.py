@@ -74,12 +74,12 @@ def error_rate_and_recall(
 
     :param accepted, correct, has_match: whether an image is so, shape (N,), bool.
     """
-    right, wrong, missed = accepted & correct, accepted & ~correct, ~accepted & has_match
-    answered = accepted if has_match.any() else np.ones_like(accepted)
-    columns = np.array([wrong, answered, right, right | missed])
+    right, wrong, misses = accepted & correct, accepted & ~correct, ~accepted & has_match
+    answers = accepted if has_match.any() else np.ones_like(accepted)
+    columns = np.array([wrong, answers, right, right | misses])
     samples = (block_samples(len(accepted), 100, seed) for seed in range(10))  # in less memory
-    sampled = [columns[:, images].sum(axis=2) for images in samples]
-    counts = np.column_stack([columns.sum(axis=1), *sampled])
+    resamples = [columns[:, images].sum(axis=2) for images in samples]
+    counts = np.column_stack([columns.sum(axis=1), *resamples])
     with np.errstate(invalid='ignore'):
         shares = counts[::2] / counts[1::2]
     return _with_interval(shares[0]), _with_interval(shares[1])
@@ -124,10 +124,10 @@ def evaluate_matches(
             f1 = evaluate_ranking(ranking, truth).best.f1
             numbers = truth.accepts(ranking.best), ranking.scores, truth.has_match
             columns = [column[truth.is_stated] for column in numbers]
-            sampled = recalls(*(column[images] for column in columns))
+            resamples = recalls(*(column[images] for column in columns))
             first, full = (
                 _with_interval(np.append(value, values))
-                for value, values in zip(recalls(*columns), sampled, strict=True)
+                for value, values in zip(recalls(*columns), resamples, strict=True)
             )
             yield Recalls(method, length, tolerance, f1, first, full)
 
@@ -158,11 +158,11 @@ def match_sequences(
     :param method: ``seqslam``, without sequences of 1 image, which contrast enhancement leaves no
         information; else lines at the speed of the map.
     """
-    enhanced = method == 'seqslam'
+    is_enhanced = method == 'seqslam'
     for length in lengths:
-        if enhanced < length <= len(D):
+        if is_enhanced < length <= len(D):
             settings = SeqSlamSettings(length=length)
-            if enhanced:
+            if is_enhanced:
                 places, scores = match_differences(D, settings)
             else:
                 places, scores = match_lines(D, replace(settings, slowest=1, fastest=1))

@@ -103,12 +103,12 @@ def evaluate_records(
     """
     # an image that was in no window (invalid, dropped) has no match
     in_window = np.array([record['status'] in IN_WINDOW for record in records], bool)
-    assigned = image_matches(
+    window_matches = image_matches(
         [match_of(record) for record in records if record['status'] in IN_WINDOW], length
     )
     matches = ImageMatches.none(len(records))
     for name in ('places', 'distances', 'accepted', 'probabilities'):
-        getattr(matches, name)[in_window] = getattr(assigned, name)
+        getattr(matches, name)[in_window] = getattr(window_matches, name)
     counts = None
     if true_places is not None:
         correct = matches.within(true_places, tolerance)

@@ -40,7 +40,7 @@ def make_drives(truth: GroundTruth, block: int) -> Iterator[Drive]:
 
 
 def measure_risks(
-    driven: Iterable[tuple[Drive, ImageMatches, np.ndarray]], block: int, method: str
+    outcomes: Iterable[tuple[Drive, ImageMatches, np.ndarray]], block: int, method: str
 ) -> ErrorRisks:
     """
     Return the risks of the blocks of a recorded query.
@@ -52,11 +52,11 @@ def measure_risks(
     :param block: images of a block; the last one also has the rest.
     :param method: key, see :class:`stavpr_ros.mapping.place_map.ErrorRisks`.
     """
-    driven = list(driven)
-    units = max(1, len(driven[0][0].images) // block)
+    outcomes = list(outcomes)
+    units = max(1, len(outcomes[0][0].images) // block)
     wrong, matched, images = np.zeros((3, units, len(PROBABILITIES)))
     on_map = np.zeros((units, 1), bool)
-    for drive, matches, at in driven:
+    for drive, matches, at in outcomes:
         truth, recorded = drive.truth.select(at), drive.recorded.has_match[at]
         has_match, correct = truth.has_match, truth.accepts(matches.places)
         unseen = [stretch[at] for stretch in drive.unseen()]

@@ -164,7 +164,7 @@ def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
     n = D.shape[1]
     firsts = np.maximum(np.arange(n) - window // 2, 0)
     ends = np.minimum(np.arange(n) + window // 2 + 1, n)
-    enhanced = np.empty_like(D)
+    result = np.empty_like(D)
     for i, row in enumerate(D):  # a row at a time: the sums need float64, the matrix is large
         centered = row.astype(np.float64) - row.mean(dtype=np.float64)
         sums = np.concatenate([[0.0], np.cumsum(centered)])
@@ -174,5 +174,5 @@ def enhance_contrast(D: np.ndarray, window: int) -> np.ndarray:
         variance = (squares[ends] - squares[firsts]) / count - mean**2
         # rounding leaves small variances where all are equal
         flat = variance <= 1e-12 * (squares[-1] / n)
-        enhanced[i] = np.where(flat, 0, (centered - mean) / np.sqrt(np.where(flat, 1, variance)))
-    return enhanced
+        result[i] = np.where(flat, 0, (centered - mean) / np.sqrt(np.where(flat, 1, variance)))
+    return result

@@ -212,7 +212,7 @@ def export_network(outputs: Chosen, size: int) -> Exported:
 
 def _record(outputs: Chosen, images: torch.Tensor, alone: bool) -> bytes:
     onnx, _ = import_onnx()
-    batched = {name: {0: 'batch'} for name in ('image', *outputs.names)}
+    axes = {name: {0: 'batch'} for name in ('image', *outputs.names)}
     with (
         tempfile.TemporaryDirectory() as folder,
         warnings.catch_warnings(),
@@ -227,7 +227,7 @@ def _record(outputs: Chosen, images: torch.Tensor, alone: bool) -> bytes:
             path,
             input_names=['image'],
             output_names=outputs.names,
-            dynamic_axes=None if alone else batched,
+            dynamic_axes=None if alone else axes,
             opset_version=OPSET,
             dynamo=False,
         )

@@ -177,15 +177,15 @@ def _from_matlab(file: BinaryIO, name: str) -> NetVladParameters:
             io.BytesIO(file.read()), struct_as_record=False, squeeze_me=True, variable_names='net'
         )
         net = content['net']
-        weighted = [
+        layers = [
             [_tensor(array) for array in layer.weights]
             for layer in net.layers
             if len(getattr(layer, 'weights', ()))
         ]
         mean = np.asarray(net.meta.normalization.averageImage, np.float64).reshape(-1, 3)[0]
-        convolutions, (assignment, *bias, centers), *rest = weighted[:13], *weighted[13:]
+        convolutions, (assignment, *bias, centers), *rest = layers[:13], *layers[13:]
         if len(convolutions) != 13 or len(rest) > 1:
-            raise ValueError(f'{len(weighted)} layers with weights, expected 14 or 15')
+            raise ValueError(f'{len(layers)} layers with weights, expected 14 or 15')
     except Exception as error:  # damaged files raise errors of any type
         raise UnavailableError(
             f'{name} cannot be read as the MATLAB file of a NetVLAD: {error}; expected a '

@@ -114,9 +114,9 @@ def read_checkpoint(file: BinaryIO, name: str) -> dict[str, torch.Tensor]:
             content = torch.load(file, map_location='cpu', weights_only=True)
     except Exception as error:  # damaged files raise errors of any type
         reason = last_line(error)
-        blocked = re.search(r'GLOBAL (\S+)', str(error))
-        if blocked:
-            reason = f'it requires {blocked[1]}, which is not plain weights and was not executed'
+        code = re.search(r'GLOBAL (\S+)', str(error))
+        if code:
+            reason = f'it requires {code[1]}, which is not plain weights and was not executed'
         raise UnavailableError(f'{name} cannot be read as a file of weights: {reason}') from error
     if isinstance(content, Mapping) and isinstance(content.get('state_dict'), Mapping):
         content = content['state_dict']

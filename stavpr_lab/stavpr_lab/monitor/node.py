@@ -201,12 +201,12 @@ class Monitor:
 
     def _poll(self) -> None:
         """Request the state of the node; subscribe to images while somebody looks."""
-        watched = self.history.viewers > 0
-        if watched and self._images is None:
+        is_watched = self.history.viewers > 0
+        if is_watched and self._images is None:
             self._images = self._node.create_subscription(
                 CompressedImage, f'{self._name}/match_image/compressed', self._on_image, 1
             )
-        elif not watched and self._images is not None:
+        elif not is_watched and self._images is not None:
             self._node.destroy_subscription(self._images)
             self._images = None
         if not self._get_state.service_is_ready():
@@ -299,8 +299,8 @@ def encode_row(row: np.ndarray) -> str:
     if not finite.size:
         return base64.b64encode(bytes([255]) * row.size).decode()
     low, middle = finite.min(), np.median(finite)
-    scaled = np.clip((row - low) / max(middle - low, 1e-9), 0, 1) * 255
-    return base64.b64encode(scaled.astype(np.uint8)).decode()
+    levels = np.clip((row - low) / max(middle - low, 1e-9), 0, 1) * 255
+    return base64.b64encode(levels.astype(np.uint8)).decode()
 
 
 def for_json(value: Any) -> Any:

@@ -339,10 +339,10 @@ class RepeatNode(Node):
         return CancelResponse.ACCEPT
 
     async def _execute(self, handle: Any) -> Repeat.Result:
-        driver, ended = self._driver, self._ended
+        driver, future = self._driver, self._ended
         assert driver is not None
-        assert ended is not None
-        await ended
+        assert future is not None
+        await future
         assert driver.outcome is not None
         text = driver.command.reason
         if driver.outcome is Outcome.REACHED:

@@ -10,12 +10,13 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from rclpy.qos import qos_profile_sensor_data
 from stavpr_msgs.msg import MapInfo
 from stavpr_nav.parameters import TEACH
 from stavpr_nav.taught_run import COLUMNS, SESSION
 from stavpr_ros.errors import OutputError, SettingsError
 from stavpr_ros.ros.messages import nanoseconds
+from stavpr_ros.ros.qos import LATCHED
 from stavpr_ros.units import SECOND
 
 PARAMETERS = TEACH
@@ -52,8 +53,7 @@ class TeachNode(Node):
         self._last = -sys.float_info.max
         topic, kind = SOURCES[source]
         self.create_subscription(kind, topic, self._on_message, qos_profile_sensor_data)
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.create_subscription(MapInfo, 'stavpr/map_info', self._on_map_info, latched)
+        self.create_subscription(MapInfo, 'stavpr/map_info', self._on_map_info, LATCHED)
         self.get_logger().info(f'recording {topic} in {path}')
 
     def destroy_node(self) -> None:

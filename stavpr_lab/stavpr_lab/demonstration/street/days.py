@@ -105,10 +105,10 @@ class Days:
         if day:
             wave = [noise(k / self.images * 9.0, 0.0, self.seed + day) for k in range(self.images)]
             speed = 0.7 * 2.0 ** np.array(wave)
-        driven = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * distance / speed.sum()
-        detour = (driven >= leaves) & (driven < leaves + around)
-        along = np.where(driven < leaves + around, driven - leaves * detour, driven - around)
-        along = np.where(driven < leaves + around, along, along + (returns - leaves))
+        meters = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * distance / speed.sum()
+        detour = (meters >= leaves) & (meters < leaves + around)
+        along = np.where(meters < leaves + around, meters - leaves * detour, meters - around)
+        along = np.where(meters < leaves + around, along, along + (returns - leaves))
         world = _Day((self.street(day), self._streets[1]))
         size, epoch = self.size, EPOCH + day * DAY
         return Traverse(world, along, detour, self.conditions(day), epoch, size)

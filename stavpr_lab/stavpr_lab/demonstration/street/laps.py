@@ -104,7 +104,7 @@ def _lanes(before: float, after: float, images: int) -> np.ndarray:
     return before + (after - before) * (1 - np.cos(pi * change)) / 2
 
 
-def _detour(world: RingWorld, driven: np.ndarray) -> np.ndarray:
+def _detour(world: RingWorld, meters: np.ndarray) -> np.ndarray:
     """Return poses on the detour, an arc of :data:`DETOUR` meters, at distances from its start."""
     line = world.center_line[round(DETOUR_FROM / CELL) : round(DETOUR_TO / CELL) + 1]
     chord = line[-1, :2] - line[0, :2]
@@ -123,7 +123,7 @@ def _detour(world: RingWorld, driven: np.ndarray) -> np.ndarray:
     points, at = line[:, :2] + low * bulge, lengths(low)
     tangents = np.unwrap(np.arctan2(*np.gradient(points, axis=0).T[::-1]))
     columns = (points[:, 0], points[:, 1], tangents)
-    return np.column_stack([np.interp(driven, at, column) for column in columns])
+    return np.column_stack([np.interp(meters, at, column) for column in columns])
 
 
 def true_poses(world: RingWorld, traverse: Traverse) -> np.ndarray:

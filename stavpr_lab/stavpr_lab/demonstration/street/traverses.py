@@ -199,10 +199,10 @@ def second_traverse(
     """Traverse along the street again, with a detour, a stop and other conditions: the query."""
     distance = LENGTH - (DETOUR_TO - DETOUR_FROM) + DETOUR
     speed = _vary_speed(world.seed, images)
-    driven = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * distance / speed.sum()
+    meters = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * distance / speed.sum()
     back = DETOUR_FROM + DETOUR
-    detour = (driven >= DETOUR_FROM) & (driven < back)
-    along = np.where(driven < back, driven - DETOUR_FROM * detour, driven - back + DETOUR_TO)
+    detour = (meters >= DETOUR_FROM) & (meters < back)
+    along = np.where(meters < back, meters - DETOUR_FROM * detour, meters - back + DETOUR_TO)
     return Traverse(world, along, detour, conditions, SECOND_EPOCH, size, lanes)
 
 

@@ -133,8 +133,8 @@ def open_dataset(name: str, root: str | Path, tolerance: int | None = None) -> D
         places, query = reference.source, queries.source
         poses = queries.poses, reference.poses
         ground_truth = GroundTruth.from_poses(*poses, layout.meters, layout.degrees)
-        counted = queries.counted[ground_truth.keys // ground_truth.n]
-        ground_truth = replace(ground_truth, keys=ground_truth.keys[counted]).widened(tolerance)
+        is_counted = queries.counted[ground_truth.keys // ground_truth.n]
+        ground_truth = replace(ground_truth, keys=ground_truth.keys[is_counted]).widened(tolerance)
     else:
         places, query = _images(map_folder), _images(query_folder)
         if layout.paired and len(query) == len(places):
