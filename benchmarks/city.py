@@ -44,7 +44,8 @@ CASES = {  # map, query, tolerance, speed of the query
     'night_map_half': ('walk_by_night/right_night', 'walk_by_night/right_day', 2, '0.5x'),
     'nordland_vary': ('nordland_64x32/winter', 'nordland_64x32/summer', 3, 'vary'),
 }
-PAGE = RESULTS / 'performance.md'
+IMAGES = 200  # of a query
+FILE, PAGE = RESULTS / 'city.json', RESULTS / 'performance.md'
 WRITTEN_BY = 'benchmarks/city.py'
 
 
@@ -62,9 +63,9 @@ class HalfFeatures(LocalFeatures):
         return LocalFeatures(strips, weights, self.settings, self.cells)
 
 
-def simulate_places(real: LocalFeatures, n: int, seed: int) -> Iterator[np.ndarray]:
+def simulate_places(real: LocalFeatures, n: int) -> Iterator[np.ndarray]:
     """Yield the strips (W, m, d) of n simulated places, block by block."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     W, m, d = real.strips.shape
     images = real.strips.transpose(1, 0, 2).reshape(m, W * d).astype(np.float64)
     mean = images.mean(axis=0)
@@ -83,11 +84,11 @@ def simulate_places(real: LocalFeatures, n: int, seed: int) -> Iterator[np.ndarr
         yield unit_norm(strips)
 
 
-def city(real: LocalFeatures, n: int, seed: int) -> tuple[HalfFeatures, int]:
+def city(real: LocalFeatures, n: int) -> tuple[HalfFeatures, int]:
     """Return a city of n places, and the first of the real ones."""
     W, m, d = real.strips.shape
     half, low = np.empty((W, n, d), dtype=np.float16), 0
-    for strips in simulate_places(real, n, seed):
+    for strips in simulate_places(real, n):
         half[:, low : low + strips.shape[1]] = strips
         low += strips.shape[1]
     first = int(AT * (n - m))
@@ -140,18 +141,16 @@ def drive(
     }
 
 
-def measure(
-    name: str, n: int, images: int, seed: int, pca: int, save: Path | None
-) -> dict[str, Any]:
+def measure(name: str, n: int, pca: int, save: Path | None) -> dict[str, Any]:
     """Return the numbers of one case."""
     folder, (reference, query_folder, tolerance, speed) = data_folder(), CASES[name]
     extractor = FeatureExtractor('gradient')
     real = extract_features(open_source(folder / reference), extractor, progress=False)
     query = extract_features(open_source(folder / query_folder), extractor, progress=False)
     indices = DriveChanges.from_name(speed, len(query)).images(len(query))
-    indices = indices[:images]
+    indices = indices[:IMAGES]
     query = query[indices]
-    features, first = city(real, n, seed)
+    features, first = city(real, n)
     place_map = descriptor_map(features)
     if pca:
         place_map, query = reduce_dimensions(features, query, pca)
@@ -186,22 +185,21 @@ def lines(results: list[dict[str, Any]]) -> list[str]:
     return table(head, rows)
 
 
-def merge_results(path: Path, new: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Add results to a file, each case and size once, the newest last; return all."""
-    before = json.loads(path.read_text(encoding='utf-8')) if path.exists() else []
-    of_cases = {(one['case'], one['places'], one['dimension']): one for one in (*before, *new)}
-    if new:
-        write_json(path, [*of_cases.values()])
-    return list(of_cases.values())
+def add_result(new: dict[str, Any]) -> list[dict[str, Any]]:
+    """Add a result to the file, each case and size once, the newest last; return all."""
+    before = json.loads(FILE.read_text(encoding='utf-8')) if FILE.exists() else []
+    results = {(one['case'], one['places'], one['dimension']): one for one in (*before, new)}
+    write_json(FILE, [*results.values()])
+    return list(results.values())
 
 
-def write_page(results: list[dict[str, Any]], page: Path) -> None:
-    """Write the table to a page."""
+def write_page(results: list[dict[str, Any]]) -> None:
+    """Write the table between the two marks of the page."""
     cases = list(CASES)
     results = sorted(
         results, key=lambda one: (one['places'], cases.index(one['case']), one['dimension'])
     )
-    write_section(page, WRITTEN_BY, lines(results))
+    write_section(PAGE, WRITTEN_BY, lines(results))
 
 
 def main() -> None:
@@ -209,22 +207,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--places', type=int, nargs='+', default=[100_000], metavar='N')
     parser.add_argument('--cases', nargs='+', choices=CASES, default=list(CASES))
-    parser.add_argument('--images', type=int, default=200, help='of a query (%(default)s)')
-    parser.add_argument('--seed', type=int, default=0)
     parser.add_argument('--pca', type=int, default=0, metavar='D', help='as map compact --pca')
     parser.add_argument('--save-map', type=Path, help='of the last case, for soak.py --map')
-    parser.add_argument('--output', type=Path, default=RESULTS / 'city.json', help='JSON file')
     arguments = parser.parse_args()
-    rows = merge_results(arguments.output, [])
     for n in arguments.places:
         for case in arguments.cases:
-            options = arguments.images, arguments.seed, arguments.pca, arguments.save_map
-            one = measure(case, n, *options)
-            rows = merge_results(arguments.output, [one])
+            one = measure(case, n, arguments.pca, arguments.save_map)
+            rows = add_result(one)
             print('\n'.join(lines([one])[2:3]), flush=True)
     print('\n'.join(lines(rows)))
-    if arguments.output == RESULTS / 'city.json':
-        write_page(rows, PAGE)
+    write_page(rows)
 
 
 if __name__ == '__main__':

@@ -323,9 +323,9 @@ class Windows:
             hits, every = counts
             return hits / every
 
-    def matched_off(self, scores: np.ndarray, threshold: float = 0.0) -> np.ndarray:
+    def matched_off(self, scores: np.ndarray) -> np.ndarray:
         """Return how many images of each kind off the map are matched, (4,)."""
-        rows = (scores > threshold) & self.decides & (self.negative >= 0)
+        rows = (scores > 0) & self.decides & (self.negative >= 0)
         return np.bincount(self.negative[rows], minlength=len(NEGATIVES))
 
 

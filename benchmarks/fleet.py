@@ -33,9 +33,9 @@ TOLERANCE = 2
 SETTINGS = RecognizerSettings(mode='robust')
 
 
-def generate_places(traverses: list[LocalFeatures], count: int, seed: int = 0) -> LocalFeatures:
+def generate_places(traverses: list[LocalFeatures], count: int) -> LocalFeatures:
     """Return the features of ``count`` generated places, see the module."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     W, _, d = traverses[0].strips.shape
     strips, weights = np.empty((W, count, d), np.float32), np.full((W, count), W**-0.5, np.float32)
     for low in range(0, count, ROUTE):

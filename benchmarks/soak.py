@@ -203,9 +203,6 @@ def main() -> None:
     parser.add_argument('--map', help=f'instead of one of {PLACES} synthetic places')
     text = 'change a parameter each second, and reset the node every 20 seconds'
     parser.add_argument('--changes', action='store_true', help=text)
-    text = 'of the node, besides map_path; may be repeated'
-    repeated: dict[str, Any] = {'action': 'append', 'default': []}
-    parser.add_argument('--parameter', metavar='NAME:=VALUE', help=text, **repeated)
     parser.add_argument('--output', help='write the figures to this JSON file as well')
     arguments = parser.parse_args()
     from rclpy.qos import qos_profile_sensor_data
@@ -219,9 +216,7 @@ def main() -> None:
         path = Path(arguments.map or Path(folder) / 'map.stavpr').resolve()
         if not arguments.map:
             make_map(path)
-        parameters = [f'map_path:={path}', *arguments.parameter]
-        options = [word for parameter in parameters for word in ('-p', parameter)]
-        command = [executable('node'), '--ros-args', *options]
+        command = [executable('node'), '--ros-args', '-p', f'map_path:={path}']
         node = subprocess.Popen(command, env=environment)
         resident: list[float] = []
         images = [image_message(image) for image in texture_route(IMAGES)]
@@ -236,8 +231,7 @@ def main() -> None:
             node.send_signal(signal.SIGINT)
             node.wait()
     name = Path(arguments.map).name if arguments.map else f'{PLACES} places'
-    figures |= {'memory_mb_by_minute': resident, 'map': name, 'parameters': arguments.parameter}
-    figures |= about(load)
+    figures |= {'memory_mb_by_minute': resident, 'map': name, **about(load)}
     text = json.dumps(figures, indent=2)
     print(text)
     if arguments.output:

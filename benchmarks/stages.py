@@ -9,7 +9,6 @@ import gc
 from itertools import count, cycle
 from typing import Any
 
-from baselines import accumulate_costs, prange, sample
 from data import along, free_bytes, make_features, make_window
 import lower_bounds as bounds
 from lower_bounds import ITEM_BYTES, Sizes
@@ -150,14 +149,69 @@ def sequence_peers(run: Run, window: np.ndarray, ours: SequenceDistances) -> lis
     return [*peers, librosa_peer(window, dtw)]
 
 
+@nb.njit(parallel=True, error_model='numpy')
+def plain_lm_dtw(D: np.ndarray, k: int, distances: np.ndarray, lengths: np.ndarray) -> None:
+    """
+    Compute the textbook's loops of LM-DTW, parallel over the starts, each of which keeps one row.
+
+    Arithmetic, tie rule and results are as in the package's kernel.
+
+    :param D: distances of images, shape (l, n), float32.
+    :param k: map images within reach of a start.
+    :param distances, lengths: results, shape (n,), float32 and int32.
+    """
+    l, n = D.shape
+    one = np.float32(1)
+    for s in nb.prange(n):
+        columns = min(k, n - s)
+        S, C = np.empty(columns, np.float32), np.empty(columns, np.float32)
+        S[0], C[0] = D[0, s], one
+        for x in range(1, columns):
+            S[x], C[x] = D[0, s + x] + S[x - 1], C[x - 1] + one
+        for i in range(1, l):
+            S_before, C_before = S[0], C[0]  # of cell (i-1, x-1)
+            S[0], C[0] = D[i, s] + S[0], C[0] + one
+            for x in range(1, columns):
+                cost = D[i, s + x]
+                diagonal, vertical, horizontal = cost + S_before, cost + S[x], cost + S[x - 1]
+                S_before, C_above = S[x], C[x]
+                if diagonal < vertical and diagonal < horizontal:
+                    S[x], C[x] = diagonal, C_before + one
+                elif vertical <= horizontal:
+                    S[x], C[x] = vertical, C_above + one
+                else:
+                    S[x], C[x] = horizontal, C[x - 1] + one
+                C_before = C_above
+        best, m = np.float32(np.inf), 0
+        for x in range(columns):
+            if S[x] / C[x] < best:
+                best, m = S[x] / C[x], x + 1
+        distances[s], lengths[s] = best, m
+
+
 def _prange_peer(window: np.ndarray, ours: SequenceDistances) -> Peer:
-    kernel, n = prange(), window.shape[1]
+    n = window.shape[1]
     distances, lengths = np.empty(n, np.float32), np.empty(n, np.int32)
-    call = partial(kernel, window, SEQUENCE.k, distances, lengths)
+    call = partial(plain_lm_dtw, window, SEQUENCE.k, distances, lengths)
     call()
     np.testing.assert_array_equal(distances, ours.distances)
     np.testing.assert_array_equal(lengths, ours.lengths)
     return Peer('prange', timed_job(call), 'plain numba, all cores; the same results bit for bit')
+
+
+def accumulate_costs(costs: np.ndarray) -> float:
+    """Return the accumulated cost of the last cell of dynamic time warping, in float64."""
+    S = np.full((costs.shape[0] + 1, costs.shape[1] + 1), np.inf)
+    S[0, 0] = 0
+    for i, j in np.ndindex(costs.shape):
+        S[i + 1, j + 1] = costs[i, j] + min(S[i, j], S[i, j + 1], S[i + 1, j])
+    return float(S[-1, -1])
+
+
+def sample(n: int, k: int, count: int) -> list[int]:
+    """Return ``count`` starts, spread evenly over the starts with k columns, or all of these."""
+    whole = max(1, n - k + 1)
+    return sorted({int(start) for start in np.linspace(0, whole - 1, min(count, whole))})
 
 
 def librosa_peer(window: np.ndarray, dtw: Callable[..., np.ndarray]) -> Peer:
