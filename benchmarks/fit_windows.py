@@ -106,7 +106,7 @@ def record_drive(drive: Drive, with_early: bool = True) -> np.ndarray:
         entries.clear()
         assess()
 
-    def matched() -> Any:
+    def note_match() -> Any:
         return note(match(), False)
 
     def early() -> Any:
@@ -118,7 +118,7 @@ def record_drive(drive: Drive, with_early: bool = True) -> np.ndarray:
         entries.append(show(*arguments))
         return entries[-1]
 
-    vars(window).update(_assess=keep, assess=assess_view, match=matched, match_newest=early)
+    vars(window).update(_assess=keep, assess=assess_view, match=note_match, match_newest=early)
     for i, stamp in enumerate(drive.stamps.tolist()):
         state['image'] = i
         recognizer.update(drive.features[i : i + 1], stamp)
@@ -249,7 +249,7 @@ class Windows:
         parts = []
         for number, (drive, shown_rows) in enumerate(zip(drives, records, strict=True)):
             rows = shown_rows
-            images = _counted(drive.images) if len(rows) else np.empty(0, int)
+            images = _middle_images(drive.images) if len(rows) else np.empty(0, int)
             whole = np.flatnonzero((rows[:, 3] == 0) & (rows[:, 0] >= 0))
             middles, first = np.unique(rows[whole, 1], return_index=True)
             counted = np.zeros(len(rows), bool)
@@ -329,7 +329,7 @@ class Windows:
         return np.bincount(self.negative[rows], minlength=len(NEGATIVES))
 
 
-def _counted(images: np.ndarray) -> np.ndarray:
+def _middle_images(images: np.ndarray) -> np.ndarray:
     """Return the images in the middle of a whole window of images that moved, (m,)."""
     number = np.cumsum(np.diff(images, prepend=images[:1]) != 0)
     return np.flatnonzero((number >= MIDDLE) & (number[-1] - number >= LENGTH - 1 - MIDDLE))
@@ -486,19 +486,19 @@ class Risks:
         rows = rows & (t[:, None] < scores) & (t[:, None] >= low)
         n = len(windows.drives)
 
-        def counted(which: np.ndarray) -> np.ndarray:
+        def count(which: np.ndarray) -> np.ndarray:
             return np.array([np.bincount(windows.drive[row & which], minlength=n) for row in rows])
 
-        matched = counted(windows.drive >= 0)
+        matched = count(windows.drive >= 0)
         lengths = np.array([0 if d.truth else len(d.images) for d in windows.drives])
-        return cls(t, windows.drives, counted(~windows.right), np.maximum(matched, lengths))
+        return cls(t, windows.drives, count(~windows.right), np.maximum(matched, lengths))
 
     @property
     def rates(self) -> np.ndarray:
         """Return the share of wrong matches, (T, D)."""
         return self.wrong / np.maximum(self.matched, 1)
 
-    def least(self, error: float, rows: np.ndarray) -> int:
+    def first_row(self, error: float, rows: np.ndarray) -> int:
         """Return the row of the least t that keeps an error rate over some drives; T = none."""
         bounds = (self.rates[:, rows].sum(axis=1) + 1) / (np.count_nonzero(rows) + 1)
         return int(len(self.t) - np.argmin(np.append(bounds[::-1] <= error, False)))

@@ -65,7 +65,7 @@ def city(route: Map, distractors: list[Map], count: int) -> tuple[Map, int]:
     return descriptor_map(LocalFeatures.concatenate(parts)), first
 
 
-def accepted(
+def drive_places(
     recognizer: PlaceRecognizer | FleetRecognizer, query: LocalFeatures, times: list[float]
 ) -> list[int]:
     """Drive a query; return the place of each window, -1 = not matched."""
@@ -87,11 +87,11 @@ def run(
 ) -> str:
     """Return cells of a row: precision, recall, images matched off the map, times."""
     times: list[float] = []
-    places = np.array(accepted(recognizer, query, times))
+    places = np.array(drive_places(recognizer, query, times))
     middles = first + np.arange(len(places)) + (SETTINGS.sequence.length - 1) // 2
     right = np.count_nonzero(abs(places - middles) <= TOLERANCE)
     matched = np.count_nonzero(places >= 0)
-    off = accepted(recognizer, off_the_map, times)
+    off = drive_places(recognizer, off_the_map, times)
     return (
         f'{right / max(matched, 1):.3f} | {right / len(places):.3f} | '
         f'{sum(place >= 0 for place in off)} of {len(off)} | '

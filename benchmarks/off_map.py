@@ -116,7 +116,7 @@ class Outcome:
         return self.accepted & ~self.correct & (self.probabilities >= LEVEL)
 
     @classmethod
-    def pooled(cls, outcomes: Sequence['Outcome']) -> 'Outcome':
+    def pool(cls, outcomes: Sequence['Outcome']) -> 'Outcome':
         """Return the images of several drives as one."""
         names = cls.__dataclass_fields__
         return cls(*(np.concatenate([getattr(part, name) for part in outcomes]) for name in names))
@@ -345,17 +345,17 @@ class Measurement:
             self.add('drives', name, result.numbers())
         pooled = [result for name, result in by_name.items() if not name.endswith(LONG_STOP)]
         if len(by_name) > 1:
-            self.add('drives', f'{pair.name}/all', Outcome.pooled(pooled).numbers())
+            self.add('drives', f'{pair.name}/all', Outcome.pool(pooled).numbers())
         each_third = sparse(pair)
         self.add('sparse', pair.name, each_third.numbers())
         self.driven += [*pooled, each_third]
-        self.add('set_calibration', pair.name, Outcome.pooled([*pooled, each_third]).calibration())
+        self.add('set_calibration', pair.name, Outcome.pool([*pooled, each_third]).calibration())
         if not pair.long:
             self.add('reverse', pair.name, drive_pair(pair, DriveChanges(reverse=True)).numbers())
         outcomes = list(detours(pair, self.coarser))
         numbers = [one.numbers() for one in outcomes]
         shares = [one['unseen_matched'] / one['unseen'] for one in numbers if one['unseen']]
-        values = Outcome.pooled(outcomes).numbers() | {'positions': len(numbers)}
+        values = Outcome.pool(outcomes).numbers() | {'positions': len(numbers)}
         self.add('detours', pair.name, values | {'worst': max(shares, default=0.0)})
         self.off_map += outcomes
         for name, counts in starts(pair, self.coarser):
@@ -376,7 +376,7 @@ class Measurement:
             one = outcome(place_map, query.features, nothing)
             shares[f'{query_name} on {map_name}'] = one.accepted.sum() / len(query)
             outcomes.append(one)
-        pooled = Outcome.pooled(outcomes)
+        pooled = Outcome.pool(outcomes)
         worst = max(shares, key=shares.__getitem__)
         matched = int(np.count_nonzero(pooled.accepted))
         values = {'images': int(np.count_nonzero(~pooled.early)), 'matched': matched}
@@ -388,10 +388,10 @@ class Measurement:
     def finish(self) -> Results:
         """Add the pooled rows, and return all."""
         if self.driven:
-            pooled = Outcome.pooled(self.driven)
+            pooled = Outcome.pool(self.driven)
             self.add('calibration', 'drives', pooled.calibration())
         if self.off_map:
-            pooled = Outcome.pooled(self.driven + self.off_map)
+            pooled = Outcome.pool(self.driven + self.off_map)
             self.add('calibration', 'with detours and floors', pooled.calibration())
         return self.rows
 

@@ -56,7 +56,7 @@ class Drive(NamedTuple):
         features = FeatureExtractor('gradient').extract(images)
         return cls(features, preprocess(images, SeqSlamSettings()), descriptors)
 
-    def repeated(self, n: int, rng: np.random.Generator) -> 'Drive':
+    def repeat(self, n: int, rng: np.random.Generator) -> 'Drive':
         """Return n images: the same ones again and again, with noise."""
         index = np.arange(n) % len(self.features)
         features = self.features[index]
@@ -161,7 +161,7 @@ def main(arguments: list[str] | None = None) -> int:
         right = float(truth.accepts(np.maximum(matches, 0))[counted].mean())
         rows[name] = {'method': name, 'images': method.images, 'right': round(right, 3)}
     for n in SIZES[:1] if options.quick else SIZES:
-        ready = methods(places.repeated(n, np.random.default_rng(0)), query)
+        ready = methods(places.repeat(n, np.random.default_rng(0)), query)
         numbers = {name: count() for name in ready}
 
         def match(name: str, method: Method, numbers: Any = numbers) -> None:

@@ -55,7 +55,7 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     accepted, *others = (np.array(values, bool) for values in columns)
     others.append(np.zeros(5, bool))  # no early ones
     outcome = off_map.Outcome(accepted, np.array([0.9, 0.8, 0.6, 0.2, np.nan]), *others)
-    found = off_map.Outcome.pooled([outcome, outcome]).numbers()
+    found = off_map.Outcome.pool([outcome, outcome]).numbers()
     assert (found['images'], found['matched'], found['wrong']) == (10, 6, 2)
     assert (found['precision'], found['recall']) == (4 / 6, 4 / 8)
     assert (found['unseen'], found['unseen_matched']) == (2, 2)
