@@ -228,11 +228,6 @@ def _number(value: float | None) -> str:
     return EMPTY if value is None else f'{value:.3f}'
 
 
-def _metric(experiment: str) -> str:
-    """Return the metric of a table, by its name in :meth:`Metrics.to_json`."""
-    return 'recall_at_1' if experiment == 'field' else 'f1'
-
-
 def _run(arguments: argparse.Namespace) -> None:
     from stavpr_lab.evaluation.report import jsonable
 
@@ -240,7 +235,8 @@ def _run(arguments: argparse.Namespace) -> None:
         require_replaceable(arguments.json, JSON, arguments.force)
     folders = _check(arguments)
     columns, datasets = _columns(arguments), _datasets(arguments)
-    metric = _metric(arguments.experiment)
+    # by its name in Metrics.to_json()
+    metric = 'recall_at_1' if arguments.experiment == 'field' else 'f1'
     rows = [['data set', 'features', *(column.title for column in columns)]]
     results: list[dict[str, Any]] = []
     blanks: dict[str, list[str]] = {}  # data sets and columns, by reason

@@ -111,7 +111,8 @@ def reduced_matrix(
     with page(path, 5.2, float(np.clip(5.2 * shape[0] / shape[1], 3.5, 7))) as figure:
         axes = figure.add_subplot()
         draw_matrix(figure, axes, distances, shape, truth, 'true place', matches)
-    return _box(axes)
+    position = axes.get_position()  # final since the page is written
+    return position.x0, 1 - position.y1, position.width, position.height
 
 
 def precision_recall(path: Path, curves: Mapping[str, tuple[str, Metrics]]) -> None:
@@ -293,12 +294,6 @@ def shade_runs(axes: Axes, mask: np.ndarray, label: str) -> None:
     for number, (first, end) in enumerate(runs(mask)):
         name = '' if number else label
         axes.axvspan(first - 0.5, end - 0.5, color='#e9e9e4', lw=0, zorder=0, label=name)
-
-
-def _box(axes: Axes) -> Box:
-    """Return where the axes of a written figure are."""
-    position = axes.get_position()
-    return position.x0, 1 - position.y1, position.width, position.height
 
 
 def draw_pairs(figure: Figure | SubFigure, pairs: Sequence[MatchPair], columns: int) -> None:
