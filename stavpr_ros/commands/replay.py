@@ -64,8 +64,8 @@ examples:
   ros2 run stavpr_ros replay phone.mp4 --lossless
         a video, 5 images of each second
 
-On a terminal, space pauses and resumes, s or the right arrow publishes the next image. The
-services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger) do the same.
+The services ~/pause, ~/resume, ~/toggle_paused and ~/play_next (std_srvs/Trigger), as of
+`ros2 bag play`, control it: the last one publishes the next image while it is paused.
 
 exit codes:
   0    all images were published; the last line names how many of them the node received

@@ -1,16 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The time of a replay, with pause and step, and the keys that control it."""
+"""The time of a replay, with pause and step."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable
 import math
-import os
-import select
-import sys
-import termios
 import time
-import tty
 
 from stavpr_ros.units import SECOND
 
@@ -73,41 +67,3 @@ class Playback:
         """Make the items up to the next image due; return whether it is paused, as it must be."""
         self._steps += self.paused
         return self.paused
-
-
-@contextmanager
-def keyboard(keys: Mapping[str, Callable[[], object]]) -> Iterator[Callable[[], None]]:
-    """
-    Read single keys from the terminal, if there is one and this process is in its foreground.
-
-    :param keys: the function of each key.
-    :returns: a function that calls the functions of the keys pressed since.
-    """
-    try:
-        terminal = sys.stdin.fileno()
-        before = termios.tcgetattr(terminal) if _in_foreground(terminal) else None
-    except (OSError, ValueError, AttributeError, termios.error):
-        before = None
-    if before is None:
-        yield lambda: None
-        return
-
-    def poll() -> None:
-        # reading in the background would stop the process
-        while _in_foreground(terminal) and select.select([terminal], [], [], 0)[0]:
-            text = os.read(terminal, 16).decode(errors='replace')
-            if not text:
-                return
-            # the sequence of an arrow is one key
-            for key in [text] if text in keys else text:
-                keys.get(key, lambda: None)()
-
-    tty.setcbreak(terminal, termios.TCSANOW)
-    try:
-        yield poll
-    finally:
-        termios.tcsetattr(terminal, termios.TCSANOW, before)
-
-
-def _in_foreground(terminal: int) -> bool:
-    return os.isatty(terminal) and os.tcgetpgrp(terminal) == os.getpgrp()

@@ -20,14 +20,14 @@ from sensor_msgs.msg import Image
 from stavpr_msgs.msg import PlaceMatch
 from stavpr_ros.errors import StavprError
 from stavpr_ros.ros.messages import message_class, record_message, time_message
-from stavpr_ros.ros.playback import keyboard, Playback
+from stavpr_ros.ros.playback import Playback
 from stavpr_ros.ros.process import Discovery
 from stavpr_ros.ros.subscriber_progress import READY, RECORDER, SubscriberProgress
 from stavpr_ros.signals import signals_deferred
 from stavpr_ros.sources.frame import ImageRecord, MessageRecord, RecordedTopic
 from std_srvs.srv import Trigger
 
-KEY_POLL = 0.1  # seconds until a signal, or a key, is noticed
+SIGNAL_POLL = 0.1  # seconds until a signal is noticed
 TRIES = 3  # how often one image is sent
 RELIABLE_QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 OTHERS_DEPTH = 1000  # messages of one topic between two images
@@ -96,7 +96,6 @@ class Replayer:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._discovery = Discovery(node, self._endpoints, options.timeout)
-        self._poll: Callable[[], None] = lambda: None
 
     @property
     def topics(self) -> Collection[str]:
@@ -135,18 +134,12 @@ class Replayer:
         """
         Publish each record when it is due; if lossless, an image after the last one's result.
 
-        While it runs, keys of the terminal pause, resume and step.
-
         :raises NoResultError: lossless, and no result after all tries.
         """
-        playback = self.playback
-        keys = {' ': self._toggle, 's': playback.step, '\x1b[C': playback.step}
-        with keyboard(keys) as self._poll:
-            for i, record in enumerate(records):
-                if i == 0:
-                    playback.start(record.time_ns)
-                self._send(record)
-        self._poll = lambda: None
+        for i, record in enumerate(records):
+            if i == 0:
+                self.playback.start(record.time_ns)
+            self._send(record)
 
     def _send(self, record: ImageRecord | MessageRecord) -> None:
         is_image = isinstance(record, ImageRecord)
@@ -199,10 +192,9 @@ class Replayer:
         return True
 
     def _spin_once(self, seconds: float) -> None:
-        """Serve one callback, or wait for one at most so long; read the keys."""
+        """Serve one callback, or wait for one at most so long."""
         with signals_deferred():
-            self._executor.spin_once(timeout_sec=min(seconds, KEY_POLL))
-        self._poll()
+            self._executor.spin_once(timeout_sec=min(seconds, SIGNAL_POLL))
 
     def _missing(self) -> str:
         """Return the endpoint that is not discovered yet; empty = none."""
@@ -289,17 +281,13 @@ class Replayer:
         if self._clock is not None and self.playback.started:
             self._clock.publish(ClockMessage(clock=time_message(self.playback.now_ns())))
 
-    def _toggle(self) -> None:
-        self.playback.pause(not self.playback.paused)
-        self.notify('paused' if self.playback.paused else 'resumed')
-
     def _serve(self) -> None:
         """Serve the services of ``ros2 bag play``, by the same names."""
         playback = self.playback
         for name, act in (
             ('pause', lambda: playback.pause(True)),
             ('resume', lambda: playback.pause(False)),
-            ('toggle_paused', self._toggle),
+            ('toggle_paused', lambda: playback.pause(not playback.paused)),
             ('play_next', playback.step),
         ):
             self.node.create_service(Trigger, f'~/{name}', partial(self._on_request, act))
