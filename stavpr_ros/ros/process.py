@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-import difflib
 import os
 from pathlib import Path
 from shutil import disk_usage
@@ -45,8 +44,6 @@ PROFILES_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 PROFILES_FILE = 'config/fastdds_large_images.xml'
 SHARED_MEMORY, UDP_FILE = '/dev/shm', 'config/fastdds_udp.xml'
 LARGE_SEGMENT, SEGMENT = 40_000_000, 1_000_000  # bytes of shared memory, with what belongs to it
-SIMILARITY = 0.54  # of names: --map is map_path (0.55), and not map_frame (0.50)
-ROS_OPTIONS = ('enclave', 'log-level', 'param', 'params-file', 'remap')
 
 AnyNode = TypeVar('AnyNode', bound=Node)
 
@@ -206,8 +203,8 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
     """
     Reject arguments that are not for ROS, for a node that has no others.
 
-    :param parameters: names with which misspelled options are compared.
-    :raises SettingsError: names the arguments, and the command line to write.
+    :param parameters: names of the node's parameters.
+    :raises SettingsError: names the arguments, and the form to write them in.
     """
     words, of_ros = [], False
     for word in arguments:
@@ -219,24 +216,10 @@ def require_ros_arguments(arguments: Sequence[str], parameters: Iterable[str] = 
     names = {word.partition(':=')[0] for word in words}
     if not own_arguments(arguments) and names.isdisjoint(parameters):
         return
-    line, unknown = ['--ros-args'], ''
-    for word in words:
-        name, _, value = word.lstrip('-').partition('=')
-        near = difflib.get_close_matches(name.replace('-', '_'), parameters, 1, SIMILARITY)
-        if word.startswith('--') and name not in ROS_OPTIONS:
-            if not near:
-                line, unknown = ['--ros-args -p NAME:=VALUE'], ' with a NAME that --help lists'
-                break
-            line += ['-p', f'{near[0]}:={value}']
-        elif ':=' in word and line[-1] not in ('-p', '-r', '--param', '--remap'):
-            line += ['-p', word]
-        elif line[-1].endswith(':=') and not word.startswith('-'):
-            line[-1] += word
-        else:
-            line.append(word)
     raise SettingsError(
-        f'nothing reads the arguments {" ".join(words)!r}: write {" ".join(line)}{unknown} '
-        '(parameters and remappings are arguments of ROS)'
+        f'nothing reads the arguments {" ".join(words)!r}: write --ros-args -p NAME:=VALUE with a '
+        'NAME that --help lists, or --ros-args -r image:=TOPIC (parameters and remappings are '
+        'arguments of ROS)'
     )
 
 
@@ -249,7 +232,7 @@ def run_node(
     :param make: returns the node; it has ``THREADS`` for callbacks, 1 by default, and ``failed``
         if its end may lose something.
     :param arguments: without the program's name; the process's own if None. All are for ROS.
-    :param parameters: names of the node's parameters, to correct misspelled arguments.
+    :param parameters: names of the node's parameters; an argument NAME:=VALUE is rejected.
     """
     node = None
     try:
