@@ -10,6 +10,7 @@ from pathlib import Path as Pathname
 import re
 import subprocess
 import sys
+import threading
 from types import ModuleType, SimpleNamespace
 
 from ament_index_python.packages import get_package_share_directory
@@ -22,6 +23,7 @@ import numpy as np
 from pipelines import at, LENGTH, localizing, message, process, recorded, SECOND
 from processes import environment, TIMEOUT
 import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import qos_profile_services_default
 from rclpy.time import Time as RclTime
 from robot import LATCHED
@@ -448,11 +450,22 @@ def test_navigation_on_a_growing_route_publishes_nothing(publishing, route):
     assert not publishing.initial
 
 
-def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeypatch):
+@pytest.mark.parametrize(
+    ('parameters', 'problem'),
+    [
+        ({'publish_tf': True}, 'publish_tf requires the package tf2_msgs: install it'),
+        ({'map_path': '/nowhere.stavpr'}, 'nowhere'),
+        ({'operation': 'mapping', 'features': 'auto', 'model_path': '/no'}, 'model_path'),
+    ],
+)
+def test_configuration_that_fails_leaves_no_thread(make_node, monkeypatch, parameters, problem):
+    """One without tf2_msgs fails at the publishers, the others at the map and the model."""
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
-    start(wait=False, publish_tf=True)
-    robot.until_logged('publish_tf requires the package tf2_msgs: install it')
-    robot.until_state('unconfigured')
+    node, before = make_node(**parameters), set(threading.enumerate())
+    assert node.trigger_configure() == TransitionCallbackReturn.ERROR
+    assert problem in node.problem
+    assert node.state == 'unconfigured'
+    assert set(threading.enumerate()) <= before
 
 
 def test_example_of_bridges_publishes_a_pose_at_the_start_and_on_each_request(robot, start, route):

@@ -83,13 +83,17 @@ class Runtime:
             on_map_change,
         )
         self.worker = Worker(self._process, settings.queue_size, node.ending)
-        self._publication = Publication(
-            node,
-            settings,
-            statistics,
-            lambda: self.pipeline.operation,
-            lambda: self.worker.call(self._publish_route),
-        )
+        try:
+            self._publication = Publication(
+                node,
+                settings,
+                statistics,
+                lambda: self.pipeline.operation,
+                lambda: self.worker.call(self._publish_route),
+            )
+        except BaseException:
+            self.worker.stop()
+            raise
         try:
             self._begin()
         except BaseException:
