@@ -204,18 +204,6 @@ def load_splat(typing: Any, array: Any, offset: Any) -> Any:
 
 
 @intrinsic
-def load_bytes(typing: Any, array: Any, offset: Any) -> Any:
-    """Read LANES neighbors of a flat array of uint8, from ``offset``, as int32."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _pointer(context, builder, signature.args[0], *arguments)
-        wide = ir.VectorType(ir.IntType(32), LANES)
-        return builder.zext(builder.load(pointer, align=1), wide)
-
-    return Vector(types.int32)(array, types.intp), generate
-
-
-@intrinsic
 def store_bytes(typing: Any, array: Any, offset: Any, vector: Any) -> Any:
     """Write the lowest byte of each int32 into a flat array of uint8, from ``offset``."""
 
@@ -248,24 +236,20 @@ def prefetch(typing: Any, array: Any, offset: Any) -> Any:
     return types.void(array, types.intp), generate
 
 
-@intrinsic
-def bits(typing: Any, vector: Any) -> Any:
-    """Return the bits of float32 numbers as int32."""
-    return Vector(types.int32)(
-        vector
-    ), lambda context, builder, signature, arguments: builder.bitcast(
-        arguments[0], ir.VectorType(ir.IntType(32), LANES)
-    )
+def _bits_as(element: types.Type) -> Any:
+    """Make a function that returns the numbers of a type that have the bits of a vector."""
+
+    @intrinsic
+    def bits_as(typing: Any, vector: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.bitcast(arguments[0], ir.VectorType(_ELEMENTS[element], LANES))
+
+        return Vector(element)(vector), generate
+
+    return bits_as
 
 
-@intrinsic
-def from_bits(typing: Any, vector: Any) -> Any:
-    """Return the float32 numbers that have these bits."""
-    return Vector(types.float32)(
-        vector
-    ), lambda context, builder, signature, arguments: builder.bitcast(
-        arguments[0], ir.VectorType(ir.FloatType(), LANES)
-    )
+bits, from_bits = _bits_as(types.int32), _bits_as(types.float32)  # of float32 numbers, and back
 
 
 @intrinsic

@@ -41,20 +41,13 @@ before the start
 """
 
 
-def match_record(message: 'PlaceMatch') -> dict[str, Any]:
-    """Return a match as plain values for JSON."""
-    return _record(message) | {'status': STATUSES[message.status]}
-
-
-def loop_closure_record(message: 'LoopClosure') -> dict[str, Any]:
-    """Return a loop closure as plain values for JSON."""
-    unknown = () if message.has_poses else ('query_pose', 'place_pose')
-    return _record(message) | dict.fromkeys(unknown)
-
-
-def _record(message: Any) -> dict[str, Any]:
-    """Return the fields of a message, its header as ``stamp`` and ``frame_id``."""
+def message_record(message: 'PlaceMatch | LoopClosure') -> dict[str, Any]:
+    """Return a match or a loop closure as plain values for JSON, with the fields of its header."""
     fields: dict[str, Any] = _plain(message)
+    if 'status' in fields:
+        fields['status'] = STATUSES[fields['status']]
+    elif not fields['has_poses']:
+        fields |= dict.fromkeys(('query_pose', 'place_pose'))
     return fields.pop('header') | fields
 
 
@@ -115,7 +108,6 @@ class Recorder:
 
     def __init__(self, file: AtomicFile, name: str, kind: str = MATCHES) -> None:
         self._file, self._name, self._kind, self.count = file, name, kind, 0
-        self._record_of: Any = match_record if kind == MATCHES else loop_closure_record
 
     def write(self, message: Any) -> None:
         """
@@ -124,7 +116,7 @@ class Recorder:
         :raises OutputError: it cannot be written; earlier ones stay.
         """
         file = self._file
-        line = json.dumps(self._record_of(message) | {'received': time.time_ns()}) + '\n'
+        line = json.dumps(message_record(message) | {'received': time.time_ns()}) + '\n'
         size = os.fstat(file.fileno()).st_size
         try:
             file.write(line.encode())
