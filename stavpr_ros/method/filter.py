@@ -177,6 +177,7 @@ class PlaceFilter(Filter):
         checks.require_ascending('gaps', gaps, columns)
         self.model, self.length, self._gaps = model, length, gaps
         self._steps = model.steps() * F(1 - model.leave)
+        self._reach = (length - 1) * model.reach  # columns that a path advances, at most
         self._rows, snapshots = length + SPACING - 1, (length - 2) // SPACING + 2
         self._buffers = snapshots + 2
         self._snapshots: deque[Snapshot] = deque(maxlen=snapshots)
@@ -300,7 +301,7 @@ class PlaceFilter(Filter):
         latest = list(self._images)[len(self._images) - later :]
         numbers = np.array([image[:4] for image in latest])
         starts = np.concatenate([newest.blocks, self._images[-1 - images // 2].blocks])
-        bounds = regions(np.sort(starts), (self.length - 1) * s.reach, self._width)
+        bounds = regions(np.sort(starts), self._reach, self._width)
         columns, parts = [NO_PLACES], [np.empty((images, 0))]
         for low, end in bounds:
             columns.append(np.arange(low, end))
@@ -317,8 +318,8 @@ class PlaceFilter(Filter):
         self, steps: np.ndarray, span: slice, excluded: np.ndarray
     ) -> tuple[float, np.ndarray]:
         """See :meth:`Filter.best_straight`."""
+        self._require_images(steps.shape[-1])
         checks.require_shape('steps', steps, 'S images', 'int64')
-        self._require_images(steps.shape[1])
         checks.require_shape('excluded', excluded, 'k 2', 'int64')
         lowest, highest = min(steps[-1, 0], 0), max(steps[-1, -1], 0)
         if steps.min() < lowest or steps.max() > highest:

@@ -126,6 +126,7 @@ class CpuMatcher:
     def _prepare(self, W: int, spatial: SpatialSettings) -> None:
         self._spatial = spatial
         self._band, self._is_rigid = spatial.band(W), spatial.strategy == 'rigid'
+        self._aligns_strips = spatial.aligns_strips
         self._a = adaptive_weights(W, spatial, np.dtype(np.float32))
 
     def strips_of(self, places: np.ndarray) -> np.ndarray:
@@ -158,7 +159,7 @@ class CpuMatcher:
             dot.vertical_image_distances(
                 self._map, queries, self._cell_a, self._a, self._band, out
             )
-        elif self._spatial.aligns_strips:
+        elif self._aligns_strips:
             dot.image_distances(self._map, queries, self._a, self._band, self._is_rigid, out)
         else:
             for x in range(len(out)):
