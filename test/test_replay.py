@@ -30,9 +30,8 @@ from stavpr_ros.commands.replay import main
 from stavpr_ros.errors import SourceError, UnavailableError
 from stavpr_ros.ros import process
 from stavpr_ros.ros.messages import message_class, record_message
-from stavpr_ros.ros.playback import Playback
 from stavpr_ros.ros.qos import LATCHED
-from stavpr_ros.ros.replay import Replayer, ReplayOptions
+from stavpr_ros.ros.replay import Playback, Replayer, ReplayOptions
 from stavpr_ros.ros.subscriber_progress import MAX_BEHIND
 from stavpr_ros.sources.bag import BagSource
 from stavpr_ros.sources.bag_messages import list_topics, read_messages

@@ -13,20 +13,12 @@ from stavpr_ros.commands.program import lacking, suggestion, until_unread
 
 ROS_MODULES = ('rclpy', 'ament_index_python', 'stavpr_msgs')
 
-PACKAGES = {
-    'weights': 'stavpr_lab',
-    'export_model': 'stavpr_lab',
-    'build_descriptor_map': 'stavpr_lab',
-    'evaluate': 'stavpr_lab',
-    'experiments': 'stavpr_lab',
-    'demo': 'stavpr_lab',
-    'monitor': 'stavpr_lab',
-    'pose_graph': 'stavpr_slam',
-    'optimize_graph': 'stavpr_slam',
-    'bridge': 'stavpr_slam',
-    'teach': 'stavpr_nav',
-    'repeat': 'stavpr_nav',
+_BY_PACKAGE = {
+    'stavpr_lab': 'weights export_model build_descriptor_map evaluate experiments demo monitor',
+    'stavpr_slam': 'pose_graph optimize_graph bridge',
+    'stavpr_nav': 'teach repeat',
 }
+PACKAGES = {name: package for package, names in _BY_PACKAGE.items() for name in names.split()}
 """Packages of the commands that are not in this one, for the message where one is missing."""
 
 

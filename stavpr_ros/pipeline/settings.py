@@ -78,12 +78,8 @@ class PipelineSettings(RecognizerSettings):
                 f'direction = {self.direction} with operation {operation}: a route that grows is '
                 'recognized along it; take operation localization, or forward'
             )
-        if operation == 'loop_closure':
-            self._require_loop_closure()
-
-    def _require_loop_closure(self) -> None:
         least = least_limit(self.exclude_places, self.sequence.length)
-        if self.max_places < least:
+        if operation == 'loop_closure' and self.max_places < least:
             raise SettingsError(
                 f'max_places = {self.max_places} leaves too few beyond exclude_places = '
                 f'{self.exclude_places}: take at least {least}'
