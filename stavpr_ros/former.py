@@ -79,10 +79,10 @@ class _Former(MetaPathFinder, Loader):
         name = module.__name__
         warnings.warn(f'{name} is {METHOD} now', DeprecationWarning, stacklevel=2)
         method = importlib.import_module(METHOD)
-        vars(module).update({each: getattr(method, each) for each in method.__all__})
+        vars(module).update({name: getattr(method, name) for name in method.__all__})
 
 
 def forward() -> None:
     """Let former packages be imported."""
-    if not any(isinstance(each, _Former) for each in sys.meta_path):
+    if not any(isinstance(finder, _Former) for finder in sys.meta_path):
         sys.meta_path.append(_Former())

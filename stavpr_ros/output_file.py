@@ -152,8 +152,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         new = temporary / target.name
         try:
             yield new
-            for each in (*new.iterdir(), new):
-                sync_folder(each)
+            for entry in (*new.iterdir(), new):
+                sync_folder(entry)
             os.rename(new, target)  # fails where a file, or a folder with content, came meanwhile
             sync_folder(target.parent)
         finally:

@@ -458,10 +458,10 @@ def _drive(arguments: argparse.Namespace, place_map: 'Map') -> 'Iterator[Map]':
 def _log(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping.versions import versions
 
-    for each in versions(arguments.map):
-        when = _time(each.time * SECOND) if each.time else 'before the first update'
-        drive = f', {each.drive}' if each.drive else ''
-        lines = [f'{each.map_id}  {when}{drive}', *(f'    {text}' for text in each.changes)]
+    for version in versions(arguments.map):
+        when = _time(version.time * SECOND) if version.time else 'before the first update'
+        drive = f', {version.drive}' if version.drive else ''
+        lines = [f'{version.map_id}  {when}{drive}', *(f'    {text}' for text in version.changes)]
         print('\n'.join(map(printable, lines)))
 
 

@@ -42,7 +42,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
     def add_usage(self, usage: Any, actions: Any, groups: Any, prefix: str | None = None) -> None:
         """Leave out the options; argparse takes an empty prefix for the names of subcommands."""
         if prefix != '':
-            requirements = [each for each in actions if each.required or not each.option_strings]
+            requirements = [row for row in actions if row.required or not row.option_strings]
             actions = [*requirements, argparse.Action((), 'option', '?', metavar='OPTION ...')]
         super().add_usage(usage, actions, (), prefix)
 
@@ -63,7 +63,7 @@ class _Parser(argparse.ArgumentParser):
         options = [name for action in self._actions for name in action.option_strings]
         for word in self._arguments:
             name = word.partition('=')[0]
-            if name.startswith('--') and not any(each.startswith(name) for each in options):
+            if name.startswith('--') and not any(option.startswith(name) for option in options):
                 message += suggestion(name, options)
             for action in self._actions:
                 if f'invalid choice: {word!r}' in message:

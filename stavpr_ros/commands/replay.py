@@ -114,7 +114,7 @@ def _run(options: argparse.Namespace, ros_arguments: list[str]) -> int:
     ) as bar:
         prepare_transport()
         with ros_node(lambda: rclpy.create_node('stavpr_replay'), ros_arguments) as node:
-            names = (each.name for each in fields(ReplayOptions))
+            names = (field.name for field in fields(ReplayOptions))
             how = ReplayOptions(**{name: getattr(options, name) for name in names})
             replayer = Replayer(node, notify, how, others)
             with closing(replayer), ExitStack() as stack:
@@ -155,7 +155,9 @@ def _others(
             and name.strip('/') in {'', topic.name.strip('/')}
         ]
         if len(matches) != 1:
-            choices = ', '.join(f'{each.name} ({each.message_type})' for each in topics.values())
+            choices = ', '.join(
+                f'{topic.name} ({topic.message_type})' for topic in topics.values()
+            )
             raise SourceError(
                 f'{len(matches)} topics {name} {of_type} with messages in {source.path}: expected '
                 f'one of {choices}'

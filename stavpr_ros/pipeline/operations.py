@@ -171,8 +171,8 @@ class Operation(ABC):
 
     def take_drives(self) -> list[GrowingMap]:
         """Return the recorded drives, which belong to the caller now; another one begins."""
-        drives = [each for each in self.drives if len(each)]
-        self.drives = [each for each in self.drives if not len(each)]
+        drives = [drive for drive in self.drives if len(drive)]
+        self.drives = [drive for drive in self.drives if not len(drive)]
         if drives and not self.drives:
             self._begin_drive()
         return drives
@@ -202,9 +202,9 @@ class Operation(ABC):
         """Empty the window: the next images do not continue those before."""
         self._last = None
         self._window.clear()
-        for each in (self._keyframes, self._check, self.recognizer):
-            if each is not None:
-                each.reset()
+        for part in (self._keyframes, self._check, self.recognizer):
+            if part is not None:
+                part.reset()
 
     def process(
         self,
@@ -353,9 +353,9 @@ class Operation(ABC):
         if check is None or places is None:
             return match
         is_weighed = self.reference is not None and not math.isnan(match.probability)
-        late = [check.check(each, places, self._query(each), False) for each in match.late]
+        late = [check.check(row, places, self._query(row), False) for row in match.late]
         match = check.check(match, places, self._query(match), is_weighed)
-        return replace(match, late=tuple(each for each in late if each.accepted))
+        return replace(match, late=tuple(row for row in late if row.accepted))
 
     def _query(self, match: Match) -> np.ndarray | None:
         """Return the thumbnail of the image that a match is of; None = unknown."""
@@ -550,7 +550,7 @@ class RouteCloser(Operation):
         return match, self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
 
 
-CLASSES = {each.name: each for each in (LocalizationOperation, Mapper, RouteCloser)}
+CLASSES = {operation.name: operation for operation in (LocalizationOperation, Mapper, RouteCloser)}
 if not TYPE_CHECKING:
     __getattr__ = former.classes(__name__)
 

@@ -185,8 +185,10 @@ class Pipeline:
         self.operation = CLASSES[name](settings, place_map, extractor, own)
         # in mapping, it is part of the growing map
         self._map, self._map_save_state = None if name == 'mapping' else place_map, state
-        for each in before - {own, state}:
-            each.close_journal(delete=False)  # its places were discarded, but may be recovered
+        for old_state in before - {own, state}:
+            old_state.close_journal(
+                delete=False
+            )  # its places were discarded, but may be recovered
 
     def _require_no_loss(self, name: str, loaded: LoadedMap | None) -> None:
         """Reject the loss of unsaved places; loading a map in localization discards them."""

@@ -221,4 +221,5 @@ def node_settings(values: Mapping[str, Any]) -> NodeSettings:
 
 def _parameters_of(settings: type, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values of the parameters that are fields of these settings."""
-    return {each.name: values[each.name] for each in fields(settings) if each.name in values}
+    names = (row.name for row in fields(settings))
+    return {name: values[name] for name in names if name in values}

@@ -236,8 +236,8 @@ class StampWatch:
         guess = intervals[len(intervals) // 5]
         if interval < 1.1 * guess:  # the period is at least three quarters of it
             return 0
-        period = median(each / max(round(each / guess), 1) for each in intervals)
-        multiples = [each / period for each in intervals]
+        period = median(pause / max(round(pause / guess), 1) for pause in intervals)
+        multiples = [pause / period for pause in intervals]
         near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)
         if near < REGULAR * len(multiples) or interval > LONGEST_LOSS * period:
             return 0

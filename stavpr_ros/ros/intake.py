@@ -112,8 +112,8 @@ class Intake:
             fields['odometry'] = odometry.freshness()
         if camera is not None:
             fields['camera'] = camera.state
-        inputs = (each for each in (images, odometry, camera) if each is not None)
-        return fields | {'oddities': tuple(text for each in inputs for text in each.oddities())}
+        inputs = [part for part in (images, odometry, camera) if part is not None]
+        return fields | {'oddities': tuple(text for part in inputs for text in part.oddities())}
 
     def follow_odometry(self, settings: NodeSettings, places: Places) -> None:
         """Subscribe to odometry while it is needed."""

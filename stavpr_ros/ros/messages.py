@@ -139,7 +139,7 @@ def filled(message: Message, *sources: object, **fields: Any) -> Message:
     for name in message.get_fields_and_field_types():  # type: ignore[attr-defined]
         if name in fields:
             setattr(message, name, fields[name])
-        elif (source := next((each for each in sources if hasattr(each, name)), None)) is not None:
+        elif (source := next((row for row in sources if hasattr(row, name)), None)) is not None:
             setattr(message, name, getattr(source, name))
     return message
 

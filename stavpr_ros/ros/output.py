@@ -64,7 +64,7 @@ class Publishers:
         """Return whether one of these topics has a subscriber; not after the shutdown of ROS."""
         requested = False
         with until_shutdown(self._node):
-            requested = any(each.get_subscription_count() for each in publishers)
+            requested = any(publisher.get_subscription_count() for publisher in publishers)
         return requested
 
 

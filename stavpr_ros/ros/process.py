@@ -99,7 +99,7 @@ def own_arguments(arguments: Sequence[str]) -> list[str]:
 
 def _texts(arguments: Sequence[str]) -> list[str]:
     """Return arguments as ROS takes them; bytes that are no UTF-8 are replaced."""
-    return [each.encode(errors='surrogateescape').decode(errors='replace') for each in arguments]
+    return [word.encode(errors='surrogateescape').decode(errors='replace') for word in arguments]
 
 
 @contextmanager

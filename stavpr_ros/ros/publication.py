@@ -50,8 +50,8 @@ class Publication:
         """Publish the outcome of an image; return it with the edge of its match."""
         edge, closures = self.edges.prepare(outcome, self._operation())
         outcome = replace(outcome, edge=edge)
-        for each in self.all:
-            each.publish(outcome)
+        for publishers in self.all:
+            publishers.publish(outcome)
         for closure in closures:
             self.edges.put(closure)
         return outcome
@@ -64,8 +64,8 @@ class Publication:
 
     def reset(self) -> None:
         """Let nothing before the next image count: the window was emptied."""
-        for each in self.all:
-            each.reset()
+        for publishers in self.all:
+            publishers.reset()
 
     def forget(self) -> None:
         """Let nothing before count: the node is deactivated."""
@@ -74,5 +74,5 @@ class Publication:
 
     def close(self) -> None:
         """Destroy the publishers."""
-        for each in self.all:
-            each.close()
+        for publishers in self.all:
+            publishers.close()

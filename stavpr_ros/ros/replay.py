@@ -227,7 +227,7 @@ class Replayer:
         """
         timeout = self.options.timeout
         if not self._spin_until(
-            lambda: all(each.wait_for_all_acked(Duration()) for each in self._publishers), timeout
+            lambda: all(p.wait_for_all_acked(Duration()) for p in self._publishers), timeout
         ):
             raise NoResultError(
                 f'the last images on {self.publisher.topic_name} are not acknowledged after '
@@ -281,8 +281,8 @@ class Replayer:
         """Return the subscriptions to our topics and the publishers of results."""
         endpoints = [
             info
-            for each in self._publishers
-            for info in self.node.get_subscriptions_info_by_topic(each.topic_name)
+            for publisher in self._publishers
+            for info in self.node.get_subscriptions_info_by_topic(publisher.topic_name)
         ]
         if self.options.lossless:
             endpoints += self.node.get_publishers_info_by_topic(self._match_topic)

@@ -174,10 +174,9 @@ class Visualization(Publishers):
             lines.points = [point for a, b, _ in self._lines for point in (a, b)]
             lines.colors = [shade for *_, shade in self._lines for _ in range(2)]
         if places is not None:
-            best = [(match.newest, match.probability, 0.8)] if match.accepted else []
-            for place, probability, size in best + [
-                (each.place, each.probability, 0.4) for each in outcome.result.candidates
-            ]:
+            balls = [(match.newest, match.probability, 0.8)] if match.accepted else []
+            balls += [(row.place, row.probability, 0.4) for row in outcome.result.candidates]
+            for place, probability, size in balls:
                 if (pose := places.place(place).pose) is not None:
                     ball = add(Marker.SPHERE, color=color(probability))
                     ball.pose.position = _point(pose)
