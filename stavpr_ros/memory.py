@@ -12,12 +12,12 @@ CACHE_LINE = 64  # bytes
 
 def aligned_empty(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
     """Return an array whose content is undefined."""
-    return _aligned(np.empty, shape, dtype)
+    return _allocate(np.empty, shape, dtype)
 
 
 def aligned_zeros(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> np.ndarray:
     """Return an array of zeros; pages that are not written take no memory."""
-    return _aligned(np.zeros, shape, dtype)
+    return _allocate(np.zeros, shape, dtype)
 
 
 def is_aligned(array: np.ndarray) -> bool:
@@ -25,7 +25,7 @@ def is_aligned(array: np.ndarray) -> bool:
     return array.ctypes.data % CACHE_LINE == 0
 
 
-def _aligned(allocate, shape, dtype):  # type: ignore[no-untyped-def]
+def _allocate(allocate, shape, dtype):  # type: ignore[no-untyped-def]
     size = math.prod(shape) * np.dtype(dtype).itemsize
     block = allocate(size + CACHE_LINE, np.uint8)
     first = -block.__array_interface__['data'][0] % CACHE_LINE  # faster than block.ctypes

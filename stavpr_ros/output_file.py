@@ -114,7 +114,7 @@ def atomic_output(path: str | Path, kind: FileKind, force: Force = False) -> Ite
     :raises OutputTakenError: the file exists, unless it may be replaced, or is being written.
     :raises OutputError: it cannot be written; what was there is untouched.
     """
-    with explained(path):
+    with explain(path):
         file = AtomicFile(path, kind, force)
         try:
             yield file
@@ -142,7 +142,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     :raises OutputError: it cannot be written.
     """
     target = Path(os.path.abspath(path))
-    with explained(path):
+    with explain(path):
         require_room(target.parent / f'{target.name}.new')
         if os.path.lexists(target):
             raise OutputTakenError(
@@ -192,7 +192,7 @@ def require_replaceable(path: str | Path, kind: FileKind, force: Force = False) 
     require_room(target)
     if not os.path.lexists(target):
         return
-    with explained(path):
+    with explain(path):
         mode = os.stat(target).st_mode
         if not stat.S_ISREG(mode):
             raise OutputTakenError(f'{path} exists and is no regular file: it is never replaced')
@@ -265,7 +265,7 @@ def _is_at(path: Path, file: int) -> bool:
     return False
 
 
-def numbered(path: str | Path) -> Iterator[Path]:
+def numbered_names(path: str | Path) -> Iterator[Path]:
     """Yield a path and the numbered names beside it: route.stavpr, route-2.stavpr ..."""
     path = Path(path)
     yield path
@@ -290,7 +290,7 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def explained(path: str | Path) -> Iterator[None]:
+def explain(path: str | Path) -> Iterator[None]:
     """
     Turn an error of the operating system into one that names the file that is being written.
 

@@ -46,14 +46,14 @@ def run_until_signal(run: Callable[[], int]) -> int:
     try:
         code = run()
     except BaseException:  # an interrupt inside a foreign library may be raised as another one
-        if not interrupted():
+        if not was_interrupted():
             raise
-    if interrupted():
+    if was_interrupted():
         end_process(code)
     return code
 
 
-def interrupted() -> bool:
+def was_interrupted() -> bool:
     """Return whether a signal was received."""
     return _State.received
 

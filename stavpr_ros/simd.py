@@ -106,7 +106,7 @@ def load_thirds(typing: Any, array: Any, offset: Any) -> Any:
         kind = ir.VectorType(ir.IntType(8), 3 * LANES).as_pointer()
         pixels = builder.load(builder.bitcast(builder.gep(data, [arguments[1]]), kind), align=1)
         masks = [range(first, 3 * LANES, 3) for first in range(3)]
-        parts = [_shuffled(builder, pixels, pixels, mask) for mask in masks]
+        parts = [_shuffle(builder, pixels, pixels, mask) for mask in masks]
         wide = [builder.zext(part, ir.VectorType(ir.IntType(32), LANES)) for part in parts]
         return context.make_tuple(builder, signature.return_type, wide)
 
@@ -134,7 +134,7 @@ def transpose(
         mixed = [[i // 2 + i % 2 * LANES + low for i in range(LANES)] for low in (0, half)]
         for _ in range(LANES.bit_length() - 1):
             pairs = zip(rows[:half], rows[half:], strict=True)
-            rows = [_shuffled(builder, a, b, mask) for a, b in pairs for mask in mixed]
+            rows = [_shuffle(builder, a, b, mask) for a, b in pairs for mask in mixed]
         for i in range(LANES):
             builder.store(rows[i], row(3, i), align=4)
         return context.get_dummy_value()
@@ -143,7 +143,7 @@ def transpose(
     return types.void(source, size, size, target, size, size), generate
 
 
-def _shuffled(builder: Any, a: Any, b: Any, lanes: Any) -> Any:
+def _shuffle(builder: Any, a: Any, b: Any, lanes: Any) -> Any:
     mask = ir.Constant(ir.VectorType(ir.IntType(32), LANES), list(lanes))
     return builder.shuffle_vector(a, b, mask)
 
@@ -162,7 +162,7 @@ def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
 
         def half(pair: Any, is_upper: bool) -> Any:
             taken = [i for i in range(2 * LANES) if (2 * (i % width) >= width) == is_upper]
-            return _shuffled(builder, pair[0], pair[1], taken)
+            return _shuffle(builder, pair[0], pair[1], taken)
 
         while width > 1:
             parts += parts[-1:] * (len(parts) % 2)
@@ -179,7 +179,7 @@ def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
 def _on_all_lanes(builder: Any, number: Any) -> Any:
     empty = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
     first = builder.insert_element(empty, number, ir.Constant(ir.IntType(32), 0))
-    return _shuffled(builder, first, first, [0] * LANES)
+    return _shuffle(builder, first, first, [0] * LANES)
 
 
 @intrinsic

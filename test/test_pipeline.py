@@ -327,7 +327,7 @@ def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline.change(operation='loop_closure')
     process(pipeline, route[:8])
     assert pipeline.places.features.strips.shape == (7, 8, 64)
-    assert not pipeline.save_state.owned(map_file)
+    assert not pipeline.save_state.own_version(map_file)
 
 
 CERTAIN = 7  # images after which the place is probable, in loop closure, too

@@ -119,7 +119,8 @@ def test_write_map_keeps_the_state_of_a_map_loaded_meanwhile(another, mapping, m
 
     write_map(mapping, on_worker, path, overwrite=False)
     assert (mapping.unsaved, mapping.save_state.path) == (0, map_file if another else path)
-    assert mapping.save_state.owned(map_file) == (FileVersion.of(map_file) if another else False)
+    version = FileVersion.of(map_file) if another else False
+    assert mapping.save_state.own_version(map_file) == version
 
 
 def test_mark_saved_in_any_order_counts_the_places_of_each_snapshot(mapping, route, tmp_path):

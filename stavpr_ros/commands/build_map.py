@@ -276,7 +276,7 @@ def _source_of(arguments: argparse.Namespace) -> str:
     return json.dumps({name: options[name] for name in sorted(decisive)})
 
 
-def _suggested(place_map: 'Map', arguments: argparse.Namespace) -> 'float | None':
+def _suggest_threshold(place_map: 'Map', arguments: argparse.Namespace) -> 'float | None':
     """Return the threshold of mode paper for a map, None = unknown; print the reason."""
     from stavpr_ros.errors import InputError
     from stavpr_ros.maintenance.threshold import suggest_threshold
@@ -339,7 +339,7 @@ def main(args: list[str] | None = None) -> int:
 
         state = 'nothing was written; the same command continues the work'
         place_map, journal = _build(arguments)
-        place_map = replace(place_map, threshold=_suggested(place_map, arguments))
+        place_map = replace(place_map, threshold=_suggest_threshold(place_map, arguments))
         if len(place_map) <= MAX_SUGGESTED:
             place_map = with_seam(place_map)
         statistics = statistics_of_map(place_map)

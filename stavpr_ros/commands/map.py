@@ -295,7 +295,7 @@ def _verify(arguments: argparse.Namespace) -> int:
     return 1 if bad else 0
 
 
-def _verified(path: str) -> 'Map':
+def _open_verified(path: str) -> 'Map':
     """Open a map, and compare all of it with its hashes."""
     from stavpr_ros.mapping import open_map, verify_map
 
@@ -311,7 +311,7 @@ def _compact(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping.reduction import with_principal_components
     from stavpr_ros.mapping.stored_features import StoredFeatures
 
-    place_map = _verified(arguments.map)
+    place_map = _open_verified(arguments.map)
     assert isinstance(place_map.features, StoredFeatures)
     storage, n = place_map.features.storage, len(place_map)
     if arguments.drop_duplicates:
@@ -334,7 +334,7 @@ def _merge(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import merge_maps
     from stavpr_ros.sources.folder import text_of
 
-    maps = [_verified(path) for path in arguments.maps]
+    maps = [_open_verified(path) for path in arguments.maps]
     if arguments.align:
         align = _tool('align')
         maps[1:] = [align(place_map, maps[0]) for place_map in maps[1:]]
@@ -360,14 +360,14 @@ def _camera(text: str) -> tuple[str, float | None]:
 def _sessions(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping import select_session
 
-    place_map, keep = _verified(arguments.map), arguments.keep is not None
+    place_map, keep = _open_verified(arguments.map), arguments.keep is not None
     _write(select_session(place_map, arguments.keep or arguments.remove, keep), arguments)
 
 
 def _close(arguments: argparse.Namespace) -> None:
     from stavpr_ros.maintenance.same_places import with_seam
 
-    place_map = with_seam(_verified(arguments.map), is_closed=True)
+    place_map = with_seam(_open_verified(arguments.map), is_closed=True)
     say(f'the last place shows place {place_map.seam}')
     _write(place_map, arguments)
 
@@ -414,7 +414,7 @@ def _update(arguments: argparse.Namespace) -> None:
     from stavpr_ros.output_file import FileVersion
     from stavpr_ros.sources.folder import text_of
 
-    opened, place_map = FileVersion.of(arguments.map), _verified(arguments.map)
+    opened, place_map = FileVersion.of(arguments.map), _open_verified(arguments.map)
     name = text_of(Path(arguments.drive).stem)[:40]
     with _drive(arguments, place_map) as drive:
         version = update_file(arguments.map, opened, place_map, drive, name)
@@ -476,7 +476,7 @@ def _upload(arguments: argparse.Namespace) -> None:
     from stavpr_ros.mapping.stores import store_of
 
     store = store_of(arguments.address)
-    place_map = _verified(arguments.map)
+    place_map = _open_verified(arguments.map)
     store.upload(place_map, arguments.address, arguments.force)
     say(f'{arguments.address}: {len(place_map)} places')
 

@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 
 from stavpr_ros.errors import printable, SettingsError, StavprError, UnavailableError
 from stavpr_ros.parameters import BY_NAME
-from stavpr_ros.signals import interrupted, obey_signals, run_until_signal
+from stavpr_ros.signals import obey_signals, run_until_signal, was_interrupted
 from stavpr_ros.threads import wait_passively
 
 DONE, FAILED, BAD_USAGE, INTERRUPTED, UNREAD = 0, 1, 2, 130, 141
@@ -191,7 +191,7 @@ def run_program(
         return FAILED
     except BaseException as error:
         # an interrupt within a foreign library comes out as another exception
-        if isinstance(error, KeyboardInterrupt) or interrupted():
+        if isinstance(error, KeyboardInterrupt) or was_interrupted():
             say(f'{name}: {interruption()}', sys.stderr)
             return INTERRUPTED
         if not isinstance(error, OSError):

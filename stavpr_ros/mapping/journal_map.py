@@ -18,7 +18,7 @@ from stavpr_ros.mapping.map_container import MapFile, Part
 from stavpr_ros.mapping.map_file import load_map, open_map, save_map
 from stavpr_ros.mapping.place_map import Map, Session
 from stavpr_ros.mapping.stored_features import StoredFeatures, StoredThumbnails
-from stavpr_ros.output_file import explained, FileVersion, numbered, write_at
+from stavpr_ros.output_file import explain, FileVersion, numbered_names, write_at
 
 DAMAGED = '.damaged'  # suffix of journals that were not read to their end
 
@@ -32,7 +32,7 @@ def journal_map(path: Path) -> Map:
     :raises JournalError: no journal, one without places, or a damaged one.
     :raises OutputError: there is no room.
     """
-    with explained(path), JournalReader(path) as reader:
+    with explain(path), JournalReader(path) as reader:
         place_map = _recorded(reader, path.parent)
     if reader.problem:
         raise JournalError(f'{path} is damaged: {reader.problem}')
@@ -132,7 +132,7 @@ def recover(
     """
     journal, problems = Path(journal), []
     target = Path(output or journal.with_name(journal.name.removesuffix(SUFFIX)))
-    with explained(target), JournalReader(journal) as reader:
+    with explain(target), JournalReader(journal) as reader:
         place_map = _recorded(reader, target.parent)
         base, problem = _base_map(reader.base)
         if base is not None:
@@ -145,7 +145,7 @@ def recover(
         if problem:
             problems.append(f'{target} lacks the map that the recording continued: {problem}')
         if reader.problem:
-            names = numbered(journal.with_name(journal.name + DAMAGED))
+            names = numbered_names(journal.with_name(journal.name + DAMAGED))
             damaged = journal.rename(next(path for path in names if not path.exists()))
             problems.append(f'{target} may lack places: {reader.problem}; {damaged} is kept')
         else:
@@ -191,7 +191,7 @@ def _continued(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, 
 
 def _save_beside(place_map: Map, target: Path) -> Path:
     """Save a map under a name that is free, or that is of an earlier state of it."""
-    for path in numbered(target):
+    for path in numbered_names(target):
         version = FileVersion.of(path)
         force = version if version and _begins(path, place_map) else False
         with suppress(OutputTakenError):

@@ -16,7 +16,7 @@ from stavpr_ros.errors import JournalError, OutputError
 from stavpr_ros.mapping.journal import Base, frame, header, JournalPlace, JournalReader, SUFFIX
 from stavpr_ros.mapping.map_file import save_map
 from stavpr_ros.mapping.place_map import Map
-from stavpr_ros.output_file import create_temporary, explained, numbered, sync_folder, write_at
+from stavpr_ros.output_file import create_temporary, explain, numbered_names, sync_folder, write_at
 
 SYNC_PERIOD = 1.0  # seconds between syncs, and between attempts after an error
 WAITING = 2**28  # most bytes that wait for room on the disk
@@ -108,7 +108,7 @@ class JournalWriter:
             last = place.number
         begin = partial(header, template=reader.template_content, source=reader.source)
         head = begin(reader.base)
-        with explained(reader.path):
+        with explain(reader.path):
             file = os.open(reader.path, os.O_RDWR | os.O_CLOEXEC)
             reader.close()
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -243,7 +243,7 @@ class JournalWriter:
 def _create(target: Path, head: bytes) -> tuple[Path, int]:
     """Begin and lock the journal of a file, or of the first numbered name that has none."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    for path in numbered(target):
+    for path in numbered_names(target):
         journal = path.with_name(path.name + SUFFIX)
         with suppress(FileExistsError):
             file = os.open(journal, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)

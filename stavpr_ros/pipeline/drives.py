@@ -21,7 +21,7 @@ from stavpr_ros.maintenance.upkeep import update_file
 from stavpr_ros.mapping import load_map, Map, open_map, save_map
 from stavpr_ros.mapping.journal_map import DAMAGED
 from stavpr_ros.mapping.versions import history_of, versions
-from stavpr_ros.output_file import explained, FileVersion, numbered
+from stavpr_ros.output_file import explain, FileVersion, numbered_names
 from stavpr_ros.pipeline.operations import Operation
 from stavpr_ros.units import DATED, SECOND
 
@@ -57,7 +57,7 @@ def take_up_drives(path: str, log: 'Logger | Any', on_update: Callable[[], objec
     places, folder = 0, _folder(path)
     if not folder.is_dir():
         return places
-    with explained(folder), (folder / LOCK).open('w') as lock:
+    with explain(folder), (folder / LOCK).open('w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # until no other program, or thread, updates the map
         files = sorted(folder.glob('*.stavpr'), key=lambda file: file.stem)
         if files:
@@ -90,14 +90,14 @@ def _folder(path: str) -> Path:
 def _write(path: str, drive: Map) -> None:
     """Write a drive under a name that no other drive of the map has."""
     folder, names = _folder(path), set()
-    with explained(folder):
+    with explain(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with suppress(MapFileError):
         names = {version.drive for version in versions(path)}
     start = int(drive.stamps[0])  # the drive of a simulation is named by the present time
     seconds = start / SECOND if start >= DATED else time.time()
     name = time.strftime('drive %Y-%m-%d %H-%M-%S.stavpr', time.gmtime(seconds))
-    for file in numbered(folder / name):
+    for file in numbered_names(folder / name):
         if file.stem not in names:
             with suppress(OutputTakenError):
                 save_map(drive, file)

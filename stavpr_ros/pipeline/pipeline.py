@@ -36,14 +36,14 @@ def read_map(path: str, settings: PipelineSettings) -> LoadedMap:
     :raises StavprError: an invalid file, or a missing model.
     """
     if os.path.isdir(path):
-        place_map = _joined(Path(path))
+        place_map = _join_maps(Path(path))
     else:
         place_map = store_of(path).open_map(path) if is_address(path) else open_map(path)
     extractor = place_map.extractor(settings.extraction_device, settings.model_path)
     return LoadedMap(path, place_map, extractor)
 
 
-def _joined(folder: Path) -> Map:
+def _join_maps(folder: Path) -> Map:
     """Return the maps of a folder as one."""
     files = sorted(folder.glob('*.stavpr'))
     if not files:

@@ -49,7 +49,7 @@ class SaveState:
         """Remember a file that contains this map now."""
         self._files[os.path.abspath(path)] = FileVersion.of(path)
 
-    def owned(self, path: str) -> Force:
+    def own_version(self, path: str) -> Force:
         """Return the version of a file that contains this map, or did, and may be replaced."""
         return self._files.get(os.path.abspath(path)) or False
 

@@ -12,7 +12,7 @@ from stavpr_ros.mapping import Map, save_map
 from stavpr_ros.mapping.journal import Base
 from stavpr_ros.mapping.journal_map import journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
-from stavpr_ros.output_file import Force, MAP, numbered, require_replaceable
+from stavpr_ros.output_file import Force, MAP, numbered_names, require_replaceable
 from stavpr_ros.pipeline.drives import OnWorker, take_up_drives, write_drives
 from stavpr_ros.pipeline.pipeline import Pipeline
 from stavpr_ros.prepare.prepared_map import statistics_of_map
@@ -148,9 +148,9 @@ def close_journals(pipeline: Pipeline, delete_route: bool, log: 'Logger | Any') 
 
 def _write_beside(pipeline: Pipeline, on_worker: OnWorker, path: str) -> tuple[int, str]:
     """Write the map to the path, or the first numbered name that is free or of this map."""
-    for name in map(str, numbered(path)):
+    for name in map(str, numbered_names(path)):
         try:
-            overwrite = pipeline.save_state.owned(name)
+            overwrite = pipeline.save_state.own_version(name)
             return write_map(pipeline, on_worker, name, overwrite), name
         except OutputTakenError:
             continue

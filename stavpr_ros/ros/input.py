@@ -165,7 +165,7 @@ class ImageInput:
                 return
             arrival = time.monotonic()
             self._statistics.add_image()
-            message = self._decoded(message)
+            message = self._decode(message)
             stamp = nanoseconds(message.header.stamp)
             self._watch.add(stamp, round(arrival * SECOND), source_of(message))
             ahead, missing = self.stamps.update(stamp)
@@ -178,7 +178,7 @@ class ImageInput:
             else:
                 self._enqueue(message, arrival)
 
-    def _decoded(self, message: Any) -> Any:
+    def _decode(self, message: Any) -> Any:
         """Return the image of a packet of video, on which later ones depend; else the message."""
         if not (self._is_video or is_packet(message)):
             return message

@@ -129,7 +129,7 @@ class Outcome:
         return turned(self.newest.pose, self.result.relative_yaw)
 
 
-def filled(message: Message, *sources: object, **fields: Any) -> Message:
+def fill(message: Message, *sources: object, **fields: Any) -> Message:
     """
     Set the fields of a message, and return it.
 
@@ -169,7 +169,7 @@ def match_message(outcome: Outcome) -> PlaceMatch:
     header, match, places = outcome.header, outcome.match, outcome.places
     path, stamps = match.path, match.window_stamps
     middle = (len(stamps) - 1) // 2
-    message = filled(
+    message = fill(
         copy(_NO_MATCH),
         match,
         outcome,
@@ -191,7 +191,7 @@ def match_message(outcome: Outcome) -> PlaceMatch:
     if (newest := outcome.newest) is None or places is None:
         return message
     session = places.session(match.place) if isinstance(places, Map) else None
-    filled(
+    fill(
         message,
         **_names(places.place(match.place)),
         camera='' if session is None else session.camera,
@@ -200,12 +200,12 @@ def match_message(outcome: Outcome) -> PlaceMatch:
     )
     if (edge := outcome.edge) is not None:
         message.has_relative_pose = edge.has_pose
-        pair = _aligned(match, places, middle, match.place)
+        pair = _align(match, places, middle, match.place)
         message.relative_pose = relative_pose_message(edge, pair, outcome.about.child)
     return message
 
 
-def _aligned(match: Match, places: Map | GrowingMap, query: int, place: int) -> AlignedPlaces:
+def _align(match: Match, places: Map | GrowingMap, query: int, place: int) -> AlignedPlaces:
     """Return an image of the window with a place; on a route, the image is a place as well."""
     first = match.first_image
     stamp = places.place(first + query).stamp if first >= 0 else match.window_stamps[query]
@@ -230,7 +230,7 @@ def candidates_message(outcome: Outcome) -> PlaceCandidates | None:
     if not result.candidates or places is None:
         return None
     candidates = [
-        filled(
+        fill(
             PlaceCandidate(),
             candidate,
             place_index=candidate.place,
@@ -238,7 +238,7 @@ def candidates_message(outcome: Outcome) -> PlaceCandidates | None:
         )
         for candidate in result.candidates
     ]
-    return filled(
+    return fill(
         PlaceCandidates(), outcome, result.match,
         candidates=candidates, session_probabilities=list(result.session_probabilities),
     )  # fmt: skip
@@ -263,16 +263,16 @@ def loop_closure_message(
     header, place, is_route = outcome.header, places.place(match.place), match.first_image >= 0
     if match.is_late:  # its window may be an earlier one
         header = Header(frame_id=header.frame_id, stamp=time_message(match.window_stamps[-1]))
-    message = filled(
+    message = fill(
         LoopClosure(),
-        _aligned(match, places, match.position, match.place),
+        _align(match, places, match.position, match.place),
         match,
         outcome,
         header=header,
         query_session=outcome.robot_id,
         place_session=outcome.robot_id if is_route else place.session,
         relative_pose=NO_EDGE,
-        pairs=[_aligned(match, places, q, m) for q, m in match.path.pairs.tolist()],
+        pairs=[_align(match, places, q, m) for q, m in match.path.pairs.tolist()],
     )
     if is_route:
         query_pose = places.place(match.first_image + match.position).pose
@@ -292,7 +292,7 @@ def relative_pose_message(
     if edge.has_pose or edge.pose[6] != 1:  # the mountings may turn one without a pose
         covariance = edge.covariance.ravel()
         pose = PoseWithCovariance(pose=pose_message(edge.pose), covariance=covariance)
-    return filled(
+    return fill(
         copy(NO_EDGE), edge, pair,
         frame=frame, pose=pose, is_independent=edge.independent, reprojection_error=edge.error,
     )  # fmt: skip
@@ -347,7 +347,7 @@ def record_message(record: ImageRecord) -> Image:
     data.frombytes(memoryview(record.data).cast('B'))
     header = Header(stamp=time_message(record.stamp_ns), frame_id=record.frame_id)
     is_bigendian = int(record.is_bigendian)
-    return filled(Image(), record, header=header, is_bigendian=is_bigendian, data=data)
+    return fill(Image(), record, header=header, is_bigendian=is_bigendian, data=data)
 
 
 def odometry_pose(message: Odometry) -> np.ndarray:
@@ -401,7 +401,7 @@ def map_info_message(pipeline: Pipeline, robot_id: str, stamp: Time) -> MapInfo:
     )
     if operation.extractor is not None:
         settings = operation.extractor.settings
-        filled(message, settings, features=settings.kind, settings=settings.to_json())
+        fill(message, settings, features=settings.kind, settings=settings.to_json())
         message.projected = settings.projection is not None
     if places is not None:
         message.map_id, message.places = places.map_id, len(places)

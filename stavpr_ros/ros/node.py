@@ -26,12 +26,12 @@ from stavpr_ros.pipeline.statistics import Statistics
 from stavpr_ros.ros.diagnostics import DiagnosticsPublisher
 from stavpr_ros.ros.health import Health, INVALID
 from stavpr_ros.ros.parameters import (
+    convert_type,
     declare_parameters,
     inside_maps_folder,
-    renamed,
+    renaming_warning,
     require_changeable,
     require_writable,
-    typed,
     unknown_parameters,
 )
 from stavpr_ros.ros.qos import LATCHED
@@ -74,7 +74,7 @@ class PlaceRecognitionNode(ManagedNode):
         self._map_info: MapInfo | None = None  # the last one
         self._info_publisher = self.create_publisher(MapInfo, '~/map_info', LATCHED)
         self._info_lock = threading.RLock()
-        self._served = Services(self, lambda: self.runtime, self.load_map, self.set_operation)
+        Services(self, lambda: self.runtime, self.load_map, self.set_operation)
         self.add_on_set_parameters_callback(self._validate_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         backwards = JumpThreshold(
@@ -225,7 +225,7 @@ class PlaceRecognitionNode(ManagedNode):
         """Set parameters, all or none, one thread at a time."""
         for i, row in enumerate(parameters):
             if row.name in RENAMED:
-                self.get_logger().warning(renamed(row.name))
+                self.get_logger().warning(renaming_warning(row.name))
                 parameters = [*parameters]
                 parameters[i] = Parameter(RENAMED[row.name], value=row.value)
         try:
@@ -233,10 +233,10 @@ class PlaceRecognitionNode(ManagedNode):
                 raise SettingsError('; '.join(unknown))
             with self._lock:
                 folder = self.settings.maps_path
-                rows = [inside_maps_folder(typed(row), self, folder) for row in parameters]
+                rows = [inside_maps_folder(convert_type(row), self, folder) for row in parameters]
                 return super().set_parameters_atomically(rows)
         except SettingsError as error:
-            return self._rejected(error)
+            return self._reject(error)
 
     def load_map(self, path: str, verify: bool = False) -> None:
         """
@@ -276,10 +276,10 @@ class PlaceRecognitionNode(ManagedNode):
                 with self._lock:
                     self._require_valid(changes)
         except StavprError as error:
-            return self._rejected(error)
+            return self._reject(error)
         return SetParametersResult(successful=True)
 
-    def _rejected(self, error: StavprError) -> SetParametersResult:
+    def _reject(self, error: StavprError) -> SetParametersResult:
         self.get_logger().error(f'parameters rejected: {error}')
         return SetParametersResult(successful=False, reason=str(error))
 

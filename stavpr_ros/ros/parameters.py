@@ -47,7 +47,7 @@ def descriptor(row: NodeParameter) -> ParameterDescriptor:
     return result
 
 
-def typed(parameter: Parameter) -> Parameter:
+def convert_type(parameter: Parameter) -> Parameter:
     """
     Return a parameter with the type of its row; rclpy rejects an integer in place of a double.
 
@@ -79,7 +79,7 @@ def declare_parameters(node: ManagedNode) -> dict[str, Any]:
     overrides = {RENAMED[name]: row for name, row in given.items() if name in RENAMED} | given
     values = {}
     for row in PARAMETERS:
-        value = typed(overrides[row.name]).value if row.name in overrides else row.default
+        value = convert_type(overrides[row.name]).value if row.name in overrides else row.default
         node.declare_parameter(row.name, value, descriptor(row), ignore_override=True)
         values[row.name] = value
     return values
@@ -92,7 +92,7 @@ def unknown_parameters(names: Iterable[str]) -> list[str]:
         if name in BY_NAME or name.startswith(_RCLPY_PARAMETERS):
             continue
         if name in RENAMED:
-            warnings.append(renamed(name))
+            warnings.append(renaming_warning(name))
             continue
         if name in REMOVED:
             warnings.append(f'parameter {name!r} was removed in 1.0: {REMOVED[name]}')
@@ -103,7 +103,7 @@ def unknown_parameters(names: Iterable[str]) -> list[str]:
     return warnings
 
 
-def renamed(name: str) -> str:
+def renaming_warning(name: str) -> str:
     """Return the warning of an earlier name."""
     return f'parameter {name!r} is {RENAMED[name]} now: the earlier name is accepted until 1.1'
 

@@ -33,7 +33,7 @@ from stavpr_ros.ros.rclpy_workarounds import (
     ros_arguments_checked,
     with_log_files,
 )
-from stavpr_ros.signals import end_process, interrupted, signals_deferred, time_left
+from stavpr_ros.signals import end_process, signals_deferred, time_left, was_interrupted
 
 SIGNAL_POLL = 0.2  # seconds until a signal is noticed by an executor that it does not wake
 LONG_POLL = 2.0  # seconds, by one that it wakes: each poll collects all entities of the node
@@ -127,7 +127,7 @@ def ros_node(make: Callable[[], AnyNode], arguments: Sequence[str] | None) -> It
             left_behind = getattr(node, 'left_behind', False)
     finally:
         rclpy.try_shutdown()
-        if left_behind and interrupted():
+        if left_behind and was_interrupted():
             end_process(int(getattr(node, 'failed', False)))
 
 
@@ -185,7 +185,7 @@ def spin_until(node: Node, is_done: Callable[[], bool] = lambda: False, threads:
                 except (StavprError, ExternalShutdownException):
                     raise
                 except Exception:
-                    if interrupted():  # inside a foreign library it may be raised as another error
+                    if was_interrupted():  # a foreign library may raise it as another error
                         raise
                     log_failure(traceback.format_exc())
     except ExternalShutdownException:
@@ -243,7 +243,7 @@ def run_node(
         get_logger('stavpr').fatal(f'cannot start: {error}')
         return 1
     except BaseException:  # an interrupt inside a foreign library may be raised as another one
-        if not interrupted():
+        if not was_interrupted():
             raise
     return int(getattr(node, 'failed', False))
 

@@ -323,7 +323,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
         An invalid one, or one during another, is logged and not made.
         """
-        return self._guarded(
+        return self._run_transition(
             trigger.__name__, lambda: trigger() == TransitionCallbackReturn.SUCCESS
         )
 
@@ -341,12 +341,12 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     def _change_or_reject(self, request: Any, response: Any) -> Any:
         transition = request.transition.label or request.transition.id
-        response.success = self._guarded(
+        response.success = self._run_transition(
             transition, lambda: self._upstream_change_state(request, response).success
         )
         return response
 
-    def _guarded(self, transition: str | int, change: Callable[[], bool]) -> bool:
+    def _run_transition(self, transition: str | int, change: Callable[[], bool]) -> bool:
         if self._destroyed:  # a timer may have been due; the state machine must not be used
             return False
         if not self._in_transition.acquire(blocking=False):

@@ -85,7 +85,7 @@ class Playback:
         self._position, self._anchor = time_ns, self._steady()
 
     @property
-    def started(self) -> bool:
+    def is_started(self) -> bool:
         """Whether :meth:`start` was called."""
         return self._position is not None
 
@@ -103,7 +103,7 @@ class Playback:
             return 0.0 if self._steps else math.inf
         return 0.0 if self._rate is None else (time_ns - self.now_ns()) / SECOND / self._rate
 
-    def passed(self, time_ns: int, is_step: bool) -> None:
+    def note_published(self, time_ns: int, is_step: bool) -> None:
         """Note that an item was published; while paused, time follows the items."""
         if self.paused or self._rate is None:
             self._position = max(self._position or 0, time_ns)
@@ -206,13 +206,13 @@ class Replayer:
         if is_image:
             self._spin_once(0.0)  # also while late: pause is served
         self._wait_until_due(record.time_ns)
-        self.playback.passed(record.time_ns, is_image)
+        self.playback.note_published(record.time_ns, is_image)
         self._publish_clock()
         if isinstance(record, MessageRecord):
             self._others[record.topic].publish(record.content)
             return
         message = record_message(record)
-        self.progress.sent(message.header)
+        self.progress.count_sent(message.header)
         if self.options.lossless:
             self._send_until_answered(message)
         else:
@@ -235,7 +235,7 @@ class Replayer:
             )
         # best-effort subscribers acknowledge nothing: a response to a later request proves it
         self._wait_for_discovery()
-        self._spin_until(self.progress.settled, None)
+        self._spin_until(self.progress.is_settled, None)
 
     def close(self) -> None:
         """Release the node; the caller destroys it."""
@@ -311,7 +311,7 @@ class Replayer:
                 self.resent += 1
                 self.notify(f'{name}: no result for {timeout:g} s, sent again (try {attempt + 1})')
             self.publisher.publish(message)
-            if self._spin_until(self.progress.complete, timeout):
+            if self._spin_until(self.progress.is_complete, timeout):
                 follow = self.progress.keeps_up
                 self.progress.expects_closures &= self._spin_until(follow, timeout)
                 break
@@ -338,7 +338,7 @@ class Replayer:
         return self.node.create_publisher(message_class(topic.message_type), name, profile)
 
     def _publish_clock(self) -> None:
-        if self._clock is not None and self.playback.started:
+        if self._clock is not None and self.playback.is_started:
             self._clock.publish(ClockMessage(clock=time_message(self.playback.now_ns())))
 
     def _serve(self) -> None:

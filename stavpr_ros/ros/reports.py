@@ -40,11 +40,11 @@ class Reports:
         self._skipped_since: tuple[float, float] | None = None
         self._last_reason = ''  # why the last image is in no window
 
-    def arrived(self) -> None:
+    def note_arrival(self) -> None:
         """Note an image that may be processed."""
         self._since_restart += 1
 
-    def restarted(self, reason: str, length: int) -> None:
+    def log_restart(self, reason: str, length: int) -> None:
         """Log a restart of the window, and restarts before it had its length again and again."""
         log = self._node.get_logger()
         log.info(f'window reset: {reason}')
@@ -58,12 +58,12 @@ class Reports:
             )
         self._since_restart = 0
 
-    def oddities(self, texts: tuple[str, ...]) -> None:
+    def log_oddities(self, texts: tuple[str, ...]) -> None:
         """Log what is odd about the inputs, each kind once."""
         for text in texts:
             self._log_once(''.join(filter(str.isalpha, text)), text)
 
-    def processed(self, result: ImageResult, stamp: int, settings: NodeSettings) -> None:
+    def log_result(self, result: ImageResult, stamp: int, settings: NodeSettings) -> None:
         """Log why an image is in no window; stamp: of the image, ns."""
         status, reason, cause = result.match.status, result.match.reason, result.cause
         if not cause:

@@ -105,7 +105,7 @@ class Runtime:
         settings, log = self.settings, self._node.get_logger()
         # a node that only localizes on a map that is named has recorded nothing
         is_own = settings.operation != 'localization' or not settings.map_path
-        recovered = recover_maps(self._journaled, log, is_own or bool(settings.save_path))
+        recovered = recover_maps(self._journal_target, log, is_own or bool(settings.save_path))
         self._pipeline = self.worker.run(self._make_pipeline)
         # a route of loop closure does not continue a map
         continued = recovered if settings.operation != 'loop_closure' else ''
@@ -126,7 +126,7 @@ class Runtime:
         return Pipeline(
             self.settings.pipeline,
             self.settings.operation,
-            lambda base, template: open_journal(self._journaled, base, template, log),
+            lambda base, template: open_journal(self._journal_target, base, template, log),
         )
 
     @property
@@ -136,7 +136,7 @@ class Runtime:
         return settings.pipeline.update_map and settings.operation == 'localization'
 
     @property
-    def _journaled(self) -> Path:
+    def _journal_target(self) -> Path:
         """Return the file whose name the journal of recorded places has."""
         return Path(self.settings.save_path or self.settings.maps_path / RECORDED)
 
@@ -255,7 +255,7 @@ class Runtime:
     def restart(self, reason: str) -> None:
         """Empty the window before the images that arrive from now on."""
         self._epoch += 1
-        self._reports.restarted(reason, self.settings.pipeline.sequence.length)
+        self._reports.log_restart(reason, self.settings.pipeline.sequence.length)
         self.intake.clear()
 
     def reset(self) -> None:
@@ -280,7 +280,7 @@ class Runtime:
     def state(self) -> dict[str, Any]:
         """Return the fields of :class:`stavpr_ros.ros.health.Health` of a configured node."""
         pipeline, operation, inputs = self.pipeline, self.pipeline.operation, self.intake.state()
-        self._reports.oddities(inputs['oddities'])
+        self._reports.log_oddities(inputs['oddities'])
         return inputs | {
             'problem': self._maps.problem or self.intake.problem or pipeline.problem,
             'loading': self._maps.path,
@@ -296,7 +296,7 @@ class Runtime:
     # images
 
     def _enqueue(self, message: Any, arrival: float) -> None:
-        self._reports.arrived()
+        self._reports.note_arrival()
         dropped = self.worker.put(_Item(message, arrival, self._epoch))
         if dropped is not None:
             reason = 'newer images arrived before it was processed'
@@ -334,7 +334,7 @@ class Runtime:
             Outcome(header, result, places, about, self.settings.robot_id)
         )
         stages = {WAITING: waiting, **result.stages, 'publishing': time.monotonic() - began}
-        self._reports.processed(result, nanoseconds(header.stamp), self.settings)
+        self._reports.log_result(result, nanoseconds(header.stamp), self.settings)
         if result.cause:
             self._statistics.add_drop(result.cause)
         else:

@@ -57,7 +57,7 @@ class OdometryInput:
     def fault(self) -> str:
         """Return why nothing can arrive, as a wrong remapping; empty = nothing known."""
         fresh = self.freshness() == 'fresh'
-        return '' if fresh else misdirected(self._node, self._subscription.topic_name)
+        return '' if fresh else find_misdirection(self._node, self._subscription.topic_name)
 
     def oddities(self) -> list[str]:
         """Return what is odd about the last poses, for the diagnostics."""
@@ -84,7 +84,7 @@ class OdometryInput:
         self.frame, self.child_frame = message.header.frame_id, message.child_frame_id
 
 
-def misdirected(node: Node, topic: str) -> str:
+def find_misdirection(node: Node, topic: str) -> str:
     """
     Return why no odometry can arrive on a topic; empty if it can, or if there is none anywhere.
 

@@ -49,13 +49,13 @@ class SubscriberProgress:
         """Return whether ``expects_closures`` is the node's, or no node publishes it."""
         return self._has_info or not self._node.count_publishers(self._info_topic)
 
-    def sent(self, header: Header) -> None:
+    def count_sent(self, header: Header) -> None:
         """Count an image; to be called before it is published."""
         self._sent += 1
         self._outstanding[_key(header)] += 1
         self._last = time.monotonic()
 
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Return whether each image has its result."""
         return self._received == self._sent
 
@@ -63,9 +63,9 @@ class SubscriberProgress:
         """Return whether a node in operation loop_closure keeps up with its edges."""
         return not self.expects_closures or self._matches - self._closures <= MAX_BEHIND
 
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Return whether no more results are expected."""
-        if self.complete() or not self._node.count_publishers(self._topic):
+        if self.is_complete() or not self._node.count_publishers(self._topic):
             return True
         return time.monotonic() - self._last > QUIET
 

@@ -50,7 +50,7 @@ class Visualization(Publishers):
     ) -> None:
         super().__init__(node)
         self.operation, self._on_subscriber = operation, on_subscriber
-        self._route = self._latched(Path, '~/map_path')
+        self._route = self._make_latched(Path, '~/map_path')
         self._matched = self._make(Path, '~/matched_path')
         self._markers = self._make(MarkerArray, '~/markers')
         self._image = self._make(CompressedImage, '~/match_image/compressed')
@@ -191,7 +191,7 @@ class Visualization(Publishers):
                     text.text += f', p {match.probability:.2f}'
         return MarkerArray(markers=markers)
 
-    def _latched(self, kind: type, topic: str) -> Publisher:
+    def _make_latched(self, kind: type, topic: str) -> Publisher:
         def on_matched(event: Any) -> None:
             if event.current_count_change > 0:
                 self._on_subscriber()
