@@ -42,11 +42,11 @@ def require_number(name: str, value: object) -> None:
         raise SettingsError(f'{name} = {value!r} is {type(value).__name__}: expected a number')
 
 
-def require_at_least(name: str, value: float, least: float, unit: str = '') -> None:
+def require_at_least(name: str, value: float, minimum: float, unit: str = '') -> None:
     """Raise SettingsError if a setting is less, or not finite."""
     require_number(name, value)
-    if not least <= value < math.inf:
-        raise SettingsError(f'{name} = {value} must be at least {least} {unit}'.rstrip())
+    if not minimum <= value < math.inf:
+        raise SettingsError(f'{name} = {value} must be at least {minimum} {unit}'.rstrip())
 
 
 def require_between(name: str, value: float, low: float, high: float, unit: str = '') -> None:
@@ -76,9 +76,9 @@ def require_monotonic(name: str, values: tuple[float, ...], start: float, end: f
         )
 
 
-def require_whole(name: str, value: float, least: int, unit: str = '') -> None:
+def require_whole(name: str, value: float, minimum: int, unit: str = '') -> None:
     """Raise SettingsError if a setting is less, or no whole number."""
-    require_at_least(name, value, least, unit)
+    require_at_least(name, value, minimum, unit)
     if not float(value).is_integer():
         raise SettingsError(f'{name} = {value} must be a whole number')
 

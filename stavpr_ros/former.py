@@ -69,7 +69,7 @@ def classes(module: str) -> Callable[[str], Any]:
 
 
 class _Former(MetaPathFinder, Loader):
-    """Imports a former package as a module whose names are those of the method."""
+    """Imports a former package as a module with the names of the method."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> ModuleSpec | None:
         return ModuleSpec(name, self) if name in FORMER else None

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What other packages add: the entry points of a group."""
+"""Imports what other packages add, by the entry points of a group."""
 
 from functools import cache
 from importlib import import_module

@@ -20,7 +20,7 @@ POINTERS = {
     b'/annex/objects/': 'a pointer of git-annex instead of the content: run `git annex get`',
 }
 """The first bytes of files that replace others, and what to do."""
-MAX_POINTER, LONGEST_TARGET = 1024, 60  # bytes, characters
+MAX_POINTER, MAX_TARGET = 1024, 60  # bytes, characters
 
 
 class ElsewhereError(OSError):
@@ -33,7 +33,7 @@ def elsewhere(path: str | Path) -> str:
     if path.is_symlink() and not path.exists():
         target = os.readlink(path)
         remedy = 'run `git annex get`' if '/annex/' in target else 'copy the file'
-        return f'a link into nothing, {target[-LONGEST_TARGET:]}: {remedy}'
+        return f'a link into nothing, {target[-MAX_TARGET:]}: {remedy}'
     if path.is_file() and path.stat().st_size <= MAX_POINTER:
         content = path.read_bytes()
         return next((text for first, text in POINTERS.items() if content.startswith(first)), '')

@@ -58,11 +58,11 @@ def was_interrupted() -> bool:
     return _State.received
 
 
-def time_left(most: float, least: float = 0.1) -> float:
+def time_left(longest: float, shortest: float = 0.1) -> float:
     """Return how long to wait for something at the end: all waits share the time of a signal."""
     if not _State.received:
-        return most
-    return min(most, max(least, _State.time + END_SECONDS - time.monotonic()))
+        return longest
+    return min(longest, max(shortest, _State.time + END_SECONDS - time.monotonic()))
 
 
 def end_process(code: int) -> NoReturn:

@@ -153,16 +153,16 @@ def store_sums(typing: Any, array: Any, offset: Any, vectors: Any) -> Any:
     """
     Write the sums over the lanes of vectors into a flat array, from ``offset``.
 
-    Of a tuple of at most LANES; behind them, the array has room for LANES numbers. Each sum is of
-    halves, as LLVM adds up lanes.
+    The tuple has at most LANES vectors, and the array has room for LANES numbers behind the sums.
+    Halves are added up, as LLVM adds up lanes.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         parts, width = cgutils.unpack_tuple(builder, arguments[2]), LANES
 
         def half(pair: Any, is_upper: bool) -> Any:
-            taken = [i for i in range(2 * LANES) if (2 * (i % width) >= width) == is_upper]
-            return _shuffle(builder, pair[0], pair[1], taken)
+            lanes = [i for i in range(2 * LANES) if (2 * (i % width) >= width) == is_upper]
+            return _shuffle(builder, pair[0], pair[1], lanes)
 
         while width > 1:
             parts += parts[-1:] * (len(parts) % 2)

@@ -43,9 +43,9 @@ def limit_threads(count: int) -> None:
     import numba
 
     _limits[:] = [count]
-    most = numba.config.NUMBA_NUM_THREADS
+    available = numba.config.NUMBA_NUM_THREADS
     # before torch: the start of numba's threads sets the number of OpenMP's, which is torch's
-    numba.set_num_threads(min(count or most, most))
+    numba.set_num_threads(min(count or available, available))
     cv2.setNumThreads(count or -1)  # -1 = the number before the first limit
     if torch := sys.modules.get('torch'):
         torch.set_num_threads(count or _of_torch())

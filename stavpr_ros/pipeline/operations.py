@@ -100,8 +100,8 @@ class Operation(ABC):
         self._start(place_map)
         self._to_bytes: ToBytes | None = None
         if self.extractor is not None:
-            is_new, known = self.extractor.is_new, scale(self.extractor.settings.value_range)
-            self._to_bytes = RangeFinder() if is_new else known
+            of_map = scale(self.extractor.settings.value_range)
+            self._to_bytes = RangeFinder() if self.extractor.is_new else of_map
         image_change(*[small_gray(BLANK_IMAGE)] * 2)  # compiles what keyframes need
         self._keyframes = KeyframeSelector(settings.keyframes)
         self._check = GeometricCheck(settings.geometric) if settings.geometric else None

@@ -121,7 +121,7 @@ def draw_window(rows: np.ndarray, first: int, match: Match) -> np.ndarray:
     return np.vstack([sheet, bar])
 
 
-def least_of_each(rows: np.ndarray, columns: int) -> np.ndarray:
+def column_minima(rows: np.ndarray, columns: int) -> np.ndarray:
     """
     Return rows of at most so many columns; each is the minimum over its places.
 

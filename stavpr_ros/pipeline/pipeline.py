@@ -79,7 +79,7 @@ class Pipeline:
         open_journal: OpenJournal = lambda base, template: None,
     ) -> None:
         self.settings, self._open_journal = settings, open_journal
-        # of localization, or of loop closure for its kind of features; its files
+        # the map of localization, whose kind of features loop closure takes, and its files
         self._map: Map | None = None
         self._map_save_state = SaveState(open_journal=open_journal)
         self.operation: Operation = LocalizationOperation(

@@ -29,7 +29,7 @@ OPERATIONS = BY_NAME['operation'].choices
 @dataclass(frozen=True)
 class PipelineSettings(RecognizerSettings):
     """
-    Settings of the pipeline: those of its recognizer, and these.
+    Settings of the pipeline, which extend the settings of its recognizer.
 
     Fields that are not explained here are parameters (:mod:`stavpr_ros.parameters`).
 
@@ -78,11 +78,11 @@ class PipelineSettings(RecognizerSettings):
                 f'direction = {self.direction} with operation {operation}: a route that grows is '
                 'recognized along it; take operation localization, or forward'
             )
-        least = least_limit(self.exclude_places, self.sequence.length)
-        if operation == 'loop_closure' and self.max_places < least:
+        min_places = least_limit(self.exclude_places, self.sequence.length)
+        if operation == 'loop_closure' and self.max_places < min_places:
             raise SettingsError(
                 f'max_places = {self.max_places} leaves too few beyond exclude_places = '
-                f'{self.exclude_places}: take at least {least}'
+                f'{self.exclude_places}: take at least {min_places}'
             )
 
     def matching_backend(self, operation: str) -> str:

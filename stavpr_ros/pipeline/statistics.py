@@ -14,12 +14,12 @@ from typing import Any
 from stavpr_ros.units import SECOND
 
 RECENT = 10  # seconds behind rates, recent counts and times
-SHORTEST_SPAN = 0.5  # seconds of a rate at least: two images of a burst are not a thousand Hz
+MIN_SPAN = 0.5  # seconds of a rate at least: two images of a burst are not a thousand Hz
 WAITING = 'waiting'  # stage before the worker takes an image: in the total, not in the work
 REORDERING_SECONDS = 0.1  # images less than this out of order were reordered in transport
 INTERVALS = 40  # pauses between images for the period of a camera, which needs half of them
 REGULAR = 0.75  # share of them near a multiple of the period, from which on a camera has one
-LONGEST_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
+MAX_LOSS = 10  # periods; longer pauses are pauses of the camera, not losses
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class Statistics:
         rate = 0.0
         if events:
             # the first event opens the span, so there is one period less than there are events
-            span = max(now - events[0][0], SHORTEST_SPAN)
+            span = max(now - events[0][0], MIN_SPAN)
             rate = max((len(events) - 1) / span, len(events) / RECENT)
         age = None if last is None else now - last
         return Tally(self._totals[kind].copy(), recent, rate, age)
@@ -239,7 +239,7 @@ class StampWatch:
         period = median(pause / max(round(pause / guess), 1) for pause in intervals)
         multiples = [pause / period for pause in intervals]
         near = sum(abs(multiple - max(round(multiple), 1)) < 0.25 for multiple in multiples)
-        if near < REGULAR * len(multiples) or interval > LONGEST_LOSS * period:
+        if near < REGULAR * len(multiples) or interval > MAX_LOSS * period:
             return 0
         return max(round(interval / period) - 1, 0)
 

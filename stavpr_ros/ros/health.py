@@ -57,8 +57,8 @@ class Health:
     @property
     def limit(self) -> float | None:
         """Return the distance below which a window is matched, None = not set."""
-        own = self.settings.pipeline.applied_threshold
-        return own if self.applied_threshold is None else self.applied_threshold
+        limit = self.settings.pipeline.applied_threshold
+        return limit if self.applied_threshold is None else self.applied_threshold
 
     @property
     def map_path(self) -> str:

@@ -88,8 +88,8 @@ class Intake:
                 odometry.frame,
                 odometry.trajectory.at(nanoseconds(header.stamp)),
             )
-        known = None if camera is None else camera.camera(about.child, header.frame_id)
-        return replace(about, camera=known)
+        image_camera = None if camera is None else camera.camera(about.child, header.frame_id)
+        return replace(about, camera=image_camera)
 
     def yaw(self, base: str, frame: str, settings: NodeSettings) -> float:
         """Return the yaw of the camera of these frames in the base, radians to the left."""

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the robot is localized, with hysteresis, and the place where it is: latched topics."""
+"""Publishes whether the robot is localized, with hysteresis, and at which place: latched."""
 
 from collections.abc import Sequence
 import math
@@ -15,7 +15,7 @@ from stavpr_ros.ros.qos import LATCHED
 from std_msgs.msg import Bool, String
 
 TRIAL, CONFIRMATIONS = 5, 3  # images after a match, and how many of them must match near it
-NEAR, FARTHEST = 10, 5  # places that are near a match, and from image to image, at most
+MAX_APART, MAX_STEP = 10, 5  # places: of a confirmation from its match, and from image to image
 NOWHERE = 'none'  # ~/current_node of a robot that is not localized
 
 
@@ -65,7 +65,7 @@ class Localization:
             self._tried += 1
             apart = abs(place - self._first)
             apart = min(apart, abs(lap - apart)) if lap else apart
-            self._confirmed += matched and apart <= max(NEAR, FARTHEST * self._tried)
+            self._confirmed += matched and apart <= max(MAX_APART, MAX_STEP * self._tried)
             if self._confirmed >= CONFIRMATIONS:
                 self.is_localized, self._first = True, -1
                 return
@@ -80,8 +80,8 @@ def along_route(places: Map) -> tuple[Sequence[int] | np.ndarray, int]:
     """
     Return the position of each place along the route, (n,), and the places of a closed lap.
 
-    Of a place that an earlier session shows as well, the position is the one there, and the places
-    after it follow, up to the next such place.
+    A place that an earlier session shows as well has the position of the place there, and the
+    places after it follow, up to the next such place.
     """
     if places.same_as is None:
         return range(len(places)), 0

@@ -55,7 +55,7 @@ BESIDE = (
 @dataclass(frozen=True)
 class Surroundings:
     """
-    What is known of an image beside its message; '' and None = unknown.
+    Frames, pose and camera of an image, beside its message; '' and None = unknown.
 
     :param frame: of the poses of the places.
     :param child: frame of the base, whose poses they are.
@@ -316,8 +316,8 @@ def matched_pose_message(outcome: Outcome) -> PoseWithCovarianceStamped | None:
     near = np.array([p.pose for p in near_by if p.pose is not None and p.session == place.session])
     from scipy.spatial.transform import Rotation
 
-    own = Rotation.from_quat(place.pose[3:])
-    turns = Rotation.from_quat(near[:, 3:]) * own.inv()
+    turn = Rotation.from_quat(place.pose[3:])
+    turns = Rotation.from_quat(near[:, 3:]) * turn.inv()
     variances = np.append(np.var(near[:, :3], axis=0), np.var(turns.as_rotvec(), axis=0))
     message = PoseWithCovarianceStamped()
     message.header.stamp, message.header.frame_id = outcome.header.stamp, outcome.about.frame
@@ -325,7 +325,7 @@ def matched_pose_message(outcome: Outcome) -> PoseWithCovarianceStamped | None:
     covariance = np.diag(np.maximum(variances, MIN_VARIANCE))
     x, y = near[-1, :2] - near[0, :2]
     if math.hypot(x, y) < SHORT:  # the robot was at rest: across the view
-        x, y = own.apply((1.0, 0.0, 0.0))[:2]
+        x, y = turn.apply((1.0, 0.0, 0.0))[:2]
     across = np.array([-y, x]) / max(math.hypot(x, y), 1e-9)
     covariance[:2, :2] += BESIDE**2 * np.outer(across, across)
     message.pose.covariance = covariance.ravel()

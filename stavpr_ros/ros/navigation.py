@@ -136,8 +136,8 @@ def planar(message: PoseWithCovarianceStamped) -> PoseWithCovarianceStamped:
     pose.position.x, pose.position.y = message.pose.pose.position.x, message.pose.pose.position.y
     yaw = Rotation.from_quat([o.x, o.y, o.z, o.w]).as_euler('ZYX')[0]
     pose.orientation.z, pose.orientation.w = float(np.sin(yaw / 2)), float(np.cos(yaw / 2))
-    for i, least in ((0, MIN_VARIANCE_XY), (7, MIN_VARIANCE_XY), (35, MIN_VARIANCE_YAW)):
-        result.pose.covariance[i] = max(least, message.pose.covariance[i])
+    for i, min_variance in ((0, MIN_VARIANCE_XY), (7, MIN_VARIANCE_XY), (35, MIN_VARIANCE_YAW)):
+        result.pose.covariance[i] = max(min_variance, message.pose.covariance[i])
     result.pose.covariance[1] = result.pose.covariance[6] = message.pose.covariance[1]
     return result
 

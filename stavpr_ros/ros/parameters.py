@@ -75,8 +75,8 @@ def declare_parameters(node: ManagedNode) -> dict[str, Any]:
 
     :raises SettingsError: a parameter was given with the wrong type.
     """
-    given = node.parameter_overrides
-    overrides = {RENAMED[name]: row for name, row in given.items() if name in RENAMED} | given
+    rows = node.parameter_overrides
+    overrides = {RENAMED[name]: row for name, row in rows.items() if name in RENAMED} | rows
     values = {}
     for row in PARAMETERS:
         value = convert_type(overrides[row.name]).value if row.name in overrides else row.default

@@ -102,7 +102,7 @@ _warning_filters = threading.Lock()  # they belong to the process
 
 
 class ReceivedGroup(CallbackGroup):
-    """Of the subscription of a :class:`Receiver`: no executor waits for it or for its events."""
+    """Group of the subscription of a :class:`Receiver`: no executor waits for it or its events."""
 
     def can_execute(self, entity: Any) -> bool:
         """Return whether an executor may call the callback of an entity."""
@@ -159,9 +159,9 @@ class Receiver(threading.Thread):
                 for event in events:
                     if event.is_ready(wait_set) and (data := event.take_data()):
                         self._call(event.callback, data)
-                if not self._ended and (taken := handle.take_message(kind, False)):
-                    self._call(callback, *taken)
-                    del taken  # an image, until the next one
+                if not self._ended and (message := handle.take_message(kind, False)):
+                    self._call(callback, *message)
+                    del message  # an image, until the next one
 
     def _call(self, callback: Callable[..., None], *arguments: Any) -> None:
         self._calls = True

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the log says of images that are in no window, once or seldom, with the remedy."""
+"""Logs why images are in no window, once or seldom, with the remedy."""
 
 from collections.abc import Callable
 from dataclasses import asdict

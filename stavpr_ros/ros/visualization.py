@@ -18,14 +18,14 @@ from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.place_map import encode_jpeg
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.pipeline.operations import Operation
-from stavpr_ros.pipeline.overlay import draw_match, draw_window, least_of_each, places_to_draw
+from stavpr_ros.pipeline.overlay import column_minima, draw_match, draw_window, places_to_draw
 from stavpr_ros.ros.messages import image_message, Outcome, Places, pose_message
 from stavpr_ros.ros.output import Publishers
 from stavpr_ros.ros.qos import LATCHED
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-KEPT = 200  # matched poses, and lines from queries to places, that are shown
+MAX_POSES = 200  # matched poses, and lines from queries to places, that are shown
 COLUMNS = 512  # of ~/distances, at most
 GROWTH = 1.05  # a growing route is published again when it has grown by this factor
 QUALITY = 80  # of JPEG
@@ -35,7 +35,7 @@ class Visualization(Publishers):
     """
     Publishers of the map's route, matched poses, markers, match images and distances.
 
-    :param operation: returns the operation; its places are those of the matches.
+    :param operation: returns the operation, whose places are matched.
     :param on_subscriber: called on another thread when the route has a new subscriber; it calls
         :meth:`publish_route` on the worker.
 
@@ -58,8 +58,8 @@ class Visualization(Publishers):
         self._distances = self._make(Image, '~/distances', 10)
         self._published: tuple[Places, int, str] = (None, 0, '')
         self.frame = ''
-        self._poses: deque[PoseStamped] = deque(maxlen=KEPT)
-        self._lines: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=KEPT)
+        self._poses: deque[PoseStamped] = deque(maxlen=MAX_POSES)
+        self._lines: deque[tuple[Point, Point, ColorRGBA]] = deque(maxlen=MAX_POSES)
         self._map: Map | None = None  # of the poses and lines; None = the route
         self._correction: np.ndarray | None = None  # from the odometry to the map, (4, 4)
 
@@ -78,8 +78,8 @@ class Visualization(Publishers):
         self._note(outcome)
         self.publish_route(outcome.places, frame)
         if self._is_requested(self._matched) and result.match.accepted:
-            own = Header(stamp=outcome.header.stamp, frame_id=frame)
-            self._send(self._matched, Path(header=own, poses=list(self._poses)))
+            header = Header(stamp=outcome.header.stamp, frame_id=frame)
+            self._send(self._matched, Path(header=header, poses=list(self._poses)))
         if self._is_requested(self._markers):
             self._send(self._markers, self._markers_message(outcome))
         if result.image is not None and self._is_requested(self._image):
@@ -130,7 +130,7 @@ class Visualization(Publishers):
             row = np.pad(row, (0, len(places) - len(row)), constant_values=np.inf)[None]
             numbers = np.arange(first, first + row.size)[None]
             columns = np.stack(
-                [least_of_each(row, COLUMNS)[0], least_of_each(numbers, COLUMNS)[0]], axis=1
+                [column_minima(row, COLUMNS)[0], column_minima(numbers, COLUMNS)[0]], axis=1
             ).astype(np.float32)
             self._send(self._distances, image_message(outcome.header, columns[None], '32FC2'))
 
@@ -159,11 +159,11 @@ class Visualization(Publishers):
     def _markers_message(self, outcome: Outcome) -> MarkerArray:
         """Return the lines, the matched place with its text, and the candidates."""
         match, places = outcome.match, outcome.places
-        own = Header(stamp=outcome.header.stamp, frame_id=self.frame)
-        markers = [Marker(header=own, action=Marker.DELETEALL)]
+        header = Header(stamp=outcome.header.stamp, frame_id=self.frame)
+        markers = [Marker(header=header, action=Marker.DELETEALL)]
 
         def add(kind: int, **fields: Any) -> Marker:
-            marker = Marker(header=own, ns='stavpr', id=len(markers), type=kind, **fields)
+            marker = Marker(header=header, ns='stavpr', id=len(markers), type=kind, **fields)
             marker.pose.orientation.w = 1.0
             markers.append(marker)
             return marker
