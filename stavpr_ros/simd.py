@@ -131,10 +131,10 @@ def transpose(
             return _pointer(context, builder, signature.args[which], array, offset)
 
         rows, half = [builder.load(row(0, i), align=4) for i in range(LANES)], LANES // 2
-        mixed = [[i // 2 + i % 2 * LANES + low for i in range(LANES)] for low in (0, half)]
+        masks = [[i // 2 + i % 2 * LANES + low for i in range(LANES)] for low in (0, half)]
         for _ in range(LANES.bit_length() - 1):
             pairs = zip(rows[:half], rows[half:], strict=True)
-            rows = [_shuffle(builder, a, b, mask) for a, b in pairs for mask in mixed]
+            rows = [_shuffle(builder, a, b, mask) for a, b in pairs for mask in masks]
         for i in range(LANES):
             builder.store(rows[i], row(3, i), align=4)
         return context.get_dummy_value()

@@ -103,10 +103,10 @@ def add_parameter(group: Any, name: str, text: str, **changes: Any) -> None:
     """
     row = BY_NAME[name]
     if isinstance(row.default, bool):
-        own: dict[str, Any] = {'action': 'store_true'}
+        base: dict[str, Any] = {'action': 'store_true'}
     else:
-        own = {'type': type(row.default), 'default': row.default, 'choices': row.choices or None}
-    group.add_argument(f'--{name.replace("_", "-")}', help=text, **own | changes)
+        base = {'type': type(row.default), 'default': row.default, 'choices': row.choices or None}
+    group.add_argument(f'--{name.replace("_", "-")}', help=text, **base | changes)
 
 
 def positive(text: str) -> float:

@@ -306,7 +306,7 @@ class Operation(ABC):
             self.save_state.record(self.places, features)
         if self.recognizer is not None:
             with _Timed(stages, 'verification'):
-                match = self._checked(match, index)
+                match = self._check_match(match, index)
         return match, index
 
     def _session_probabilities(self) -> tuple[float, ...]:
@@ -343,7 +343,7 @@ class Operation(ABC):
                 self._start(None)  # with these settings
         return f'images of 16 bits, {images} of {RANGE_IMAGES} for their range' if images else ''
 
-    def _checked(self, match: Match, index: int) -> Match:
+    def _check_match(self, match: Match, index: int) -> Match:
         """
         Return a match, and its late ones that are matches, after the geometric check.
 
@@ -502,9 +502,9 @@ class Mapper(Operation):
             match = recognizer.update(features, row.stamp, row.pose)
         return match, self.places.add(features, row.stamp, pose=row.pose, thumbnail=jpeg)
 
-    def _checked(self, match: Match, index: int) -> Match:
+    def _check_match(self, match: Match, index: int) -> Match:
         """Return a match after the geometric check; without one, it is of a place only."""
-        match = super()._checked(match, index)
+        match = super()._check_match(match, index)
         if not match.accepted:
             return replace(match, status=Status.MAPPED, reason='')
         self._relate(match, index)

@@ -181,11 +181,11 @@ class Pipeline:
             base = Base.of(loaded.path, loaded.places.stamps)
             state = SaveState(loaded.path, base, open_journal=self._open_journal)
         is_route, before = name == 'loop_closure', {self.save_state, self._map_save_state}
-        own = SaveState(open_journal=self._open_journal) if is_route else state
-        self.operation = CLASSES[name](settings, place_map, extractor, own)
+        new_state = SaveState(open_journal=self._open_journal) if is_route else state
+        self.operation = CLASSES[name](settings, place_map, extractor, new_state)
         # in mapping, it is part of the growing map
         self._map, self._map_save_state = None if name == 'mapping' else place_map, state
-        for old_state in before - {own, state}:
+        for old_state in before - {new_state, state}:
             old_state.close_journal(
                 delete=False
             )  # its places were discarded, but may be recovered

@@ -65,17 +65,17 @@ class EdgePublisher:
         :returns: the edge for the message of the match, None without a match; the closures of the
             match and of its late ones.
         """
-        own, camera, place_map = outcome.match, outcome.about.camera, outcome.place_map
+        newest, camera, place_map = outcome.match, outcome.about.camera, outcome.place_map
         edge: Edge | None = None
         closures: list[WaitingClosure] = []
-        if not own.accepted:
+        if not newest.accepted:
             return edge, closures
         # a route has the camera of the query
-        place_camera = camera if place_map is None else place_map.camera_of(own.place)
-        for match in (own, *own.late):
+        place_camera = camera if place_map is None else place_map.camera_of(newest.place)
+        for match in (newest, *newest.late):
             yaw = outcome.result.relative_yaw  # of a map, where no match is late
             pair = operation.matched_pair(match, self._estimator.method, yaw)
-            if match is own:
+            if match is newest:
                 edge = self._immediate(pair, camera, place_camera)
             if pair is None:
                 continue

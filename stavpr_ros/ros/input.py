@@ -132,8 +132,8 @@ class ImageInput:
         """Return what is odd about the last images, for the diagnostics."""
         infos = self._node.get_publishers_info_by_topic(self.topic)
         count = sum(info.topic_type == self._type for info in infos)
-        mixed = f'images of {count} publishers are mixed on {self.topic}: a topic for each'
-        return [mixed] * (count > 1) + self._watch.oddities(has_epoch=False)
+        text = f'images of {count} publishers are mixed on {self.topic}: a topic for each'
+        return [text] * (count > 1) + self._watch.oddities(has_epoch=False)
 
     def close(self) -> None:
         """Unsubscribe from images, including one that another thread has just taken."""

@@ -67,7 +67,7 @@ def other_node(
         values = {renamed.get(n, n): value for n, value in _values(texts, types).items()}
         return [_node(package, executable, {**values, **(fixed or {})}, name=name)]
 
-    own = [
+    arguments = [
         DeclareLaunchArgument(
             argument,
             default_value=str(default) if argument in renamed else '',
@@ -76,7 +76,7 @@ def other_node(
         for argument, (default, sentence) in table.items()
         if argument not in TYPES
     ]
-    return [*own, OpaqueFunction(function=start)]
+    return [*arguments, OpaqueFunction(function=start)]
 
 
 def node_launch(
@@ -97,9 +97,9 @@ def node_launch(
     :param needs: package of the actions, '' = none; where it is missing, nothing is started.
     :param fixed: parameters that the launch file sets itself.
     """
-    own = [other for other in others if isinstance(other, DeclareLaunchArgument)]
-    arguments = [*own, *_arguments(image, odom, fixed)]
-    actions = [other for other in others if other not in own]
+    declarations = [other for other in others if isinstance(other, DeclareLaunchArgument)]
+    arguments = [*declarations, *_arguments(image, odom, fixed)]
+    actions = [other for other in others if other not in declarations]
     check = _check([argument.name for argument in arguments], needs)
 
     def start(context: LaunchContext) -> list[Node]:
@@ -151,8 +151,8 @@ def _check(names: list[str], needs: str) -> OpaqueFunction:
     def check(context: LaunchContext) -> None:
         file = context.get_locals_as_dict().get('current_launch_file_path')
         paths = (os.path.realpath(word) for word in sys.argv)
-        own = not PACKAGES.isdisjoint(sys.argv) or os.path.realpath(file or '') in paths
-        if own and (problems := unknown_arguments(sys.argv, [*names, *END_TIMEOUTS])):
+        is_ours = not PACKAGES.isdisjoint(sys.argv) or os.path.realpath(file or '') in paths
+        if is_ours and (problems := unknown_arguments(sys.argv, [*names, *END_TIMEOUTS])):
             raise RuntimeError('; '.join(problems))
         if needs:
             try:
@@ -181,8 +181,8 @@ def _arguments(image: str, odom: str, fixed: dict[str, object]) -> list[DeclareL
         'namespace': ('', 'namespace of node and topics'),
         'params_file': (params_file, 'file of the parameters of all nodes'),
     }  # fmt: skip
-    own = (name for name in sentences if name not in fixed)
-    rows |= {name: ('', f'{sentences[name]} Empty: as set in params_file.') for name in own}
+    parameters = (name for name in sentences if name not in fixed)
+    rows |= {name: ('', f'{sentences[name]} Empty: as set in params_file.') for name in parameters}
     return [
         DeclareLaunchArgument(name, default_value=default, description=text)
         for name, (default, text) in rows.items()

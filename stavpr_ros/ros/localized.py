@@ -56,9 +56,9 @@ class Localization:
         if matched or self._position is None:
             self._position = position
         if self.is_localized:
-            moved = 0.0 if position is None else float(np.linalg.norm(position - self._position))
+            shift = 0.0 if position is None else float(np.linalg.norm(position - self._position))
             limits = self._settings.lost_images, self._settings.lost_distance
-            if self._unmatched >= limits[0] or 0 < limits[1] <= moved:
+            if self._unmatched >= limits[0] or 0 < limits[1] <= shift:
                 self.reset()
             return
         if self._first >= 0:

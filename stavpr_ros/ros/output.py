@@ -62,10 +62,10 @@ class Publishers:
 
     def _is_requested(self, *publishers: Publisher) -> bool:
         """Return whether one of these topics has a subscriber; not after the shutdown of ROS."""
-        requested = False
+        has_subscriber = False
         with until_shutdown(self._node):
-            requested = any(publisher.get_subscription_count() for publisher in publishers)
-        return requested
+            has_subscriber = any(publisher.get_subscription_count() for publisher in publishers)
+        return has_subscriber
 
 
 class Output(Publishers):

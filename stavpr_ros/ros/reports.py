@@ -104,8 +104,8 @@ class Reports:
             return
         if cause == 'no odometry':
             topic = self._node.resolve_topic_name('odom')
-            own = f"publish it on {topic}, with stamps of the camera's clock"
-            remedy = self._odometry_fault() or own
+            hint = f"publish it on {topic}, with stamps of the camera's clock"
+            remedy = self._odometry_fault() or hint
             remedy += '; or set keyframe_distance and keyframe_angle_deg to 0'
         else:
             rules = asdict(settings.pipeline.keyframes).items()

@@ -105,11 +105,11 @@ class Runtime:
         settings, log = self.settings, self._node.get_logger()
         # a node that only localizes on a map that is named has recorded nothing
         is_own = settings.operation != 'localization' or not settings.map_path
-        recovered = recover_maps(self._journal_target, log, is_own or bool(settings.save_path))
+        recovery = recover_maps(self._journal_target, log, is_own or bool(settings.save_path))
         self._pipeline = self.worker.run(self._make_pipeline)
         # a route of loop closure does not continue a map
-        continued = recovered if settings.operation != 'loop_closure' else ''
-        if map_path := settings.map_path or continued:
+        start_map = recovery if settings.operation != 'loop_closure' else ''
+        if map_path := settings.map_path or start_map:
             if self.updates_map:
                 take_up_earlier_drives(map_path, log)
             self.load(map_path)

@@ -228,7 +228,7 @@ class CameraInput:
 
 def camera_info_topic(node: Node) -> str:
     """Return the topic of the intrinsics: camera_info if remapped, else beside the images."""
-    own = node.resolve_topic_name('camera_info')
+    topic = node.resolve_topic_name('camera_info')
     plain = f'{node.get_namespace().rstrip("/")}/camera_info'
     beside = node.resolve_topic_name('image').rpartition('/')[0] + '/camera_info'
-    return own if own != plain else beside
+    return topic if topic != plain else beside

@@ -122,9 +122,9 @@ class Services:
         if request.path:
             path = inside(runtime.settings.maps_path, request.path)
         elif (
-            own := runtime.settings.save_path or runtime.pipeline.save_state.path
-        ) and not os.path.isdir(own):  # the maps of a folder are no file
-            path = os.path.abspath(own)
+            file := runtime.settings.save_path or runtime.pipeline.save_state.path
+        ) and not os.path.isdir(file):  # the maps of a folder are no file
+            path = os.path.abspath(file)
         else:
             raise StavprError(
                 "path = '', save_path is not set, and the map has no file: set a path"

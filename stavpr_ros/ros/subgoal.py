@@ -56,17 +56,17 @@ def place_ahead(places: Map, index: int, distance: float, direction: int = 1) ->
     :param distance: along the route, meters; on a map without poses, number of places.
     :param direction: 1 = along the map, -1 = against it.
     """
-    session, ahead, moved, here = places.session(index), index, 0.0, places.pose(index)
-    while moved < distance:
+    session, ahead, length, here = places.session(index), index, 0.0, places.pose(index)
+    while length < distance:
         following = ahead + direction
         if not 0 <= following < len(places) or places.session(following) != session:
             break
         ahead = following
         pose = places.pose(ahead)
         if not places.has_poses:
-            moved += 1
+            length += 1
         elif pose is not None:
-            moved += 0.0 if here is None else float(np.linalg.norm(pose[:3] - here[:3]))
+            length += 0.0 if here is None else float(np.linalg.norm(pose[:3] - here[:3]))
             here = pose
     return ahead
 
