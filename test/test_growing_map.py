@@ -154,7 +154,7 @@ def test_add_with_error_changes_nothing(count, arguments, error, words):
     with pytest.raises(error, match=words):
         made.add(*arguments)
     if count:
-        with pytest.raises(InputError, match='6 dimensions: the map has 14'):
+        with pytest.raises(FeatureMismatchError, match='6 dimensions, the map has 14'):
             made.add(features(2, d=6))
         assert_holds(made, range(count))
     assert add(made, count) == count

@@ -14,7 +14,7 @@ import numpy as np
 import oracle
 import pytest
 from stavpr_ros.alignment import image_distances, SpatialSettings
-from stavpr_ros.alignment.cpu import int8
+from stavpr_ros.alignment.cpu import dot, int8
 from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
@@ -48,7 +48,7 @@ def kernel_distances(reference, queries, x):
     held = int8.Int8Strips(W, n, d)
     held[:, :] = reference
     out = np.empty((-(-W // TILE) * TILE, W, n), np.float32)
-    int8.strip_distances(held.kernel_arguments(), int8.tiled(queries), x, out)
+    dot.strip_distances(held.kernel_arguments(), int8.tiled(queries), x, out)
     return out[:W], held
 
 
@@ -203,13 +203,13 @@ def test_instruction_of_processor_fits_its_lanes():
 
 HASHED = """
 import hashlib, numpy as np
-from stavpr_ros.alignment.cpu import int8
+from stavpr_ros.alignment.cpu import dot, int8
 rng = np.random.default_rng(0)
 strips = rng.standard_normal((3, 21, 37)).astype(np.float32)
 held = int8.Int8Strips(3, 21, 37)
 held[:, :] = strips
 out = np.empty((7, 3, 21), np.float32)
-int8.strip_distances(held.kernel_arguments(), int8.tiled(strips), 5, out)
+dot.strip_distances(held.kernel_arguments(), int8.tiled(strips), 5, out)
 print(int8.INSTRUCTION, hashlib.sha256(out[:3].tobytes()).hexdigest())
 """
 

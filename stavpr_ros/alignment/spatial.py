@@ -33,9 +33,9 @@ def strip_distances(query: np.ndarray, reference: np.ndarray) -> np.ndarray:
         vectors, vector = np.ascontiguousarray(reference[0]), np.ascontiguousarray(query)
         dot.cosine_distances(vectors, vector, distances[0])
         return distances
-    rows = dot.tiled(query[:, None])[0]
-    distances = np.empty((len(rows), W, n), np.float32)
-    dot.strip_distances(np.ascontiguousarray(reference), rows, distances)
+    rows = dot.tiled(query[:, None])
+    distances = np.empty((rows.shape[1], W, n), np.float32)
+    dot.strip_distances(np.ascontiguousarray(reference), rows, 0, distances)
     return distances[:W]
 
 

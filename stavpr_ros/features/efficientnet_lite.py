@@ -29,7 +29,7 @@ class EfficientNetLite1:
 
     def __init__(self, settings: EfficientNetSettings, device: str = 'cpu') -> None:
         path = Path(settings.model) if settings.model != CACHED else find_file()
-        file, digest = read_model(path, map_hash=settings.sha256)
+        content, digest = read_model(path, map_hash=settings.sha256)
         onnx = OnnxSettings(
             model=str(path),
             layer=MAP,
@@ -40,6 +40,5 @@ class EfficientNetLite1:
             mean=MEAN,
             std=STD,
         )
-        with file:
-            self.feature_maps = Network(onnx, file.read(), device).feature_maps
+        self.feature_maps = Network(onnx, content, device).feature_maps
         self.settings = replace(settings, sha256=digest)

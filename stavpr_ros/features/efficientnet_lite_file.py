@@ -97,9 +97,8 @@ def convert(path: Path) -> bytes:
     :returns: the ONNX file of :func:`make_graph` for images of 224 x 224 pixels.
     :raises UnavailableError: the file cannot be read, or is another one.
     """
-    file, _ = read_model(path, expected=SHA256)
-    with file:
-        return make_graph(read_weights(file.read()), 224)
+    content, _ = read_model(path, expected=SHA256)
+    return make_graph(read_weights(content), 224)
 
 
 def read_weights(content: bytes) -> dict[str, np.ndarray]:

@@ -6,7 +6,6 @@ import hashlib
 import io
 import os
 from pathlib import Path
-from typing import BinaryIO
 
 from stavpr_ros.errors import FeatureMismatchError, UnavailableError
 from stavpr_ros.regular_file import home_folder, open_regular
@@ -58,13 +57,13 @@ def open_model(path: Path) -> io.BufferedReader:
         raise UnavailableError(f'model {str(path)!r} cannot be read: {error}') from error
 
 
-def read_model(path: Path, expected: str = '', map_hash: str = '') -> tuple[BinaryIO, str]:
+def read_model(path: Path, expected: str = '', map_hash: str = '') -> tuple[bytes, str]:
     """
     Read a model into memory and check its hash: what is checked is what is used.
 
     :param expected: its hash, '' for any.
     :param map_hash: the hash that a map states, '' for any.
-    :returns: its content, as a file, and its sha256.
+    :returns: its content and its sha256.
     :raises UnavailableError: it cannot be read, or is damaged.
     :raises FeatureMismatchError: it is another file than the required one.
     """
@@ -84,4 +83,4 @@ def read_model(path: Path, expected: str = '', map_hash: str = '') -> tuple[Bina
             f'model {path} has sha256 {digest[:16]}, the settings require {map_hash[:16]}: '
             'give the file that the map was built with'
         )
-    return io.BytesIO(content), digest
+    return content, digest

@@ -223,9 +223,7 @@ class Onnx(Network):
 
     def __init__(self, settings: OnnxSettings, device: str = 'cpu') -> None:
         onnx, _ = import_onnx()
-        file, digest = read_model(Path(settings.model), map_hash=settings.sha256)
-        with file:
-            content = file.read()
+        content, digest = read_model(Path(settings.model), map_hash=settings.sha256)
         self.settings = replace(settings, sha256=digest)
         model = self._with_output(onnx, content)
         properties = {row.key: row.value for row in model.metadata_props}

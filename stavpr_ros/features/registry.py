@@ -259,9 +259,7 @@ def kinds() -> tuple[str, ...]:
 
 def _all() -> dict[str, Kind]:
     """Return the kinds of this package, and of those whose entry points add one."""
-    return KINDS | {
-        name: kind for name, kind in plugins.load(plugins.FEATURES).items() if name not in KINDS
-    }
+    return KINDS | plugins.load(plugins.FEATURES) | KINDS  # the order, and the kinds, of this one
 
 
 def settings_class(kind: str) -> Any:

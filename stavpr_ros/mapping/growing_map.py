@@ -181,7 +181,7 @@ class GrowingMap:
         :param pose: x y z (meters) and quaternion x y z w, shape (7,); None = unknown.
         :param thumbnail: a small JPEG, see :func:`encode_thumbnail`.
         :returns: number of the place, counting all added places.
-        :raises FeatureMismatchError: features with other settings.
+        :raises FeatureMismatchError: features with other settings, or of another network.
         :raises InputError: the map is full; not one image; values that are not finite.
         """
         rows, n = self._checked(features), self._count
@@ -258,7 +258,7 @@ class GrowingMap:
 
     def _checked(self, features: LocalFeatures) -> dict[str, np.ndarray]:
         """Return the rows of the features of an image that fits."""
-        features.require_same_settings(self.settings, 'the map')
+        features.require_fit(self.settings, 'the map', self.dimension)
         if len(features) != 1:
             raise InputError(f'features of {len(features)} images: expected those of one')
         if self.full:
@@ -267,8 +267,6 @@ class GrowingMap:
                 'places or save it and start another'
             )
         added = _rows_of(features)
-        if self.dimension not in (0, d := features.dimension):
-            raise InputError(f'strips of {d} dimensions: the map has {self.dimension}')
         if not all(np.isfinite(values).all() for values in added.values()):
             raise InputError('the features are not finite: check the network and its input')
         return added

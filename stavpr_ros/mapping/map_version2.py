@@ -14,15 +14,9 @@ from stavpr_ros.mapping.map_schema import integer, list_of, MANIFEST, record, te
 
 FORMAT, VERSION = 'stavpr-map', 2
 MAX_HEADER = 2**20  # bytes: parsing takes at most 25 times as much memory
-# name: highest known version
 ERROR_RISKS = 'error_risks'
-KNOWN_SECTIONS = dict.fromkeys(
-    (
-        *('cameras', ERROR_RISKS, 'intrinsics', 'same_places', 'statistics', 'threshold'),
-        'value_range',
-    ),
-    1,
-)
+SECTIONS = ERROR_RISKS, 'cameras', 'intrinsics', 'same_places', 'statistics', 'threshold'
+KNOWN_SECTIONS = dict.fromkeys((*SECTIONS, 'value_range'), 1)  # name: highest known version
 _METADATA = record(dict.fromkeys(('format', 'version', 'manifest', 'sha256'), text(MAX_HEADER)))
 _TENSOR = record(
     {

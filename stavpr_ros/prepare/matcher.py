@@ -170,10 +170,7 @@ class CpuMatcher:
         """Return the distances of image x by the other strategies, (n,)."""
         W, n = self._weights.shape
         d = np.empty((-(-W // dot.TILE) * dot.TILE, W, n), np.float32)
-        if isinstance(self._map, tuple):
-            int8.strip_distances(self._map, queries, x, d)
-        else:
-            dot.strip_distances(self._map, queries[x], d)
+        dot.strip_distances(self._map, queries, x, d)
         if self._spatial.strategy == 'sliding_window':
             return image_distances(d[:W], self._spatial)
         similarity = 1 - d.diagonal()[:, :W]  # (n, W)

@@ -67,7 +67,16 @@ class EdgeEstimator:
         :param query_camera, place_camera: of the two images; None = unknown.
         :param obstacle: why there is no time for PnP; empty = there is.
         """
-        edge = self._estimated(pair, query_camera, place_camera, obstacle)
+        edge = self.without_pnp(pair, query_camera, place_camera)
+        if edge is None and obstacle:
+            edge = Edge(Source.DROPPED, f'PnP: {obstacle}')
+        elif edge is None:
+            assert query_camera is not None
+            assert place_camera is not None
+            try:
+                edge = self._pnp(pair, query_camera, place_camera)
+            except InputError as error:
+                edge = self._other(pair, f'PnP: {error}')
         return replace(edge, independent=self._is_independent(pair, edge))
 
     def _is_independent(self, pair: MatchedPair, edge: Edge) -> bool:
@@ -82,24 +91,6 @@ class EdgeEstimator:
                 return False
         self._last = pair.source, base[:3, 3]
         return True
-
-    def _estimated(
-        self,
-        pair: MatchedPair,
-        query_camera: Camera | None,
-        place_camera: Camera | None,
-        obstacle: str,
-    ) -> Edge:
-        if (edge := self.without_pnp(pair, query_camera, place_camera)) is not None:
-            return edge
-        if obstacle:
-            return Edge(Source.DROPPED, f'PnP: {obstacle}')
-        assert query_camera is not None
-        assert place_camera is not None
-        try:
-            return self._pnp(pair, query_camera, place_camera)
-        except InputError as error:
-            return self._other(pair, f'PnP: {error}')
 
     def without_pnp(
         self, pair: MatchedPair, query_camera: Camera | None, place_camera: Camera | None

@@ -69,9 +69,14 @@ class OpenBag:
         Only types of ``sensor_msgs`` and ``nav_msgs`` are read, equal in every distribution, and
         the ones of video topics, of which fields may follow: no definition in the bag is needed.
         """
+        store = _store(self.is_ros1)
         if self.is_ros1:
-            return _ros1_store().deserialize_ros1(raw, kind)
-        return _deserialize_cdr(raw, kind)
+            return store.deserialize_ros1(raw, kind)
+        if kind != FOXGLOVE:
+            return store.deserialize_cdr(raw, kind)
+        definition = store.get_msgdef(kind)  # without the check that no bytes are left
+        read = definition.deserialize_cdr_le if raw[1] else definition.deserialize_cdr_be
+        return read(raw[4:], 0, definition.cls, store)[0]
 
     def messages(
         self, topics: Collection[str], start: float = 0.0, duration: float = math.inf
@@ -235,25 +240,9 @@ def _copied(file: Path, logs: list[Path], stack: ExitStack) -> Path:
 
 
 @cache
-def _ros1_store() -> Typestore:
-    store = get_typestore(Stores.ROS1_NOETIC)
-    for name, text in (DEFINITIONS | {FFMPEG: ROS1_FFMPEG}).items():
+def _store(is_ros1: bool) -> Typestore:
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+    definitions = DEFINITIONS | ({FFMPEG: ROS1_FFMPEG} if is_ros1 else {})
+    for name, text in definitions.items():
         store.register(get_types_from_msg(text, name))
     return store
-
-
-@cache
-def _ros2_store() -> Typestore:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
-    return store
-
-
-def _deserialize_cdr(raw: bytes, kind: str) -> Any:
-    store = _ros2_store()
-    if kind != FOXGLOVE:
-        return store.deserialize_cdr(raw, kind)
-    definition = store.get_msgdef(kind)  # without the check that no bytes are left
-    read = definition.deserialize_cdr_le if raw[1] else definition.deserialize_cdr_be
-    return read(raw[4:], 0, definition.cls, store)[0]

@@ -103,8 +103,8 @@ _FROM_BGR = partial(convert, cv2.COLOR_BGR2RGB)
 _FROM_RGBA = partial(convert, cv2.COLOR_RGBA2RGB)
 _FROM_BGRA = partial(convert, cv2.COLOR_BGRA2RGB)
 _FROM_GRAY = partial(convert, cv2.COLOR_GRAY2RGB)
-_FROM_UYVY = partial(convert, cv2.COLOR_YUV2RGB_UYVY)
-_FROM_YUYV = partial(convert, cv2.COLOR_YUV2RGB_YUYV)
+_UYVY = Encoding(2, 1, partial(convert, cv2.COLOR_YUV2RGB_UYVY), block=(1, 2))
+_YUYV = Encoding(2, 1, partial(convert, cv2.COLOR_YUV2RGB_YUYV), block=(1, 2))
 
 ENCODINGS: dict[str, Encoding] = {
     'rgb8': Encoding(3, 1, keep),
@@ -132,59 +132,60 @@ ENCODINGS: dict[str, Encoding] = {
         for value_bytes in (1, 2)
         for pattern in ('rggb', 'bggr', 'gbrg', 'grbg')
     },
-    'uyvy': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
-    'yuv422': Encoding(2, 1, _FROM_UYVY, block=(1, 2)),
-    'yuyv': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
-    'yuv422_yuy2': Encoding(2, 1, _FROM_YUYV, block=(1, 2)),
-    'nv12': Encoding(
-        1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV12), block=(2, 2), chroma_rows=0.5
-    ),
-    'nv21': Encoding(
-        1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV21), block=(2, 2), chroma_rows=0.5
-    ),
+    'uyvy': _UYVY,
+    'yuv422': _UYVY,
+    'yuyv': _YUYV,
+    'yuv422_yuy2': _YUYV,
+    'nv12': Encoding(1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV12), (2, 2), chroma_rows=0.5),
+    'nv21': Encoding(1, 1, partial(convert, cv2.COLOR_YUV2RGB_NV21), (2, 2), chroma_rows=0.5),
     'nv24': Encoding(1, 1, nv24_to_rgb, chroma_rows=2),
 }
 """The supported raw encodings."""
 _LOWER_CASE = {name.lower(): encoding for name, encoding in ENCODINGS.items()}
 
 
-def decode_image(
-    height: int,
-    width: int,
-    encoding: str,
-    is_bigendian: bool,
-    step: int,
-    data: Any,
+def decode_message(
+    message: Any,
     least: tuple[int, int] | None = None,
     to_bytes: files.ToBytes | None = None,
 ) -> np.ndarray:
     """
-    Decode the fields of a raw ``sensor_msgs/Image``.
+    Decode an image message, raw or compressed, of rclpy or rosbags, or any object with its fields.
 
-    The bytes are viewed in place for any ``step``; ``rgb8`` without padding remains such a view if
+    Raw bytes are viewed in place for any ``step``; ``rgb8`` without padding remains such a view if
     the bytes can be written, all others get memory of their own. YUV is BT.601 in the range of
     video, as in cv_bridge.
 
-    :param height: rows of the image; NV12, NV21 and NV24 have rows of color below them.
-    :param width: pixels per row.
-    :param encoding: a key of :data:`ENCODINGS`, in upper or lower case.
-    :param is_bigendian: byte order of 16 bit values.
-    :param step: bytes from one row to the next; rows may be padded. 0 = they are not.
-    :param data: the bytes: anything with the buffer protocol. The last row's padding may be
-        missing.
+    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, the image of a video
+        topic if it decodes itself, else a ``sensor_msgs/Image``.
     :param least: rows and columns that are needed of a large image, which is reduced then, see
         :func:`stavpr_ros.sources.files.reduce`; None = all.
     :param to_bytes: converts values of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: header and data contradict each other, the encoding is unsupported, or the
-        image has more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels.
+    :raises ImageError: header and data contradict each other, the encoding is unsupported, the
+        image has more than :data:`stavpr_ros.sources.files.MAX_PIXELS` pixels; or see
+        :func:`stavpr_ros.sources.files.decode_file`.
     """
+    if hasattr(message, 'decode'):
+        return files.reduce(message.decode(), least)
+    if hasattr(message, 'format'):
+        return _decode_compressed(message, least, to_bytes)
+    if message.encoding.lower() in _FILES:
+        return files.decode_file(message.data, None, least, to_bytes)
+    return _decode_raw(message, least, to_bytes)
+
+
+def _decode_raw(
+    message: Any, least: tuple[int, int] | None, to_bytes: files.ToBytes | None
+) -> np.ndarray:
+    """Decode a ``sensor_msgs/Image``; step may be 0, and the padding of the last row missing."""
+    height, width, encoding = message.height, message.width, message.encoding
     layout = _layout(encoding)
     row = width * layout.channels * layout.value_bytes
-    step = step or row
+    step = message.step or row
     rows = height + int(height * layout.chroma_rows)
     _check_header(height, width, encoding, layout, step, row)
-    flat = files.flat_bytes(data)
+    flat = files.flat_bytes(message.data)
     min_size = (rows - 1) * step + row
     if flat.size < min_size:
         raise ImageError(
@@ -203,63 +204,22 @@ def decode_image(
         return image if is_own else np.array(image, order='C')
     if to_bytes is None:  # the more significant byte lies first if big-endian
         pairs: np.ndarray = np.ndarray((rows, values, 2), np.uint8, flat, 0, (step, 2, 1))
-        high = np.asarray(cv2.extractChannel(pairs, 0 if is_bigendian else 1))
+        high = np.asarray(cv2.extractChannel(pairs, 0 if message.is_bigendian else 1))
     else:
-        order = '>u2' if is_bigendian else '<u2'
+        order = '>u2' if message.is_bigendian else '<u2'
         wide: np.ndarray = np.ndarray((rows, values), order, flat, 0, (step, 2))
         high = to_bytes(wide.astype(np.uint16))
     return files.reduce(layout.to_rgb(high.reshape(rows, width, layout.channels)), least)
 
 
-def decode_message(
-    message: Any,
-    least: tuple[int, int] | None = None,
-    to_bytes: files.ToBytes | None = None,
+def _decode_compressed(
+    message: Any, least: tuple[int, int] | None, to_bytes: files.ToBytes | None
 ) -> np.ndarray:
     """
-    Decode an image message, raw or compressed, of rclpy or rosbags, or any object with its fields.
+    Decode a ``sensor_msgs/CompressedImage``; the bytes decide the file format.
 
-    :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, the image of a video
-        topic if it decodes itself, else a ``sensor_msgs/Image``.
-    :param least: rows and columns that are needed of a large image, which is reduced then; None =
-        all.
-    :param to_bytes: converts values of 16 bits; None = the upper byte.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: see :func:`decode_image` and :func:`decode_compressed_message`.
-    """
-    if hasattr(message, 'decode'):
-        return files.reduce(message.decode(), least)
-    if hasattr(message, 'format'):
-        return decode_compressed_message(message, least, to_bytes)
-    if message.encoding.lower() in _FILES:
-        return files.decode_file(message.data, None, least, to_bytes)
-    return decode_image(
-        message.height,
-        message.width,
-        message.encoding,
-        bool(message.is_bigendian),
-        message.step,
-        message.data,
-        least,
-        to_bytes,
-    )
-
-
-def decode_compressed_message(
-    message: Any,
-    least: tuple[int, int] | None = None,
-    to_bytes: files.ToBytes | None = None,
-) -> np.ndarray:
-    """
-    Decode a ``sensor_msgs/CompressedImage``.
-
-    The bytes decide the file format. The message's ``format`` is needed twice: to reject depth
-    images, and to detect Bayer mosaics, which image_transport stores as gray files.
-
-    :param message: anything with ``format`` and ``data``.
-    :param least, to_bytes: of :func:`decode_message`.
-    :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
-    :raises ImageError: a depth image, or see :func:`stavpr_ros.sources.files.decode_file`.
+    The message's ``format`` is needed twice: to reject depth images, and to detect Bayer mosaics,
+    which image_transport stores as gray files.
     """
     original = message.format.partition(';')[0].strip()
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):

@@ -72,9 +72,8 @@ class NetVlad:
 
     def __init__(self, settings: NetVladSettings, device: str = 'cpu') -> None:
         path = Path(settings.model)
-        file, digest = read_model(path, expected_hash(path), settings.sha256)
-        with file:
-            model = read_parameters(file, str(path))
+        content, digest = read_model(path, expected_hash(path), settings.sha256)
+        model = read_parameters(io.BytesIO(content), str(path))
         self.settings = replace(settings, sha256=digest)
         if settings.whitening and model.whitening is None:
             raise SettingsError(

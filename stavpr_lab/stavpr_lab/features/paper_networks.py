@@ -14,6 +14,7 @@ its first fully connected layer fc6.
 
 from collections.abc import Sequence
 from dataclasses import replace
+import io
 import re
 from typing import ClassVar
 
@@ -61,9 +62,8 @@ class PublishedNetwork:
     def __init__(self, settings: PublishedSettings, device: str = 'cpu') -> None:
         self._device = torch.device(choose_device(device))
         path = published_path(settings.model, self.published)
-        file, digest = read_model(path, expected_hash(path, self.published), settings.sha256)
-        with file:
-            parameters = read_checkpoint(file, str(path))
+        content, digest = read_model(path, expected_hash(path, self.published), settings.sha256)
+        parameters = read_checkpoint(io.BytesIO(content), str(path))
         self.settings = replace(settings, sha256=digest)
         with torch.device('meta'):
             network = self.whole_network()

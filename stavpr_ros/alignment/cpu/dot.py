@@ -146,20 +146,23 @@ def _float_block_distances(features, queries, x, first, count, d):
 
 
 @parallel_kernel
-def strip_distances(features, query, d):
+def strip_distances(features, queries, x, d):
     """
-    Distances d[i, j, y] = 1 - <x_i, y_j>.
+    Distances d[i, j, y] = 1 - <x_i, y_j> of query x.
 
-    :param features: the map's unit-norm local features, shape (W, n, d), float32.
-    :param query: features of one image, shape (R, d), float32; R is W rounded up to whole TILEs,
-        zeros there.
+    :param features: the map's unit-norm local features, shape (W, n, d), float32; or in int8, of
+        :meth:`stavpr_ros.alignment.cpu.int8.Int8Strips.kernel_arguments`.
+    :param queries: features of Q images, shape (Q, R, d), of :func:`tiled`; or in int8, of
+        :func:`stavpr_ros.alignment.cpu.int8.tiled`.
     :param d: shape (R, W, n), written.
     """
-    n = features.shape[1]
+    n = d.shape[2]
     for block in nb.prange((n + IMAGES - 1) // IMAGES):
         first = block * IMAGES
         count = min(IMAGES, n - first)
-        _float_block_distances(features, query[None], 0, first, count, d[:, :, first:])
+        part = np.empty((d.shape[0], d.shape[1], IMAGES), np.float32)
+        _block_distances(features, queries, x, first, count, part)
+        d[:, :, first : first + count] = part[:, :, :count]
 
 
 @kernel
@@ -180,10 +183,7 @@ def image_distances(features, queries, weights, xi, is_rigid, out):
     """
     Image distances of Q images to all map images, aligned or shifted, from the features in one go.
 
-    :param features: as in :func:`strip_distances`, or in int8, of
-        :meth:`stavpr_ros.alignment.cpu.int8.Int8Strips.kernel_arguments`.
-    :param queries: features of Q images, shape (Q, R, d), likewise; or int8, of
-        :func:`stavpr_ros.alignment.cpu.int8.tiled`.
+    :param features, queries: as in :func:`strip_distances`.
     :param weights, xi, is_rigid: as in :func:`stavpr_ros.alignment.cpu.dtw.spatial_dtw`.
     :param out: shape (Q, m), written; m <= n: only so many map images are looked at.
     """

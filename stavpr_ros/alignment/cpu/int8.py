@@ -368,23 +368,6 @@ def block_distances(features, queries, x, first, count, d):
 
 
 @parallel_kernel
-def strip_distances(features, queries, x, d):
-    """
-    Distances d[i, j, y] of query x to all places.
-
-    :param features, queries: as in :func:`block_distances`.
-    :param d: shape (R, W, n), written.
-    """
-    n = d.shape[2]
-    for block in nb.prange((n + IMAGES - 1) // IMAGES):
-        first = block * IMAGES
-        count = min(IMAGES, n - first)
-        part = np.empty((d.shape[0], d.shape[1], IMAGES), np.float32)
-        block_distances(features, queries, x, first, count, part)
-        d[:, :, first : first + count] = part[:, :, :count]
-
-
-@parallel_kernel
 def cosine_distances(features, queries, out):
     """
     Distances of images that are one vector each (W = 1), equal to the other kernels' results.
