@@ -32,7 +32,7 @@ def diagonals(rows: int, columns: int, band: int) -> list[Diagonal]:
     for t in range(rows + columns - 1):
         first = max(0, t - columns + 1, (t - band) // 2 + 1)
         every.append((t, first, min(rows - 1, t, (t + band - 1) // 2) - first + 1))
-    return [each for each in every if each[2] > 0]
+    return [diagonal for diagonal in every if diagonal[2] > 0]
 
 
 def accumulate(
@@ -68,7 +68,7 @@ def accumulate(
         torch.minimum(diagonal, straight, out=corner)
         steps = steps if t % 2 else steps - 1
         torch.where(diagonal < straight, F[own, here], steps, out=F[own, here])
-    S, F = (each.transpose(0, 1).flatten(0, 1) for each in (S, F))
+    S, F = (table.transpose(0, 1).flatten(0, 1) for table in (S, F))
     return S, F
 
 

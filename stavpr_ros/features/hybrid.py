@@ -40,6 +40,6 @@ class Hybrid:
         :returns: shape (n, 1008, 1, 7), float32.
         """
         maps = (kind.feature_maps(images) for kind in (self._gradient, self._learned))
-        (g, a), (e, b) = (normalize(cut_strips(each, STRIPS)) for each in maps)
+        (g, a), (e, b) = (normalize(cut_strips(kind_maps, STRIPS)) for kind_maps in maps)
         strips = np.concatenate([g, e], axis=2) * (np.sqrt(a**2 + b**2) / 2)[:, :, None]
         return strips.transpose(1, 2, 0)[:, :, None]

@@ -244,7 +244,7 @@ class Onnx(Network):
         layers = [output for node in model.graph.node for output in node.output]
         if layer not in layers:
             outputs = [value.name for value in model.graph.output]
-            names = outputs + [each for each in layers if each not in outputs]
+            names = outputs + [layer_name for layer_name in layers if layer_name not in outputs]
             text = ', '.join(names[:60]) + (', ...' if len(names) > 60 else '')
             raise SettingsError(f'{name} has no layer {layer!r}: its layers are {text}')
         weights = {tensor.name for tensor in model.graph.initializer}

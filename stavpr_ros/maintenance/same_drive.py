@@ -25,7 +25,8 @@ def rows_of(place_map: Map, name: str) -> list[Row]:
     """Return a row for each session of a map; name: of a map without sessions."""
     index, rows = place_map.session_index, []
     index = np.zeros(len(place_map)) if index is None else index
-    for number, own in enumerate([each.name or each.id for each in place_map.sessions] or [name]):
+    names = [session.name or session.id for session in place_map.sessions] or [name]
+    for number, own in enumerate(names):
         images = np.flatnonzero(index == number)
         probes = images[np.linspace(0, len(images) - 1, min(PROBES, len(images))).astype(int)]
         strips = place_map.features[probes].strips.transpose(1, 0, 2)  # (images, W, d)
@@ -33,7 +34,7 @@ def rows_of(place_map: Map, name: str) -> list[Row]:
             (strips.shape[2], max(BITS // strips.shape[1], 1)), np.float32
         )
         bits = (strips - strips.mean(axis=2, keepdims=True)) @ planes > 0
-        text = ' '.join(np.packbits(each).tobytes().hex() for each in bits)
+        text = ' '.join(np.packbits(image_bits).tobytes().hex() for image_bits in bits)
         rows.append((own, int(place_map.stamps[images[0]]), text))
     return rows
 

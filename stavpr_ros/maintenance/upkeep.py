@@ -179,8 +179,8 @@ def _require_fitting_thumbnails(place_map: Map, drive: Map, on_map: _OnMap) -> N
             continue
         other = (place + max(FAR, len(place_map) // 2)) % len(place_map)
         flipped = np.ascontiguousarray(np.fliplr(query))
-        views = (query, place), (query, other), (flipped, place)
-        right, *wrong = (verifier.inliers(image, place_map, each) or 0 for image, each in views)
+        pairs = (query, place), (query, other), (flipped, place)
+        right, *wrong = (verifier.inliers(view, place_map, i) or 0 for view, i in pairs)
         signs.append(np.sign(right - np.array(wrong)))
     if (np.sum(signs, axis=0) < -2 * np.abs(signs).sum(axis=0) ** 0.5).any():
         raise InputError(
@@ -226,7 +226,7 @@ def _with_drive(
     """
     n, has = len(place_map), places >= 0
     # identifiers that stay when places come and go: their numbers where there is none
-    ids = tuple(each or str(i) for i, each in enumerate(place_map.ids))
+    ids = tuple(identifier or str(i) for i, identifier in enumerate(place_map.ids))
     own = tuple(
         ids[place] if place >= 0 else f'{name}/{drive.ids[image] or image}'
         for image, place in zip(images.tolist(), places.tolist(), strict=True)

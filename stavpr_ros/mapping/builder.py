@@ -110,20 +110,21 @@ def build_map(
         frames = frames.source
     fit_value_range(frames, extractor)
     features: list[LocalFeatures] = []
-    rows_of_places: list[tuple[Place, bytes]] = []
+    rows: list[tuple[Place, bytes]] = []
     options = keyframes, thumbnail_width if thumbnails else None
     with closing(_extracted(frames, extractor, poses, *options, progress)) as batches:
         for batch, extracted in batches:
             features.append(extracted)
-            rows_of_places += [(each.place, each.thumbnail) for each in batch]
-    places, encoded = zip(*rows_of_places, strict=True)
-    rows = np.array([np.full(7, np.nan) if each.pose is None else each.pose for each in places])
+            rows += [(row.place, row.thumbnail) for row in batch]
+    places, encoded = zip(*rows, strict=True)
+    unknown = np.full(7, np.nan)
+    pose_rows = np.array([unknown if place.pose is None else place.pose for place in places])
     return Map(
         features=LocalFeatures.concatenate(features),
         projection=extractor.projection,
-        stamps=np.array([each.stamp for each in places], np.int64),
-        ids=tuple(each.identifier for each in places),
-        poses=None if np.isnan(rows).all() else rows,
+        stamps=np.array([place.stamp for place in places], np.int64),
+        ids=tuple(place.identifier for place in places),
+        poses=None if np.isnan(pose_rows).all() else pose_rows,
         thumbnails=encoded if thumbnails else (),
     )
 
@@ -226,7 +227,7 @@ def _extracted(
         Progress(total=total, unit='image', desc='extracting', disable=not progress) as bar,
     ):
         for batch in batches:
-            yield batch, extractor.extract([each.image for each in batch])
+            yield batch, extractor.extract([row.image for row in batch])
             bar.update(batch[-1].number + 1 - bar.n)
 
 

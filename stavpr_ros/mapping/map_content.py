@@ -146,11 +146,11 @@ def _sessions(manifest: dict[str, Any], has_cameras: bool) -> tuple[Session, ...
     return tuple(
         replace(
             session,
-            camera=each['name'],
-            yaw=each['yaw'],
-            intrinsics=each['intrinsics'] and _made(Camera, each['intrinsics']),
+            camera=camera['name'],
+            yaw=camera['yaw'],
+            intrinsics=camera['intrinsics'] and _made(Camera, camera['intrinsics']),
         )
-        for session, each in zip(sessions, data, strict=True)
+        for session, camera in zip(sessions, data, strict=True)
     )
 
 

@@ -62,16 +62,17 @@ def save_map(
 
 def _manifest(place_map: Map, statistics: MapStatistics | None) -> dict[str, Any]:
     data: dict[str, Any] = {}
+    sessions = place_map.sessions
     if place_map.camera is not None:
         data['intrinsics'] = asdict(place_map.camera)
-    if any(each.camera or each.yaw is not None or each.intrinsics for each in place_map.sessions):
+    if any(own.camera or own.yaw is not None or own.intrinsics for own in sessions):
         data['cameras'] = [
             {
-                'name': each.camera,
-                'yaw': each.yaw,
-                'intrinsics': each.intrinsics and asdict(each.intrinsics),
+                'name': session.camera,
+                'yaw': session.yaw,
+                'intrinsics': session.intrinsics and asdict(session.intrinsics),
             }
-            for each in place_map.sessions
+            for session in sessions
         ]
     if place_map.same_as is not None:
         data['same_places'] = None
@@ -89,8 +90,8 @@ def _manifest(place_map: Map, statistics: MapStatistics | None) -> dict[str, Any
         'settings': {name: {**vars(settings), 'backbone': backbone}[name] for name in SETTINGS},
         'cells': place_map.features.cells,
         'projection': projection.name if projection else None,
-        'sessions': [{key: vars(each)[key] for key in SESSION} for each in place_map.sessions],
-        'sections': {name: _section(each, name) for name, each in data.items()},
+        'sessions': [{key: vars(session)[key] for key in SESSION} for session in sessions],
+        'sections': {name: _section(content, name) for name, content in data.items()},
     }
 
 

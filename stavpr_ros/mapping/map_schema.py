@@ -95,9 +95,9 @@ def mapping(key: Check, item: Check) -> Check:
 
     def check(value: Any, where: str) -> None:
         sized(value, where)
-        for name, each in value.items():
+        for name, entry in value.items():
             key(name, f'a name in {where}')
-            item(each, f'{where}.{name}')
+            item(entry, f'{where}.{name}')
 
     return check
 

@@ -76,7 +76,7 @@ def _id_of(manifest: dict[str, Any], digest: str) -> str:
     :param digest: SHA-256 of the manifest.
     """
     if ERROR_RISKS in manifest['sections']:
-        sections = {n: each for n, each in manifest['sections'].items() if n != ERROR_RISKS}
+        sections = {n: section for n, section in manifest['sections'].items() if n != ERROR_RISKS}
         digest = hashlib.sha256(_json({**manifest, 'sections': sections}).encode()).hexdigest()
     return digest[:16]
 

@@ -31,7 +31,7 @@ def merge_maps(
     if len(cameras) not in (0, len(maps)):
         raise InputError(f'{len(cameras)} cameras of {len(maps)} maps: expected one each')
     # one section for the whole map
-    camera = maps[0].camera if len({each.camera for each in maps}) == 1 else None
+    camera = maps[0].camera if len({part.camera for part in maps}) == 1 else None
     sessions: list[Session] = []
     index = []
     for number, (place_map, name) in enumerate(zip(maps, names, strict=True)):
@@ -57,16 +57,16 @@ def merge_maps(
                 one = replace(one, camera=label, yaw=yaw)
             sessions.append(one)
     poses = [
-        np.full((len(each), 7), np.nan) if each.poses is None else each.poses for each in maps
+        np.full((len(part), 7), np.nan) if part.poses is None else part.poses for part in maps
     ]
-    thumbnails = [content for each in maps for content in each.thumbnails or [b''] * len(each)]
+    thumbnails = [content for part in maps for content in part.thumbnails or [b''] * len(part)]
     return Map(
-        features=LocalFeatures.concatenate([each.features for each in maps]),
+        features=LocalFeatures.concatenate([part.features for part in maps]),
         projection=maps[0].projection,
-        stamps=np.concatenate([each.stamps for each in maps]),
-        ids=tuple(identifier for each in maps for identifier in each.ids),
-        poses=np.concatenate(poses) if any(each.has_poses for each in maps) else None,
-        thumbnails=tuple(thumbnails) if any(len(each.thumbnails) for each in maps) else (),
+        stamps=np.concatenate([part.stamps for part in maps]),
+        ids=tuple(identifier for part in maps for identifier in part.ids),
+        poses=np.concatenate(poses) if any(part.has_poses for part in maps) else None,
+        thumbnails=tuple(thumbnails) if any(len(part.thumbnails) for part in maps) else (),
         sessions=tuple(sessions),
         session_index=np.concatenate(index),
         camera=camera,
@@ -131,11 +131,11 @@ def _free_id(base: str, sessions: list[Session]) -> str:
 
 
 def _joined_same_as(maps: Sequence[Map]) -> np.ndarray | None:
-    if all(each.same_as is None for each in maps):
+    if all(part.same_as is None for part in maps):
         return None
     parts, first = [], 0
-    for each in maps:
-        own = np.arange(len(each)) if each.same_as is None else each.same_as
+    for place_map in maps:
+        own = np.arange(len(place_map)) if place_map.same_as is None else place_map.same_as
         parts.append(own + first)
-        first += len(each)
+        first += len(place_map)
     return np.concatenate(parts).astype(np.int32)

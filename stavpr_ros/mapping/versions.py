@@ -54,7 +54,7 @@ class Version:
 
 
 def _drive(value: Any, where: str) -> None:
-    if not (isinstance(value, list) and [type(each) for each in value] == [str, int, str]):
+    if not (isinstance(value, list) and [type(item) for item in value] == [str, int, str]):
         raise ValueError(f'{where} is {value!r:.80}: expected name, stamp and bits of a drive')
     bytes.fromhex(value[2])
 
@@ -93,7 +93,7 @@ def versions(path: str | Path) -> list[Version]:
     :raises MapFileError: as :func:`current_version`.
     """
     chain = [current_version(path)]
-    while (parent := chain[-1].parent) and parent not in {each.map_id for each in chain}:
+    while (parent := chain[-1].parent) and parent not in {version.map_id for version in chain}:
         chain.append(_read(history_of(path), parent) or Version(parent))
     return chain
 
@@ -130,7 +130,7 @@ def save_version(
     content = json.dumps(asdict(version), allow_nan=False)
     write_output(folder / f'{map_id}.json', content, JSON, True)
     _copy(folder / f'{map_id}.stavpr', Path(path), opened or False)
-    _clean(folder, [each.map_id for each in versions(path)])
+    _clean(folder, [version.map_id for version in versions(path)])
     return version
 
 
@@ -153,7 +153,7 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
     opened, chain = FileVersion.of(path), versions(path)
     target = map_id or chain[0].parent
     file = history_of(path) / f'{target}.stavpr'
-    known = [each.map_id for each in chain[1:] if _file(path, each).exists()]
+    known = [version.map_id for version in chain[1:] if _file(path, version).exists()]
     if target not in known:
         raise InputError(f'{target or "an earlier one"} is no version of {path}: it has {known}')
     if load_map(file).map_id != target:

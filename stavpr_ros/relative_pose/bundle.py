@@ -55,7 +55,7 @@ class Observations:
         information = np.bincount(self.keypoint, weight * (a * a).sum(axis=1), k)
         rho = np.bincount(self.keypoint, weight * (a * b).sum(axis=1), k)
         precision = np.maximum(information, 1e-12)
-        common = [np.bincount(self.keypoint, weight * each, k) for each in a.T]
+        common = [np.bincount(self.keypoint, weight * column, k) for column in a.T]
         variance = 1 / precision + np.sum(np.square(common), axis=0) / precision**2
         return np.maximum(rho / precision, MIN_INVERSE_DEPTH), information, variance
 
@@ -70,7 +70,7 @@ class Observations:
 
     def chosen(self, use: np.ndarray) -> 'Observations':
         """Return a part of the observations, (m,) bool."""
-        return Observations(*(each[use] for each in vars(self).values()))
+        return Observations(*(array[use] for array in vars(self).values()))
 
     def refined(
         self, motions: np.ndarray, rho: np.ndarray, prior: np.ndarray, information: np.ndarray,
@@ -124,7 +124,7 @@ class Observations:
 def _motion_difference(motions: np.ndarray, prior: np.ndarray) -> np.ndarray:
     """Return translations and rotations from the prior to motions, one after the other, (6n,)."""
     rotations = motions[:, :3, :3] @ prior[:, :3, :3].transpose(0, 2, 1)
-    turns = [cv2.Rodrigues(each)[0].ravel() for each in rotations]
+    turns = [cv2.Rodrigues(rotation)[0].ravel() for rotation in rotations]
     return np.column_stack([motions[:, :3, 3] - prior[:, :3, 3], turns]).ravel()
 
 

@@ -60,7 +60,7 @@ class Expansion:
         if math.isnan(focal):
             return math.nan, math.nan
         first, last = max(0, place - RADIUS), min(len(self._distances), place + RADIUS + 1)
-        log = np.sum([self._evidence(each) for each in range(first, last)], axis=0)
+        log = np.sum([self._evidence(i) for i in range(first, last)], axis=0)
         share = np.exp(log - log.max())
         share /= share.sum()
         mean = float(share @ np.log(RATES))

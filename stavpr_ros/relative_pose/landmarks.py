@@ -55,7 +55,7 @@ class Landmarks:
 
     def seen_from(self, motion: np.ndarray) -> 'Landmarks':
         """Return the points in another frame, to which this one has the transform (4, 4)."""
-        rays, points = (each @ motion[:3, :3].T for each in (self.rays, self.points))
+        rays, points = (vectors @ motion[:3, :3].T for vectors in (self.rays, self.points))
         return replace(self, points=points + motion[:3, 3], rays=rays)
 
 

@@ -107,7 +107,7 @@ class _Matches:
     def chosen(self, use: np.ndarray) -> '_Matches':
         """Return the pairs of these indices."""
         arrays = (self.keypoint, self.pixels, self.points, self.rays, self.deviations)
-        keypoint, pixels, points, rays, deviations = (each[use] for each in arrays)
+        keypoint, pixels, points, rays, deviations = (array[use] for array in arrays)
         return _Matches(keypoint, pixels, points, rays, deviations, self.focal)
 
     def residuals(self, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -120,7 +120,7 @@ class _Matches:
 
 def _matched(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
     """Match the query with the landmarks of each place."""
-    pairs = [mutual_matches(query.descriptors, each.descriptors, RATIO) for each in landmarks]
+    pairs = [mutual_matches(query.descriptors, place.descriptors, RATIO) for place in landmarks]
     mine = np.concatenate([own for own, _ in pairs])
     points, rays, deviations = (
         np.concatenate(

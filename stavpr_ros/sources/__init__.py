@@ -57,7 +57,7 @@ def open_source(
     if is_bag(path):
         from stavpr_ros.sources.bag import BagSource
 
-        images = path.is_dir() and sum(each.suffix.lower() in SUFFIXES for each in path.iterdir())
+        images = path.is_dir() and sum(file.suffix.lower() in SUFFIXES for file in path.iterdir())
         if images > 1:
             note_once(
                 f'{path} is a bag beside {images} images: the bag is read; to read the images, '

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from stavpr_ros.errors import ImageError, SourceError
-from stavpr_ros.sources.bag_file import message_type, open_bag, OpenBag
+from stavpr_ros.sources.bag_file import message_count, message_type, open_bag, OpenBag
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.files import ToBytes
 from stavpr_ros.sources.frame import Frame, ImageRecord
@@ -164,7 +164,7 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
     return {
         name: (
             ' and '.join(sorted(set(map(message_type, connections)))),
-            sum(each.msgcount for each in connections),
+            message_count(connections),
         )
         for name, connections in sorted(bag.topics.items())
     }

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens bag files of every kind with rosbags, without writing beside them."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import closing, contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
@@ -52,14 +52,15 @@ class OpenBag:
     @property
     def is_ros1(self) -> bool:
         """Whether its messages are of ROS 1."""
-        return all(isinstance(each, Ros1Reader) for each in self.readers)
+        return all(isinstance(reader, Ros1Reader) for reader in self.readers)
 
     @property
     def topics(self) -> dict[str, list[Connection]]:
         """Return the connections of each topic, of all files."""
         topics: dict[str, list[Connection]] = {}
-        for connection in (each for reader in self.readers for each in reader.connections):
-            topics.setdefault(connection.topic, []).append(connection)
+        for reader in self.readers:
+            for connection in reader.connections:
+                topics.setdefault(connection.topic, []).append(connection)
         return topics
 
     def deserialize(self, raw: bytes, kind: str) -> Any:
@@ -88,17 +89,17 @@ class OpenBag:
         :param duration: seconds from there on.
         """
         with reading(self.path):
-            starts = (getattr(each, 'metadata', each).start_time for each in self.readers)
+            starts = (getattr(reader, 'metadata', reader).start_time for reader in self.readers)
             first = min(starts) + round(start * SECOND)
             last = None if math.isinf(duration) else first + round(duration * SECOND)
             parts = []
             for reader in self.readers:
                 has_index = not isinstance(reader, McapReader) or reader.chunks
                 read = reader.messages if has_index else reader.messages_scan
-                wanted = [each for each in reader.connections if each.topic in topics]
-                if wanted:  # none would be all
-                    parts.append(read(wanted, first if start else None, last))
-            for connection, time_ns, raw in merge(*parts, key=lambda each: each[1]):
+                connections = [own for own in reader.connections if own.topic in topics]
+                if connections:  # none would be all
+                    parts.append(read(connections, first if start else None, last))
+            for connection, time_ns, raw in merge(*parts, key=lambda row: row[1]):
                 # of ZSTD; no CDR starts so
                 is_packed = not self.is_ros1 and bytes(raw[:4]) in bag_path.MAGIC
                 yield connection, time_ns, zstd.decompress(raw) if is_packed else raw
@@ -108,6 +109,11 @@ def message_type(connection: Connection) -> str:
     """Return the full name of the type; in bags from before 2019 ``msg`` is missing."""
     package, _, name = connection.msgtype.rpartition('/')
     return connection.msgtype if package.endswith('/msg') else f'{package}/msg/{name}'
+
+
+def message_count(connections: Iterable[Connection]) -> int:
+    """Return the messages that a bag states of connections."""
+    return sum(connection.msgcount for connection in connections)
 
 
 @contextmanager
@@ -150,9 +156,9 @@ def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
     content = file.read_bytes()
     try:
         stated = YAML(typ='safe').load(content)['rosbag2_bagfile_information']
-        names = [PureWindowsPath(each).name for each in stated['relative_file_paths']]
+        names = [PureWindowsPath(path).name for path in stated['relative_file_paths']]
         topics = stated.get('topics_with_message_count') or []
-        counts = {each['topic_metadata']['name']: int(each['message_count']) for each in topics}
+        counts = {entry['topic_metadata']['name']: int(entry['message_count']) for entry in topics}
     except Exception as error:  # garbage raises errors of any type
         reason = f'{type(error).__name__}: {error}'.partition('\n')[0]
         note_once(f'{file} is damaged or of another program ({reason}): read without it')
@@ -167,11 +173,11 @@ def _files(folder: Path, names: list[str]) -> list[Path]:
     if len(files) < len(names) or not names:  # perhaps renamed
         files.update(bag_path.storage_files(folder))
     others = {file.name.lower() for file in files if file.suffix.lower() != '.bag'}
-    if not files or (not names and len({re.sub(r'_\d+\.', '.', each) for each in others}) > 1):
+    if not files or (not names and len({re.sub(r'_\d+\.', '.', name) for name in others}) > 1):
         raise SourceError(
             f'{folder} has no {METADATA} with the names of its files: expected exactly one .db3 '
             'or .mcap file then, or the parts of one bag, found '
-            f'{", ".join(sorted(each.name for each in files)) or "none"}; name one of the files'
+            f'{", ".join(sorted(file.name for file in files)) or "none"}; name one of the files'
         )
     return sorted(files)
 
@@ -182,7 +188,7 @@ def _note_missing(
     """Log in one line what the metadata state and the files do not have."""
     topics, present = bag.topics, {file.name.lower() for file in files}
     notes = [f'{name} is missing' for name in names if name.lower() not in present]
-    totals = {topic: sum(each.msgcount for each in topics.get(topic, [])) for topic in counts}
+    totals = {topic: message_count(topics.get(topic, [])) for topic in counts}
     rows = ((topic, totals[topic], count) for topic, count in counts.items())
     notes += [f'{topic} has {n} of {count} messages' for topic, n, count in rows if n < count]
     if notes:
@@ -224,14 +230,14 @@ def _copied(file: Path, logs: list[Path], stack: ExitStack) -> Path:
             with zstd.open(file) as whole, target.open('wb') as copy:
                 shutil.copyfileobj(whole, copy)
             return target
-        for each in (file, *logs):
-            shutil.copyfile(each, f'{target}{each.name.removeprefix(file.name)}')
+        for part in (file, *logs):
+            shutil.copyfile(part, f'{target}{part.name.removeprefix(file.name)}')
         with closing(sqlite3.connect(target)) as database:
             # opening rolls a journal back; this writes a write-ahead log into the database
             database.execute('PRAGMA wal_checkpoint(TRUNCATE)').fetchall()
         return target
     except OSError as error:
-        size = sum(each.stat().st_size for each in (file, *logs))
+        size = sum(part.stat().st_size for part in (file, *logs))
         writes = f'{logs[0].name} has writes that are not in it' if logs else 'it is compressed'
         raise SourceError(
             f'{file} needs a temporary copy of {size / 1e6:.0f} MB or more, as {writes}: '

@@ -11,7 +11,7 @@ from rosbags.convert.converter import migrate_bytes
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, QosDurability
 from rosbags.typesys import get_typestore, Stores
 from stavpr_ros.errors import SourceError
-from stavpr_ros.sources.bag_file import message_type, open_bag
+from stavpr_ros.sources.bag_file import message_count, message_type, open_bag
 from stavpr_ros.sources.frame import MessageRecord, RecordedTopic
 
 
@@ -27,7 +27,7 @@ def list_topics(path: Path) -> dict[str, RecordedTopic]:
                 name, message_type(connections[0]), any(map(_is_latched, connections))
             )
             for name, connections in sorted(bag.topics.items())
-            if sum(each.msgcount for each in connections)
+            if message_count(connections)
         }
 
 

@@ -167,10 +167,10 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
 
     unread: Counter[str] = Counter()
     for name, folders, files in os.walk(top, onerror=fail):
-        visible = [each for each in folders if not each.startswith('.')]
-        folders[:] = [each for each in visible if not FOREIGN.fullmatch(each)]
+        visible = [folder for folder in folders if not folder.startswith('.')]
+        folders[:] = [folder for folder in visible if not FOREIGN.fullmatch(folder)]
         unread['foreign'] += len(visible) - len(folders)
-        paths = [Path(name, each) for each in files if not each.startswith('.')]
+        paths = [Path(name, file) for file in files if not file.startswith('.')]
         images = [path for path in paths if path.suffix.lower() in SUFFIXES]
         # a link into nothing is an image that is missing
         images = [path for path in images if path.is_file() or not path.exists()]

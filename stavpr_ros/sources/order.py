@@ -118,7 +118,7 @@ def _by_times(files: list[Path], guess: str) -> tuple[list[Path], str]:
 
 def _follows(file: Path, after: Path) -> bool:
     """Return whether two names differ by the next number only."""
-    a, b = ([int(number) for number in re.findall(r'\d+', str(each))] for each in (file, after))
+    a, b = ([int(number) for number in re.findall(r'\d+', str(path))] for path in (file, after))
     return a[:-1] == b[:-1] and 0 < b[-1] - a[-1] <= 2
 
 

@@ -133,12 +133,12 @@ def by_name(names: Sequence[str], keys: Sequence[str]) -> np.ndarray:
     """
     best = np.full(len(names), -1)
     for form in (PureWindowsPath.as_posix, attrgetter('name'), attrgetter('stem')):
-        own, others = ([form(PureWindowsPath(each)) for each in every] for every in (names, keys))
+        own, others = ([form(PureWindowsPath(text)) for text in every] for every in (names, keys))
         if len({*own}) < len({*names}) or len({*others}) < len({*keys}):
             break  # several files of this name
         row_of = {key: row for row, key in enumerate(others)}
         rows = np.array([row_of.get(name, -1) for name in own])
-        best = max(best, rows, key=lambda each: np.count_nonzero(each >= 0))
+        best = max(best, rows, key=lambda candidate: np.count_nonzero(candidate >= 0))
     return best
 
 

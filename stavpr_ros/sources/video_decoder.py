@@ -80,8 +80,8 @@ def _video(container: Any) -> Any:
     from av.stream import Disposition
 
     stills = Disposition.attached_pic | Disposition.timed_thumbnails
-    tracks = [each for each in container.streams.video if each.codec_context is not None]
-    tracks.sort(key=lambda each: bool(each.disposition & stills) or each.frames == 1)
+    tracks = [track for track in container.streams.video if track.codec_context is not None]
+    tracks.sort(key=lambda track: bool(track.disposition & stills) or track.frames == 1)
     if not tracks:
         sys.exit(NOT_OPENED)
     if tracks[0].width * tracks[0].height > MAX_PIXELS:

@@ -106,7 +106,7 @@ class VideoStream:
         except ImageError as error:
             frame = error
             self.interrupt()
-        return VideoImage(header, frame, lambda each: rgb_of(each, self._reformatter))
+        return VideoImage(header, frame, lambda image: rgb_of(image, self._reformatter))
 
     def _decode(self, message: Any) -> Any:
         import av

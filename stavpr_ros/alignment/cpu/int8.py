@@ -85,8 +85,8 @@ def write_multiply_add(builder: Any, name: str, total: Any, places: Any, query: 
     if name == 'plain':
         for t in range(QUAD):
             left, right = (
-                builder.ashr(builder.shl(each, _filled(wide, 24 - 8 * t)), _filled(wide, 24))
-                for each in (places, query)
+                builder.ashr(builder.shl(vector, _filled(wide, 24 - 8 * t)), _filled(wide, 24))
+                for vector in (places, query)
             )
             total = builder.add(total, builder.mul(left, right))
         return total
