@@ -6,7 +6,7 @@ import numpy as np
 import oracle
 import pytest
 from stavpr_ros.alignment import best_match, SequenceDistances, SequenceSettings, SpatialSettings
-from stavpr_ros.alignment.cpu.int8 import Int8Strips, rounded_queries
+from stavpr_ros.alignment.cpu.int8 import Int8Strips, round_queries
 from stavpr_ros.alignment.device import lm_dtw, spatial_alignment
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
@@ -123,7 +123,7 @@ def expected_row(reference, query, i, settings, precision):
     """Distances of image i of the query, by products in float64 and the oracle."""
     x, y = query.strips[:, i].astype(float), reference.strips.astype(float)
     if precision == 'int8':
-        whole, lengths = rounded_queries(query.strips)
+        whole, lengths = round_queries(query.strips)
         x = whole[i].astype(float) * lengths[i, :, None]
         held = Int8Strips(*y.shape)
         held[:, :] = reference.strips
@@ -167,11 +167,11 @@ def test_strip_distances_of_int8_are_those_of_cpu_bit_for_bit(device):
     matcher = make_matcher(reference, SpatialSettings(), device, 'int8')
     held = Int8Strips(*reference.strips.shape)
     held[:, :] = reference.strips
-    whole, lengths = rounded_queries(query.strips)
+    whole, lengths = round_queries(query.strips)
     for i in range(2):
         matcher.distances(query.strips[:, i], query.weights[:, i])
         expected = oracle.whole_number_distances(
-            whole[i], held.rounded(), lengths[i], held.reciprocals[:, :9]
+            whole[i], held.codes(), lengths[i], held.reciprocals[:, :9]
         )
         np.testing.assert_array_equal(matcher._strip_distances().cpu(), expected)
 

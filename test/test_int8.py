@@ -48,16 +48,16 @@ def kernel_distances(reference, queries, x):
     held = int8.Int8Strips(W, n, d)
     held[:, :] = reference
     out = np.empty((-(-W // TILE) * TILE, W, n), np.float32)
-    dot.strip_distances(held.kernel_arguments(), int8.tiled(queries), x, out)
+    dot.strip_distances(held.kernel_arguments(), int8.tile(queries), x, out)
     return out[:W], held
 
 
 def expected_distances(held, queries, x):
     """Return the oracle's d of the same whole numbers."""
-    whole, lengths = int8.rounded_queries(queries)
+    whole, lengths = int8.round_queries(queries)
     n = held.shape[1]
     return oracle.whole_number_distances(
-        whole[x], held.rounded(), lengths[x], held.reciprocals[:, :n]
+        whole[x], held.codes(), lengths[x], held.reciprocals[:, :n]
     )
 
 
@@ -82,7 +82,7 @@ def test_vectors_equal_single_strips_bit_for_bit(n, d):
     reference, queries = random_strips(1, n, d), random_strips(1, 2, d, seed=10)
     held = convert_features(features_of(reference), rounds=True).strips
     out = np.empty((2, n), np.float32)
-    int8.cosine_distances(held.kernel_arguments(), int8.tiled(queries), out)
+    int8.cosine_distances(held.kernel_arguments(), int8.tile(queries), out)
     for x in range(2):
         found, _ = kernel_distances(reference, queries, x)
         np.testing.assert_array_equal(out[x], found[0, 0])
@@ -107,13 +107,13 @@ def test_rounding_moves_distances_little(d):
     """A rounded value is off by half a step; strips are as long as 16 bits of a product allow."""
     reference, query = random_strips(1, 400, d), random_strips(1, 2, d, seed=1)
     found, held = kernel_distances(reference, query, 1)
-    whole = held.rounded()[0].astype(np.int64)
-    assert np.sqrt((whole**2).sum(axis=1)).max() <= int8.LONGEST
+    whole = held.codes()[0].astype(np.int64)
+    assert np.sqrt((whole**2).sum(axis=1)).max() <= int8.MAX_LENGTH
     assert np.abs(whole).max() <= 127
     exact = 1 - reference[0].astype(np.float64) @ query[0, 1].astype(np.float64)
     off = found[0, 0] - exact
     # both sides are off by a vector of length sqrt(d / 12) / N in a direction of its own
-    N = int8.LONGEST - np.sqrt(d) / 2
+    N = int8.MAX_LENGTH - np.sqrt(d) / 2
     assert np.sqrt((off**2).mean()) < 1.5 * max(np.sqrt(2 / 12) / N, 0.29 / 63)
     assert held[:, 3:5].shape == (1, 2, d)
     assert (
@@ -209,7 +209,7 @@ strips = rng.standard_normal((3, 21, 37)).astype(np.float32)
 held = int8.Int8Strips(3, 21, 37)
 held[:, :] = strips
 out = np.empty((7, 3, 21), np.float32)
-dot.strip_distances(held.kernel_arguments(), int8.tiled(strips), 5, out)
+dot.strip_distances(held.kernel_arguments(), int8.tile(strips), 5, out)
 print(int8.INSTRUCTION, hashlib.sha256(out[:3].tobytes()).hexdigest())
 """
 

@@ -97,7 +97,7 @@ def test_kernels_equal_plain_sums():
     expected, enough = plain_evidence(query, place)
     np.testing.assert_allclose(evidence, expected, rtol=0, atol=1e-4)
     np.testing.assert_array_equal(is_enough, enough)
-    np.testing.assert_array_equal(module._drifted(evidence), plain_drifted(evidence))
+    np.testing.assert_array_equal(module._drift(evidence), plain_drifted(evidence))
 
 
 @pytest.mark.parametrize('shift', [-48.0, -7.5, 0.0, 3.3, 60.0])

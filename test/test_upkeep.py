@@ -347,7 +347,7 @@ def test_map_that_another_program_has_replaced_stays(path, first, rebuilt):
 
 
 def test_old_versions_are_deleted(path, first, monkeypatch):
-    monkeypatch.setattr(versions, 'KEPT', 2)
+    monkeypatch.setattr(versions, 'MAX_VERSIONS', 2)
     for day in range(1, 4):
         later = replace(first, stamps=first.stamps + day)
         changed(path, later, Version('', changes=(f'{day}',)))

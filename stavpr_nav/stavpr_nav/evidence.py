@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from stavpr_nav.observation import Observation
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
+from stavpr_ros.mapping.trajectory import distance, normalize_pose, rotation
 
 MIN_DISTANCE = 0.3  # meters after which evidence is demanded, where the places are dense
 ARM = 0.5  # meters
@@ -182,7 +182,7 @@ class OdometryComparison:
         :param pose: x y z (meters) and quaternion x y z w, shape (7,).
         :raises InputError: it is not valid, or no motion from the one before; it does not count.
         """
-        last, self._last = self._last, (frame, stamp, pose := checked_pose(pose))
+        last, self._last = self._last, (frame, stamp, pose := normalize_pose(pose))
         if last is None:
             self._from = pose
             return

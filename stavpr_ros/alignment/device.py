@@ -28,11 +28,11 @@ Diagonal = tuple[int, int, int]  # t, i of the first cell, number of cells
 
 def diagonals(rows: int, columns: int, band: int) -> list[Diagonal]:
     """List the anti-diagonals that have cells; those with |i - j| >= band are banned."""
-    every = []
+    all_diagonals = []
     for t in range(rows + columns - 1):
         first = max(0, t - columns + 1, (t - band) // 2 + 1)
-        every.append((t, first, min(rows - 1, t, (t + band - 1) // 2) - first + 1))
-    return [diagonal for diagonal in every if diagonal[2] > 0]
+        all_diagonals.append((t, first, min(rows - 1, t, (t + band - 1) // 2) - first + 1))
+    return [diagonal for diagonal in all_diagonals if diagonal[2] > 0]
 
 
 def accumulate(
@@ -109,7 +109,7 @@ def spatial_alignment(
             best = torch.minimum(best, total / (W - abs(s)) + SHIFT_COST * abs(s))
         return best
 
-    def warped(d: torch.Tensor) -> torch.Tensor:
+    def warp(d: torch.Tensor) -> torch.Tensor:
         a = None
         if settings.strategy == 'adaptive':
             a = a_of_nearest[d[c, low:high].argmin(dim=0)]
@@ -118,7 +118,7 @@ def spatial_alignment(
         D = F[W] + (W - 1)
         return S[W] / ((-1 if a is None else a - 2) * D + (2 * W - 1))
 
-    return {'sliding_window': sliding_window, 'rigid': rigid}.get(settings.strategy, warped)
+    return {'sliding_window': sliding_window, 'rigid': rigid}.get(settings.strategy, warp)
 
 
 def lm_dtw(window: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:

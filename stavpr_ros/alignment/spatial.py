@@ -33,7 +33,7 @@ def strip_distances(query: np.ndarray, reference: np.ndarray) -> np.ndarray:
         vectors, vector = np.ascontiguousarray(reference[0]), np.ascontiguousarray(query)
         dot.cosine_distances(vectors, vector, distances[0])
         return distances
-    rows = dot.tiled(query[:, None])
+    rows = dot.tile(query[:, None])
     distances = np.empty((rows.shape[1], W, n), np.float32)
     dot.strip_distances(np.ascontiguousarray(reference), rows, 0, distances)
     return distances[:W]

@@ -168,7 +168,7 @@ class Network:
         """Return whether two images in a batch have the output that each has alone."""
         bright = np.random.default_rng(0).integers(0, 256, (TEST_SIDE, TEST_SIDE, 3), np.uint8)
         two = [bright, bright // 8]
-        alone = np.concatenate([self._run_batch([one]) for one in two])
+        alone = np.concatenate([self._run_batch([image]) for image in two])
         try:
             both = self._run_batch(two)
         except SettingsError:  # a batch of one is written into the network

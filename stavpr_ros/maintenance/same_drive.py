@@ -46,7 +46,7 @@ def earlier_drive(drive: Row, earlier: Iterable[Row]) -> str:
         has_one_clock = start and drive[1] and (start >= DATED) == (drive[1] >= DATED)
         others = [int(word, 16) for word in text.split()]
         if len(own) == len(others) and not (has_one_clock and start != drive[1]):
-            near = [(a ^ b).bit_count() <= NEAR for a, b in zip(own, others, strict=True)]
-            if sum(near) >= SHARE * len(near):
+            is_near = [(a ^ b).bit_count() <= NEAR for a, b in zip(own, others, strict=True)]
+            if sum(is_near) >= SHARE * len(is_near):
                 return name
     return ''

@@ -21,7 +21,7 @@ from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
 from stavpr_ros.maintenance.same_places import recognized, SamePlaces
 from stavpr_ros.mapping import Map, merge_maps, select_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.mapping.versions import current_version, KEPT, save_version, Version
+from stavpr_ros.mapping.versions import current_version, MAX_VERSIONS, save_version, Version
 from stavpr_ros.method.error_rate import least_probability
 from stavpr_ros.method.localizer import PlaceRecognizer
 from stavpr_ros.method.model import MODEL
@@ -64,19 +64,19 @@ def update_map(place_map: Map, drive: Map, name: str, version: Version) -> tuple
     # by the places before the first update: errors would add up from drive to drive
     places = recognized(select_places(place_map, np.arange(base)), drive, images)
     places = np.where(places >= 0, places, on_map.of_windows[images])
-    grown = _with_drive(place_map, drive, name, images, places)
-    assert grown.session_index is not None
-    begins = np.searchsorted(grown.session_index, np.arange(len(grown.sessions)))
-    gone = np.flatnonzero(begins >= base)[:-DRIVES]
-    kept = np.flatnonzero(~np.isin(grown.session_index, gone))
+    updated = _with_drive(place_map, drive, name, images, places)
+    assert updated.session_index is not None
+    begins = np.searchsorted(updated.session_index, np.arange(len(updated.sessions)))
+    old_sessions = np.flatnonzero(begins >= base)[:-DRIVES]
+    others = np.flatnonzero(~np.isin(updated.session_index, old_sessions))
     certain = (on_map.of_windows >= 0).mean()
     changes = [f'certain of {certain:.0%} of {len(drive)} images']
     changes.append(f'added the drive, {len(images)} images')
-    if removed := len(grown) - len(kept):
-        names = ', '.join(grown.sessions[number].id for number in gone)
-        changes.append(f'removed the {removed} places of {names}: {DRIVES} drives are kept')
-        grown = select_places(grown, kept)
-    return grown, replace(version, drive=name, changes=tuple(changes))
+    if count := len(updated) - len(others):
+        names = ', '.join(updated.sessions[number].id for number in old_sessions)
+        changes.append(f'removed the {count} places of {names}: {DRIVES} drives are kept')
+        updated = select_places(updated, others)
+    return updated, replace(version, drive=name, changes=tuple(changes))
 
 
 def update_file(
@@ -95,11 +95,11 @@ def update_file(
     drive.features.require_same_settings(place_map.settings, 'the map')
     before = current_version(path)
     row = (name, *rows_of(drive, name)[0][1:])
-    if one := earlier_drive(row, [*before.drives, *rows_of(place_map, 'the map')]):
-        text = f'{name} has the images of {one}, taken already: the map stays as it is'
+    if earlier := earlier_drive(row, [*before.drives, *rows_of(place_map, 'the map')]):
+        text = f'{name} has the images of {earlier}, taken already: the map stays as it is'
         return replace(before, changes=(text,))
     updated, version = update_map(place_map, drive, name, before)
-    version = replace(version, drives=(*before.drives[1 - KEPT :], row))
+    version = replace(version, drives=(*before.drives[1 - MAX_VERSIONS :], row))
     return save_version(path, opened, updated, before, version, statistics_of_map(updated))
 
 
@@ -199,9 +199,9 @@ def _share(on_map: _OnMap) -> float:
         if sessions[p] == sessions[q] and 0 <= steps <= FASTEST * (b - a) + SLACK:
             between = p + np.arange(steps + 1)
             is_passed[between % lap if p < lap else between] = True
-    passed = np.bincount(sessions[is_passed], minlength=1)
-    number = int(passed.argmax())
-    return float(passed[number] / (sessions == number).sum())
+    counts = np.bincount(sessions[is_passed], minlength=1)
+    number = int(counts.argmax())
+    return float(counts[number] / (sessions == number).sum())
 
 
 def _most_certain(on_map: _OnMap, limit: int) -> np.ndarray:
@@ -224,7 +224,7 @@ def _with_drive(
     :param places: of the map that they show, (m,), and whose identifiers and poses they get;
         -1 = none.
     """
-    n, has = len(place_map), places >= 0
+    n, is_hit = len(place_map), places >= 0
     # identifiers that stay when places come and go: their numbers where there is none
     ids = tuple(identifier or str(i) for i, identifier in enumerate(place_map.ids))
     own = tuple(
@@ -241,10 +241,10 @@ def _with_drive(
     )
     if not place_map.thumbnails:
         session = replace(session, thumbnails=())
-    merged = merge_maps([replace(place_map, ids=ids), session], ['first', name])
+    both = merge_maps([replace(place_map, ids=ids), session], ['first', name])
     roots = np.arange(n) if place_map.same_as is None else place_map.same_as
-    same_as = np.concatenate([roots, np.where(has, roots[places], n + np.arange(len(images)))])
-    return replace(merged, threshold=place_map.threshold, same_as=same_as.astype(np.int32))
+    same_as = np.concatenate([roots, np.where(is_hit, roots[places], n + np.arange(len(images)))])
+    return replace(both, threshold=place_map.threshold, same_as=same_as.astype(np.int32))
 
 
 def _poses(

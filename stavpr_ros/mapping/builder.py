@@ -23,7 +23,7 @@ from stavpr_ros.mapping.place_map import (
     plain_text,
     THUMBNAIL_WIDTH,
 )
-from stavpr_ros.mapping.trajectory import checked_pose, Trajectory
+from stavpr_ros.mapping.trajectory import normalize_pose, Trajectory
 from stavpr_ros.progress import Progress
 from stavpr_ros.sources.arrays import Images
 from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale
@@ -112,7 +112,7 @@ def build_map(
     features: list[LocalFeatures] = []
     rows: list[tuple[Place, bytes]] = []
     options = keyframes, thumbnail_width if thumbnails else None
-    with closing(_extracted(frames, extractor, poses, *options, progress)) as batches:
+    with closing(_extract(frames, extractor, poses, *options, progress)) as batches:
         for batch, extracted in batches:
             features.append(extracted)
             rows += [(row.place, row.thumbnail) for row in batch]
@@ -151,10 +151,10 @@ def build_journal(
     :returns: the journal, complete.
     :raises JournalError: the journal is of another work, in use, or cannot be written.
     """
-    writer, last = _resumed(Path(f'{target}{SUFFIX}'), extractor, source)
+    writer, last = _resume(Path(f'{target}{SUFFIX}'), extractor, source)
     options = keyframes, thumbnail_width if thumbnails else None
     try:
-        with closing(_extracted(frames, extractor, poses, *options, progress, last)) as batches:
+        with closing(_extract(frames, extractor, poses, *options, progress, last)) as batches:
             for batch, features in batches:
                 if writer is None:
                     template = Map(
@@ -175,7 +175,7 @@ def build_journal(
     return writer.path
 
 
-def _resumed(
+def _resume(
     journal: Path, extractor: FeatureExtractor, source: str
 ) -> tuple[JournalWriter | None, int]:
     """Return the writer of a journal to be continued, and the number of its last image."""
@@ -195,7 +195,7 @@ def _ignore(error: str) -> None:
     """Leave an error of the journal to :func:`build_journal`."""
 
 
-def _extracted(
+def _extract(
     frames: Iterable[Frame | np.ndarray],
     extractor: FeatureExtractor,
     poses: np.ndarray | Trajectory | None,
@@ -218,8 +218,8 @@ def _extracted(
     if thumbnail_width is not None:
         require_at_least('thumbnail width', thumbnail_width, 1, 'pixel')
     source: Any = getattr(frames, 'source', frames)  # of a part of its images
-    if hasattr(source, 'least'):  # as in the node
-        source.least = extractor.needed_size(thumbnail_width or 0)
+    if hasattr(source, 'min_size'):  # as in the node
+        source.min_size = extractor.needed_size(thumbnail_width or 0)
     total = len(frames) if isinstance(frames, Sized) else None
     places = _places(_with_poses(frames, poses), selector, thumbnail_width, last)
     with (
@@ -311,6 +311,6 @@ def _pose(row: np.ndarray, name: str) -> np.ndarray | None:
     if np.isnan(row).all():
         return None
     try:
-        return checked_pose(row)
+        return normalize_pose(row)
     except InputError as error:
         raise InputError(f'{name}: {error}') from error

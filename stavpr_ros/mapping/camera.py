@@ -9,7 +9,7 @@ import math
 import cv2
 import numpy as np
 from stavpr_ros.errors import InputError, SettingsError
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 
 MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
 FORWARD = (0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5)
@@ -53,7 +53,7 @@ class Camera:
                 f'distortion model {self.model!r} with {len(self.distortion)} coefficients: take '
                 f'one of {", ".join(MODELS)}'
             )
-        object.__setattr__(self, 'mount', tuple(checked_pose(np.array(self.mount)).tolist()))
+        object.__setattr__(self, 'mount', tuple(normalize_pose(np.array(self.mount)).tolist()))
 
     @property
     def yaw(self) -> float:

@@ -17,7 +17,7 @@ from stavpr_ros.mapping.place_map import (
     require_projection,
     Session,
 )
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 
 ROOM = 256  # initial capacity in places; doubled when it is full
 
@@ -184,10 +184,10 @@ class GrowingMap:
         :raises FeatureMismatchError: features with other settings, or of another network.
         :raises InputError: the map is full; not one image; values that are not finite.
         """
-        rows, n = self._checked(features), self._count
+        rows, n = self._check(features), self._count
         added = {
             'stamps': np.array([stamp], np.int64),
-            'poses': np.full((1, 7), np.nan) if pose is None else checked_pose(pose)[None],
+            'poses': np.full((1, 7), np.nan) if pose is None else normalize_pose(pose)[None],
         }
         if self._held_features is not None:
             rows = {}
@@ -256,7 +256,7 @@ class GrowingMap:
         added = np.full(self._count - len(index), number, np.int32)
         return sessions, np.concatenate([index, added])
 
-    def _checked(self, features: LocalFeatures) -> dict[str, np.ndarray]:
+    def _check(self, features: LocalFeatures) -> dict[str, np.ndarray]:
         """Return the rows of the features of an image that fits."""
         features.require_fit(self.settings, 'the map', self.dimension)
         if len(features) != 1:
@@ -274,11 +274,11 @@ class GrowingMap:
     def _make_room(self, room: int, rows: dict[str, np.ndarray]) -> None:
         """Reallocate every array with a capacity of ``room`` places, of such rows; all or none."""
         larger = {
-            name: np.empty((room, *one.shape[1:]), one.dtype)
-            for name, one in (rows | self._rows).items()
+            name: np.empty((room, *column.shape[1:]), column.dtype)
+            for name, column in (rows | self._rows).items()
         }
-        for name, one in self._rows.items():
-            larger[name][: self._count] = one[: self._count]
+        for name, column in self._rows.items():
+            larger[name][: self._count] = column[: self._count]
         self._rows = larger
 
 

@@ -220,9 +220,9 @@ class JournalReader:
         try:
             match read_json(about, 'its first record'):
                 case {
-                    'format': found, 'version': 2 | 3 as version, 'source': str(source),
+                    'format': name, 'version': 2 | 3 as version, 'source': str(source),
                     'path': str(path), 'places': int(places), 'checksum': int(checksum),
-                } if found == FORMAT:  # fmt: skip
+                } if name == FORMAT:  # fmt: skip
                     self.source, self.base = source, Base(path, places, checksum)
                 case _:
                     raise ValueError('another format or version')
@@ -260,11 +260,11 @@ class JournalReader:
             except OSError:  # a hole up to the end
                 return
             piece = self.read(at, PIECE)
-            for found in _HEADS.finditer(piece):
-                head = piece[found.start() : found.start() + _HEAD_BYTES]
+            for match in _HEADS.finditer(piece):
+                head = piece[match.start() : match.start() + _HEAD_BYTES]
                 if head[_HEAD.size :] == _checksum(head[: _HEAD.size]):
                     _, length, checksum = _HEAD.unpack_from(head)
-                    yield at + found.start(), length, checksum
+                    yield at + match.start(), length, checksum
             at += max(len(piece) - _HEAD_BYTES + 1, 1) if piece else SECTOR
 
     def read(self, at: int, count: int) -> bytes:

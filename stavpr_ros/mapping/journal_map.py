@@ -33,13 +33,13 @@ def journal_map(path: Path) -> Map:
     :raises OutputError: there is no room.
     """
     with explain(path), JournalReader(path) as reader:
-        place_map = _recorded(reader, path.parent)
+        place_map = _read_places(reader, path.parent)
     if reader.problem:
         raise JournalError(f'{path} is damaged: {reader.problem}')
     return place_map
 
 
-def _recorded(reader: JournalReader, folder: Path) -> Map:
+def _read_places(reader: JournalReader, folder: Path) -> Map:
     """
     Return the places of a journal, with a temporary file in a folder.
 
@@ -72,7 +72,8 @@ def _recorded(reader: JournalReader, folder: Path) -> Map:
         write_at(raw.fileno(), content[size - (ends[i + 1] - ends[i]) :], first + ends[i])
     file = MapFile(raw, reader.path)
     file.parts = {'strips': strips, 'thumbnails': Part('U8', (ends[-1],), first)}
-    poses = np.array([np.full(7, np.nan) if one.pose is None else one.pose for one in places])
+    unknown = np.full(7, np.nan)
+    poses = np.array([unknown if place.pose is None else place.pose for place in places])
     cells = template.features.cells
     return Map(
         features=StoredFeatures(file, np.concatenate(weights, axis=1), template.settings, cells),
@@ -133,11 +134,11 @@ def recover(
     journal, problems = Path(journal), []
     target = Path(output or journal.with_name(journal.name.removesuffix(SUFFIX)))
     with explain(target), JournalReader(journal) as reader:
-        place_map = _recorded(reader, target.parent)
+        place_map = _read_places(reader, target.parent)
         base, problem = _base_map(reader.base)
         if base is not None:
             sessions = reader.template.sessions
-            place_map = relate(_continued(base, place_map, reader.base, sessions))
+            place_map = relate(_append(base, place_map, reader.base, sessions))
         if output is None:
             target = _save_beside(place_map, target)
         else:
@@ -167,7 +168,7 @@ def _base_map(base: Base) -> tuple[Map | None, str]:
     return place_map, ''
 
 
-def _continued(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, ...]) -> Map:
+def _append(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, ...]) -> Map:
     """
     Return a map with the recorded places behind it.
 

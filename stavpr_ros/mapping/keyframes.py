@@ -9,12 +9,12 @@ import numpy as np
 from stavpr_ros.checks import require_at_least, require_between, rgb_image
 from stavpr_ros.compilation import kernel
 from stavpr_ros.features.area import BLUE, GREEN, HALF, RED
-from stavpr_ros.mapping.trajectory import checked_pose, distance, rotation
+from stavpr_ros.mapping.trajectory import distance, normalize_pose, rotation
 from stavpr_ros.units import SECOND
 
 OUT_OF_ORDER = SECOND // 10  # images later than this after a newer one: the clock jumped back
 SIZE = (32, 24)  # width and height of the images compared: averages noise out, but not motion
-MOST_ROWS = 257  # of a block, whose sums of bytes have 16 bits
+MAX_ROWS = 257  # of a block, whose sums of bytes have 16 bits
 BLUR = cv2.getGaussianKernel(5, 0.5, cv2.CV_32F).ravel()  # by .5 pixels of the small image
 FLAT = 1.0  # standard deviation, gray levels, below which an image shows only noise
 
@@ -66,12 +66,12 @@ def small_gray(image: np.ndarray) -> np.ndarray:
     image = rgb_image(image)
     width, height = SIZE
     is_whole = not (image.shape[0] % height or image.shape[1] % width)
-    if not is_whole or image.shape[0] > MOST_ROWS * height:
+    if not is_whole or image.shape[0] > MAX_ROWS * height:
         small = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
     else:
         small = np.empty((height, width, 3), np.uint8)
         _block_means(image.reshape(height, -1, image.shape[1] * 3), small)
-    return np.asarray(_blurred(small))
+    return np.asarray(_blur(small))
 
 
 @kernel
@@ -99,7 +99,7 @@ def _block_means(rows: np.ndarray, small: np.ndarray) -> None:
 
 
 @kernel
-def _blurred(small: np.ndarray) -> np.ndarray:
+def _blur(small: np.ndarray) -> np.ndarray:
     """Return an RGB image (h, w, 3) in OpenCV's gray levels, blurred, mirrored at its edges."""
     height, width, reach = small.shape[0], small.shape[1], len(BLUR) // 2
     bottom, right = height - 1, width - 1
@@ -134,9 +134,9 @@ def image_change(a: np.ndarray, b: np.ndarray) -> float:
         for x in range(a.shape[1]):
             of_a, of_b = a[y, x] - sum_a / a.size, b[y, x] - sum_b / b.size
             aa, bb, ab = aa + of_a * of_a, bb + of_b * of_b, ab + of_a * of_b
-    least = FLAT**2 * a.size
-    if aa < least or bb < least:
-        return 0.0 if aa < least and bb < least else 1.0
+    min_energy = FLAT**2 * a.size
+    if aa < min_energy or bb < min_energy:
+        return 0.0 if aa < min_energy and bb < min_energy else 1.0
     return min(max(1 - ab / np.sqrt(aa * bb), 0.0), 2.0)
 
 
@@ -185,7 +185,7 @@ class KeyframeSelector:
                     f'{settings.interval:g} s'
                 )
         if settings.needs_poses and self._pose is not None and pose is not None:
-            return self._not_moved(checked_pose(pose), self._pose)
+            return self._not_moved(normalize_pose(pose), self._pose)
         return ''
 
     def too_alike(self, image: np.ndarray) -> str:
@@ -195,16 +195,16 @@ class KeyframeSelector:
         :param image: RGB, uint8, shape (h, w, 3).
         :returns: the reason in words; empty if there is none.
         """
-        least = self.settings.change
-        if not least or self._last is None:
+        min_change = self.settings.change
+        if not min_change or self._last is None:
             return ''
         last, gray = self._last
         last_gray = small_gray(last) if gray is None else gray
         compared = small_gray(image)
         self._last, self._compared = (last, last_gray), (image, compared)
         change = image_change(compared, last_gray)
-        if change < least:
-            return f'differs by {change:.4f} from the last keyframe: less than {least:g}'
+        if change < min_change:
+            return f'differs by {change:.4f} from the last keyframe: less than {min_change:g}'
         return ''
 
     def accept(self, stamp: int, pose: np.ndarray | None, image: np.ndarray) -> None:
@@ -216,7 +216,7 @@ class KeyframeSelector:
         :param image: RGB, uint8, shape (h, w, 3), kept.
         :raises InputError: an invalid pose or image; nothing is changed.
         """
-        pose, compared = None if pose is None else checked_pose(pose), self._compared
+        pose, compared = None if pose is None else normalize_pose(pose), self._compared
         is_compared = compared is not None and compared[0] is image
         if not is_compared:
             rgb_image(image)

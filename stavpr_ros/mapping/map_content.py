@@ -30,7 +30,7 @@ from stavpr_ros.mapping.map_version2 import ERROR_RISKS, KNOWN_SECTIONS
 from stavpr_ros.mapping.place_map import ErrorRisks, Map, Session
 from stavpr_ros.mapping.stored_features import (
     CHANGES,
-    LONGEST,
+    MAX_NORM,
     STATISTICS,
     statistics_of,
     StoredFeatures,
@@ -75,7 +75,7 @@ def map_content(file: MapFile) -> Map:
     settings = _settings(manifest['settings'])
     if 'vectors' in sections:
         _note_vectors(file.path)
-    readable = {n for n, one in sections.items() if one['version'] <= KNOWN_SECTIONS.get(n, 0)}
+    readable = {n for n, row in sections.items() if row['version'] <= KNOWN_SECTIONS.get(n, 0)}
     if 'value_range' in readable:
         VALUE_RANGE(data := sections['value_range']['data'], 'section value_range')
         if data[0] >= data[1]:
@@ -113,7 +113,7 @@ def map_content(file: MapFile) -> Map:
         if name not in readable:
             return None
         check(data := missing | sections[name]['data'], f'section {name}')
-        return _made(make, data)
+        return _construct(make, data)
 
     return Map(
         features=features,
@@ -132,7 +132,7 @@ def map_content(file: MapFile) -> Map:
     )
 
 
-def _made(make: Callable[..., T], data: dict[str, Any]) -> T:
+def _construct(make: Callable[..., T], data: dict[str, Any]) -> T:
     return make(**{k: tuple(v) if type(v) is list else v for k, v in data.items()})
 
 
@@ -148,7 +148,7 @@ def _sessions(manifest: dict[str, Any], has_cameras: bool) -> tuple[Session, ...
             session,
             camera=camera['name'],
             yaw=camera['yaw'],
-            intrinsics=camera['intrinsics'] and _made(Camera, camera['intrinsics']),
+            intrinsics=camera['intrinsics'] and _construct(Camera, camera['intrinsics']),
         )
         for session, camera in zip(sessions, data, strict=True)
     )
@@ -185,9 +185,9 @@ def _require_parts(parts: dict[str, Part], sections: dict[str, Any]) -> None:
     for name in ('strips', 'weights', 'stamps'):
         if name not in parts:
             raise ValueError(f'part {name} is missing')
-    for one, other in _TOGETHER:
-        if (one in parts) is not (other in parts):
-            raise ValueError(f'of the parts {one} and {other}, one is missing')
+    for name, other in _TOGETHER:
+        if (name in parts) is not (other in parts):
+            raise ValueError(f'of the parts {name} and {other}, one is missing')
     for name in parts:
         section, slash, _ = name.partition('/')
         if (slash or name not in PARTS) and section not in sections:
@@ -263,7 +263,7 @@ def require_weights(weights: np.ndarray) -> None:
 
     :raises ValueError: they are not.
     """
-    if weights.size and not (weights.min() >= 0 and weights.max() <= LONGEST):
+    if weights.size and not (weights.min() >= 0 and weights.max() <= MAX_NORM):
         raise ValueError('part weights is not between 0 and 1')
 
 

@@ -50,11 +50,11 @@ def text(longest: int = 256, pattern: re.Pattern[str] | None = None) -> Check:
     return _rule(is_valid, f'a text{expected}')
 
 
-def list_of(item: Check, least: int = 0, most: int = 2**16) -> Check:
+def list_of(item: Check, min_length: int = 0, max_length: int = 2**16) -> Check:
     """Take a list."""
     sized = _rule(
-        lambda value: type(value) is list and least <= len(value) <= most,
-        f'a list of {least} to {most} elements',
+        lambda value: type(value) is list and min_length <= len(value) <= max_length,
+        f'a list of {min_length} to {max_length} elements',
     )
 
     def check(value: Any, where: str) -> None:
@@ -136,7 +136,7 @@ MANIFEST = record(
         'settings': record(SETTINGS),
         'cells': nullable(list_of(integer(1, 4096), 2, 2)),
         'projection': nullable(text()),
-        'sessions': list_of(record(SESSION), most=1024),
+        'sessions': list_of(record(SESSION), max_length=1024),
         'sections': mapping(text(64, NAME), record(SECTION)),
         'parts': mapping(text(129), record(PART)),
     }
@@ -148,13 +148,13 @@ INTRINSICS = record(
         'focal': list_of(number, 2, 2),
         'center': list_of(number, 2, 2),
         'model': text(64),
-        'distortion': list_of(number, most=16),
+        'distortion': list_of(number, max_length=16),
         'mount': list_of(number, 7, 7),
     }
 )
 CAMERAS = list_of(
     record({'name': text(64), 'yaw': nullable(number), 'intrinsics': nullable(INTRINSICS)}),
-    most=1024,
+    max_length=1024,
 )
 VALUE_RANGE = list_of(integer(0, 65535 + 1), 2, 2)
 RISKS = record(
@@ -171,7 +171,7 @@ _SETTING_TYPES: dict[Any, Check] = {
     int: integer(-(2**31)),
     float: number,
     str: text(1024),
-    tuple[float, ...]: list_of(number, most=64),
+    tuple[float, ...]: list_of(number, max_length=64),
 }
 
 

@@ -49,13 +49,13 @@ def merge_maps(
         index.append(numbers + np.int32(len(sessions)))
         for session in own:
             intrinsics = session.intrinsics or (place_map.camera if camera is None else None)
-            one = replace(session, id=_free_id(session.id, sessions), intrinsics=intrinsics)
+            added = replace(session, id=_free_id(session.id, sessions), intrinsics=intrinsics)
             if cameras:
-                known, (label, yaw) = one.intrinsics or camera, cameras[number]
-                if yaw is None and known is not None:
-                    yaw = known.yaw
-                one = replace(one, camera=label, yaw=yaw)
-            sessions.append(one)
+                calibration, (label, yaw) = added.intrinsics or camera, cameras[number]
+                if yaw is None and calibration is not None:
+                    yaw = calibration.yaw
+                added = replace(added, camera=label, yaw=yaw)
+            sessions.append(added)
     poses = [
         np.full((len(part), 7), np.nan) if part.poses is None else part.poses for part in maps
     ]
@@ -70,7 +70,7 @@ def merge_maps(
         sessions=tuple(sessions),
         session_index=np.concatenate(index),
         camera=camera,
-        same_as=_joined_same_as(maps),
+        same_as=_join_same_as(maps),
     )
 
 
@@ -130,7 +130,7 @@ def _free_id(base: str, sessions: list[Session]) -> str:
     return next(name for name in names if name not in others)
 
 
-def _joined_same_as(maps: Sequence[Map]) -> np.ndarray | None:
+def _join_same_as(maps: Sequence[Map]) -> np.ndarray | None:
     if all(part.same_as is None for part in maps):
         return None
     parts, first = [], 0

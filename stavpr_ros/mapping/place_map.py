@@ -383,8 +383,8 @@ def thumbnail_of(image: np.ndarray, width: int = THUMBNAIL_WIDTH) -> np.ndarray:
     """
     image = rgb_image(image)
     require_at_least('width of thumbnails', width, 1, 'pixel')
-    most = math.sqrt(MAX_THUMBNAIL_PIXELS / 2 / (image.shape[0] * image.shape[1]))
-    scale = min(1.0, width / image.shape[1], most)
+    max_scale = math.sqrt(MAX_THUMBNAIL_PIXELS / 2 / (image.shape[0] * image.shape[1]))
+    scale = min(1.0, width / image.shape[1], max_scale)
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 

@@ -20,13 +20,13 @@ from stavpr_ros.memory import aligned_empty
 STATISTICS = 'statistics'  # name of the section
 DATA = record({'method': text(128), 'features': text(64, SHA256)})
 CHANGES = 5  # places apart, at most, whose changes are kept
-LIMITS = {  # of the values in each part; norms may be 1.01, see LONGEST
+LIMITS = {  # of the values in each part; norms may be 1.01, see MAX_NORM
     'mean': (-1.01, 1.01),
     'directions': (-1.01, 1.01),
     'gains': (0.01, 1.01),
     'changes': (-0.05, 2.05),
 }
-LONGEST = 1.01  # norm of a strip; float16 rounds it
+MAX_NORM = 1.01  # norm of a strip; float16 rounds it
 CODES = f'{STATISTICS}/codes'
 PLACES_AT_ONCE = 512  # of one strip: they stay in the cache while they are checked
 
@@ -71,13 +71,13 @@ def statistics_of(file: MapFile, arrays: dict[str, np.ndarray]) -> MapStatistics
     data = file.manifest['sections'][STATISTICS]['data']
     DATA(data, f'section {STATISTICS}')
     values = []
-    for name, (least, most) in LIMITS.items():
+    for name, (low, high) in LIMITS.items():
         part = f'{STATISTICS}/{name}'
         if part not in arrays:
             raise ValueError(f'part {part} is missing')
         array = arrays[part]
-        if array.size and not (array.min() >= least and array.max() <= most):  # NaN included
-            raise ValueError(f'part {part} is not between {least} and {most}')
+        if array.size and not (array.min() >= low and array.max() <= high):  # NaN included
+            raise ValueError(f'part {part} is not between {low} and {high}')
         values.append(array)
     is_present = data['features'] == features_key(file.parts['strips'].hashes)
     return MapStatistics(data['method'], *values) if is_present else None
@@ -217,7 +217,7 @@ def require_normalized(rows: np.ndarray, name: str, place: int) -> None:
     """
     for low in range(0, len(rows), PLACES_AT_ONCE):
         block = rows[low : low + PLACES_AT_ONCE].astype(np.float32, copy=False)
-        if not (np.einsum('ij,ij->i', block, block) <= LONGEST**2).all():  # NaN included
+        if not (np.einsum('ij,ij->i', block, block) <= MAX_NORM**2).all():  # NaN included
             raise ValueError(
                 f'part {name}, from place {place + low} on: features are not finite, or longer '
                 'than 1'

@@ -15,7 +15,7 @@ FARTHEST = 1e8  # meters of a coordinate: farther from the origin is no place on
 NORMS = 1e-3, 1e3  # of a quaternion that is normalized
 
 
-def checked_pose(pose: np.ndarray) -> np.ndarray:
+def normalize_pose(pose: np.ndarray) -> np.ndarray:
     """
     Return a copy of a pose whose quaternion has the norm 1.
 
@@ -125,7 +125,7 @@ class Trajectory:
         """
         if stamp <= 0:
             raise InputError(f'pose with stamp {stamp}: expected nanoseconds above 0')
-        pose = checked_pose(pose)
+        pose = normalize_pose(pose)
         with self._lock:
             stamps, poses = self._stamps, self._poses
             if stamps and stamp < stamps[-1] - self._timeout:

@@ -27,7 +27,7 @@ def to_poses(transforms: np.ndarray) -> np.ndarray:
     return np.concatenate([transforms[..., :3, 3], turns.reshape(*shape, 4)], axis=-1)
 
 
-def turned(pose: np.ndarray, yaw: float) -> np.ndarray:
+def turn_pose(pose: np.ndarray, yaw: float) -> np.ndarray:
     """Return a pose (7,) turned about its own z axis, radians to the left."""
     if not yaw:
         return pose

@@ -25,7 +25,7 @@ from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output
 
 SUFFIX = '.history'
-KEPT = 10  # versions; older ones, and those of a branch that was left, are deleted
+MAX_VERSIONS = 10  # versions; older ones, and those of a branch that was left, are deleted
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ _check = record(
         **dict.fromkeys(('number', 'time', 'base_places'), integer(0, 2**40)),
         'drive': text(4096),
         'changes': list_of(text(4096), 0, 4096),
-        'drives': list_of(_drive, 0, KEPT),
+        'drives': list_of(_drive, 0, MAX_VERSIONS),
     }
 )
 
@@ -82,8 +82,8 @@ def current_version(path: str | Path) -> Version:
     :raises MapFileError: no map, or a damaged record.
     """
     place_map = open_map(path)
-    found = _read(history_of(path), place_map.map_id)
-    return found or Version(place_map.map_id, base_places=len(place_map))
+    version = _read(history_of(path), place_map.map_id)
+    return version or Version(place_map.map_id, base_places=len(place_map))
 
 
 def versions(path: str | Path) -> list[Version]:
@@ -136,9 +136,9 @@ def save_version(
 
 def _clean(folder: Path, chain: list[str]) -> None:
     """Delete old versions, and all of a branch that was left by a return to an earlier one."""
-    for suffix, kept in (('.stavpr', chain[:KEPT]), ('.json', chain)):
+    for suffix, ids in (('.stavpr', chain[:MAX_VERSIONS]), ('.json', chain)):
         for file in folder.glob(f'{"[0-9a-f]" * 16}{suffix}'):
-            if file.stem not in kept:
+            if file.stem not in ids:
                 file.unlink(missing_ok=True)
 
 
@@ -153,9 +153,9 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
     opened, chain = FileVersion.of(path), versions(path)
     target = map_id or chain[0].parent
     file = history_of(path) / f'{target}.stavpr'
-    known = [version.map_id for version in chain[1:] if _file(path, version).exists()]
-    if target not in known:
-        raise InputError(f'{target or "an earlier one"} is no version of {path}: it has {known}')
+    earlier = [version.map_id for version in chain[1:] if _file(path, version).exists()]
+    if target not in earlier:
+        raise InputError(f'{target or "an earlier one"} is no version of {path}: it has {earlier}')
     if load_map(file).map_id != target:
         raise MapFileError(f'{file} is another map than its name states')
     _copy(file, Path(path), opened or False)

@@ -33,7 +33,7 @@ from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.registry import evidence_of
 from stavpr_ros.mapping import Map
 from stavpr_ros.mapping.stored_features import StoredFeatures
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.method.cells import CellAgreement
 from stavpr_ros.method.match import Candidate, Limits, Match, Path, Status, WindowMatch
 from stavpr_ros.method.model import EARLY, UNUSUAL
@@ -427,7 +427,7 @@ def position_of(pose: np.ndarray | None) -> np.ndarray:
 
     :raises InputError: an invalid pose.
     """
-    return np.full(2, np.nan) if pose is None else checked_pose(pose)[:2]
+    return np.full(2, np.nan) if pose is None else normalize_pose(pose)[:2]
 
 
 def require_finite(features: LocalFeatures, where: str) -> None:

@@ -21,7 +21,7 @@ from stavpr_ros.mapping import encode_thumbnail, GrowingMap, Map, thumbnail_of, 
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.keyframes import image_change, KeyframeSelector, small_gray
 from stavpr_ros.mapping.place_map import THUMBNAIL_WIDTH
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.method import Candidate, Match, PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.localizer import SequenceRecognizer
 from stavpr_ros.method.loop_closer import LoopCloser
@@ -226,7 +226,7 @@ class Operation(ABC):
             None = unknown. Called only where the map states the mounting of its own camera.
         :raises InputError: an invalid pose; nothing is changed then.
         """
-        pose = None if pose is None else checked_pose(pose)
+        pose = None if pose is None else normalize_pose(pose)
         if self.missing:
             return self.unmatched(Status.NOT_READY, self.missing, 'not ready')
         if reason := self._keyframes.too_soon(stamp, pose):

@@ -3,7 +3,7 @@
 """The matcher in torch operations: the features of the map stay on the device."""
 
 import numpy as np
-from stavpr_ros.alignment.cpu.int8 import rounded_queries
+from stavpr_ros.alignment.cpu.int8 import round_queries
 from stavpr_ros.alignment.device import spatial_alignment
 from stavpr_ros.alignment.settings import SpatialSettings
 from stavpr_ros.device_graph import DeviceGraph, HostCopy
@@ -35,7 +35,7 @@ class DeviceMatcher:
         self.places = at_once = n
         if isinstance(features, Int8Features):
             lengths = features.strips.reciprocals[:, :n]
-            strips, self._lengths = features.strips.rounded(), torch.from_numpy(lengths).to(device)
+            strips, self._lengths = features.strips.codes(), torch.from_numpy(lengths).to(device)
             at_once = max(1, WIDENED // (W * d))
         else:
             strips = np.ascontiguousarray(features.strips, np.float32)
@@ -71,7 +71,7 @@ class DeviceMatcher:
             self._sent.wait()
             query, lengths = strips, np.float32(1)
             if self._lengths is not None:
-                query, lengths = (part[0] for part in rounded_queries(strips[:, None]))
+                query, lengths = (part[0] for part in round_queries(strips[:, None]))
             self._sent.numpy[:, :-2], self._sent.numpy[:, -2] = query, lengths
             self._sent.numpy[:, -1] = weights
             self._sent.send()

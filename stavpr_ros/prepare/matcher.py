@@ -149,12 +149,12 @@ class CpuMatcher:
         out: np.ndarray = np.empty((Q, self.places), np.float32)
         if len(strips) == 1:  # one vector an image: its alignment is its cosine distance
             if isinstance(self._map, tuple):
-                int8.cosine_distances(self._map, int8.tiled(strips), out)
+                int8.cosine_distances(self._map, int8.tile(strips), out)
             else:
                 dot.cosine_distances(self._map[0], np.ascontiguousarray(strips[0]), out)
             return out
         strips = strips if self._cells is None else cut_cells(strips, self._cells)
-        queries = int8.tiled(strips) if isinstance(self._map, tuple) else dot.tiled(strips)
+        queries = int8.tile(strips) if isinstance(self._map, tuple) else dot.tile(strips)
         if self._cells is not None:
             dot.vertical_image_distances(
                 self._map, queries, self._cell_a, self._a, self._band, out

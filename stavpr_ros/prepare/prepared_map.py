@@ -115,7 +115,7 @@ def with_codes(statistics: MapStatistics, place_map: Map, storage: str) -> MapSt
     features = _AsStored(place_map.features, storage)
     rounded = MeanCentering(features, statistics=statistics).places(features, rounds=True)
     assert isinstance(rounded, Int8Features)
-    return replace(statistics, codes=rounded.strips.rounded())
+    return replace(statistics, codes=rounded.strips.codes())
 
 
 def statistics_of_map(place_map: Map, storage: str = '') -> MapStatistics | None:

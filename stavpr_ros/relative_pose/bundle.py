@@ -34,7 +34,7 @@ class Observations:
     ray: np.ndarray
     observed: np.ndarray
 
-    def _turned(self, motions: np.ndarray) -> np.ndarray:
+    def _rotate_rays(self, motions: np.ndarray) -> np.ndarray:
         return np.einsum('mij,mj->mi', motions[self.neighbor, :3, :3], self.ray)
 
     def depths(
@@ -46,7 +46,7 @@ class Observations:
         Both are for a noise of one in the rays: the information of the neighbors alone, the
         variance with the noise of the place as well, which all neighbors have in common.
         """
-        base, slope = self._turned(motions), motions[self.neighbor, :3, 3]
+        base, slope = self._rotate_rays(motions), motions[self.neighbor, :3, 3]
         # (base + rho slope)_xy = observed (base + rho slope)_z
         a = slope[:, :2] - self.observed * slope[:, 2:]
         b = self.observed * base[:, 2:] - base[:, :2]
@@ -62,17 +62,17 @@ class Observations:
     def residuals(self, motions: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far observations are off, (m, 2), and whether they are ahead, (m,)."""
         direction = (
-            self._turned(motions) + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
+            self._rotate_rays(motions) + rho[self.keypoint, None] * motions[self.neighbor, :3, 3]
         )
         ahead = direction[:, 2] > 1e-6
         depth = np.where(ahead, direction[:, 2], 1)[:, None]
         return direction[:, :2] / depth - self.observed, ahead
 
-    def chosen(self, use: np.ndarray) -> 'Observations':
+    def select(self, use: np.ndarray) -> 'Observations':
         """Return a part of the observations, (m,) bool."""
         return Observations(*(array[use] for array in vars(self).values()))
 
-    def refined(
+    def refine(
         self, motions: np.ndarray, rho: np.ndarray, prior: np.ndarray, information: np.ndarray,
         focal: float,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
@@ -84,7 +84,7 @@ class Observations:
         :param prior: the motions by odometry, shape (n, 4, 4), and ``information`` of them.
         """
         count, keypoints = len(motions), len(rho)
-        directions = self._turned(motions)
+        directions = self._rotate_rays(motions)
         slope = motions[self.neighbor, :3, 3]
         x, y, z = (directions + rho[self.keypoint, None] * slope).T
         z = np.maximum(z, 1e-6)

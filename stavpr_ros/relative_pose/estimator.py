@@ -14,7 +14,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.mapping import GrowingMap, Map
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.place_map import decode_thumbnail
-from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses, turned
+from stavpr_ros.mapping.transforms import cross, inverse, matrices, to_poses, turn_pose
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View, view_of
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import Edge, LANDMARK_RADIUS, MatchedPair, NEIGHBORS, Source
@@ -108,7 +108,7 @@ class EdgeEstimator:
         """Return the edge by odometry where the method permits it, else one without a pose."""
         edge = Edge(Source.NONE) if self.method in ('none', 'pnp') else align(pair)
         reason = f'{reason}; {edge.reason}' if edge.reason else reason
-        return replace(edge, reason=reason, pose=turned(edge.pose, pair.relative_yaw))
+        return replace(edge, reason=reason, pose=turn_pose(edge.pose, pair.relative_yaw))
 
     def _pnp(self, pair: MatchedPair, query_camera: Camera, place_camera: Camera) -> Edge:
         """
@@ -149,20 +149,20 @@ class EdgeEstimator:
         for motion, index in zip(own.motions, neighbors, strict=True):
             if abs(index - pair.place) <= LANDMARK_RADIUS:
                 beside, _, _ = self._landmarks_of(pair, index, place_camera)
-                landmarks.append(beside.seen_from(inverse(motion)))
+                landmarks.append(beside.transform(inverse(motion)))
         return self._view(pair.query, query_camera), landmarks, reach
 
     def _landmarks_of(
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
-        make = partial(self._triangulated, pair, place, camera)
-        return _cached(self._landmarks, place, LANDMARKS, make)
+        make = partial(self._triangulate, pair, place, camera)
+        return _get_or_make(self._landmarks, place, LANDMARKS, make)
 
     def _view(self, image: np.ndarray, camera: Camera) -> View:
         camera.require_fitting(image.shape[1], image.shape[0])
         return view_of(image, camera)
 
-    def _triangulated(
+    def _triangulate(
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
         """Return the landmarks of a place, how far from it they serve (m), and its neighbors."""
@@ -193,7 +193,7 @@ class EdgeEstimator:
             image = decode_thumbnail(pair.thumbnails[index])
             return None if image is None else self._view(image, camera)
 
-        return _cached(self._views, index, VIEWS, make)
+        return _get_or_make(self._views, index, VIEWS, make)
 
 
 def _missing_for_pnp(
@@ -210,13 +210,13 @@ def _missing_for_pnp(
     return ''
 
 
-def _cached(
-    values: OrderedDict[int, Value], key: int, most: int, make: Callable[[], Value]
+def _get_or_make(
+    values: OrderedDict[int, Value], key: int, size: int, make: Callable[[], Value]
 ) -> Value:
     """Return the value of a key, made if it is missing; the least recently used one goes."""
     if key not in values:
         values[key] = make()
-        if len(values) > most:
+        if len(values) > size:
             values.popitem(last=False)
     values.move_to_end(key)
     return values[key]

@@ -53,7 +53,7 @@ class Landmarks:
     descriptors: np.ndarray
     motions: np.ndarray
 
-    def seen_from(self, motion: np.ndarray) -> 'Landmarks':
+    def transform(self, motion: np.ndarray) -> 'Landmarks':
         """Return the points in another frame, to which this one has the transform (4, 4)."""
         rays, points = (vectors @ motion[:3, :3].T for vectors in (self.rays, self.points))
         return replace(self, points=points + motion[:3, 3], rays=rays)
@@ -102,9 +102,9 @@ def triangulate(
             off, ahead = observations.residuals(motions, rho)
             use = ahead & (np.linalg.norm(off, axis=1) * place.focal < limit)
         if limit != PIXELS[-1]:
-            inliers = observations.chosen(use)
+            inliers = observations.select(use)
             for _ in range(STEPS):
-                motions, rho = inliers.refined(motions, rho, prior, trust, place.focal)
+                motions, rho = inliers.refine(motions, rho, prior, trust, place.focal)
     good = information * MAX_SHIFT**2 > 1
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
     points = rays[good] / rho[good, None]

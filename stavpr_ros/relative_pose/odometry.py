@@ -34,21 +34,21 @@ def align(pair: MatchedPair) -> Edge:
     from scipy.interpolate import CubicSpline
 
     places, images = np.flatnonzero(np.isfinite(track)), np.flatnonzero(np.isfinite(driven))
-    apart = places[np.diff(track[places], prepend=-1) > MIN_STEP]  # not where the robot stood
-    if min(len(images), len(apart)) < MIN_IMAGES or not pair.spacing > 0:
+    spaced = places[np.diff(track[places], prepend=-1) > MIN_STEP]  # not where the robot stood
+    if min(len(images), len(spaced)) < MIN_IMAGES or not pair.spacing > 0:
         reason = 'the odometry of query or places has gaps, or no motion, in the window'
         return Edge(Source.NONE, reason)
     offsets = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * pair.spacing
     start = float(track[pair.place - pair.first])
     total = np.zeros(len(offsets))
-    rows = np.array([_finite(pair.distances[image, apart]) for image in images])
+    rows = np.array([_finite(pair.distances[image, spaced]) for image in images])
     # smooth: between places, linear interpolation would pull all images to the same side
-    grid = np.arange(track[apart[0]], track[apart[-1]], STEP * pair.spacing)
-    smooth = CubicSpline(track[apart], rows.T)(grid)
+    grid = np.arange(track[spaced[0]], track[spaced[-1]], STEP * pair.spacing)
+    smooth = CubicSpline(track[spaced], rows.T)(grid)
     for column, image in enumerate(images):
         at = start + offsets + pair.direction * (driven[image] - driven[pair.middle])
         total += np.interp(at, grid, smooth[:, column])
-    at = start + _least(offsets, total)
+    at = start + _find_minimum(offsets, total)
     place = matrices(pair.pose(pair.place))
     pose = to_poses(inverse(place) @ matrices(_on_track(pair.poses[places], track[places], at)))
     direction = _direction(pair, place)
@@ -65,15 +65,15 @@ def _finite(row: np.ndarray) -> np.ndarray:
     return np.where(is_compared, row, farthest)
 
 
-def _least(offsets: np.ndarray, total: np.ndarray) -> float:
+def _find_minimum(offsets: np.ndarray, total: np.ndarray) -> float:
     """Return the offset at the vertex of the parabola around the least sum."""
-    least = int(np.argmin(total))
+    lowest = int(np.argmin(total))
     width = round(NEAR / STEP)
-    near = slice(max(0, least - width), least + width + 1)
-    a, b, _ = np.polyfit(offsets[near], total[near], 2)
+    window = slice(max(0, lowest - width), lowest + width + 1)
+    a, b, _ = np.polyfit(offsets[window], total[window], 2)
     if not a > 0:
-        return float(offsets[least])
-    return float(np.clip(-b / (2 * a), offsets[near][0], offsets[near][-1]))
+        return float(offsets[lowest])
+    return float(np.clip(-b / (2 * a), offsets[window][0], offsets[window][-1]))
 
 
 def _lengths(poses: np.ndarray) -> np.ndarray:

@@ -155,7 +155,7 @@ class OffsetFilter:
         """
         query, place = _columns(query, 'query'), _columns(place, 'place')
         evidence, is_covered = block_evidence(query, place, self._beside)
-        self._earlier = FORGETTING * _drifted(self._earlier) + evidence
+        self._earlier = FORGETTING * _drift(self._earlier) + evidence
         log = np.where(is_covered, self._earlier + self._prior, -np.inf)
         posterior = np.exp(log - log.max())
         posterior /= posterior.sum()
@@ -262,7 +262,7 @@ def _in_between(means: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _drifted(earlier: np.ndarray) -> np.ndarray:
+def _drift(earlier: np.ndarray) -> np.ndarray:
     """Return the sum of the earlier images where the shift has changed: a parabola, or a jump."""
     result = np.maximum(earlier, earlier.max() - JUMP)
     last = earlier.shape[1] - 1

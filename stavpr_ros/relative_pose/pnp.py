@@ -47,7 +47,7 @@ def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
     :param landmarks: of the place, and of others near by in its frame: a point that several of
         them have is an inlier once.
     """
-    matches = _matched(query, landmarks)
+    matches = _match(query, landmarks)
     if matches.count < MIN_INLIERS:
         return NOTHING
     matrix = np.diag([query.focal, query.focal, 1.0])
@@ -64,15 +64,15 @@ def solve_pnp(query: View, landmarks: Sequence[Landmarks]) -> PnpPose:
     motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
     indices = inliers.ravel()
     for _ in range(2):  # the second time with the inliers of the refined pose
-        pairs = matches.chosen(indices)
+        pairs = matches.select(indices)
         try:
-            motion, covariance = _refined(pairs, motion)
+            motion, covariance = _refine(pairs, motion)
         except np.linalg.LinAlgError:  # the landmarks do not determine a pose
             return NOTHING
         off, ahead = matches.residuals(motion)
         distances = np.linalg.norm(off, axis=1)
         indices = np.flatnonzero(ahead & (distances < PIXELS))
-        count = matches.chosen(indices).count
+        count = matches.select(indices).count
         if count < MIN_INLIERS:
             return PnpPose(None, NOTHING.covariance, count, np.nan)
     pose = inverse(motion)
@@ -104,7 +104,7 @@ class _Matches:
         """Return the number of keypoints."""
         return len(np.unique(self.keypoint))
 
-    def chosen(self, use: np.ndarray) -> '_Matches':
+    def select(self, use: np.ndarray) -> '_Matches':
         """Return the pairs of these indices."""
         arrays = (self.keypoint, self.pixels, self.points, self.rays, self.deviations)
         keypoint, pixels, points, rays, deviations = (array[use] for array in arrays)
@@ -118,7 +118,7 @@ class _Matches:
         return self.focal * np.stack([x / z, y / z], axis=1) - self.pixels, ahead
 
 
-def _matched(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
+def _match(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
     """Match the query with the landmarks of each place."""
     pairs = [mutual_matches(query.descriptors, place.descriptors, RATIO) for place in landmarks]
     mine = np.concatenate([own for own, _ in pairs])
@@ -132,7 +132,7 @@ def _matched(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
     return _Matches(mine, pixels, points, rays, deviations, query.focal)
 
 
-def _refined(pairs: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _refine(pairs: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Refine a pose together with the inverse depths of its landmarks: maximum likelihood.
 

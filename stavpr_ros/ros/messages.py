@@ -36,7 +36,7 @@ from stavpr_ros.errors import UnavailableError
 from stavpr_ros.mapping import GrowingMap, Map, Place
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.map_version2 import VERSION
-from stavpr_ros.mapping.transforms import turned
+from stavpr_ros.mapping.transforms import turn_pose
 from stavpr_ros.method import Match
 from stavpr_ros.pipeline import Pipeline
 from stavpr_ros.pipeline.result import ImageResult
@@ -126,7 +126,7 @@ class Outcome:
         """Return the pose of the robot at the place of the newest image, (7,); None = unknown."""
         if self.newest is None or self.newest.pose is None:
             return None
-        return turned(self.newest.pose, self.result.relative_yaw)
+        return turn_pose(self.newest.pose, self.result.relative_yaw)
 
 
 def fill(message: Message, *sources: object, **fields: Any) -> Message:

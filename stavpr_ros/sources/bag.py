@@ -33,7 +33,7 @@ class BagSource:
 
     Iterating yields :class:`Frame` with the header's stamp (the time of recording where that is 0)
     and ``topic#i`` as identifier, i counting the topic's messages from 0. Every iteration opens
-    the bag again. ``to_bytes`` and ``least`` are as of a
+    the bag again. ``to_bytes`` and ``min_size`` are as of a
     :class:`stavpr_ros.sources.folder.FolderSource`.
 
     :param path: a ROS 1 .bag file; a ROS 2 bag: its folder, or its .db3 or .mcap file.
@@ -52,11 +52,11 @@ class BagSource:
         self.path = Path(path)
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
-        self.least: tuple[int, int] | None = None
+        self.min_size: tuple[int, int] | None = None
         self._noted: dict[str, str] = {}  # oddities, by their first words
         with open_bag(self.path) as bag:
             topics = _topics(bag)
-        self.topic = _choose(self.path, topics, topic)
+        self.topic = _choose_topic(self.path, topics, topic)
         self.message_type, self._count = topics[self.topic]
         files = self.path.iterdir() if self.path.is_dir() else [self.path]
         self._most = sum(file.stat().st_size for file in files) // MIN_MESSAGE
@@ -71,7 +71,7 @@ class BagSource:
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode one image after the other."""
-        return self._each(self._frame)
+        return self._read(self._frame)
 
     def records(self, start: float = 0.0, duration: float = math.inf) -> Iterator[ImageRecord]:
         """
@@ -81,10 +81,10 @@ class BagSource:
         :param duration: seconds from there on.
         :raises SourceError: the bag is damaged further on.
         """
-        return self._each(self._record, start, duration)
+        return self._read(self._record, start, duration)
 
     def _frame(self, index: int, time_ns: int, message: Any) -> Frame:
-        image = decode_message(message, self.least, self.to_bytes)
+        image = decode_message(message, self.min_size, self.to_bytes)
         return Frame(image, _stamp(message) or time_ns, f'{self.topic}#{index}')
 
     def _record(self, _: int, time_ns: int, message: Any) -> ImageRecord:
@@ -104,7 +104,7 @@ class BagSource:
             message.data,
         )
 
-    def _each(
+    def _read(
         self,
         finish: Callable[[int, int, Any], Item],
         start: float = 0.0,
@@ -170,27 +170,29 @@ def _topics(bag: OpenBag) -> dict[str, tuple[str, int]]:
     }
 
 
-def _choose(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
+def _choose_topic(path: Path, topics: dict[str, tuple[str, int]], topic: str | None) -> str:
     """Return the requested image topic, or the only one; an error lists the topics."""
     kinds = {RAW, COMPRESSED, *VIDEO}
     images = {name: info for name, info in topics.items() if info[0] in kinds}
     if topic is not None:
-        return _named(path, topics, topic, kinds)
+        return _find_topic(path, topics, topic, kinds)
     nonempty = {name: info for name, info in images.items() if info[1]}
     if len(nonempty) == 1:
         return next(iter(nonempty))
     if nonempty:
         raise SourceError(
-            f'{path} has {len(nonempty)} image topics, choose one (--topic): {_listed(nonempty)}'
+            f'{path} has {len(nonempty)} image topics, choose one (--topic): {_describe(nonempty)}'
         )
     expected = ', '.join([RAW, COMPRESSED, *sorted(VIDEO)])
-    text = f'{path} has no images (expected {expected}): there are {_listed(topics)}'
+    text = f'{path} has no images (expected {expected}): there are {_describe(topics)}'
     if any('Packet' in kind or 'Compressed' in kind for kind, _ in topics.values()):
         text += '; `ros2 run image_transport republish TRANSPORT raw` converts it while played'
     raise SourceError(text)
 
 
-def _named(path: Path, topics: dict[str, tuple[str, int]], topic: str, kinds: set[str]) -> str:
+def _find_topic(
+    path: Path, topics: dict[str, tuple[str, int]], topic: str, kinds: set[str]
+) -> str:
     """Return the topic of this name, with or without a slash, if it is of these kinds."""
     suitable = {name: info for name, info in topics.items() if info[0] in kinds}
     name = next((name for name in topics if name.strip('/') == topic.strip('/')), None)
@@ -199,11 +201,11 @@ def _named(path: Path, topics: dict[str, tuple[str, int]], topic: str, kinds: se
     where = 'is not in' if name is None else f'is of type {topics[name][0]} in'
     where = 'has no messages in' if name in suitable else where
     raise SourceError(
-        f'topic {topic!r} {where} {path}: expected one of {_listed(suitable or topics)}'
+        f'topic {topic!r} {where} {path}: expected one of {_describe(suitable or topics)}'
     )
 
 
-def _listed(topics: dict[str, tuple[str, int]]) -> str:
+def _describe(topics: dict[str, tuple[str, int]]) -> str:
     rows = [f'{name} ({kind}, {count} messages)' for name, (kind, count) in topics.items()]
     return ', '.join(rows) or 'no topics at all'
 
@@ -223,7 +225,7 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
     stamps: list[int] = []
     poses = []
     with open_bag(path) as bag:
-        name = _named(path, _topics(bag), topic, {ODOMETRY})
+        name = _find_topic(path, _topics(bag), topic, {ODOMETRY})
         for _, time_ns, raw in bag.messages({name}):
             try:
                 message = bag.deserialize(raw, ODOMETRY)

@@ -130,7 +130,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     """
     with ExitStack() as stack:
         with reading(path):
-            names, counts = _stated(path) if path.is_dir() else ([], {})
+            names, counts = _read_metadata(path) if path.is_dir() else ([], {})
             files = _files(path, names) if path.is_dir() else [path]
             readers, damaged = [], []
             for file in files:
@@ -148,16 +148,16 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         yield bag
 
 
-def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
+def _read_metadata(folder: Path) -> tuple[list[str], dict[str, int]]:
     """Return the names of the files, and the messages of each topic, by the metadata."""
     file = folder / METADATA
     if not file.exists():
         return [], {}
     content = file.read_bytes()
     try:
-        stated = YAML(typ='safe').load(content)['rosbag2_bagfile_information']
-        names = [PureWindowsPath(path).name for path in stated['relative_file_paths']]
-        topics = stated.get('topics_with_message_count') or []
+        information = YAML(typ='safe').load(content)['rosbag2_bagfile_information']
+        names = [PureWindowsPath(path).name for path in information['relative_file_paths']]
+        topics = information.get('topics_with_message_count') or []
         counts = {entry['topic_metadata']['name']: int(entry['message_count']) for entry in topics}
     except Exception as error:  # garbage raises errors of any type
         reason = f'{type(error).__name__}: {error}'.partition('\n')[0]
@@ -168,8 +168,8 @@ def _stated(folder: Path) -> tuple[list[str], dict[str, int]]:
 
 def _files(folder: Path, names: list[str]) -> list[Path]:
     """Return the files of a bag that are present; without metadata, they are alike in name."""
-    stated = {name.lower() for name in names}
-    files = {file for file in folder.iterdir() if file.name.lower() in stated}
+    lower_names = {name.lower() for name in names}
+    files = {file for file in folder.iterdir() if file.name.lower() in lower_names}
     if len(files) < len(names) or not names:  # perhaps renamed
         files.update(bag_path.storage_files(folder))
     others = {file.name.lower() for file in files if file.suffix.lower() != '.bag'}
@@ -206,7 +206,7 @@ def _open_file(file: Path, stack: ExitStack) -> Any:
     logs = [Path(f'{file}{end}') for end in LOG_SUFFIXES]
     logs = [log for log in logs if log.exists() and log.stat().st_size]
     if logs or kind == ZSTD:
-        source = _copied(file, logs, stack)
+        source = _copy(file, logs, stack)
         kind = storage_kind(source)
     reader: Any
     if kind == '.bag':
@@ -222,7 +222,7 @@ def _open_file(file: Path, stack: ExitStack) -> Any:
     return reader
 
 
-def _copied(file: Path, logs: list[Path], stack: ExitStack) -> Path:
+def _copy(file: Path, logs: list[Path], stack: ExitStack) -> Path:
     """Return a copy of a file: with the writes of its logs, else decompressed."""
     try:
         target = Path(stack.enter_context(TemporaryDirectory(prefix='stavpr_bag_')), 'bag')

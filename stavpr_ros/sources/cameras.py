@@ -27,7 +27,7 @@ SINGLE = re.compile(r'(?<![^\W_])[a-fA-F](?![^\W_])')  # else they are hexadecim
 TOKEN = re.compile(r'[A-Z]?[a-z]+|[A-Z]+')
 WORD = re.compile(r'[^\W\d_]*[^\W\d_a-f][^\W\d_]*')  # no hexadecimal digits
 MIN_SHARE = 0.05  # of all images, of a camera
-MOST = 0.75  # of all images are of the cameras: hall_left, hall_right and stairs are parts
+MIN_ROLE_SHARE = 0.75  # of images with cameras in their names; else parts: hall_left, stairs
 MIN_COMMON = 0.95  # of the counters of two cameras that take images together
 STAMPS = 10**7  # stamps and dates are not below
 
@@ -49,27 +49,28 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
         by_name = {name.casefold(): group for name, group in groups.items()}
         if group := by_name.get(camera.strip('/').casefold()):
             return list(group)
-        choice = f'expected one of {_listed(groups)}' if len(groups) > 1 else 'leave it out'
+        choice = f'expected one of {_describe(groups)}' if len(groups) > 1 else 'leave it out'
         raise SourceError(f'{top} has no camera {camera!r}: {choice}')
     alike: dict[str, list[Path]] = {}  # by their names without the camera's and without numbers
     for file in files:
         rest = Path(_role(file.relative_to(top))[1]).name.casefold()
         alike.setdefault(re.sub(r'[\W\d_]', '', rest), []).append(file)
-    most = max(alike.values(), key=len, default=[])
-    of_roles = _groups(most if len(most) >= MOST * len(files) else [], top, _role)
+    largest = max(alike.values(), key=len, default=[])
+    of_roles = _groups(largest if len(largest) >= MIN_ROLE_SHARE * len(files) else [], top, _role)
     several, is_sure = _parallel(of_roles, len(files), MIN_COMMON), True
     if not several:
         several = _parallel(streams, len(files), 0.5)
         is_sure = bool(several) and all(map(_is_stamped, several.values()))
     if several and is_sure:
         raise SourceError(
-            f'{top} has images of {len(several)} cameras, {_listed(several)}: expected one; '
+            f'{top} has images of {len(several)} cameras, {_describe(several)}: expected one; '
             'choose it, --camera NAME; parts of one drive need other names'
         )
     if several:
         note_once(
-            f'{top} has images of the same numbers, {_listed(several)}: they are taken for parts '
-            'of one drive; if they are of several cameras or drives, choose one, --camera NAME'
+            f'{top} has images of the same numbers, {_describe(several)}: they are taken for '
+            'parts of one drive; if they are of several cameras or drives, choose one, --camera '
+            'NAME'
         )
     return list(files)
 
@@ -120,20 +121,20 @@ def _parallel(groups: Groups, count: int, common: float) -> Groups:
     Return the groups whose times are among another group's, or whose counters are equal.
 
     :param count: images of the folder.
-    :param common: least share of the counters of the larger group.
+    :param common: smallest share of the counters of the larger group.
     """
     large = {name: own for name, own in groups.items() if len(own) >= max(2, MIN_SHARE * count)}
     several: Groups = {}
     for a, b in combinations(large, 2):
         small, other = sorted((large[a], large[b]), key=len)
         first, last = min(other.values()), max(other.values())
-        least = len(small) / 2
+        min_count = len(small) / 2
         if not (_is_stamped(small) and _is_stamped(other)):
-            least = max(least, common * len(other))
-        if sum(first <= own <= last for own in small.values()) >= least:
+            min_count = max(min_count, common * len(other))
+        if sum(first <= own <= last for own in small.values()) >= min_count:
             several |= {a: large[a], b: large[b]}
     return several
 
 
-def _listed(groups: Groups) -> str:
+def _describe(groups: Groups) -> str:
     return ', '.join(f'{name} ({len(group)})' for name, group in sorted(groups.items()))

@@ -146,7 +146,7 @@ _LOWER_CASE = {name.lower(): encoding for name, encoding in ENCODINGS.items()}
 
 def decode_message(
     message: Any,
-    least: tuple[int, int] | None = None,
+    min_size: tuple[int, int] | None = None,
     to_bytes: files.ToBytes | None = None,
 ) -> np.ndarray:
     """
@@ -158,7 +158,7 @@ def decode_message(
 
     :param message: a ``sensor_msgs/CompressedImage`` if it has a ``format``, the image of a video
         topic if it decodes itself, else a ``sensor_msgs/Image``.
-    :param least: rows and columns that are needed of a large image, which is reduced then, see
+    :param min_size: rows and columns that are needed of a large image, which is reduced then, see
         :func:`stavpr_ros.sources.files.reduce`; None = all.
     :param to_bytes: converts values of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
@@ -167,16 +167,16 @@ def decode_message(
         :func:`stavpr_ros.sources.files.decode_file`.
     """
     if hasattr(message, 'decode'):
-        return files.reduce(message.decode(), least)
+        return files.reduce(message.decode(), min_size)
     if hasattr(message, 'format'):
-        return _decode_compressed(message, least, to_bytes)
+        return _decode_compressed(message, min_size, to_bytes)
     if message.encoding.lower() in _FILES:
-        return files.decode_file(message.data, None, least, to_bytes)
-    return _decode_raw(message, least, to_bytes)
+        return files.decode_file(message.data, None, min_size, to_bytes)
+    return _decode_raw(message, min_size, to_bytes)
 
 
 def _decode_raw(
-    message: Any, least: tuple[int, int] | None, to_bytes: files.ToBytes | None
+    message: Any, min_size: tuple[int, int] | None, to_bytes: files.ToBytes | None
 ) -> np.ndarray:
     """Decode a ``sensor_msgs/Image``; step may be 0, and the padding of the last row missing."""
     height, width, encoding = message.height, message.width, message.encoding
@@ -186,11 +186,11 @@ def _decode_raw(
     rows = height + int(height * layout.chroma_rows)
     _check_header(height, width, encoding, layout, step, row)
     flat = files.flat_bytes(message.data)
-    min_size = (rows - 1) * step + row
-    if flat.size < min_size:
+    min_bytes = (rows - 1) * step + row
+    if flat.size < min_bytes:
         raise ImageError(
             f'{flat.size} bytes of data for {width}x{height} {encoding} with step {step}: '
-            f'expected {min_size} or more; the image is cut off',
+            f'expected {min_bytes} or more; the image is cut off',
             kind='cut off',
         )
     if width * height > files.MAX_PIXELS:  # last: a wrong header fails the checks above
@@ -199,7 +199,7 @@ def _decode_raw(
     if layout.value_bytes == 1:
         strides = (step, layout.channels, 1)
         pixels: np.ndarray = np.ndarray((rows, width, layout.channels), np.uint8, flat, 0, strides)
-        image = files.reduce(layout.to_rgb(pixels), least)
+        image = files.reduce(layout.to_rgb(pixels), min_size)
         is_own = image is not pixels or (image.flags.c_contiguous and image.flags.writeable)
         return image if is_own else np.array(image, order='C')
     if to_bytes is None:  # the more significant byte lies first if big-endian
@@ -209,11 +209,11 @@ def _decode_raw(
         order = '>u2' if message.is_bigendian else '<u2'
         wide: np.ndarray = np.ndarray((rows, values), order, flat, 0, (step, 2))
         high = to_bytes(wide.astype(np.uint16))
-    return files.reduce(layout.to_rgb(high.reshape(rows, width, layout.channels)), least)
+    return files.reduce(layout.to_rgb(high.reshape(rows, width, layout.channels)), min_size)
 
 
 def _decode_compressed(
-    message: Any, least: tuple[int, int] | None, to_bytes: files.ToBytes | None
+    message: Any, min_size: tuple[int, int] | None, to_bytes: files.ToBytes | None
 ) -> np.ndarray:
     """
     Decode a ``sensor_msgs/CompressedImage``; the bytes decide the file format.
@@ -229,7 +229,7 @@ def _decode_compressed(
             kind='depth',
         )
     try:
-        return files.decode_file(message.data, _demosaic_of(message.format), least, to_bytes)
+        return files.decode_file(message.data, _demosaic_of(message.format), min_size, to_bytes)
     except ImageError as error:
         raise ImageError(f'format {message.format!r}: {error}', kind=error.kind) from error
 

@@ -54,25 +54,25 @@ COMPRESSED_FORMATS = ('JPEG', 'PNG', 'BMP', 'TIFF', 'PPM', 'WEBP')
 """The supported files, in Pillow's names."""
 
 
-def reduction(height: int, width: int, least: tuple[int, int] | None) -> int:
+def reduction(height: int, width: int, min_size: tuple[int, int] | None) -> int:
     """
     Return by what the sides of a large image are divided, a power of two; 1 for a small image.
 
-    :param least: rows and columns that must remain; None = all.
+    :param min_size: rows and columns that must remain; None = all.
     """
     divisor = 1
-    if least is None or height * width <= LARGE_PIXELS:
+    if min_size is None or height * width <= LARGE_PIXELS:
         return divisor
     while (
         height * width > ENOUGH_PIXELS
         and not (height % 2 or width % 2)
-        and (height // 2 >= least[0] and width // 2 >= least[1])
+        and (height // 2 >= min_size[0] and width // 2 >= min_size[1])
     ):
         height, width, divisor = height // 2, width // 2, 2 * divisor
     return divisor
 
 
-def reduce(image: np.ndarray, least: tuple[int, int] | None) -> np.ndarray:
+def reduce(image: np.ndarray, min_size: tuple[int, int] | None) -> np.ndarray:
     """
     Reduce an image by :func:`reduction`: blocks of 2 x 2 pixels are averaged, again and again.
 
@@ -80,7 +80,7 @@ def reduce(image: np.ndarray, least: tuple[int, int] | None) -> np.ndarray:
     :returns: the same image if it is not large.
     """
     height, width = image.shape[:2]
-    divisor = reduction(height, width, least)
+    divisor = reduction(height, width, min_size)
     while divisor > 1:
         height, width, divisor = height // 2, width // 2, divisor // 2
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)  # its fast case
@@ -132,7 +132,7 @@ def scale(value_range: tuple[int, int] | None) -> ToBytes | None:
 def decode_file(
     data: Any,
     demosaic: Callable[[np.ndarray], np.ndarray] | None = None,
-    least: tuple[int, int] | None = None,
+    min_size: tuple[int, int] | None = None,
     to_bytes: ToBytes | None = None,
 ) -> np.ndarray:
     """
@@ -143,34 +143,34 @@ def decode_file(
     :param data: the file's bytes: anything with the buffer protocol.
     :param demosaic: converts a gray image (height, width), a Bayer mosaic, to RGB; not called if
         the file has color.
-    :param least: rows and columns that are needed of a large image, which is reduced then; None =
-        all.
+    :param min_size: rows and columns that are needed of a large image, which is reduced then;
+        None = all.
     :param to_bytes: converts images of 16 bits; None = the upper byte.
     :returns: RGB, uint8, shape (height, width, 3), C-contiguous.
     :raises ImageError: not such a file, damaged, cut off, or of more than :data:`MAX_PIXELS`
         pixels.
     """
     flat = flat_bytes(data)
-    header, turn = checked_header(flat, MAX_PIXELS)
+    header, turn = check_file_header(flat, MAX_PIXELS)
     flag = cv2.IMREAD_COLOR  # OpenCV rounds color TIFF of 16 bits, and takes the upper byte else
     if header.format in JPEG_FORMATS:
         flat = _complete_jpeg(flat)
-        flag = REDUCED_JPEG[min(8, reduction(header.height, header.width, least))]
+        flag = REDUCED_JPEG[min(8, reduction(header.height, header.width, min_size))]
     # Pillow's modes of one channel: L of 8 bits, I or I;16 of more
     if is_mosaic := demosaic is not None and (header.mode == 'L' or header.mode.startswith('I')):
         flag = cv2.IMREAD_GRAYSCALE
     image = _unpack(flat, flag if to_bytes is None else flag | cv2.IMREAD_ANYDEPTH, header)
     if image is None:
-        raise _damaged(flat.size)
+        raise _damage_error(flat.size)
     if image.dtype == np.uint16:
         image = (to_bytes or upper_byte)(image)
-    image = _turned(image, turn)
+    image = _apply_orientation(image, turn)
     if demosaic is not None and is_mosaic:
         if image.ndim == 3:  # a TIFF that OpenCV does not decode: three equal channels
             image = np.ascontiguousarray(image[..., 0])
-        return reduce(demosaic(image), least)
+        return reduce(demosaic(image), min_size)
     code = cv2.COLOR_BGR2RGB if image.ndim == 3 else cv2.COLOR_GRAY2RGB
-    return np.asarray(cv2.cvtColor(reduce(image, least), code))
+    return np.asarray(cv2.cvtColor(reduce(image, min_size), code))
 
 
 def _unpack(flat: np.ndarray, flag: int, header: 'Image.Image') -> np.ndarray | None:
@@ -208,7 +208,7 @@ def _has_own_maximum(header: 'Image.Image') -> bool:
     return bool(decoder) and isinstance(decoder[0], tuple) and decoder[0][1] not in (255, 65535)
 
 
-def _turned(image: np.ndarray, turn: int) -> np.ndarray:
+def _apply_orientation(image: np.ndarray, turn: int) -> np.ndarray:
     """Apply the orientation of EXIF, 1 to 8."""
     if turn >= 5:
         image = image.swapaxes(0, 1)
@@ -216,14 +216,14 @@ def _turned(image: np.ndarray, turn: int) -> np.ndarray:
     return np.ascontiguousarray(image[::rows, ::columns])
 
 
-def _damaged(size: int) -> ImageError:
+def _damage_error(size: int) -> ImageError:
     return ImageError(
         f'compressed image of {size} bytes is damaged or cut off: copy or record it again',
         kind='damaged',
     )
 
 
-def checked_header(flat: np.ndarray, max_pixels: int) -> tuple['Image.Image', int]:
+def check_file_header(flat: np.ndarray, max_pixels: int) -> tuple['Image.Image', int]:
     """
     Check what a file claims, which OpenCV allocates before it reads.
 
@@ -336,7 +336,7 @@ def _check_chunks_of_png(data: memoryview) -> None:
         length, kind = int.from_bytes(data[at : at + 4], 'big'), bytes(data[at + 4 : at + 8])
         at += PNG_CHUNK + length
         if at > len(data):
-            raise _damaged(len(data))
+            raise _damage_error(len(data))
 
 
 def too_large(width: int, height: int) -> ImageError:

@@ -34,7 +34,7 @@ FOREIGN = re.compile(
     re.IGNORECASE,
 )
 """Names of sub-folders that a NAS, an archive program or a viewer adds."""
-FEW = 5  # times as many images in sub-folders: images beside these are not the drive
+MAX_RATIO = 5  # of images in sub-folders to images beside them, if these are the drive
 
 
 def text_of(path: str | Path) -> str:
@@ -50,8 +50,8 @@ class FolderSource:
     folders are ignored; ``left_out`` counts other images and folders by their
     :data:`stavpr_ros.errors.CAUSES`. Iterating yields :class:`Frame` with an unknown stamp and,
     as identifier, the file's name, in a sub-folder its path from the folder. ``to_bytes`` converts
-    images of 16 bits, None = by the upper byte; ``least`` are the rows and columns needed of large
-    images, which are reduced, None = all.
+    images of 16 bits, None = by the upper byte; ``min_size`` are the rows and columns needed of
+    large images, which are reduced, None = all.
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
@@ -69,7 +69,7 @@ class FolderSource:
         self.path = Path(path)
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
-        self.least: tuple[int, int] | None = None
+        self.min_size: tuple[int, int] | None = None
         self._counted: set[Path] = set()
         try:
             files, self.left_out = _images_of(self.path)
@@ -91,7 +91,7 @@ class FolderSource:
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode one file after the other."""
-        for _, frame in self._numbered():
+        for _, frame in self._decode():
             yield frame
 
     @property
@@ -117,10 +117,10 @@ class FolderSource:
             math.ceil(min(t * frames_per_second - 1e-6, len(self)))
             for t in (start, start + duration)
         )
-        for i, frame in self._numbered(max(first, 0), last):
+        for i, frame in self._decode(max(first, 0), last):
             yield ImageRecord.of_image(frame.image, round((i + 1) * SECOND / frames_per_second))
 
-    def _numbered(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
+    def _decode(self, first: int = 0, last: int | None = None) -> Iterator[tuple[int, Frame]]:
         for i, file in enumerate(self.files[first:last], first):
             try:
                 frame = Frame(self._read(file), 0, text_of(file.relative_to(self.path)))
@@ -140,7 +140,7 @@ class FolderSource:
                     '0 bytes: a placeholder of a cloud, or an interrupted copy; download it again',
                     kind='elsewhere',
                 )
-            image = decode_file(data, None, self.least, self.to_bytes)
+            image = decode_file(data, None, self.min_size, self.to_bytes)
         except ElsewhereError as error:
             raise ImageError(f'{text_of(file)}: {error.strerror}', kind='elsewhere') from error
         except OSError as error:
@@ -183,6 +183,6 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         unread['bag'] += sum(path.suffix.lower() in STORAGE_SUFFIXES for path in paths)
         unread['video'] += sum(path.suffix.lower() in VIDEOS for path in paths)
         (own if Path(name) == top else below).extend(images)
-    is_drive = len(own) * FEW > len(below)
+    is_drive = len(own) * MAX_RATIO > len(below)
     unread['below' if is_drive else 'beside'] = len(below if is_drive else own)
     return own if is_drive else below, +unread

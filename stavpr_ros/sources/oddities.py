@@ -60,21 +60,23 @@ def _clock_oddities(stamps: Sequence[int], times: Sequence[int], has_epoch: bool
     steps = [b - a for a, b in pairwise(stamps)]
     jumps = [step for step in steps if step < -MAX_REORDERING or step > HOUR]
     # of all, since images come in bursts, and of two, since cameras pause
-    stamped, passed = stamps[-1] - stamps[0], times[-1] - times[0]
+    stamp_span, time_span = stamps[-1] - stamps[0], times[-1] - times[0]
     step, pause = median(steps), median(b - a for a, b in pairwise(times))
-    differ = all(min(pair) * MAX_RATIO < max(pair) for pair in ((stamped, passed), (step, pause)))
-    apart = median(stamp - time for stamp, time in zip(stamps, times, strict=True))
+    differ = all(
+        min(pair) * MAX_RATIO < max(pair) for pair in ((stamp_span, time_span), (step, pause))
+    )
+    ahead = median(stamp - time for stamp, time in zip(stamps, times, strict=True))
     remedy = 'correct the clock of the driver'
     if len(set(stamps)) == 1:
         yield f'all stamps are {stamps[0] / SECOND:.3f} s: {remedy}'
     elif jumps:
         largest = max(jumps, key=abs) / SECOND
         yield f'stamps jump {len(jumps)} times, by up to {largest:.1f} s: {remedy}'
-    elif passed > SECOND // 2 and differ:
-        took = f'{stamped / SECOND:.4g} s in {passed / SECOND:.4g} s'
+    elif time_span > SECOND // 2 and differ:
+        took = f'{stamp_span / SECOND:.4g} s in {time_span / SECOND:.4g} s'
         yield f'stamps advance by {took}, as of another unit: {remedy}'
-    elif has_epoch and abs(apart) > DAY and all(times):
-        yield f'stamps are {apart / DAY:.1f} days from the times of recording: {remedy}'
+    elif has_epoch and abs(ahead) > DAY and all(times):
+        yield f'stamps are {ahead / DAY:.1f} days from the times of recording: {remedy}'
 
 
 def speed_oddity(stamps: np.ndarray, poses: np.ndarray) -> str:

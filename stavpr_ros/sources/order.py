@@ -60,13 +60,17 @@ def _add_keys(keys: dict[Path, Any], folder: Path, names: list[str]) -> str:
     values, guess = natural, ''
     if len(parts) == len(stems) and len({(part[0], part[4]) for part in parts}) == 1:
         _, signs, wholes, fractions, _ = zip(*parts, strict=True)
-        values, guess = _real(signs, wholes, fractions) or _continued(wholes) or (natural, '')
+        values, guess = (
+            _read_decimals(signs, wholes, fractions)
+            or _read_restarted_counter(wholes)
+            or (natural, '')
+        )
     own = [*zip(values, natural, strict=True)]
     keys.update(zip((folder / name for name in names), own, strict=True))
     return guess if [key for _, key in sorted(own)] != sorted(natural) else ''
 
 
-def _real(signs: Texts, wholes: Texts, fractions: Texts) -> tuple[list[Any], str] | None:
+def _read_decimals(signs: Texts, wholes: Texts, fractions: Texts) -> tuple[list[Any], str] | None:
     """Read decimal numbers of unequal length, and numbers of both signs."""
     is_sure = is_signed = len({*signs}) > 1
     if not is_signed:
@@ -82,7 +86,7 @@ def _real(signs: Texts, wholes: Texts, fractions: Texts) -> tuple[list[Any], str
     return values, '' if is_sure else guess
 
 
-def _continued(texts: Texts) -> tuple[list[Any], str] | None:
+def _read_restarted_counter(texts: Texts) -> tuple[list[Any], str] | None:
     """Read a counter that began again at its end: 9998, 9999, 0001."""
     tens = []
     if len(texts) > 1 and len({*map(len, texts)}) == 1:  # behind digits that all have
@@ -103,7 +107,7 @@ def _continued(texts: Texts) -> tuple[list[Any], str] | None:
 
 def _by_times(files: list[Path], guess: str) -> tuple[list[Path], str]:
     """Compare an order with the times in EXIF, if the files have them."""
-    times = [*map(_taken, files)] if files and _taken(files[0]) else ['']
+    times = [*map(_exposure_time, files)] if files and _exposure_time(files[0]) else ['']
     if not all(times):
         return files, guess
     falls = [i for i in range(1, len(files)) if times[i] < times[i - 1]]
@@ -122,7 +126,7 @@ def _follows(file: Path, after: Path) -> bool:
     return a[:-1] == b[:-1] and 0 < b[-1] - a[-1] <= 2
 
 
-def _taken(file: Path) -> str:
+def _exposure_time(file: Path) -> str:
     """Return the time of the exposure by EXIF, which sorts as text; '' = unknown."""
     from PIL import Image
 

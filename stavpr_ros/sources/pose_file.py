@@ -90,7 +90,7 @@ def _rows_of(
     table: Table, names: list[str], columns: list[int] | None, images: Sequence[str]
 ) -> np.ndarray | None:
     """Return the row of each image by its name, number or stamp; None = they are not named."""
-    keys, wanted = table.labels, list(images)
+    keys, image_keys = table.labels, list(images)
     if not keys:
         own = [0] if columns is None and table.width - 1 in NUMBERS else []
         if columns is not None:
@@ -99,22 +99,22 @@ def _rows_of(
             return None
         keys = [str(key) for key in table.numbers(own[:1])[:, 0].tolist()]
         numbers = [NUMBER.findall(PureWindowsPath(image).stem) for image in images]
-        wanted = [str(float(number[-1])) if number else '' for number in numbers]
-    rows = by_name(wanted, keys)
+        image_keys = [str(float(number[-1])) if number else '' for number in numbers]
+    rows = by_name(image_keys, keys)
     missing = [image for image, row in zip(images, rows, strict=True) if row < 0]
     is_text = table.labels and (len(missing) < len(images) or FILE.fullmatch(keys[0]))
-    if not images or len({*wanted}) < len({*images}) or (missing and not is_text):
+    if not images or len({*image_keys}) < len({*images}) or (missing and not is_text):
         return None
     if missing:
         raise table.error(
-            f'it names {_listed(keys)}, but {len(missing)} images not, {_listed(missing)}'
+            f'it names {_join(keys)}, but {len(missing)} images not, {_join(missing)}'
         )
     if others := [keys[row] for row in sorted({*range(len(keys))} - {*rows.tolist()})]:
-        note_once(f'poses {table.path}: {len(others)} lines are of no image: {_listed(others)}')
+        note_once(f'poses {table.path}: {len(others)} lines are of no image: {_join(others)}')
     return rows
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join(names: Sequence[str]) -> str:
     return ', '.join(names[:LISTED]) + (' ...' if len(names) > LISTED else '')
 
 
@@ -138,16 +138,16 @@ def _doubt(poses: np.ndarray, oriented: bool) -> str:
 
 def _columns(names: list[str]) -> list[int] | None:
     """Return the columns of a pose by their names; None = they name none."""
-    found: dict[str, int] = {}
+    columns: dict[str, int] = {}
     for i, name in enumerate(names):
         if match := ROTATION.fullmatch(name):
-            found.setdefault(f'q{match[4]}', i)
+            columns.setdefault(f'q{match[4]}', i)
         elif match := POSITION.fullmatch(name):
-            found.setdefault(match[5], i)
-    if not found.keys() >= set('xyz'):
+            columns.setdefault(match[5], i)
+    if not columns.keys() >= set('xyz'):
         return None
-    rotation = [found.get(f'q{axis}', -1) for axis in 'xyzw']
-    return [found[axis] for axis in 'xyz'] + (rotation if min(rotation) >= 0 else [])
+    rotation = [columns.get(f'q{axis}', -1) for axis in 'xyzw']
+    return [columns[axis] for axis in 'xyz'] + (rotation if min(rotation) >= 0 else [])
 
 
 def _of_matrices(table: Table, matrices: np.ndarray) -> np.ndarray:

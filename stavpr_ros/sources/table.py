@@ -61,13 +61,13 @@ class Table:
         files = [i for i, cell in enumerate(cells) if FILE.fullmatch(cell)]
         self._label = 0 if is_labeled else files[0] if files else None
         self.width = width - (self._label is not None)
-        self._header = _is_header(self._unlabeled(names), self.width, counted or unnamed)
+        self._header = _is_header(self._without_label(names), self.width, counted or unnamed)
         if self._header and not second:
             raise self.error('it has names, but no line of numbers')
         comment = self._cells(self._comment)
         if not self._header:
             names = comment if len(comment) == width else []
-        self.names = self._unlabeled(names)[: self.width]
+        self.names = self._without_label(names)[: self.width]
 
     def error(self, reason: str, row: int | None = None) -> SourceError:
         """Return the error of the table, or of a row of :meth:`numbers`, and what it expected."""
@@ -103,10 +103,10 @@ class Table:
             if self._label is not None:
                 cells = row.split(self._separator)
                 self.labels += [cell.strip(' "') for cell in cells[self._label :][:1]]
-                row = (self._separator or ' ').join(self._unlabeled(cells))
+                row = (self._separator or ' ').join(self._without_label(cells))
             yield row
 
-    def _unlabeled(self, cells: list[str]) -> list[str]:
+    def _without_label(self, cells: list[str]) -> list[str]:
         return [cell for i, cell in enumerate(cells) if i != self._label]
 
     def _lines(self) -> Iterator[tuple[int, str]]:
@@ -133,7 +133,7 @@ def by_name(names: Sequence[str], keys: Sequence[str]) -> np.ndarray:
     """
     best = np.full(len(names), -1)
     for form in (PureWindowsPath.as_posix, attrgetter('name'), attrgetter('stem')):
-        own, others = ([form(PureWindowsPath(text)) for text in every] for every in (names, keys))
+        own, others = ([form(PureWindowsPath(text)) for text in texts] for texts in (names, keys))
         if len({*own}) < len({*names}) or len({*others}) < len({*keys}):
             break  # several files of this name
         row_of = {key: row for row, key in enumerate(others)}

@@ -42,9 +42,9 @@ def video_files(path: str | Path) -> list[Path]:
     path = Path(path)
     with reading(path):
         files = list(path.glob('[!.]*')) if path.is_dir() else [path]
-        videos = [one for one in files if one.suffix.lower() in VIDEOS and not one.is_dir()]
-    videos = [one for one in videos if one.suffix.lower() not in PROXIES] or videos
-    if sum(one.suffix.lower() in IMAGES for one in files) >= max(len(videos), 2):
+        videos = [file for file in files if file.suffix.lower() in VIDEOS and not file.is_dir()]
+    videos = [file for file in videos if file.suffix.lower() not in PROXIES] or videos
+    if sum(file.suffix.lower() in IMAGES for file in files) >= max(len(videos), 2):
         return []
     return sorted(videos, key=lambda file: natural_key(file.name))
 
@@ -71,7 +71,7 @@ class VideoSource:
     Iterating yields :class:`Frame` with ``name#i`` as identifier, i counting the images from 0. A
     stamp is the time since the first frame, counted from the creation time that the file states,
     else from 1 s, since 0 is unknown. Of an interlaced frame, one field is taken.
-    ``least`` is as of a :class:`stavpr_ros.sources.folder.FolderSource`.
+    ``min_size`` is as of a :class:`stavpr_ros.sources.folder.FolderSource`.
 
     Each iteration decodes in a process of its own, with limited memory and time: a damaged
     file cannot crash this one.
@@ -93,7 +93,7 @@ class VideoSource:
     ) -> None:
         require_above('fps', fps, 0)
         self.path, self.on_error, self.fps = Path(path), on_error, fps
-        self.least: tuple[int, int] | None = None
+        self.min_size: tuple[int, int] | None = None
         self._files = video_files(path) if self.path.is_dir() else [self.path]
         if any(file.suffix.lower() in IMAGES for file in self.path.glob('[!.]*')):
             raise SourceError(f'{path} has videos and images: expected one kind; name a video')
@@ -112,12 +112,12 @@ class VideoSource:
         disorder = created.all() and (np.diff(created) < 0).any()
         if disorder or np.ptp(sizes, 1).any() or np.ptp(rates) > SAME_RATE * self._rate:
             rows = zip(self._files, facts, strict=True)
-            listed = ', '.join(
-                f'{one.name} ({w}x{h}, {r:.4g} Hz)' for one, (_, r, _, h, w) in rows
+            videos = ', '.join(
+                f'{file.name} ({w}x{h}, {r:.4g} Hz)' for file, (_, r, _, h, w) in rows
             )
             raise SourceError(
                 f'{path} has videos of several sizes or rates, or not in the order of creation: '
-                f'expected the files of one drive; name one of {listed}'
+                f'expected the files of one drive; name one of {videos}'
             )
         self._start = round(created[0] * SECOND) or SECOND
 
@@ -140,7 +140,7 @@ class VideoSource:
                         image = np.frombuffer(next(messages), np.uint8)
                         stamp = self._start + round(seconds * SECOND)
                         name = f'{self._files[file].name}#{i}'
-                        image = reduce(image.reshape(height, width, 3), self.least)
+                        image = reduce(image.reshape(height, width, 3), self.min_size)
                         yield Frame(image, stamp, name)
                         i += 1
                     elif width == CUT_OFF:
@@ -187,7 +187,7 @@ class _DecoderError(Exception):
 def _messages(files: list[Path], fps: float) -> Generator[bytearray]:
     """Yield what a decoder sends; end it at the end; raise _DecoderError if it is not in time."""
     messages, end = Pipe(duplex=False)
-    one = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), '1')
+    threads = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'), '1')
     with messages:
         with end:
             process = subprocess.Popen(
@@ -196,7 +196,7 @@ def _messages(files: list[Path], fps: float) -> Generator[bytearray]:
                 stdout=end.fileno(),
                 stderr=subprocess.DEVNULL,
                 process_group=0,  # an interrupt from the terminal is for this process
-                env=os.environ | one,
+                env=os.environ | threads,
             )
         try:
             with suppress(EOFError, OSError):  # ended, perhaps within a message

@@ -94,8 +94,8 @@ def _facts(container: Any) -> tuple[float, float, float, int, int]:
     bare = container.format.flags & NO_TIMES
     rate = (not bare and stream.average_rate) or stream.guessed_rate or RATE
     with suppress(ValueError):
-        stated = datetime.fromisoformat(container.metadata.get('creation_time', ''))
-        created = stated.replace(tzinfo=stated.tzinfo or UTC).timestamp()
+        creation = datetime.fromisoformat(container.metadata.get('creation_time', ''))
+        created = creation.replace(tzinfo=creation.tzinfo or UTC).timestamp()
         created *= 0 < created < 2**31  # the range of stamps in ROS
     if container.format.name == 'avi':  # FFmpeg shortens the duration of a file that is cut off
         duration = float(stream.frames / rate)
@@ -166,13 +166,13 @@ def _frames(
             with suppress(InvalidDataError):  # damaged: players skip it, too
                 for frame in packet.decode():
                     ticks = frame.dts if avi or frame.pts is None else frame.pts
-                    stated = math.nan if bare or ticks is None else float(ticks * frame.time_base)
+                    time = math.nan if bare or ticks is None else float(ticks * frame.time_base)
                     following, jump = seconds + period, 0.0
                     if math.isnan(origin):
-                        origin = stated - following
-                    elif (step := stated - origin - seconds) < -RESTART or step > ahead:
-                        origin, jump = stated - following, step
-                    seconds = stated - origin if stated - origin > seconds + TICK else following
+                        origin = time - following
+                    elif (step := time - origin - seconds) < -RESTART or step > ahead:
+                        origin, jump = time - following, step
+                    seconds = time - origin if time - origin > seconds + TICK else following
                     yield seconds, frame, jump
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from stavpr_ros.errors import ImageError, InputError, SourceError
 from stavpr_ros.regular_file import require_regular
-from stavpr_ros.sources.files import checked_header, MAX_PIXELS
+from stavpr_ros.sources.files import check_file_header, MAX_PIXELS
 from stavpr_ros.sources.suffixes import SUFFIXES
 from stavpr_ros.sources.table import by_name, is_name, is_stamps, Table
 
@@ -192,7 +192,7 @@ def _wrong_shape(shape: tuple[int, ...], path: Path, N: int, n: int) -> str:
 def _from_image(path: Path, N: int, n: int) -> Pairs:
     try:
         content = np.frombuffer(path.read_bytes(), np.uint8)
-        checked_header(content, max(MAX_PIXELS, N * n))
+        check_file_header(content, max(MAX_PIXELS, N * n))
         image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE)
     except (OSError, ImageError) as error:
         raise SourceError(f'ground truth {path} cannot be read: {error}') from error

@@ -24,7 +24,7 @@ AHEAD = 2048  # numbers of the map that are on their way to the cache
 FEW_IMAGES = 64  # likewise, where the distances of all cells are kept
 
 
-def tiled(queries: np.ndarray) -> np.ndarray:
+def tile(queries: np.ndarray) -> np.ndarray:
     """
     Lay out the local features of Q images as the kernels of the CPU want them.
 
@@ -152,8 +152,8 @@ def strip_distances(features, queries, x, d):
 
     :param features: the map's unit-norm local features, shape (W, n, d), float32; or in int8, of
         :meth:`stavpr_ros.alignment.cpu.int8.Int8Strips.kernel_arguments`.
-    :param queries: features of Q images, shape (Q, R, d), of :func:`tiled`; or in int8, of
-        :func:`stavpr_ros.alignment.cpu.int8.tiled`.
+    :param queries: features of Q images, shape (Q, R, d), of :func:`tile`; or in int8, of
+        :func:`stavpr_ros.alignment.cpu.int8.tile`.
     :param d: shape (R, W, n), written.
     """
     n = d.shape[2]

@@ -30,7 +30,7 @@ from stavpr_ros.simd import LANES, load, load_splat, splat, store, Vector
 TILE = 7  # query strips whose sums stay in registers
 QUAD = 4  # dimensions of a lane
 IMAGES = 256  # places a thread takes at a time; a multiple of LANES
-LONGEST = 181.0  # of a rounded strip
+MAX_LENGTH = 181.0  # of a rounded strip
 MAP_PEAK, QUERY_PEAK = 127.0, 63.0
 
 # name, required features of the processor, lanes, LLVM's function; the first that fits is taken
@@ -66,7 +66,7 @@ _, _, FEATURES = cpu_target.target_context.codegen().magic_tuple()
 INSTRUCTION = choose_instruction(FEATURES, LANES)
 
 
-def _filled(vector: ir.VectorType, value: int) -> ir.Constant:
+def _constant(vector: ir.VectorType, value: int) -> ir.Constant:
     return ir.Constant(vector, [value] * vector.count)
 
 
@@ -84,16 +84,16 @@ def write_multiply_add(builder: Any, name: str, total: Any, places: Any, query: 
     bytes_ = ir.VectorType(INT8, wide.count * QUAD)
     if name == 'plain':
         for t in range(QUAD):
-            left, right = (
-                builder.ashr(builder.shl(vector, _filled(wide, 24 - 8 * t)), _filled(wide, 24))
+            a, b = (
+                builder.ashr(builder.shl(vector, _constant(wide, 24 - 8 * t)), _constant(wide, 24))
                 for vector in (places, query)
             )
-            total = builder.add(total, builder.mul(left, right))
+            total = builder.add(total, builder.mul(a, b))
         return total
     if name == 'dotprod':
         arguments = [total, builder.bitcast(places, bytes_), builder.bitcast(query, bytes_)]
         return _call(builder, function, wide, arguments)
-    unsigned = builder.xor(places, _filled(wide, -(2**31) | 0x00808080))  # 128 more
+    unsigned = builder.xor(places, _constant(wide, -(2**31) | 0x00808080))  # 128 more
     if 'vpdpbusd' in function:
         return _call(builder, function, wide, [total, unsigned, query])
     pairs = ir.VectorType(INT16, wide.count * 2)
@@ -111,14 +111,14 @@ def write_total(builder: Any, name: str, total: Any, query_sum: Any) -> Any:
     wide = total.type
     if name in ('plain', 'dotprod'):
         return total
-    surplus = builder.shl(query_sum, _filled(wide, 7))  # 128 for each value of the query
+    surplus = builder.shl(query_sum, _constant(wide, 7))  # 128 for each value of the query
     if 'vnni' in name:
         return builder.sub(total, surplus)
     # two sums of 16 bits a lane, which may have wrapped; the whole sum fits again
-    low = builder.ashr(builder.shl(total, _filled(wide, 16)), _filled(wide, 16))
-    high = builder.ashr(total, _filled(wide, 16))
+    low = builder.ashr(builder.shl(total, _constant(wide, 16)), _constant(wide, 16))
+    high = builder.ashr(total, _constant(wide, 16))
     whole = builder.sub(builder.add(low, high), surplus)
-    return builder.ashr(builder.shl(whole, _filled(wide, 16)), _filled(wide, 16))
+    return builder.ashr(builder.shl(whole, _constant(wide, 16)), _constant(wide, 16))
 
 
 def _call(builder: Any, name: str, result: Any, arguments: list[Any]) -> Any:
@@ -155,13 +155,13 @@ def _total(typing: Any, total: Any, query_sum: Any) -> Any:
 @reassociating_kernel
 def _scale(x, longest, peak):
     """Return the scale of a strip, 0 for a zero one."""
-    squares, most = np.float32(0), np.float32(0)
+    squares, peak_value = np.float32(0), np.float32(0)
     for t in range(len(x)):
         squares += x[t] * x[t]
-        most = max(most, abs(x[t]))
+        peak_value = max(peak_value, abs(x[t]))
     if squares == 0:
         return np.float32(0)
-    return min(longest / np.sqrt(squares), peak / most)
+    return min(longest / np.sqrt(squares), peak / peak_value)
 
 
 @parallel_kernel
@@ -208,8 +208,8 @@ def _copy_places(codes, j, first, values, reciprocals):
     :returns: the largest square of a length.
     """
     m, d = codes.shape
-    most = np.zeros((m + LANES - 1) // LANES, np.int64)
-    for group in nb.prange(len(most)):
+    max_squares = np.zeros((m + LANES - 1) // LANES, np.int64)
+    for group in nb.prange(len(max_squares)):
         for y in range(group * LANES, min(m, (group + 1) * LANES)):
             squares = np.int64(0)
             for t in range(d):
@@ -219,13 +219,13 @@ def _copy_places(codes, j, first, values, reciprocals):
             reciprocals[j, first + y] = (
                 np.float32(1 / np.sqrt(squares)) if squares else np.float32(0)
             )
-            most[group] = max(most[group], squares)
-    return most.max()
+            max_squares[group] = max(max_squares[group], squares)
+    return max_squares.max()
 
 
 def _longest(d: int) -> np.float32:
     """Return N: rounding lengthens a strip by sqrt(d) / 2 at most."""
-    return np.float32(max(LONGEST - np.sqrt(d) / 2, 1))
+    return np.float32(max(MAX_LENGTH - np.sqrt(d) / 2, 1))
 
 
 class Int8Strips:
@@ -255,14 +255,14 @@ class Int8Strips:
         Copy strips that were rounded before.
 
         :param first: their first place, a multiple of LANES.
-        :param codes: strip j of places, shape (m, d), int8, as of :meth:`rounded`.
+        :param codes: strip j of places, shape (m, d), int8, as of :meth:`codes`.
         :raises ValueError: a strip is longer than rounding makes it: sums could overflow.
         """
         longest = _copy_places(codes, j, first, self.values, self.reciprocals)
-        if longest > LONGEST**2:
+        if longest > MAX_LENGTH**2:
             raise ValueError(
                 f'codes of strip {j}, from place {first} on, have length {longest**0.5:.0f}: at '
-                f'most {LONGEST:.0f}'
+                f'most {MAX_LENGTH:.0f}'
             )
 
     def __getitem__(self, index: tuple[slice, slice | np.ndarray]) -> np.ndarray:
@@ -272,7 +272,7 @@ class Int8Strips:
         strips = codes.reshape(len(places), len(self), -1)[:, :, : self.shape[2]]
         return np.ascontiguousarray(strips.transpose(1, 0, 2) * self.reciprocals[:, places, None])
 
-    def rounded(self) -> np.ndarray:
+    def codes(self) -> np.ndarray:
         """Return a copy of the whole numbers, (W, n, d), int8."""
         W, n, d = self.shape
         strips = self.values.transpose(0, 1, 3, 2, 4).reshape(W, self.values.shape[1] * LANES, -1)
@@ -283,7 +283,7 @@ class Int8Strips:
         return self.values.view(np.int32)[..., 0], self.reciprocals
 
 
-def rounded_queries(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def round_queries(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Round the strips of Q images.
 
@@ -297,7 +297,7 @@ def rounded_queries(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return codes, reciprocals
 
 
-def tiled(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def tile(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Round the strips of Q images and lay them out as the kernels take them.
 
@@ -309,7 +309,7 @@ def tiled(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     tiles, quads = -(-W // TILE), -(-d // QUAD)
     codes: np.ndarray = np.zeros((Q, tiles * TILE, quads * QUAD), np.int8)
     reciprocals: np.ndarray = np.zeros((Q, tiles * TILE), np.float32)
-    codes[:, :W, :d], reciprocals[:, :W] = rounded_queries(queries)
+    codes[:, :W, :d], reciprocals[:, :W] = round_queries(queries)
     packed = codes.view(np.int32).reshape(Q, tiles, TILE, quads).transpose(0, 1, 3, 2)
     sums = codes.sum(axis=2, dtype=np.int32)
     return np.ascontiguousarray(packed), reciprocals, sums
@@ -345,7 +345,7 @@ def block_distances(features, queries, x, first, count, d):
     """
     Fill d (rows, W, .), contiguous: strips of query x against ``count`` places from ``first``.
 
-    :param features: of :meth:`Int8Strips.kernel_arguments`; queries: of :func:`tiled`.
+    :param features: of :meth:`Int8Strips.kernel_arguments`; queries: of :func:`tile`.
     :param first: a multiple of LANES; count: rounded up to whole lanes, which d has room for.
     """
     values, reciprocals = features

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_slam.pose_graph.path_errors import LARGEST_COVARIANCE
 
 VARIANCES = 1e-10, 1e6  # m^2, rad^2: least and largest that the graph computes with
@@ -62,8 +62,8 @@ class Closure:
             raise InputError('a closure has a stamp of 0: expected those of the two images')
         if self.map_id and self.place_pose is None:
             raise InputError('a closure with a map has no pose of the place in the map')
-        place = None if self.place_pose is None else checked_pose(self.place_pose)
-        pose = checked_pose(self.pose)
+        place = None if self.place_pose is None else normalize_pose(self.place_pose)
+        pose = normalize_pose(self.pose)
         return replace(self, pose=pose, covariance=covariance, place_pose=place)
 
 

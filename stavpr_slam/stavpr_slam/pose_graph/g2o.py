@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.closures import Closure
@@ -123,7 +123,7 @@ def _edge(tag: str, fields: list[str]) -> Edge:
         norm = float(np.linalg.norm(motion[3:]))
         if abs(norm - 1) > NORM_ERROR:
             raise ValueError(f'a quaternion of norm {norm:.3g}: expected qx qy qz qw of norm 1')
-    transform = matrices(checked_pose(motion))
+    transform = matrices(normalize_pose(motion))
     if start == end and not np.allclose(transform, np.eye(4), atol=1e-6):
         raise ValueError(f'an edge with a motion from vertex {start} to itself')
     return start, end, transform, information

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from stavpr_ros.errors import InputError
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import inverse, matrices
 from stavpr_ros.units import SECOND
 from stavpr_slam.pose_graph.path_errors import given_growth, LEAST, OdometryNoise, step_errors
@@ -104,7 +104,7 @@ class KeyframeChain:
             not grow between keyframes, the errors of the settings apply.
         :raises InputError: an invalid pose or stamp; nothing is changed.
         """
-        pose = checked_pose(pose)
+        pose = normalize_pose(pose)
         if stamp <= 0:
             raise InputError(f'odometry with stamp {stamp}: expected nanoseconds above 0')
         current = self._current.get(robot)
@@ -201,7 +201,7 @@ class KeyframeChain:
         """Return the node of a place of a map, whose pose in the map is known, shape (7,)."""
         key = (map_id, stamp)
         if key not in self._fixed:
-            transform = matrices(checked_pose(pose))
+            transform = matrices(normalize_pose(pose))
             self._fixed[key] = self._extend(stamp, transform, self.FIXED, self.FIXED)
         return self._fixed[key]
 

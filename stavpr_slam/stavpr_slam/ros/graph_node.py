@@ -21,7 +21,7 @@ from rclpy.timer import Timer
 from stavpr_msgs.msg import LoopClosure, RelativePose
 from stavpr_msgs.srv import SaveMap
 from stavpr_ros.errors import InputError, SettingsError, StavprError
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.ros.diagnostics import one_status
@@ -232,7 +232,7 @@ class PoseGraphNode(ManagedNode):
         self.counts['odometry'] += 1
         self._graph.add(RobotOdometry(robot, stamp, pose.tolist(), covariance))
         try:
-            odometry = matrices(checked_pose(pose))
+            odometry = matrices(normalize_pose(pose))
         except InputError:
             return  # the graph counts it
         self._child_frames[robot] = message.child_frame_id

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from stavpr_ros.errors import InputError, StavprError, UnavailableError
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.output_file import Force
 from stavpr_slam.pose_graph import Closure, GraphSettings, PoseGraph
@@ -133,7 +133,7 @@ class GraphServer:
         if isinstance(item, Closure):
             self._graph.add_closure(item)
             return
-        pose, covariance = matrices(checked_pose(np.array(item.pose))), None
+        pose, covariance = matrices(normalize_pose(np.array(item.pose))), None
         origin = self._origins.setdefault(item.robot, np.eye(4))
         if item.covariance is not None:
             turn = np.kron(np.eye(2), origin[:3, :3])

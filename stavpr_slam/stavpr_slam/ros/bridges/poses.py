@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from stavpr_msgs.msg import LoopClosure
-from stavpr_ros.mapping.trajectory import checked_pose
+from stavpr_ros.mapping.trajectory import normalize_pose
 from stavpr_ros.mapping.transforms import matrices, to_poses
 from stavpr_ros.ros.messages import nanoseconds, pose_message
 from stavpr_ros.units import SECOND
@@ -52,7 +52,7 @@ class PoseBridge(Bridge):
         closure = closure.checked()
         if cause := self.wanted(message):
             return cause
-        place = matrices(checked_pose(pose_array(message.place_pose)))
+        place = matrices(normalize_pose(pose_array(message.place_pose)))
         turn = np.kron(np.eye(2), place[:3, :3])
         result = PoseWithCovarianceStamped()
         result.header.stamp, result.header.frame_id = relative.query_stamp, self.frame(message)
