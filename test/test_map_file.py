@@ -374,7 +374,7 @@ HAND_MADE = [  # parts, a change of the manifest, and what the error names; the 
     ({}, setting('kind', 'teleport'), 'teleport'),
     ({}, setting('strips', 2.0), r'strips is 2\.0'),
     ({}, setting('feature_version', 2), 'gradient of version 2 are unknown'),
-    ({}, setting('projection', 'mine'), 'projection None is not that of the features, mine'),
+    ({}, setting('projection', 'mine'), 'projection None is another than the features have, mine'),
     ({}, backbone('size', 10**6), 'size = 1000000 must be 1 to'),
     ({}, backbone('signed', 1), 'signed is 1'),
     ({}, network(model='/dev/zero'), "unknown 'model'"),

@@ -76,7 +76,7 @@ def spatial_alignment(
     W: int, settings: SpatialSettings, device: torch.device
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """
-    Return the distance of one image to n others, as a function of those of strips (section 2).
+    Return the distance of an image to n others, a function of strip distances (section 2).
 
     :param settings: any strategy but ``none``.
     :returns: function of d, (W, W, n), float32, that returns (n,).

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Spatial alignment: the distances of strips, and from them those of two images (section 2)."""
+"""Spatial alignment: distances of strips, and distances of images from them (section 2)."""
 
 import numpy as np
 from stavpr_ros.alignment.settings import SpatialSettings

@@ -31,7 +31,7 @@ INT = np.int32
 RED, GREEN, BLUE, HALF, UNIT = INT(9798), INT(19235), INT(3735), INT(2**14), F(2**-15)  # as OpenCV
 LEVELS = INT(-(2**15))  # bits of a gray level over UNIT
 MAGIC, TWO_23 = INT(0x4B000000), F(2**23)  # bits of 2^23, whose last one counts 1
-MIN_SHARE = 1e-3  # of a pixel at the end of a cell; smaller ones do not count
+MIN_SHARE = 1e-3  # smallest part of a pixel that counts at the end of a cell
 
 
 @cache
@@ -72,7 +72,7 @@ def shrink(
     Write an image in gray, averaged over cells, with a border equal to its neighbors.
 
     :param image: RGB, shape (h, w, 3), uint8, of at least LANES columns.
-    :param firsts, weights, row_firsts, row_weights: of :func:`cells`, of the columns and the rows.
+    :param firsts, weights, row_firsts, row_weights: :func:`cells` of the columns and the rows.
     :param table: new gray level of each, (256,), uint8.
     :param padded: shape (size + 2, size + 2), uint8, written.
     """
@@ -80,7 +80,7 @@ def shrink(
     columns, square = np.zeros((width + count) * LANES, F), np.empty(LANES * LANES, F)
     sums, lines = np.zeros((size + LANES) * LANES, F), np.empty((LANES, size + LANES), F)
     total, levels = np.empty(size + LANES, F), np.empty(size + LANES, np.uint8)
-    first = -LANES  # of the rows in lines
+    first = -LANES  # number of the first row in lines
     for y in range(size):
         total[:] = 0
         for t in range(row_weights.shape[1]):

@@ -16,7 +16,7 @@ from stavpr_ros.features.model_files import read_model
 from stavpr_ros.features.onnx import Network
 from stavpr_ros.features.registry import CACHED, EfficientNetSettings, OnnxSettings
 
-MEAN, STD = (127.0,) * 3, (128.0,) * 3  # of the training, for values 0..255
+MEAN, STD = (127.0,) * 3, (128.0,) * 3  # normalization in the training, for values 0..255
 
 
 class EfficientNetLite1:

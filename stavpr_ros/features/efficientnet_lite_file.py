@@ -34,10 +34,10 @@ INPUT, MAP = 'image', 'map'  # names in the file
 POOLED = 2  # cells of the block, whose mean is a cell of the map, and as many rows
 BLOCKS = 15  # up to the last one with 112 channels, at 1/16 of the size
 HALVING = (1, 4, 7)  # blocks that halve the size; the stem does, too
-EPSILON = 1e-3  # of the batch normalizations
+EPSILON = 1e-3  # added to the variances of the batch normalizations
 OPSET, IR_VERSION = 17, 8
 FLOAT, INT, INTS = 1, 2, 7  # types of a tensor, and of an attribute, as ONNX numbers them
-STORAGES = {'FloatStorage': '<f4', 'LongStorage': '<i8'}  # of torch, and their numbers
+STORAGES = {'FloatStorage': '<f4', 'LongStorage': '<i8'}  # names in torch, types of numbers
 
 
 def find_weights() -> Path:
@@ -123,7 +123,7 @@ def read_weights(content: bytes) -> dict[str, np.ndarray]:
 
 
 class _Tensor:
-    """What ``torch._utils._rebuild_tensor_v2`` states of a tensor whose numbers follow."""
+    """A tensor whose numbers follow, by the arguments of ``_rebuild_tensor_v2`` of torch."""
 
     def __init__(
         self, storage: tuple[str, str], first: int, shape: Any, strides: Any, *_: object
@@ -196,7 +196,7 @@ class _Graph:
         self.nodes: list[bytes] = []
         self.constants: list[bytes] = []
         self._weights = weights
-        self._limits = [self._constant('low', 0), self._constant('high', 6)]  # of ReLU6
+        self._limits = [self._constant('low', 0), self._constant('high', 6)]  # range of ReLU6
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
         """Add a node and return the name of its output."""

@@ -24,7 +24,7 @@ from stavpr_ros.features.registry import (
     settings_class,
 )
 
-STRIPS = 7  # of a feature map, as in the paper; a vector is one strip
+STRIPS = 7  # strips of a feature map, as in the paper; a vector is one strip
 GEM_EXPONENT = 3
 TEST_SIDE = 64  # pixels of the image that a network is tried on
 
@@ -89,8 +89,8 @@ class FeatureSettings:
     :param strips: number of vertical strips W; 1 for features that are one vector.
     :param projection: identity of the random projection, None without one.
     :param feature_version: version of the computation: another one gives other features.
-    :param value_range: of images of 16 bits, the values that become 0 and 255; None = the upper
-        byte is taken.
+    :param value_range: the values of 16 bits that become 0 and 255; None = the upper byte is
+        taken.
     """
 
     kind: str
@@ -173,7 +173,7 @@ class LocalFeatures:
         """
         Reject features that do not fit the places: kernels trust their shapes.
 
-        :param settings, dimension: of the places; a dimension of 0 is unknown yet.
+        :param settings, dimension: the places'; a dimension of 0 is unknown yet.
         :raises FeatureMismatchError: other settings, or another network.
         :raises InputError: strips or weights of another shape or type.
         """
@@ -209,7 +209,7 @@ class FeatureExtractor:
     :param strips: number of vertical strips W; None = 7, or 1 if an image has one vector.
     :param projection: number of dimensions of a new Gaussian projection, a :class:`Projection`,
         or None.
-    :param seed: of a new projection.
+    :param seed: seed of a new projection.
     :param device: ``cpu``, ``cuda`` or ``auto``: ``cuda`` where it is available.
     :raises SettingsError: the network's output cannot be used.
     :raises UnavailableError: the device or the network's file is not there.

@@ -23,7 +23,7 @@ class Hybrid:
     """
     Feature maps (n, 1008, 1, 7): a column is a strip.
 
-    :param device: of the learned features.
+    :param device: device of the learned features.
     :raises UnavailableError: as for features ``efficientnet_lite1``.
     """
 

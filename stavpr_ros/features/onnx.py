@@ -303,8 +303,8 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:
         transformer (n, T, C), of square images; a NumPy array or a tensor.
     :param images: number n of images.
     :param prefix_tokens: leading tokens that are no patches.
-    :param name: of the layer.
-    :returns: maps or vectors, likewise.
+    :param name: name of the layer, for errors.
+    :returns: maps or vectors, an array or a tensor as ``output``.
     :raises SettingsError: another shape or type; tokens that are no square.
     """
     shape = tuple(getattr(output, 'shape', ()))
@@ -314,7 +314,7 @@ def as_maps(output: Any, images: int, prefix_tokens: int, name: str) -> Any:
             f'{name} returns {form} for {images} images: expected maps (n, C, H, W), tokens '
             '(n, T, C) or vectors (n, D); name another layer'
         )
-    if shape[2:] == (1, 1):  # of a pooling over the whole map
+    if shape[2:] == (1, 1):  # result of a pooling over the whole map
         return output[:, :, 0, 0]
     if len(shape) != 3:
         return output

@@ -24,7 +24,7 @@ RESIZE_METHODS = ('bilinear', 'area')
 AUTO = 'auto'  # instead of a kind: hybrid where it can be computed, else gradient
 CACHED = 'cached'  # the file that `stavpr weights` puts in its place, instead of a path
 POOLINGS = ('flatten', 'mean', 'gem')
-IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of R, G, B in 0..1: torchvision's networks are trained so
+IMAGENET_MEAN = (0.485, 0.456, 0.406)  # R, G, B in 0..1, as in the training of torchvision
 IMAGENET_STD = (0.229, 0.224, 0.225)
 RESIZE_HELP = 'how images are resized: bilinear, or area (averages, no aliasing)'
 
@@ -48,7 +48,7 @@ def setting(
 class GradientSettings:
     """Settings of the oriented-gradient features."""
 
-    # of maps without these settings, which were added later
+    # values of settings that older maps do not state
     BEFORE: ClassVar[dict[str, Any]] = {'logarithm': False}
 
     size: int = setting(224, help='images are resized to size x size pixels first')
@@ -170,7 +170,7 @@ class Cells:
     """
     Where the cells of an image are in its strips, (channels, rows, columns) from ``first`` on.
 
-    :param dimension: of a strip, without a projection.
+    :param dimension: numbers of a strip, without a projection.
     """
 
     first: int
@@ -188,8 +188,8 @@ class Kind:
     :param settings: the frozen dataclass of its settings.
     :param backbone: its class, a :class:`Backbone`, as ``package.module:Class``; imported on use;
         '' for features that are not computed from images.
-    :param constant: of the evidence of a window (:mod:`stavpr_ros.method.evidence`).
-    :param cells: of its strips, with its default settings.
+    :param constant: constant term of a window's evidence (:mod:`stavpr_ros.method.evidence`).
+    :param cells: cells of its strips, with its default settings.
     :param with_cells: the constant where they are compared; route: in loop closure.
     """
 

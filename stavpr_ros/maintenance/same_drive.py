@@ -14,8 +14,8 @@ from stavpr_ros.mapping import Map
 from stavpr_ros.units import DATED
 
 PROBES = 64  # images of a drive that are compared, from its first to its last one
-BITS, NEAR = 256, 26  # of an image; that differ at most
-SHARE = 0.8  # of the probes
+BITS, NEAR = 256, 26  # bits of an image; bits that differ at most
+SHARE = 0.8  # part of the probes that is near
 
 Row = tuple[str, int, str]
 """Name of a drive, stamp of its first image, ns, 0 = unknown, and the bits, hexadecimal."""

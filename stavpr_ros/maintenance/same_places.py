@@ -31,7 +31,7 @@ class SamePlaces:
 
     ``middles`` has the places of the middle images only, (N,).
 
-    :param count: of the images.
+    :param count: number of images.
     """
 
     def __init__(self, count: int) -> None:

@@ -10,7 +10,7 @@ from stavpr_ros.mapping import Map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.progress import Progress
 
-WINDOWS = 24  # that are tried
+WINDOWS = 24  # altered windows
 
 
 def alter_image(image: np.ndarray, variant: int, rng: np.random.Generator) -> np.ndarray:

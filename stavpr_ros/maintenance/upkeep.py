@@ -33,7 +33,7 @@ from stavpr_ros.prepare.prepared_map import statistics_of_map
 DRIVES = 3  # latest ones, which are kept beside the map before its first update
 MAX_ERROR = 0.005  # rate of wrong matches that a certain image keeps
 MIN_IMAGES, MIN_CERTAIN = 40, 0.3  # certain images, and their share of those in motion
-MIN_SHARE = 0.5  # of the places of a session, which a drive passes
+MIN_SHARE = 0.5  # part of a session's places that a drive passes
 MAX_LAPS = 2  # images of a drive in motion that are kept, times the places before the first update
 FASTEST = max(MODEL.speeds)  # places an image, of a drive on the map
 SLACK = 4  # places by which two certain images may disagree
@@ -46,8 +46,8 @@ def update_map(place_map: Map, drive: Map, name: str, version: Version) -> tuple
     Return a map after a drive, and its version, without id and parent.
 
     :param drive: all its images, as a map with the features of this one.
-    :param name: of the drive, for its session.
-    :param version: of the map.
+    :param name: name of the drive, for its session.
+    :param version: present version of the map.
     :raises InputError: the drive is not certain where it is, or passes too little of the route; it
         changes nothing.
     """
@@ -108,10 +108,10 @@ class _OnMap:
     """
     A drive on the map.
 
-    :param places: that its images, in the middle of a window, are certain of, (N,); -1 = none.
-    :param of_windows: that images are certain of in any part of a window, (N,); -1 = none.
+    :param places: places of its images, certain in the middle of a window, (N,); -1 = none.
+    :param of_windows: places of its images, certain in any part of a window, (N,); -1 = none.
     :param moves: whether the camera has moved since the image before, (N,).
-    :param roots: of the places of the map, (n,); sessions: their numbers, (n,).
+    :param roots: root of each place of the map, (n,); sessions: number of its session, (n,).
     """
 
     places: np.ndarray
@@ -221,7 +221,7 @@ def _with_drive(
     Return the map with images of a drive as a session.
 
     :param images: numbers in the drive, (m,).
-    :param places: of the map that they show, (m,), and whose identifiers and poses they get;
+    :param places: places of the map that they show, (m,), whose identifiers and poses they get;
         -1 = none.
     """
     n, is_hit = len(place_map), places >= 0

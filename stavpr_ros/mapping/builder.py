@@ -91,8 +91,8 @@ def build_map(
 
     :param frames: images in the order of the route: a source, :func:`stavpr_ros.images`, or frames
         or arrays, RGB (h, w, 3) uint8.
-    :param extractor: of their features; the map records its settings.
-    :param poses: of each image, shape (images, 7), see :class:`Map`; or by their stamps.
+    :param extractor: extractor of their features; the map records its settings.
+    :param poses: pose of each image, shape (images, 7), see :class:`Map`; or by their stamps.
     :param thumbnails: keep a small image of each place.
     :param progress: show a progress bar.
     :param keyframes: minimum differences between places; None = every image is one.
@@ -147,7 +147,7 @@ def build_journal(
     again.
 
     :param target: file that the map will be saved to; the journal is beside it.
-    :param source: of the images and the options; another one is not continued.
+    :param source: name of the images and the options; another one is not continued.
     :returns: the journal, complete.
     :raises JournalError: the journal is of another work, in use, or cannot be written.
     """
@@ -217,7 +217,7 @@ def _extract(
         )
     if thumbnail_width is not None:
         require_at_least('thumbnail width', thumbnail_width, 1, 'pixel')
-    source: Any = getattr(frames, 'source', frames)  # of a part of its images
+    source: Any = getattr(frames, 'source', frames)  # a part of a source has the whole
     if hasattr(source, 'min_size'):  # as in the node
         source.min_size = extractor.needed_size(thumbnail_width or 0)
     total = len(frames) if isinstance(frames, Sized) else None

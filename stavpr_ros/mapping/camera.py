@@ -14,7 +14,7 @@ from stavpr_ros.mapping.trajectory import normalize_pose
 MODELS = {'plumb_bob': (4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
 FORWARD = (0.0, 0.0, 0.0, -0.5, 0.5, -0.5, 0.5)
 """Pose in the base (x ahead, z up) of an optical frame (z ahead, y down) that looks ahead."""
-ASPECT = 0.02  # by which the proportions of an image may differ from the intrinsics' image
+ASPECT = 0.02  # largest relative difference of the proportions of image and intrinsics
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Camera:
     """
     A calibrated camera on a robot.
 
-    :param width, height: of the images that the intrinsics are of, pixels.
+    :param width, height: size of the images that were calibrated, pixels.
     :param focal: fx and fy, pixels; center: cx and cy.
-    :param model: of the distortion, as in sensor_msgs/CameraInfo; '' = none.
+    :param model: model of the distortion, as in sensor_msgs/CameraInfo; '' = none.
     :param distortion: its coefficients.
     :param mount: pose of the optical frame (z ahead, x right) in the frame whose poses the places
         have, x y z (meters) and quaternion x y z w.
@@ -90,7 +90,7 @@ class Camera:
         Return the directions in which points of an image are, without distortion.
 
         :param points: pixels (x, y), centers of pixels are whole numbers, shape (m, 2).
-        :param width, height: of the image, which may be smaller than the intrinsics' image.
+        :param width, height: size of the image, which may be smaller than the calibrated one.
         :returns: x / z and y / z in the optical frame, shape (m, 2), float64.
         """
         if not len(points):

@@ -50,15 +50,15 @@ class GrowingMap:
         require_projection(projection, settings)
         self.settings, self.projection, self.limit = settings, projection, limit
         self._held_features = held_features
-        self._cells: tuple[int, int] | None = None  # of the features of the first place
+        self._cells: tuple[int, int] | None = None  # cells of the strips of the first place
         self.dimension = 0  # d of a strip, once there is a place
         self.first = self._count = 0
         # a row for each place, and for those to come; strips (room, W, d) once there is a place
         self._rows = {'stamps': np.empty(0, np.int64), 'poses': np.empty((0, 7))}
-        self.camera: Camera | None = None  # of the images, None = unknown
-        self.sessions: tuple[Session, ...] = ()  # of the map that is continued
+        self.camera: Camera | None = None  # camera of the images, None = unknown
+        self.sessions: tuple[Session, ...] = ()  # sessions of the map that is continued
         self._session_index: np.ndarray | None = None
-        self._session_id = ''  # of the added places, '' = chosen when the map is copied
+        self._session_id = ''  # session of the added places, '' = not named yet
         self._same_as: np.ndarray | None = None
         self._related: dict[int, int] = {}  # added places that show the same as an earlier one
         self.ids: list[str] = []  # '' = none
@@ -99,7 +99,7 @@ class GrowingMap:
         Make the places that are added from now on a session of their own.
 
         :param before: id of the session that the places of a map without sessions become.
-        :param identifier: of the new session, or of one of the map that goes on; '' = a free one.
+        :param identifier: id of the new session, or of one that goes on; '' = a free one.
         """
         if self._session_index is None:
             self.sessions = (Session(before[:64], start=max(int(self.stamps[0]), 0)),)
@@ -124,7 +124,7 @@ class GrowingMap:
 
     @property
     def full(self) -> bool:
-        """There is no room for another place."""
+        """Return whether there is no room for another place."""
         return self._count >= self.limit
 
     @property
@@ -162,7 +162,7 @@ class GrowingMap:
         return Place(int(self.stamps[i]), self.ids[i], copy, session)
 
     def thumbnail(self, index: int) -> np.ndarray | None:
-        """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted likewise."""
+        """Return the thumbnail of a place, RGB (h, w, 3) uint8, or None; counted as by add."""
         return decode_thumbnail(self.thumbnails[index - self.first])
 
     def add(
@@ -176,7 +176,7 @@ class GrowingMap:
         """
         Add a place; an error changes nothing.
 
-        :param features: of one image, strips (W, 1, d).
+        :param features: features of one image, strips (W, 1, d).
         :param stamp: time of its image, ns; 0 = unknown.
         :param pose: x y z (meters) and quaternion x y z w, shape (7,); None = unknown.
         :param thumbnail: a small JPEG, see :func:`encode_thumbnail`.

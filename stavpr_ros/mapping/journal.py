@@ -41,7 +41,7 @@ PIECE = 2**20  # bytes searched at a time
 SECTOR = 4096  # bytes skipped where the disk has an error
 _HEAD = struct.Struct('<4sII')  # MAGIC, length and CRC-32 of the content; its own CRC-32 follows
 _HEAD_BYTES = _HEAD.size + 4
-_HEADS = re.compile(MAGIC + rb'(?=...[\0-\x0f])', re.DOTALL)  # of records of at most 2**28 bytes
+_HEADS = re.compile(MAGIC + rb'(?=...[\0-\x0f])', re.DOTALL)  # records of at most 2**28 bytes
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class JournalPlace(NamedTuple):
     """
     A place in a journal.
 
-    :param number: of its image, as the writer counts them; increases from place to place.
-    :param features: of its image, strips (W, 1, d).
+    :param number: number of its image, as the writer counts; increases from place to place.
+    :param features: features of its image, strips (W, 1, d).
     :param thumbnail: a small JPEG, empty = none.
     """
 
@@ -148,7 +148,7 @@ def header(base: Base, template: bytes, source: str = '') -> bytes:
     Return the two equal records that begin a journal.
 
     :param template: file of a map of one place, with the settings of the features.
-    :param source: of the places, so that only the same work is resumed.
+    :param source: name of the work that makes the places: only the same is resumed.
     """
     about = {'format': FORMAT, 'version': VERSION, 'source': source} | asdict(base)
     return 2 * frame(json.dumps(about).encode() + b'\n' + template)

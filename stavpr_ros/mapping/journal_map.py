@@ -173,7 +173,7 @@ def _append(base: Map, recorded: Map, opened: Base, sessions: tuple[Session, ...
     Return a map with the recorded places behind it.
 
     :param opened: the map when the journal was opened.
-    :param sessions: the one that the recorded places are of; empty = they have none.
+    :param sessions: session of the recorded places, alone; empty = they have none.
     """
     growing, n = GrowingMap.from_map(base, 2**31), len(recorded)
     if sessions:

@@ -32,8 +32,8 @@ class JournalWriter:
     they wait, and are written when there is room again. A journal that is removed from its folder
     is written anew. All calls must come from one thread.
 
-    :param path: of the journal; ``file`` its descriptor, locked.
-    :param ends: of its header, and of each place.
+    :param path: path of the journal; ``file`` its descriptor, locked.
+    :param ends: ends of its header and of each place, bytes.
     :param begin: returns the header of a journal by its base.
     :param log: called with an error, once.
 
@@ -73,7 +73,7 @@ class JournalWriter:
         :param target: file that the map will be saved to; the journal is beside it.
         :param base: the map that the places continue.
         :param template: a map of one place with the settings of the features.
-        :param source: of the places, see :func:`stavpr_ros.mapping.journal.header`.
+        :param source: what makes the places, see :func:`stavpr_ros.mapping.journal.header`.
         :raises JournalError: it cannot be created.
         """
         try:
@@ -96,7 +96,7 @@ class JournalWriter:
         """
         Continue a journal behind its last whole place, or before its first damage.
 
-        :param reader: of the journal; it is closed.
+        :param reader: reader of the journal; it is closed.
         :returns: the writer, and the number of that place, -1 = none.
         :raises OutputError: it cannot be written.
         """

@@ -4,7 +4,7 @@
 
 import numpy as np
 
-MAX_THUMBNAIL_PIXELS = 2**24  # of a thumbnail: 50 MB when it is decoded
+MAX_THUMBNAIL_PIXELS = 2**24  # 50 MB when it is decoded
 MAX_SEGMENTS = 64  # before the frame header
 FIRST_FRAME, LAST_FRAME = 0xC0, 0xC2  # markers: baseline, extended, progressive
 FRAME_BYTES = 10  # marker, length, precision, height, width, components
@@ -20,7 +20,7 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
     starts = np.concatenate([[0], ends[:-1]]).astype(np.int64)
     pixels = np.where(ends > starts, -1, 0)
     padded = np.append(content, np.zeros(FRAME_BYTES, np.uint8))
-    # of the images whose header is not found yet: number, and position of the next marker
+    # numbers of the images whose header is not found yet, and positions of the next marker
     images = np.flatnonzero(ends - starts >= 2 + FRAME_BYTES)
     images = images[(padded[starts[images]] == 0xFF) & (padded[starts[images] + 1] == 0xD8)]
     at = starts[images] + 2
@@ -43,6 +43,6 @@ def jpeg_pixels(content: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 def is_thumbnail(content: bytes) -> bool:
-    """Whether this is a JPEG of 1 to :data:`MAX_THUMBNAIL_PIXELS` pixels, by its header."""
+    """Return whether this is a JPEG of 1 to :data:`MAX_THUMBNAIL_PIXELS` pixels, by its header."""
     data = np.frombuffer(content, np.uint8)
     return 0 < jpeg_pixels(data, np.array([len(data)]))[0] <= MAX_THUMBNAIL_PIXELS

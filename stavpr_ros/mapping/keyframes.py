@@ -14,7 +14,7 @@ from stavpr_ros.units import SECOND
 
 OUT_OF_ORDER = SECOND // 10  # images later than this after a newer one: the clock jumped back
 SIZE = (32, 24)  # width and height of the images compared: averages noise out, but not motion
-MAX_ROWS = 257  # of a block, whose sums of bytes have 16 bits
+MAX_ROWS = 257  # rows of a block, whose sums of bytes have 16 bits
 BLUR = cv2.getGaussianKernel(5, 0.5, cv2.CV_32F).ravel()  # by .5 pixels of the small image
 FLAT = 1.0  # standard deviation, gray levels, below which an image shows only noise
 
@@ -46,7 +46,7 @@ class KeyframeSettings:
 
     @property
     def any(self) -> bool:
-        """Any rule is on: not every image is a keyframe."""
+        """Return whether any rule is on: not every image is a keyframe."""
         return bool(self.interval or self.needs_poses or self.change)
 
     @property
@@ -79,7 +79,7 @@ def _block_means(rows: np.ndarray, small: np.ndarray) -> None:
     """
     Write the means of blocks of pixels, rounded as OpenCV's: its sums are of whole numbers, too.
 
-    :param rows: of each row of blocks, shape (h, rows, 3 columns), uint8.
+    :param rows: pixels of each row of blocks, shape (h, rows, 3 columns), uint8.
     :param small: shape (h, w, 3), uint8, written.
     """
     height, count, length = rows.shape
@@ -123,7 +123,7 @@ def image_change(a: np.ndarray, b: np.ndarray) -> float:
     """
     Return 1 - the normalized cross-correlation, invariant to brightness and gain.
 
-    :param a: of :func:`small_gray`, shape (24, 32), float32; so is b.
+    :param a: result of :func:`small_gray`, shape (24, 32), float32; so is b.
     :returns: 0 (equal) to 2 (negatives of each other); two flat images 0, one flat image 1.
     """
     sum_a = sum_b = aa = bb = ab = 0.0
@@ -158,9 +158,8 @@ class KeyframeSelector:
         """Discard the last keyframe: the next image is one."""
         self._stamp = 0
         self._pose: np.ndarray | None = None
-        # of the last keyframe, and of the last compared image; gray where it has been compared
-        self._last: tuple[np.ndarray, np.ndarray | None] | None = None
-        self._compared: tuple[np.ndarray, np.ndarray | None] | None = None
+        self._gray: np.ndarray | None = None  # small and gray, of the last keyframe
+        self._compared: tuple[np.ndarray, np.ndarray] | None = None  # an image, and the same of it
 
     def too_soon(self, stamp: int, pose: np.ndarray | None) -> str:
         """
@@ -196,13 +195,10 @@ class KeyframeSelector:
         :returns: the reason in words; empty if there is none.
         """
         min_change = self.settings.change
-        if not min_change or self._last is None:
+        if not min_change or self._gray is None:
             return ''
-        last, gray = self._last
-        last_gray = small_gray(last) if gray is None else gray
-        compared = small_gray(image)
-        self._last, self._compared = (last, last_gray), (image, compared)
-        change = image_change(compared, last_gray)
+        self._compared = image, small_gray(image)
+        change = image_change(self._compared[1], self._gray)
         if change < min_change:
             return f'differs by {change:.4f} from the last keyframe: less than {min_change:g}'
         return ''
@@ -213,15 +209,13 @@ class KeyframeSelector:
 
         :param stamp: nanoseconds; 0 = unknown.
         :param pose: where it was taken, shape (7,); None = unknown.
-        :param image: RGB, uint8, shape (h, w, 3), kept.
+        :param image: RGB, uint8, shape (h, w, 3).
         :raises InputError: an invalid pose or image; nothing is changed.
         """
         pose, compared = None if pose is None else normalize_pose(pose), self._compared
-        is_compared = compared is not None and compared[0] is image
-        if not is_compared:
-            rgb_image(image)
-        self._compared = None
-        self._last = compared if is_compared else (image, None)
+        if compared is None or compared[0] is not image:
+            compared = image, small_gray(image)
+        self._gray, self._compared = compared[1], None
         self._stamp, self._pose = stamp, pose
 
     def _not_moved(self, pose: np.ndarray, last: np.ndarray) -> str:

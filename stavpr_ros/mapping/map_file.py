@@ -44,8 +44,8 @@ def save_map(
     """
     Write a map to a file, all of it or nothing.
 
-    :param storage: of the features, ``float32`` or ``float16``; '' = as in the file where they
-        are, float32 in memory.
+    :param storage: type of the features, ``float32`` or ``float16``; '' = as in their file,
+        float32 in memory.
     :param force: replace an existing map, see :func:`stavpr_ros.output_file.atomic_output`.
     :param statistics: learned by recognition from the features as they will be stored, see
         :func:`stavpr_ros.prepare.prepared_map.statistics_of_map`; None = write none.

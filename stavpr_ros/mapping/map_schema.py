@@ -15,7 +15,7 @@ from typing import Any
 from stavpr_ros.features.registry import settings_class
 
 SHA256 = re.compile('[0-9a-f]{64}')
-NAME = re.compile('[a-z][a-z0-9_]{0,63}')  # of a section
+NAME = re.compile('[a-z][a-z0-9_]{0,63}')  # name of a section
 MAX_KEYS = 64
 Check = Callable[[Any, str], None]
 

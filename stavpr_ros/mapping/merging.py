@@ -21,7 +21,7 @@ def merge_maps(
     Return one map with the places of all, in their order; without threshold and error risks.
 
     :param names: id and name of the session that a map without sessions becomes; one each.
-    :param cameras: of each map, the name of its camera, and the yaw of the optical axis in the
+    :param cameras: name of each map's camera, and the yaw of the optical axis in the
         base, radians to the left; None = of its intrinsics, else unknown. Empty = not stated.
     :raises FeatureMismatchError: features of different settings.
     :raises InputError: no map.
@@ -106,7 +106,7 @@ def select_places(place_map: Map, places: np.ndarray) -> Map:
     if index is not None:
         numbers, index = np.unique(index[places], return_inverse=True)
         sessions, index = tuple(sessions[i] for i in numbers), index.astype(np.int32)
-    if same_as is not None:  # the earliest of those that show the same is the one that they name
+    if same_as is not None:  # of places that show the same, all name the earliest
         _, first, group = np.unique(same_as[places], return_index=True, return_inverse=True)
         same_as = first[group].astype(np.int32)
     return replace(

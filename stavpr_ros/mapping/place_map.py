@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from stavpr_ros.output_file import Force
 
 THUMBNAIL_WIDTH = 192  # pixels
-MAX_SECONDS = 2**31  # of a stamp, since 1970: the range of ROS messages
+MAX_SECONDS = 2**31  # stamp, since 1970: the range of ROS messages
 LONGEST_ID = 4096  # characters
 
 
@@ -81,9 +81,9 @@ class Session:
     :param robot: id of the robot, '' = unknown.
     :param start: time of its first image, ns, 0 = unknown.
     :param camera: name of the camera, such as ``rear``, '' = unknown.
-    :param yaw: of its optical axis in the base of the robot, radians to the left (REP-103), pi =
-        backward; None = unknown.
-    :param intrinsics: of the camera, where the cameras of the map differ; None = the map's.
+    :param yaw: yaw of its optical axis in the base of the robot, radians to the left (REP-103),
+        pi = backward; None = unknown.
+    :param intrinsics: its camera, where the cameras of the map differ; None = the map's.
     """
 
     id: str
@@ -128,7 +128,7 @@ class Map:
         place; empty = none kept.
     :param sessions: the drives that the places are of; empty = one drive, nothing known of it.
     :param session_index: number of each place's session, shape (n,), int32; None without sessions.
-    :param camera: of its images; None = unknown, or another one of each session.
+    :param camera: camera of its images; None = unknown, or each session has another.
     :param same_as: of each place, itself, or the place of an earlier session, or of the start of a
         closed route, that shows the same, shape (n,), int32; None = unknown. By
         :mod:`stavpr_ros.maintenance.same_places`.
@@ -136,7 +136,7 @@ class Map:
         :func:`stavpr_ros.maintenance.threshold.suggest_threshold` returns it; None = unknown.
     :param map_id: first 16 hexadecimal digits of the hash of its file's content, '' = it was not
         read from a file.
-    :param error_risks: of drives on this map, which ``max_error`` is kept by; None = unknown.
+    :param error_risks: rates of drives on this map, for ``max_error``; None = unknown.
     """
 
     partial: ClassVar[bool] = False  # places are fetched from elsewhere on use
@@ -191,7 +191,7 @@ class Map:
             it, which has options; or RGB arrays (h, w, 3), uint8.
         :param features: their kind, such as ``gradient``, or ``auto``: ``hybrid`` where its
             network is there; or the settings of another map's; or an extractor.
-        :param options: of :func:`stavpr_ros.mapping.build_map`, such as ``poses``, ``keyframes``.
+        :param options: see :func:`stavpr_ros.mapping.build_map`, such as ``poses``, ``keyframes``.
         :raises InputError: no images, or an item that is no image, and how to convert it.
         :raises SourceError: the source cannot be read, or has no images.
         """
@@ -243,7 +243,7 @@ class Map:
 
     @cached_property
     def has_poses(self) -> bool:
-        """Any place has a pose."""
+        """Return whether any place has a pose."""
         return self.poses is not None and not bool(np.isnan(self.poses[:, 0]).all())
 
     def pose(self, place: int) -> np.ndarray | None:
@@ -316,7 +316,7 @@ def require_projection(projection: Projection | None, settings: FeatureSettings)
     identity = projection.identity if projection else None
     if identity != settings.projection:
         raise InputError(
-            f'projection {identity} is not that of the features, {settings.projection}'
+            f'projection {identity} is another than the features have, {settings.projection}'
         )
 
 

@@ -11,7 +11,7 @@ from stavpr_ros.features.extractor import normalize
 from stavpr_ros.mapping.place_map import Map
 
 BLOCK_PLACES = 1024  # at a time: features of an opened map stay in its file
-STRIPS_A_DIRECTION = 3  # of fewer, directions follow chance (docs/performance.md)
+STRIPS_A_DIRECTION = 3  # with fewer, directions follow chance (docs/performance.md)
 
 
 def with_principal_components(place_map: Map, dimension: int) -> Map:

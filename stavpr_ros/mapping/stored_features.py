@@ -20,7 +20,7 @@ from stavpr_ros.memory import aligned_empty
 STATISTICS = 'statistics'  # name of the section
 DATA = record({'method': text(128), 'features': text(64, SHA256)})
 CHANGES = 5  # places apart, at most, whose changes are kept
-LIMITS = {  # of the values in each part; norms may be 1.01, see MAX_NORM
+LIMITS = {  # range of the values in each part; norms may be 1.01, see MAX_NORM
     'mean': (-1.01, 1.01),
     'directions': (-1.01, 1.01),
     'gains': (0.01, 1.01),
@@ -28,7 +28,7 @@ LIMITS = {  # of the values in each part; norms may be 1.01, see MAX_NORM
 }
 MAX_NORM = 1.01  # norm of a strip; float16 rounds it
 CODES = f'{STATISTICS}/codes'
-PLACES_AT_ONCE = 512  # of one strip: they stay in the cache while they are checked
+PLACES_AT_ONCE = 512  # places of one strip: they stay in the cache while they are checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class MapStatistics:
 
     :param method: names how they were computed.
     :param mean: shape (W, d), float32.
-    :param directions: of the whitening, unit norm or zero, shape (W, r, d), float32.
-    :param gains: of the directions, over 0, at most 1, shape (W, r), float64.
+    :param directions: directions of the whitening, unit norm or zero, shape (W, r, d), float32.
+    :param gains: gains of the directions, over 0, at most 1, shape (W, r), float64.
     :param changes: change of each place from the ones 1 to ``CHANGES`` places before, shape
         (``CHANGES``, n), float32.
     :param codes: the features, centered, whitened and rounded to int8, shape (W, n, d); None =
@@ -172,7 +172,7 @@ class StoredFeatures(LocalFeatures):
 
     @property
     def has_codes(self) -> bool:
-        """Whether the file has the features as codes, too, that its statistics are of."""
+        """Return whether the file has the codes, too, of the features of its statistics."""
         return self.statistics is not None and CODES in self.file.parts
 
     def codes(self, j: int, first: int, count: int) -> np.ndarray:
@@ -212,7 +212,7 @@ def require_normalized(rows: np.ndarray, name: str, place: int) -> None:
     Reject features that are not finite, or longer than 1.
 
     :param rows: shape (places, d).
-    :param name: of the part, in the error; ``place`` is the number of the first one.
+    :param name: name of the part, for the error; ``place`` is the number of the first one.
     :raises ValueError: names part and place.
     """
     for low in range(0, len(rows), PLACES_AT_ONCE):

@@ -12,7 +12,7 @@ from stavpr_ros.units import SECOND
 
 MAX_GAP = 5 * SECOND  # without odometry, across which interpolation would be a guess
 FARTHEST = 1e8  # meters of a coordinate: farther from the origin is no place on Earth
-NORMS = 1e-3, 1e3  # of a quaternion that is normalized
+NORMS = 1e-3, 1e3  # range of the norms of quaternions that are normalized
 
 
 def normalize_pose(pose: np.ndarray) -> np.ndarray:

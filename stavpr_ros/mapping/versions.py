@@ -25,7 +25,7 @@ from stavpr_ros.mapping.stored_features import MapStatistics, StoredFeatures
 from stavpr_ros.output_file import atomic_output, FileVersion, Force, JSON, MAP, write_output
 
 SUFFIX = '.history'
-MAX_VERSIONS = 10  # versions; older ones, and those of a branch that was left, are deleted
+MAX_VERSIONS = 10  # older ones, and a branch that a return has left, are deleted
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Version:
     """
     A version of a map.
 
-    :param map_id: of its file.
+    :param map_id: id of its file.
     :param parent: id of the version before it, '' = none.
-    :param number: of updates up to it.
+    :param number: number of updates up to it.
     :param drive: name of the drive of the last update.
     :param time: when it was made, seconds since 1970.
     :param base_places: number of places before the first update.
@@ -146,7 +146,7 @@ def roll_back(path: str | Path, map_id: str = '') -> Version:
     """
     Make an earlier version the map again.
 
-    :param map_id: of the version; '' = the one before.
+    :param map_id: id of the version; '' = the previous one.
     :raises InputError: there is no such version.
     :raises StavprError: its file is damaged, or the map cannot be written.
     """

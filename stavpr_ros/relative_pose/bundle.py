@@ -26,7 +26,7 @@ class Observations:
     Keypoints of the place, observed from its neighbors: m pairs.
 
     :param keypoint: its number, shape (m,); neighbor: number of the neighbor.
-    :param ray: of the keypoint in the place, shape (m, 3); observed: in the neighbor, (m, 2).
+    :param ray: ray of the keypoint in the place, shape (m, 3); observed: in the neighbor, (m, 2).
     """
 
     keypoint: np.ndarray

@@ -64,7 +64,7 @@ class EdgeEstimator:
         Where PnP is possible, nothing else replaces it: an edge that keypoints do not confirm has
         no pose.
 
-        :param query_camera, place_camera: of the two images; None = unknown.
+        :param query_camera, place_camera: cameras of the two images; None = unknown.
         :param obstacle: why there is no time for PnP; empty = there is.
         """
         edge = self.without_pnp(pair, query_camera, place_camera)

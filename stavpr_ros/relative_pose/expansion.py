@@ -40,8 +40,8 @@ class Expansion:
     """
     How far the scene beside the path moves outward per meter, by place of a map.
 
-    :param columns: of the image of a place, see :func:`describe_columns`; raises ImageError for a
-        place without an image, which is left out.
+    :param columns: returns the columns of a place's image, see :func:`describe_columns`; raises
+        ImageError for a place without an image, which is left out.
     :param distances: meters along the path, not decreasing, shape (n,).
     """
 
@@ -53,7 +53,7 @@ class Expansion:
         """
         Return how far the camera is to the left of the path, and the deviation, meters.
 
-        :param offset: of an image against the place.
+        :param offset: offset of an image against the place.
         :param focal: focal length, as a part of the width of the image; NaN = unknown, as is the
             result.
         """

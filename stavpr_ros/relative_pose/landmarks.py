@@ -12,11 +12,11 @@ from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.method.verification import mutual_matches
 from stavpr_ros.relative_pose.bundle import MIN_INVERSE_DEPTH, Observations, odometry_information
 
-RATIO = 0.8  # of the distances to the nearest and the second nearest descriptor
+RATIO = 0.8  # largest ratio of the distances to the nearest two descriptors
 FEATURES = 600  # most keypoints of a thumbnail
-CONTRAST = 0.02  # of SIFT; thumbnails are small, so that weaker keypoints count
+CONTRAST = 0.02  # threshold of SIFT; thumbnails are small, so that weaker keypoints count
 PIXELS = (6.0, 4.0, 3.0, 2.0)  # how far an observation may be off its landmark, round by round
-STEPS = 2  # of the bundle adjustment in each round but the last
+STEPS = 2  # steps of the bundle adjustment in each round but the last
 MAX_SHIFT = 2.0  # deviation of a landmark in an image one meter away, pixels
 
 
@@ -42,8 +42,8 @@ class Landmarks:
 
     :param points: shape (m, 3), meters, float64.
     :param rays: from the camera of the place to the points, shape (m, 3), meters.
-    :param deviations: of their inverse depths, relative to these, for a noise of one pixel, (m,).
-    :param descriptors: of the place's keypoints, shape (m, 128), float32.
+    :param deviations: relative deviations of the inverse depths for a noise of one pixel, (m,).
+    :param descriptors: descriptors of the keypoints, shape (m, 128), float32.
     :param motions: from that frame to the neighbors' frames, refined, shape (neighbors, 4, 4).
     """
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a query is along the track of the places, by the odometry of both passes."""
+"""The position of a query along the track of the places, by the odometry of both passes."""
 
 import math
 
@@ -10,7 +10,7 @@ from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 
 FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
-NEAR = 0.5  # of the least sum: where a parabola is fitted, places
+NEAR = 0.5  # places around the least sum to which a parabola is fitted
 MIN_IMAGES = 3
 MIN_STEP = 0.01  # meters
 # Deviations: along the track, in places, and at least (m); across it (m); of the rotation (rad).

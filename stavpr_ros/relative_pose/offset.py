@@ -21,34 +21,35 @@ import math
 
 import cv2
 import numpy as np
+from stavpr_ros.alignment.cpu.dot import dot_product
 from stavpr_ros.checks import float_array, no_nan, rgb_image
-from stavpr_ros.compilation import kernel, reassociating_kernel
+from stavpr_ros.compilation import kernel
 
 WIDTH = 192  # pixels of the compared images
 GROUND = 0.62  # the rows below this part of the height are not compared
 ROWS, ORIENTATIONS = 20, 4
-BLOCKS = 16  # of columns
+BLOCKS = 16  # blocks of columns
 REACH = WIDTH // 2  # largest shift, pixels
 SMOOTHING, COLUMN_SMOOTHING, CONTRAST_RADIUS = 1.0, 2.0, 12.0  # pixels, deviations
 CONTRAST, CLIP = 0.05, 2.5  # added to the local contrast; largest relative gradient
 EVIDENCE = 60.0  # nats for a mean similarity of 1 over the whole image; images are dependent
-MIN_OVERLAP = 0.4  # of the blocks
+MIN_OVERLAP = 0.4  # part of the blocks
 FORGETTING = 0.8  # factor on the sum of the earlier images
 DRIFT, STEP = 3.0, 6  # pixels that the shift changes between two images, deviation and maximum
 JUMP = 8.0  # nats: the most that the earlier images say against a shift, a camera may turn at once
 PEAK = 5  # pixels from the most probable shift that are one peak
-MIN_RATIO = 9.0  # of the peak of a valid offset to the second peak
-MIN_SIMILARITY = 0.12  # of a valid offset
+MIN_RATIO = 9.0  # probability of a valid offset's peak over the second peak's
+MIN_SIMILARITY = 0.12  # similarity of a valid offset
 DISTANT = 0.3  # parallax of the distant scene, which is not infinitely far, over `parallax`
 # Pixels of a sharp peak; errors of neighboring columns are dependent.
 FLOOR, INFLATION = 0.5, 2.0
-FLOOR_B = 0.007  # of the parallax: of a step of B
+FLOOR_B = 0.007  # deviation of the parallax by a step of B
 # Deviations of the prior: h in widths; a and b in half widths.
 PRIOR_H, PRIOR_A, PRIOR_B = 0.25, 0.08, 0.15
 A, B = (axis.ravel() for axis in np.meshgrid(
     np.linspace(-0.1, 0.1, 5), np.linspace(-0.3, 0.3, 25), indexing='ij'
 ))  # fmt: skip
-PARTS = 4  # of a pixel, in which the shift of a block is known: a small parallax is less than one
+PARTS = 4  # shifts of a block are in parts of a pixel: a small parallax is less than a pixel
 SHIFTS = np.arange(-REACH, REACH + 1)
 BLOCK_CENTERS = ((np.arange(BLOCKS) + 0.5) / BLOCKS - 0.5) * 2
 
@@ -60,10 +61,10 @@ class Offset:
 
     :param shift: h as a part of the width of the image, positive: the distant scene is further to
         the right, the camera is turned to the left (REP-103).
-    :param deviation: of the shift.
+    :param deviation: standard deviation of the shift.
     :param parallax: b / 2, how much further the scene is shifted at both sides of the image, as a
         part of the width, positive: the camera is to the left of the path.
-    :param ratio: of the probabilities of the peak and of the second peak.
+    :param ratio: probability of the peak over the second peak's.
     :param similarity: mean similarity of the columns of this image alone at the peak; about 0 for
         a covered camera, or for images of other places.
     :param parallax_deviation: NaN = unknown.
@@ -78,12 +79,12 @@ class Offset:
 
     @property
     def is_similar(self) -> bool:
-        """Whether the image is similar to the image of the place."""
+        """Return whether the image is similar to the image of the place."""
         return self.similarity >= MIN_SIMILARITY
 
     @property
     def is_valid(self) -> bool:
-        """Whether the images determine the shift."""
+        """Return whether the images determine the shift."""
         return self.is_similar and self.ratio >= MIN_RATIO
 
     def heading(self, focal: float) -> float:
@@ -189,14 +190,6 @@ def _columns(columns: np.ndarray, name: str) -> np.ndarray:
 # ------------------------------------------------ kernels
 
 
-@reassociating_kernel
-def _dot(x: np.ndarray, y: np.ndarray) -> np.float32:
-    total = np.float32(0)
-    for i in range(len(x)):
-        total += x[i] * y[i]
-    return total
-
-
 @kernel
 def block_evidence(
     query: np.ndarray, place: np.ndarray, beside: np.ndarray
@@ -218,7 +211,7 @@ def block_evidence(
             first = max(block * size, REACH - k)
             last = min((block + 1) * size, WIDTH + REACH - k)
             for x in range(first, last):
-                total += _dot(place[x], query[x + k - REACH])
+                total += dot_product(place[x], query[x + k - REACH])
             if 2 * (last - first) >= size:
                 means[block, k], is_covered[block, k] = total / (last - first), True
     parts = np.empty((BLOCKS, PARTS * (shifts - 1) + 1))

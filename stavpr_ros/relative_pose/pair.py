@@ -36,8 +36,8 @@ class Edge:
     :param source: what it follows from; only ``ALIGNED`` and ``PNP`` have a pose.
     :param reason: why the source is not ``PNP``; empty = it is ``PNP``.
     :param pose: x y z (meters) and quaternion x y z w, shape (7,).
-    :param covariance: of x y z and of rotations about the fixed axes of the place, shape (6, 6).
-    :param inliers: of PnP, -1 = not tried.
+    :param covariance: covariance of x y z and rotations about the place's fixed axes, (6, 6).
+    :param inliers: inliers of PnP, -1 = not tried.
     :param error: root mean square of their distances, pixels of the thumbnail; NaN = none.
     :param independent: far enough from the last such edge.
     """
@@ -52,7 +52,7 @@ class Edge:
 
     @property
     def has_pose(self) -> bool:
-        """Whether there is a relative pose."""
+        """Return whether there is a relative pose."""
         return self.source in (Source.ALIGNED, Source.PNP)
 
 
@@ -66,17 +66,17 @@ class MatchedPair:
     :param source: the map that the place is of.
     :param place: its index.
     :param query: thumbnail of the image, RGB (h, w, 3) uint8; None = unknown.
-    :param query_poses: of the base, at the images of the window, shape (l, 7); NaN = unknown.
+    :param query_poses: poses of the base at the window's images, shape (l, 7); NaN = unknown.
     :param middle: position of the image in the window.
     :param distances: of the images of the window to the places around, shape (l, k); +inf = not
         compared. Empty where alignment by odometry is impossible or not wanted.
     :param first: index of the first of the places around it, all of the place's session.
-    :param poses: of the base at those places, shape (k, 7); NaN = unknown.
+    :param poses: poses of the base at these places, shape (k, 7); NaN = unknown.
     :param direction: 1 = the camera moves along the places, -1 = against them.
     :param thumbnails: of these places at most ``TRIANGULATION_RADIUS`` away, by index: JPEG
         images, empty = none.
-    :param relative_yaw: of the base of the query in the base of the place, by the mountings of
-        the cameras, radians to the left.
+    :param relative_yaw: yaw of the query's base in the base of the place, by the mountings of the
+        cameras, radians to the left.
     """
 
     source: Map | GrowingMap

@@ -12,10 +12,10 @@ from stavpr_ros.method.verification import mutual_matches
 from stavpr_ros.relative_pose.landmarks import Landmarks, RATIO, View
 
 MIN_INLIERS = 14  # keypoints of the query; 1,000 pairs of wrong places had 12 at most
-PIXELS = 2.5  # of an inlier, off its landmark
+PIXELS = 2.5  # distance of an inlier from its landmark
 ITERATIONS, CONFIDENCE = 500, 0.999
-STEPS = 6  # of Gauss and Newton
-MIN_SCALE = 0.05  # of an inverse depth, relative to the triangulated one
+STEPS = 6  # steps of Gauss and Newton
+MIN_SCALE = 0.05  # inverse depth over the triangulated one
 MIN_DEPTH = 0.05  # meters
 
 
@@ -144,7 +144,7 @@ def _refine(pairs: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray
         one pixel.
     :raises LinAlgError: the landmarks do not determine it.
     """
-    shift = np.zeros(len(pairs.points))  # of inverse depths, in deviations
+    shift = np.zeros(len(pairs.points))  # changes of inverse depths, in deviations
     for _ in range(STEPS):
         scale = np.maximum(1 + shift * pairs.deviations, MIN_SCALE)
         points = pairs.points + pairs.rays * (1 / scale - 1)[:, None]

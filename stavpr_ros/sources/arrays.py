@@ -20,8 +20,8 @@ class Image(np.ndarray):
     """
     An array (height, width, 3), RGB, that carries its stamp and its name; parts carry them too.
 
-    ``stamp`` is when it was taken, ns, 0 = unknown; ``name`` that of its file, or of its video or
-    topic with a number.
+    ``stamp`` is when it was taken, ns, 0 = unknown; ``name`` the name of its file, or of its video
+    or topic with a number.
     """
 
     def __array_finalize__(self, other: object) -> None:
@@ -57,7 +57,7 @@ def images(
     """
     Open a folder of images, a video or a bag, and iterate over its images.
 
-    :param path: as all others, of :func:`stavpr_ros.sources.open_source`.
+    :param path: see :func:`stavpr_ros.sources.open_source` for all parameters.
     :returns: an iterable of :class:`Image`, uint8; uint16 where the source has 16 bits:
         :class:`stavpr_ros.Localizer` converts them as its map's.
     :raises SourceError: it cannot be read, has no images, or the topic or camera is ambiguous.

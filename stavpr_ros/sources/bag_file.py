@@ -43,7 +43,7 @@ class OpenBag:
     """
     A bag that is open for reading.
 
-    :param readers: of its files.
+    :param readers: readers of its files.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class OpenBag:
 
     @property
     def is_ros1(self) -> bool:
-        """Whether its messages are of ROS 1."""
+        """Return whether its messages are of ROS 1."""
         return all(isinstance(reader, Ros1Reader) for reader in self.readers)
 
     @property
@@ -100,7 +100,7 @@ class OpenBag:
                 if connections:  # none would be all
                     parts.append(read(connections, first if start else None, last))
             for connection, time_ns, raw in merge(*parts, key=lambda row: row[1]):
-                # of ZSTD; no CDR starts so
+                # begins as ZSTD, and no CDR
                 is_packed = not self.is_ros1 and bytes(raw[:4]) in bag_path.MAGIC
                 yield connection, time_ns, zstd.decompress(raw) if is_packed else raw
 

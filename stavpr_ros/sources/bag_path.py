@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a path is a bag, and the files of one, without rosbags, which loads slowly."""
+"""Paths of bags and their files, without rosbags, which loads slowly."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +41,7 @@ def is_bag(path: Path) -> bool:
 
 
 def storage_kind(file: Path) -> str:
-    """Return the suffix that the content of a file asks for; else the one that it has."""
+    """Return the suffix that fits the content of a file; else its own one."""
     with open_regular(file) as opened:  # a pipe would never end
         start = opened.read(max(map(len, MAGIC)))
     kinds = (kind for magic, kind in MAGIC.items() if start.startswith(magic))

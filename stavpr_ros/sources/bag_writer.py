@@ -16,7 +16,7 @@ from stavpr_ros.units import SECOND
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
 VERSION: int = 9
-"""Of the bag's metadata: the one that ROS 2 Jazzy writes."""
+"""Version of the bag's metadata, as of ROS 2 Jazzy."""
 
 
 def write_bag(
@@ -30,7 +30,7 @@ def write_bag(
     Write a bag with raw images and other messages, all of it or nothing.
 
     :param path: the bag's folder, which must not exist yet.
-    :param topic: of the images.
+    :param topic: topic of the images.
     :param records: images and other messages, in the order of their times of recording.
     :param storage: ``sqlite3`` or ``mcap``.
     :param others: the topics of other messages: name to type.

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which camera the image files of a folder are of, by their names."""
+"""The cameras of the image files of a folder, by their names."""
 
 from collections.abc import Callable, Sequence
 from itertools import combinations
@@ -26,9 +26,9 @@ NUMBERED = re.compile(
 SINGLE = re.compile(r'(?<![^\W_])[a-fA-F](?![^\W_])')  # else they are hexadecimal digits
 TOKEN = re.compile(r'[A-Z]?[a-z]+|[A-Z]+')
 WORD = re.compile(r'[^\W\d_]*[^\W\d_a-f][^\W\d_]*')  # no hexadecimal digits
-MIN_SHARE = 0.05  # of all images, of a camera
+MIN_SHARE = 0.05  # images of a camera over all images
 MIN_ROLE_SHARE = 0.75  # of images with cameras in their names; else parts: hall_left, stairs
-MIN_COMMON = 0.95  # of the counters of two cameras that take images together
+MIN_COMMON = 0.95  # common counters of two cameras that take images together
 STAMPS = 10**7  # stamps and dates are not below
 
 Groups = dict[str, dict[Path, tuple[int, ...]]]
@@ -39,7 +39,7 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
     """
     Return the files of one camera.
 
-    :param files: of the folder ``top`` and its sub-folders.
+    :param files: files of the folder ``top`` and its sub-folders.
     :param camera: its name as the error lists it; None = there is one.
     :raises SourceError: several cameras passed the same places, or none has the name.
     """
@@ -51,7 +51,7 @@ def of_one_camera(files: Sequence[Path], top: Path, camera: str | None = None) -
             return list(group)
         choice = f'expected one of {_describe(groups)}' if len(groups) > 1 else 'leave it out'
         raise SourceError(f'{top} has no camera {camera!r}: {choice}')
-    alike: dict[str, list[Path]] = {}  # by their names without the camera's and without numbers
+    alike: dict[str, list[Path]] = {}  # by names without camera and numbers
     for file in files:
         rest = Path(_role(file.relative_to(top))[1]).name.casefold()
         alike.setdefault(re.sub(r'[\W\d_]', '', rest), []).append(file)

@@ -65,7 +65,7 @@ def demosaic(code: int, mosaic: np.ndarray) -> np.ndarray:
     """
     Interpolate (bilinear) the two missing colors of each pixel behind a Bayer filter.
 
-    :param code: of OpenCV with four letters: the top-left 2x2 pixels, as ROS names a mosaic.
+    :param code: OpenCV's, with four letters: the top-left 2x2 pixels, as ROS names a mosaic.
     :param mosaic: uint8, shape (height, width) or (height, width, 1); rows may be apart.
     :raises ImageError: fewer than 2 rows or columns: a color is missing.
     """

@@ -27,7 +27,7 @@ VIDEOS = frozenset({
     '.mxf', '.nut', '.ogv', '.osv', '.qt', '.rm', '.tod', '.tp', '.ts', '.vob', '.webm', '.wmv',
     '.wtv', '.y4m',
 })  # fmt: skip
-PROXIES = frozenset({'.lrf', '.lrv'})  # of cameras: small copies of the videos beside them
+PROXIES = frozenset({'.lrf', '.lrv'})  # small copies that cameras put beside videos
 FOREIGN = re.compile(
     r'@.*|#recycle|#snapshot|\$recycle\.bin|lost\+found|__macosx|system volume information|'
     r'_*thumb(nail)?s?',
@@ -55,7 +55,7 @@ class FolderSource:
 
     :param on_error: called with the :class:`ImageError` of a file that cannot be read, which is
         then skipped; without it the error is raised.
-    :param camera: of the cameras in the folder, the one to read, as the error names it.
+    :param camera: the camera to read of several in the folder, as the error names it.
     :raises SourceError: there is no such folder, or no image in it and its sub-folders, or several
         cameras.
     """
@@ -174,7 +174,7 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         images = [path for path in paths if path.suffix.lower() in SUFFIXES]
         # a link into nothing is an image that is missing
         images = [path for path in images if path.is_file() or not path.exists()]
-        # of an image in two formats, the one that every program reads
+        # an image in two formats is read in the common one
         names = {path.stem for path in images if path.suffix.lower() not in HEIF}
         images = [p for p in images if p.suffix.lower() not in HEIF or p.stem not in names]
         names |= {path.stem for path in images}

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is odd about a stream: two sources in one, clocks that jump, numbers of another unit."""
+"""Oddities of a stream: two sources in one, clocks that jump, numbers of another unit."""
 
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,10 @@ from stavpr_ros.units import SECOND
 
 RECENT = 100  # messages that are compared
 MIN_MESSAGES = 8
-MIN_CHANGES = 4  # of the source: fewer are a camera that was set up anew
+MIN_CHANGES = 4  # fewer changes of the source are a camera that was set up anew
 MAX_REORDERING = SECOND // 2
 HOUR, DAY = 3600 * SECOND, 86400 * SECOND
-MAX_RATIO = 50  # of two clocks; a replay may be faster
+MAX_RATIO = 50  # speeds of two clocks; a replay may be faster
 MAX_SPEED = 80.0  # m/s
 
 

@@ -18,8 +18,8 @@ NaturalKey = tuple[list[str | int], list[str | int], str]
 Texts = Sequence[str]
 
 REAL = re.compile(r'(.*?)(?<![\d.])(-?)(\d+)(?:\.(\d+))?(\D*)')  # the last number
-SPANS = 2**8, 2**16, 2**31, 2**32  # of counters, beside powers of ten
-DIGITS = 7  # of a fraction of seconds since 1970, as a float; more are nanoseconds
+SPANS = 2**8, 2**16, 2**31, 2**32  # ranges of counters, beside powers of ten
+DIGITS = 7  # decimals of seconds since 1970 as a float; more are nanoseconds
 EXIF, TAKEN, FRACTION, CHANGED = 0x8769, 0x9003, 0x9291, 0x0132  # tags
 TIME = re.compile(r'\d{4}:\d\d:\d\d \d\d:\d\d:\d\d')
 
@@ -96,7 +96,7 @@ def _read_restarted_counter(texts: Texts) -> tuple[list[Any], str] | None:
         tens = [10 ** len(texts[0])]
     values = sorted(map(int, texts))
     steps = [b - a for a, b in pairwise(values)]
-    last = steps.index(max(steps)) if steps else 0  # of the counter
+    last = steps.index(max(steps)) if steps else 0  # the last value of the counter
     usual = max([*steps[:last], *steps[last + 1 :], 1])
     for span in (*tens, *SPANS) if steps and steps[last] > 10 * usual else ():
         if 0 < values[0] + span - values[-1] <= 2 * usual:

@@ -14,7 +14,7 @@ EXPECTED = (
     'a line an image, in meters: x y z; x y z qx qy qz qw; stamp x y z qx qy qz qw (TUM); or a '
     '3x4 matrix in rows, 12 numbers (KITTI)'
 )
-NUMBERS = 3, 7, 12  # of a pose
+NUMBERS = 3, 7, 12  # numbers that a pose may have
 POSITION = re.compile(r'((.*[._])?(position|pos|translation|p|t)(_.*)?[._]?)?([xyz])')
 ROTATION = re.compile(r'(.*[._])?(orientation|quaternion|quat|rotation|rot|q)(_.*)?[._]?([xyzw])')
 DEGREES = re.compile(
@@ -26,8 +26,8 @@ KEY = re.compile(
 NUMBER = re.compile(r'\d+(?:\.\d+)?')
 LISTED = 3  # names that an error lists
 STEPS, MIN_MOVES, ALIKE = (0.004, 40.0), 9, 0.9  # meters an image; images; cosine
-NORMS = 0.9, 1.1  # of a quaternion in text, of a few digits
-MAX_STEP, MAX_EXTENT = 3e-4, 0.5  # of positions in degrees, median and sum; too small in meters
+NORMS = 0.9, 1.1  # range of the norm of a quaternion of a few digits
+MAX_STEP, MAX_EXTENT = 3e-4, 0.5  # positions in degrees: median step, extent; too small in meters
 
 
 def read_poses(path: Path, images: Sequence[str] = ()) -> tuple[np.ndarray, bool]:

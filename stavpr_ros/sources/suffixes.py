@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The ends of the names of image files."""
+"""Suffixes of image files."""
 
 HEIF = frozenset({'.heic', '.heif', '.hif'})
 SUFFIXES = HEIF | {

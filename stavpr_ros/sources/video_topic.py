@@ -43,7 +43,7 @@ class VideoImage:
     """
     The image of a packet, as a message: ``header``, and pixels that are converted when needed.
 
-    :param frame: of PyAV, or why there is none.
+    :param frame: a frame of PyAV, or why there is none.
     :param convert: returns the RGB image of a frame.
     """
 
@@ -82,8 +82,8 @@ class VideoStream:
         self._reformatter = VideoReformatter()
         self._context: Any = None  # None until a key frame
         self._codec = ''
-        self._number = 0  # of the packet
-        self._pts: int | None = None  # of the last packet
+        self._number = 0  # number of the packet
+        self._pts: int | None = None  # stated by the last packet
         self._counts = False  # pts counts packets; other publishers state a time
 
     def interrupt(self) -> None:
@@ -96,7 +96,7 @@ class VideoStream:
 
         :param message: ``FFMPEGPacket``, ``CompressedVideo`` or ``CompressedImage``, or any object
             with its fields.
-        :param make_header: of ``stamp`` and ``frame_id``, where the message has no header.
+        :param make_header: makes a header of ``stamp`` and ``frame_id``, if the message has none.
         """
         header = getattr(message, 'header', None)
         if header is None:

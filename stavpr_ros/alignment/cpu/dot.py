@@ -21,7 +21,7 @@ from stavpr_ros.simd import LANES, LINE, load, prefetch, splat, store, store_sum
 TILE = 7  # query strips whose sums stay in registers: all of them, with the paper's W
 IMAGES = 256  # map images a thread takes at a time; a multiple of LANES
 AHEAD = 2048  # numbers of the map that are on their way to the cache
-FEW_IMAGES = 64  # likewise, where the distances of all cells are kept
+FEW_IMAGES = 64  # map images likewise, where the distances of all cells are kept
 
 
 def tile(queries: np.ndarray) -> np.ndarray:
@@ -88,8 +88,8 @@ def _dots_of_two(y, z, q, sums):
 
 
 @reassociating_kernel
-def _dot(y, q):
-    """Multiply a vector of the map (d,) by one of the query (d,)."""
+def dot_product(y: np.ndarray, q: np.ndarray) -> np.float32:
+    """Multiply a vector (d,) by another."""
     total = np.float32(0)
     for t in range(y.shape[0]):
         total += q[t] * y[t]
@@ -110,7 +110,7 @@ def cosine_distances(features, queries, out):
         first = block * FEW_IMAGES
         for x in range(queries.shape[0]):
             for y in range(first, min(n, first + FEW_IMAGES)):
-                out[x, y] = np.float32(1) - _dot(features[y], queries[x])
+                out[x, y] = np.float32(1) - dot_product(features[y], queries[x])
 
 
 def _block_distances(features, queries, x, first, count, d):

@@ -18,7 +18,7 @@ from stavpr_ros.simd import LANES, load, select, splat, store
 
 SLOT = 2 * LANES  # S, then C
 VERTICAL, HORIZONTAL, DIAGONAL = 0, 1, 2
-SHIFT_COST = 1 / 32  # of a strip: a camera that looks to the side shifts from place to place
+SHIFT_COST = 1 / 32  # distance a strip: a camera that looks to the side shifts from place to place
 BLOCKS = 16  # vectors of map images that a thread takes at a time
 
 

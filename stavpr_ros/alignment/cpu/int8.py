@@ -30,7 +30,7 @@ from stavpr_ros.simd import LANES, load, load_splat, splat, store, Vector
 TILE = 7  # query strips whose sums stay in registers
 QUAD = 4  # dimensions of a lane
 IMAGES = 256  # places a thread takes at a time; a multiple of LANES
-MAX_LENGTH = 181.0  # of a rounded strip
+MAX_LENGTH = 181.0  # norm of a rounded strip
 MAP_PEAK, QUERY_PEAK = 127.0, 63.0
 
 # name, required features of the processor, lanes, LLVM's function; the first that fits is taken
@@ -50,7 +50,7 @@ def choose_instruction(features: str, lanes: int) -> str:
     """
     Return the name of the instruction that multiplies and adds.
 
-    :param features: of the processor as LLVM names them, '+avx2,-avx512f,...'.
+    :param features: features of the processor, as LLVM names them, '+avx2,-avx512f,...'.
     :param lanes: places that lie side by side.
     """
     available = set(features.split(','))
@@ -61,7 +61,7 @@ def choose_instruction(features: str, lanes: int) -> str:
     )
 
 
-# of numba's compiler, which is fixed by the first function that the process has compiled
+# features that numba's compiler uses, fixed by the first function that it compiles
 _, _, FEATURES = cpu_target.target_context.codegen().magic_tuple()
 INSTRUCTION = choose_instruction(FEATURES, LANES)
 
@@ -74,7 +74,7 @@ def write_multiply_add(builder: Any, name: str, total: Any, places: Any, query: 
     """
     Write the code that adds four products to each lane.
 
-    :param name: of the instruction.
+    :param name: name of the instruction.
     :param total: sums so far, as many int32 as lanes; what they mean is known to the instruction
         until :func:`write_total`.
     :param places, query: four int8 a lane, as int32.
@@ -345,7 +345,7 @@ def block_distances(features, queries, x, first, count, d):
     """
     Fill d (rows, W, .), contiguous: strips of query x against ``count`` places from ``first``.
 
-    :param features: of :meth:`Int8Strips.kernel_arguments`; queries: of :func:`tile`.
+    :param features: result of :meth:`Int8Strips.kernel_arguments`; queries: of :func:`tile`.
     :param first: a multiple of LANES; count: rounded up to whole lanes, which d has room for.
     """
     values, reciprocals = features
