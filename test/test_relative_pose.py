@@ -14,7 +14,7 @@ from stavpr_ros.maintenance.same_places import with_same_places
 from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map, thumbnail_of
 from stavpr_ros.mapping.camera import FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
-from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
+from stavpr_ros.relative_pose.estimator import EdgeEstimator, MIN_PLACES_APART
 from stavpr_ros.relative_pose.odometry import align
 from stavpr_ros.relative_pose.pair import MatchedPair, Source, TRIANGULATION_RADIUS
 from stavpr_ros.relative_pose.pnp import MIN_INLIERS
@@ -126,7 +126,7 @@ def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, monkeypatch):
     other = scene(CAMERA, pose(0), seed=9)
     pair = replace(scene(CAMERA, pose(0)), query=other.query)
     far = scene(CAMERA, pose(0.5))
-    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.REACH', 0.1)
+    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.MAX_DISTANCE_RATIO', 0.1)
     for case, words in ((pair, 'fewer than 14'), (far, 'more than 0.4 m from the place')):
         edge = EdgeEstimator(method).estimate(case, CAMERA, CAMERA)
         assert (edge.source, edge.has_pose, edge.independent) == (Source.REFUTED, False, False)
@@ -237,7 +237,7 @@ def test_independent_edges_are_apart(method):
         near[:, place - PLACE : place - PLACE + PLACES] = distances
         pair = MatchedPair(source, place, None, query_poses, middle, near, 0, poses, {})
         found.append(estimator.estimate(pair, None, None).independent)
-    assert np.flatnonzero(found).tolist() == list(range(0, 30, APART[Source.ALIGNED]))
+    assert np.flatnonzero(found).tolist() == list(range(0, 30, MIN_PLACES_APART[Source.ALIGNED]))
     assert not EdgeEstimator('none').estimate(pair, None, None).independent
 
 

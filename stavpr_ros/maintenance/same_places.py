@@ -19,7 +19,7 @@ from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.progress import Progress
 
 SURE = 0.9  # probability above which two places are taken to be the same
-AT_END = 60  # last places of a route, which are compared with its first ones
+MAX_END = 60  # last places of a route, which are compared with its first ones
 
 
 class SamePlaces:
@@ -79,7 +79,7 @@ def with_same_places(place_map: Map, first: int = 1) -> Map:
         if not len(earlier):
             continue
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
-        matched = recognized(reference, place_map, places)
+        matched = recognize_places(reference, place_map, places)
         is_matched = matched >= 0
         same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
     return replace(place_map, same_as=same_as.astype(np.int32))
@@ -111,9 +111,9 @@ def with_seam(place_map: Map, is_closed: bool = False) -> Map:
             raise SettingsError('a closed route has one session and at least 60 places')
         return place_map
     reference = select_places(place_map, np.arange(third))
-    end = np.arange(n - min(third, AT_END), n)
-    matched = recognized(reference, place_map, end)
-    last = int(np.flatnonzero(matched >= 0)[-1:].sum())
+    end = np.arange(n - min(third, MAX_END), n)
+    matched = recognize_places(reference, place_map, end)
+    last = int(np.flatnonzero(matched >= 0).max(initial=0))
     is_found = matched[last] >= 0 and len(end) - last <= SequenceSettings().length
     if not is_found and not is_closed:
         return place_map
@@ -125,7 +125,7 @@ def with_seam(place_map: Map, is_closed: bool = False) -> Map:
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 
-def recognized(reference: Map, drive: Map, images: np.ndarray) -> np.ndarray:
+def recognize_places(reference: Map, drive: Map, images: np.ndarray) -> np.ndarray:
     """Return the place of a reference that each image of a drive shows, -1 = none, (m,)."""
     settings = RecognizerSettings(min_probability=SURE)
     recognizer, length = PlaceRecognizer(reference, settings), settings.sequence.length

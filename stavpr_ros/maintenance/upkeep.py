@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
-from stavpr_ros.maintenance.same_places import recognized, SamePlaces
+from stavpr_ros.maintenance.same_places import recognize_places, SamePlaces
 from stavpr_ros.mapping import Map, merge_maps, select_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.mapping.versions import current_version, MAX_VERSIONS, save_version, Version
@@ -35,7 +35,7 @@ MAX_ERROR = 0.005  # rate of wrong matches that a certain image keeps
 MIN_IMAGES, MIN_CERTAIN = 40, 0.3  # certain images, and their share of those in motion
 MIN_SHARE = 0.5  # part of a session's places that a drive passes
 MAX_LAPS = 2  # images of a drive in motion that are kept, times the places before the first update
-FASTEST = max(MODEL.speeds)  # places an image, of a drive on the map
+MAX_SPEED = max(MODEL.speeds)  # places an image, of a drive on the map
 SLACK = 4  # places by which two certain images may disagree
 LAP = 40  # places of a closed route at least
 PROBES, FAR = 24, 25  # images of the geometric check; places to where another one is
@@ -62,7 +62,7 @@ def update_map(place_map: Map, drive: Map, name: str, version: Version) -> tuple
         )
     images = _most_certain(on_map, MAX_LAPS * base)
     # by the places before the first update: errors would add up from drive to drive
-    places = recognized(select_places(place_map, np.arange(base)), drive, images)
+    places = recognize_places(select_places(place_map, np.arange(base)), drive, images)
     places = np.where(places >= 0, places, on_map.of_windows[images])
     updated = _with_drive(place_map, drive, name, images, places)
     assert updated.session_index is not None
@@ -160,7 +160,7 @@ def _require_certain(drive: Map, on_map: _OnMap) -> None:
         )
     for a, b in pairwise(certain.tolist()):
         p, q = (int(roots[on_map.places[image]]) for image in (a, b))
-        is_possible = -SLACK <= on_map.ahead(p, q) <= FASTEST * (b - a) + SLACK
+        is_possible = -SLACK <= on_map.ahead(p, q) <= MAX_SPEED * (b - a) + SLACK
         if sessions[p] == sessions[q] and not is_possible:
             raise InputError(
                 f'images {a} and {b} are certain of places {p} and {q}, which they cannot both '
@@ -196,7 +196,7 @@ def _share(on_map: _OnMap) -> float:
     for a, b in pairwise(np.flatnonzero(places >= 0).tolist()):
         p, q = int(roots[places[a]]), int(roots[places[b]])
         steps = on_map.ahead(p, q)
-        if sessions[p] == sessions[q] and 0 <= steps <= FASTEST * (b - a) + SLACK:
+        if sessions[p] == sessions[q] and 0 <= steps <= MAX_SPEED * (b - a) + SLACK:
             between = p + np.arange(steps + 1)
             is_passed[between % lap if p < lap else between] = True
     counts = np.bincount(sessions[is_passed], minlength=1)

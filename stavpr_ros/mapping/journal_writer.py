@@ -19,7 +19,7 @@ from stavpr_ros.mapping.place_map import Map
 from stavpr_ros.output_file import create_temporary, explain, numbered_names, sync_folder, write_at
 
 SYNC_PERIOD = 1.0  # seconds between syncs, and between attempts after an error
-WAITING = 2**28  # most bytes that wait for room on the disk
+MAX_WAITING = 2**28  # most bytes that wait for room on the disk
 SLACK = 2**24  # bytes of forgotten places, and half of the file, before it is rewritten
 PIECE = 2**20  # bytes copied at a time
 
@@ -123,7 +123,7 @@ class JournalWriter:
         with self._changed:
             if len(self._ends) == 1 and not self._waiting:
                 self._first = place.number
-            full = self.failed and sum(map(len, self._waiting)) > WAITING
+            full = self.failed and sum(map(len, self._waiting)) > MAX_WAITING
             self._waiting.append(b'' if full else content)  # the error is logged
             if not self.failed:
                 self._write_waiting()

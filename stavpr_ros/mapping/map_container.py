@@ -103,12 +103,12 @@ class MapFile:
         if self.problem:  # after reading, so that nothing later can have been read
             raise MapFileError(self.problem)
         if len(view):
-            raise self.damaged(f'is truncated: byte {start} is missing')
+            raise self.damage_error(f'is truncated: byte {start} is missing')
 
     def bytes_at(self, start: int, count: int) -> bytes:
         """Read bytes; they must be within the file, checked before memory is taken."""
         if start < 0 or count < 0 or start + count > self.size:
-            raise self.damaged(
+            raise self.damage_error(
                 f'has {self.size} bytes, {count} from byte {start} on are missing: it is truncated'
             )
         content = np.empty(count, np.uint8)
@@ -136,7 +136,7 @@ class MapFile:
                 start = part.start + i * PIECE
                 end = min(start + PIECE, part.start + part.size)
                 if self._hash(start, end, rest) != sha256:
-                    raise self.damaged(
+                    raise self.damage_error(
                         f'is damaged: bytes {start} to {end}, of part {name}, do not match their '
                         'hash'
                     )
@@ -166,11 +166,11 @@ class MapFile:
                 f'cp --sparse=never, {BUILD_AGAIN}'
             )
 
-    def damaged(self, what: str) -> MapFileError:
+    def damage_error(self, what: str) -> MapFileError:
         """Return the error for this file."""
         return MapFileError(f'map {self.path} {what}: {BUILD_AGAIN}')
 
-    def foreign(self, why: str) -> MapFileError:
+    def foreign_error(self, why: str) -> MapFileError:
         """Return the error for a file of something else."""
         return MapFileError(
             f'{self.path} is no map of this program ({why}), or damaged or truncated: build one '

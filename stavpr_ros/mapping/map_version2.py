@@ -37,7 +37,7 @@ def read_header(file: MapFile) -> None:
     head = file.bytes_at(0, min(8, file.size))
     length = int.from_bytes(head, 'little')
     if file.size < 8 or not 2 <= length <= min(MAX_HEADER, file.size - 8):
-        raise file.foreign(f'its header would have {length} of {file.size} bytes')
+        raise file.foreign_error(f'its header would have {length} of {file.size} bytes')
     content = file.bytes_at(8, length)
     try:
         header = read_json(content, 'the header')
@@ -46,7 +46,7 @@ def read_header(file: MapFile) -> None:
             raise ValueError(f'another format than {FORMAT}')
         version = metadata['version']
     except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise file.foreign(f'no manifest in its header, {error}') from error
+        raise file.foreign_error(f'no manifest in its header, {error}') from error
     if version != str(VERSION):
         raise MapFileError(
             f'{file.path} has format version {str(version)[:20]}, this program reads {VERSION}: '

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 THUMBNAIL_WIDTH = 192  # pixels
 MAX_SECONDS = 2**31  # stamp, since 1970: the range of ROS messages
-LONGEST_ID = 4096  # characters
+MAX_ID = 4096  # characters
 
 
 @dataclass(frozen=True)
@@ -338,10 +338,10 @@ def _require_whole_rows(poses: np.ndarray) -> None:
 def _require_texts(ids: tuple[str, ...]) -> None:
     """Reject identifiers that cannot be published."""
     for place, identifier in enumerate(ids):
-        if identifier and (len(identifier) > LONGEST_ID or identifier != plain_text(identifier)):
+        if identifier and (len(identifier) > MAX_ID or identifier != plain_text(identifier)):
             raise InputError(
                 f'the identifier of place {place} is {identifier[:80]!a}: expected at most '
-                f'{LONGEST_ID} characters, without NUL and lone surrogates'
+                f'{MAX_ID} characters, without NUL and lone surrogates'
             )
 
 

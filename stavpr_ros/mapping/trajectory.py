@@ -11,7 +11,7 @@ from stavpr_ros.errors import InputError
 from stavpr_ros.units import SECOND
 
 MAX_GAP = 5 * SECOND  # without odometry, across which interpolation would be a guess
-FARTHEST = 1e8  # meters of a coordinate: farther from the origin is no place on Earth
+MAX_COORDINATE = 1e8  # meters of a coordinate: farther from the origin is no place on Earth
 NORMS = 1e-3, 1e3  # range of the norms of quaternions that are normalized
 
 
@@ -21,7 +21,7 @@ def normalize_pose(pose: np.ndarray) -> np.ndarray:
 
     :param pose: x y z (meters) and quaternion x y z w, shape (7,).
     :returns: the same, float64.
-    :raises InputError: another shape, values that are not finite or beyond ``FARTHEST``, or a
+    :raises InputError: another shape, values that are not finite or above ``MAX_COORDINATE``, or a
         quaternion of a norm outside ``NORMS``.
     """
     try:
@@ -31,9 +31,9 @@ def normalize_pose(pose: np.ndarray) -> np.ndarray:
             f'pose {pose!r:.200} is no array ({error}): expected 7 numbers'
         ) from error
     require_shape('pose, x y z and quaternion x y z w', own, '7')
-    if not (np.abs(own) <= FARTHEST).all():  # NaN as well
+    if not (np.abs(own) <= MAX_COORDINATE).all():  # NaN as well
         raise InputError(
-            f'pose {own.tolist()} is not finite: expected meters up to {FARTHEST:g} and a '
+            f'pose {own.tolist()} is not finite: expected meters up to {MAX_COORDINATE:g} and a '
             'quaternion'
         )
     norm = float(np.linalg.norm(own[3:]))

@@ -24,8 +24,8 @@ METHODS = ('auto', 'none', 'aligned', 'pnp')
 VIEWS, LANDMARKS = 64, 32  # places kept: about 300 kB and 100 kB each
 MIN_BASELINE = 0.05  # meters between the place and a neighbor
 # Places between independent edges: their errors have views, or odometry, in common.
-APART = {Source.PNP: 5, Source.ALIGNED: 10}
-REACH = 2.0  # a query is at most so many times as far from the place as its neighbors
+MIN_PLACES_APART = {Source.PNP: 5, Source.ALIGNED: 10}
+MAX_DISTANCE_RATIO = 2.0  # distances from the place of a query and of the farthest neighbor
 # Meters: with a larger deviation of the position, keypoints do not determine it. Wrong places that
 # reached MIN_INLIERS had 4 m and more; 2 of 1,741 right ones had more than 1 m.
 MAX_DEVIATION = 1.0
@@ -87,7 +87,7 @@ class EdgeEstimator:
         last = self._last
         if last is not None and last[0] is pair.source:
             distance = float(np.linalg.norm(base[:3, 3] - last[1]))
-            if distance < (APART[edge.source] - 0.5) * pair.spacing:
+            if distance < (MIN_PLACES_APART[edge.source] - 0.5) * pair.spacing:
                 return False
         self._last = pair.source, base[:3, 3]
         return True
@@ -179,7 +179,7 @@ class EdgeEstimator:
             if baseline > MIN_BASELINE:
                 neighbors.append((view, motion))
                 indices.append(index)
-                reach = max(reach, REACH * baseline)
+                reach = max(reach, MAX_DISTANCE_RATIO * baseline)
         view = self._view_of(pair, place, camera)
         if view is None or not neighbors:
             raise InputError('the place has no neighbors with poses and thumbnails')

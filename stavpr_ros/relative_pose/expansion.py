@@ -32,7 +32,7 @@ STEPS = (1, 2, 4, 8)  # places between two compared images
 MAX_DISTANCE = 1.2  # meters between them; the next place counts in any case
 MIN_DISTANCE = 0.02
 RADIUS = 4  # places on both sides whose evidence is summed
-REMEMBERED = 64  # places
+MAX_CACHED = 64  # places
 AHEAD = 0.13  # DISTANT of the scene that the camera drives towards
 
 
@@ -47,7 +47,7 @@ class Expansion:
 
     def __init__(self, columns: Callable[[int], np.ndarray], distances: np.ndarray) -> None:
         self._columns, self._distances = columns, distances
-        self._evidence = lru_cache(REMEMBERED)(self._evidence_of)
+        self._evidence = lru_cache(MAX_CACHED)(self._evidence_of)
 
     def lateral(self, offset: Offset, place: int, focal: float) -> tuple[float, float]:
         """

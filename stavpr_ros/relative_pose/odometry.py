@@ -9,7 +9,7 @@ from stavpr_ros.mapping.trajectory import interpolate
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.relative_pose.pair import Edge, MatchedPair, Source
 
-FARTHEST, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
+MAX_OFFSET, STEP = 4.0, 0.05  # offsets that are tried, and between two of them, places
 NEAR = 0.5  # places around the least sum to which a parabola is fitted
 MIN_IMAGES = 3
 MIN_STEP = 0.01  # meters
@@ -38,7 +38,7 @@ def align(pair: MatchedPair) -> Edge:
     if min(len(images), len(spaced)) < MIN_IMAGES or not pair.spacing > 0:
         reason = 'the odometry of query or places has gaps, or no motion, in the window'
         return Edge(Source.NONE, reason)
-    offsets = np.arange(-FARTHEST, FARTHEST + STEP, STEP) * pair.spacing
+    offsets = np.arange(-MAX_OFFSET, MAX_OFFSET + STEP, STEP) * pair.spacing
     start = float(track[pair.place - pair.first])
     total = np.zeros(len(offsets))
     rows = np.array([_finite(pair.distances[image, spaced]) for image in images])

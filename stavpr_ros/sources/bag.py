@@ -22,7 +22,7 @@ RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 VIDEO = {FFMPEG, FOXGLOVE}
 ODOMETRY = 'nav_msgs/msg/Odometry'
-LATE = SECOND // 2  # messages may be out of order by so much; more is a clock that jumped back
+MAX_DISORDER = SECOND // 2  # of messages; more is a clock that jumped back
 MIN_MESSAGE = 16  # bytes of a message in a bag, with its entry in the index
 Item = TypeVar('Item')
 
@@ -240,14 +240,14 @@ def read_odometry(path: str | Path, topic: str) -> tuple[np.ndarray, np.ndarray]
         raise SourceError(f'odometry {topic!r} of {path} has none of the messages that it states')
     when, where = np.array(stamps, np.int64), np.array(poses, np.float64)
     before, after = when[:-2], when[2:]  # a single stamp of another time is invalid
-    is_alone = (when[1:-1] < before - LATE) | (when[1:-1] > after + LATE)
-    alone = 1 + np.flatnonzero(is_alone & (after >= before - LATE))
+    is_alone = (when[1:-1] < before - MAX_DISORDER) | (when[1:-1] > after + MAX_DISORDER)
+    alone = 1 + np.flatnonzero(is_alone & (after >= before - MAX_DISORDER))
     when[alone], where[alone] = when[alone - 1], np.nan
     if text := speed_oddity(when, where):
         note_once(f'{path}, {topic}: {text}')
     back = np.maximum.accumulate(when) - when
-    if back.max() > LATE:
-        i = int(np.argmax(back > LATE))
+    if back.max() > MAX_DISORDER:
+        i = int(np.argmax(back > MAX_DISORDER))
         raise SourceError(
             f'odometry {topic!r} of {path} goes back by {back[i] / SECOND:.1f} s at message {i}: '
             'expected one run, cut the bag'

@@ -24,7 +24,7 @@ KEY = re.compile(
     r'(.*[._])?(image|img|frame|file|name|id|idx|index|number|seq|stamp|time|t)[a-z]*(_.*)?'
 )
 NUMBER = re.compile(r'\d+(?:\.\d+)?')
-LISTED = 3  # names that an error lists
+MAX_LISTED = 3  # names that an error lists
 STEPS, MIN_MOVES, ALIKE = (0.004, 40.0), 9, 0.9  # meters an image; images; cosine
 NORMS = 0.9, 1.1  # range of the norm of a quaternion of a few digits
 MAX_STEP, MAX_EXTENT = 3e-4, 0.5  # positions in degrees: median step, extent; too small in meters
@@ -115,7 +115,7 @@ def _rows_of(
 
 
 def _join(names: Sequence[str]) -> str:
-    return ', '.join(names[:LISTED]) + (' ...' if len(names) > LISTED else '')
+    return ', '.join(names[:MAX_LISTED]) + (' ...' if len(names) > MAX_LISTED else '')
 
 
 def _doubt(poses: np.ndarray, oriented: bool) -> str:

@@ -15,7 +15,7 @@ from stavpr_ros.regular_file import require_regular
 SEPARATORS = ';\t,'  # else blanks
 COMMENTS = ('#', '%', 'sep=')  # a spreadsheet writes the last one
 MIN_STAMP = 1e8  # seconds of 1973; no meters on Earth, and no number of an image
-LONGEST_REASON = 120  # characters
+MAX_REASON = 120  # characters
 FILE = re.compile(r'.*\.[a-z]\w{2,4}', re.IGNORECASE)  # the name of one
 
 
@@ -86,7 +86,7 @@ class Table:
                 comments=None, usecols=columns,
             )  # fmt: skip
         except (OSError, ValueError) as error:
-            reason = str(error).partition(' at row ')[0][:LONGEST_REASON]
+            reason = str(error).partition(' at row ')[0][:MAX_REASON]
             raise self.error(reason, -1 if self.lines else None) from error
 
     def cells(self) -> list[list[str]]:

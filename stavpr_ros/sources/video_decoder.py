@@ -27,7 +27,7 @@ FACTS = struct.Struct('<dddII')  # duration, s; rate, Hz; creation, s since 1970
 FRAME = struct.Struct('<dIII')  # seconds after the start of the first file, file, height, width
 CUT_OFF, JUMP = 1, 2  # width of a header without height
 MEMORY = 4 << 30  # bytes of address space
-COMPLETE = 0.9  # share of the stated duration, which may be an estimate
+MIN_COMPLETE = 0.9  # share of the stated duration, which may be an estimate
 EARLY = 0.002  # seconds that an image may be early by: containers round to milliseconds
 RESTART = 1.0  # seconds back: another recording in the same file, no frames out of order
 AHEAD = 10.0  # seconds, or periods, ahead in a stream: another clock, as ffmpeg takes it, no pause
@@ -139,7 +139,7 @@ def decode(fps: float, paths: list[str], output: Connection) -> None:
                     output.send_bytes(image.reshape(-1).data)
                     due = math.floor(number) + 1
                 end = seconds + 1 / rate
-            if max(end - start, span[1] - span[0]) < COMPLETE * duration:
+            if max(end - start, span[1] - span[0]) < MIN_COMPLETE * duration:
                 output.send_bytes(FRAME.pack(end - start, file, 0, CUT_OFF))
 
 
