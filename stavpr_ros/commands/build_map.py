@@ -303,7 +303,7 @@ def _report(place_map: 'Map', output: str) -> None:
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:
     """Build a map of each input; return the exit code."""
-    from stavpr_ros.features.choice import choose_kind
+    from stavpr_ros.features.extractor import choose_kind
 
     folder = Path(arguments.output)
     if folder.is_file():

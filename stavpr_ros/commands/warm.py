@@ -28,8 +28,8 @@ def _run(_: object) -> None:
     from stavpr_ros.compilation import CACHE
     from stavpr_ros.errors import OutputError, UnavailableError
     from stavpr_ros.features import FeatureExtractor
-    from stavpr_ros.features.choice import choose_kind
     from stavpr_ros.features.efficientnet_lite_file import find_file
+    from stavpr_ros.features.extractor import choose_kind
     from stavpr_ros.mapping import build_map, merge_maps
     from stavpr_ros.pipeline import PipelineSettings
     from stavpr_ros.pipeline.operations import LocalizationOperation, RouteCloser

@@ -20,6 +20,7 @@ from stavpr_ros.units import SECOND, WRAP
 
 RAW = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+PIXEL_FIELDS = 'height', 'width', 'encoding', 'is_bigendian', 'step', 'data'
 VIDEO = {FFMPEG, FOXGLOVE}
 ODOMETRY = 'nav_msgs/msg/Odometry'
 MAX_DISORDER = SECOND // 2  # of messages; more is a clock that jumped back
@@ -93,15 +94,7 @@ class BagSource:
             image = decode_message(message, to_bytes=np.asarray)  # the map decides the range
             return ImageRecord.of_image(image, time_ns, stamp_ns, frame_id)
         return ImageRecord(
-            time_ns,
-            stamp_ns,
-            frame_id,
-            message.height,
-            message.width,
-            message.encoding,
-            bool(message.is_bigendian),
-            message.step,
-            message.data,
+            time_ns, stamp_ns, frame_id, *(getattr(message, name) for name in PIXEL_FIELDS)
         )
 
     def _read(
