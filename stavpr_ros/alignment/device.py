@@ -57,17 +57,17 @@ def accumulate(
             F = torch.zeros(size, dtype=counts, device=d.device)
             S[columns % 2, columns // 2] = d[0]
             continue
-        q, own = divmod(columns + 2 * first - t, 2)
-        here, above = slice(q, q + m), slice(q - 1 + own, q - 1 + own + m)
-        left = slice(q + own, q + own + m)
-        corner, S_before, F_before = S[own, here], S[1 - own], F[1 - own]
+        q, parity = divmod(columns + 2 * first - t, 2)
+        here, above = slice(q, q + m), slice(q - 1 + parity, q - 1 + parity + m)
+        left = slice(q + parity, q + parity + m)
+        corner, S_before, F_before = S[parity, here], S[1 - parity], F[1 - parity]
         vertical, horizontal = S_before[above] + d, S_before[left] + d
         diagonal = corner + d if a is None else corner.addcmul(d, a)
         straight = torch.minimum(vertical, horizontal)
         steps = torch.where(horizontal < vertical, F_before[left], F_before[above])
         torch.minimum(diagonal, straight, out=corner)
         steps = steps if t % 2 else steps - 1
-        torch.where(diagonal < straight, F[own, here], steps, out=F[own, here])
+        torch.where(diagonal < straight, F[parity, here], steps, out=F[parity, here])
     S, F = (table.transpose(0, 1).flatten(0, 1) for table in (S, F))
     return S, F
 

@@ -26,7 +26,7 @@ def rows_of(place_map: Map, name: str) -> list[Row]:
     index, rows = place_map.session_index, []
     index = np.zeros(len(place_map)) if index is None else index
     names = [session.name or session.id for session in place_map.sessions] or [name]
-    for number, own in enumerate(names):
+    for number, session_name in enumerate(names):
         images = np.flatnonzero(index == number)
         probes = images[np.linspace(0, len(images) - 1, min(PROBES, len(images))).astype(int)]
         strips = place_map.features[probes].strips.transpose(1, 0, 2)  # (images, W, d)
@@ -35,18 +35,18 @@ def rows_of(place_map: Map, name: str) -> list[Row]:
         )
         bits = (strips - strips.mean(axis=2, keepdims=True)) @ planes > 0
         text = ' '.join(np.packbits(image_bits).tobytes().hex() for image_bits in bits)
-        rows.append((own, int(place_map.stamps[images[0]]), text))
+        rows.append((session_name, int(place_map.stamps[images[0]]), text))
     return rows
 
 
 def earlier_drive(drive: Row, earlier: Iterable[Row]) -> str:
     """Return the name of the drive that this one repeats; '' = none, or one of another time."""
-    own = [int(word, 16) for word in drive[2].split()]
+    numbers = [int(word, 16) for word in drive[2].split()]
     for name, start, text in earlier:
         has_one_clock = start and drive[1] and (start >= DATED) == (drive[1] >= DATED)
         others = [int(word, 16) for word in text.split()]
-        if len(own) == len(others) and not (has_one_clock and start != drive[1]):
-            is_near = [(a ^ b).bit_count() <= NEAR for a, b in zip(own, others, strict=True)]
+        if len(numbers) == len(others) and not (has_one_clock and start != drive[1]):
+            is_near = [(a ^ b).bit_count() <= NEAR for a, b in zip(numbers, others, strict=True)]
             if sum(is_near) >= SHARE * len(is_near):
                 return name
     return ''

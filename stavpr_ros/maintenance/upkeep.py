@@ -227,13 +227,13 @@ def _with_drive(
     n, is_hit = len(place_map), places >= 0
     # identifiers that stay when places come and go: their numbers where there is none
     ids = tuple(identifier or str(i) for i, identifier in enumerate(place_map.ids))
-    own = tuple(
+    identifiers = tuple(
         ids[place] if place >= 0 else f'{name}/{drive.ids[image] or image}'
         for image, place in zip(images.tolist(), places.tolist(), strict=True)
     )
     session = replace(
         select_places(drive, images),
-        ids=own,
+        ids=identifiers,
         poses=_poses(place_map, drive, images, places),
         sessions=(),
         session_index=None,
@@ -257,11 +257,11 @@ def _poses(
     with_pose = np.flatnonzero(np.isfinite(poses).all(axis=1))
     if drive.poses is None or not len(with_pose):
         return poses
-    own = drive.poses[images]
-    for i in np.flatnonzero((places < 0) & np.isfinite(own).all(axis=1)).tolist():
+    odometry = drive.poses[images]
+    for i in np.flatnonzero((places < 0) & np.isfinite(odometry).all(axis=1)).tolist():
         # the last one that it passed
         at = with_pose[max(int(np.searchsorted(with_pose, i)) - 1, 0)]
-        if np.isfinite(own[at]).all():
-            moved = inverse(matrices(own[at])) @ matrices(own[i])
+        if np.isfinite(odometry[at]).all():
+            moved = inverse(matrices(odometry[at])) @ matrices(odometry[i])
             poses[i] = to_poses(matrices(poses[at]) @ moved)
     return poses

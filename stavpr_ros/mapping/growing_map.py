@@ -225,9 +225,11 @@ class GrowingMap:
         sessions, session_index = self._with_session()
         same_as = self._same_as
         if same_as is not None or self._related:
-            own = np.arange(self._count, dtype=np.int32)
-            same_as = own if same_as is None else np.concatenate([same_as, own[len(same_as) :]])
-            same_as[list(self._related)] = list(self._related.values())
+            roots = np.arange(self._count, dtype=np.int32)
+            if same_as is not None:
+                roots[: len(same_as)] = same_as
+            roots[list(self._related)] = list(self._related.values())
+            same_as = roots
         return Map(
             same_as=same_as,
             sessions=sessions,

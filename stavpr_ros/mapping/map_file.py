@@ -65,7 +65,7 @@ def _manifest(place_map: Map, statistics: MapStatistics | None) -> dict[str, Any
     sessions = place_map.sessions
     if place_map.camera is not None:
         data['intrinsics'] = asdict(place_map.camera)
-    if any(own.camera or own.yaw is not None or own.intrinsics for own in sessions):
+    if any(s.camera or s.yaw is not None or s.intrinsics for s in sessions):
         data['cameras'] = [
             {
                 'name': session.camera,

@@ -42,12 +42,12 @@ def merge_maps(
                 f'{maps[0].dimension}'
             )
         start = int(place_map.stamps[0]) if len(place_map) else 0
-        own = place_map.sessions or (Session(name[:64], name[:128], start=max(start, 0)),)
+        map_sessions = place_map.sessions or (Session(name[:64], name[:128], start=max(start, 0)),)
         numbers = place_map.session_index
         if numbers is None:
             numbers = np.zeros(len(place_map), np.int32)
         index.append(numbers + np.int32(len(sessions)))
-        for session in own:
+        for session in map_sessions:
             intrinsics = session.intrinsics or (place_map.camera if camera is None else None)
             added = replace(session, id=_free_id(session.id, sessions), intrinsics=intrinsics)
             if cameras:
@@ -135,7 +135,7 @@ def _join_same_as(maps: Sequence[Map]) -> np.ndarray | None:
         return None
     parts, first = [], 0
     for place_map in maps:
-        own = np.arange(len(place_map)) if place_map.same_as is None else place_map.same_as
-        parts.append(own + first)
+        roots = np.arange(len(place_map)) if place_map.same_as is None else place_map.same_as
+        parts.append(roots + first)
         first += len(place_map)
     return np.concatenate(parts).astype(np.int32)

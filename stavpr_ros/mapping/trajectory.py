@@ -25,25 +25,25 @@ def normalize_pose(pose: np.ndarray) -> np.ndarray:
         quaternion of a norm outside ``NORMS``.
     """
     try:
-        own = np.array(pose, np.float64)
+        copy = np.array(pose, np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(
             f'pose {pose!r:.200} is no array ({error}): expected 7 numbers'
         ) from error
-    require_shape('pose, x y z and quaternion x y z w', own, '7')
-    if not (np.abs(own) <= MAX_COORDINATE).all():  # NaN as well
+    require_shape('pose, x y z and quaternion x y z w', copy, '7')
+    if not (np.abs(copy) <= MAX_COORDINATE).all():  # NaN as well
         raise InputError(
-            f'pose {own.tolist()} is not finite: expected meters up to {MAX_COORDINATE:g} and a '
+            f'pose {copy.tolist()} is not finite: expected meters up to {MAX_COORDINATE:g} and a '
             'quaternion'
         )
-    norm = float(np.linalg.norm(own[3:]))
+    norm = float(np.linalg.norm(copy[3:]))
     if not NORMS[0] <= norm <= NORMS[1]:
         raise InputError(
-            f'pose {own.tolist()} has a quaternion of norm {norm:g}: expected one of norm 1, '
+            f'pose {copy.tolist()} has a quaternion of norm {norm:g}: expected one of norm 1, '
             '0 0 0 1 for no rotation'
         )
-    own[3:] /= norm
-    return own
+    copy[3:] /= norm
+    return copy
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:

@@ -98,7 +98,7 @@ class Observations:
         )
         by_depth = np.einsum('mij,mj->mi', projection, slope)
         weight = 1 / (1 + (off**2).sum(axis=1))
-        own = np.bincount(self.keypoint, weight * (by_depth**2).sum(axis=1), keypoints) + 1e-9
+        hessian = np.bincount(self.keypoint, weight * (by_depth**2).sum(axis=1), keypoints) + 1e-9
         pull = np.bincount(self.keypoint, weight * (by_depth * off).sum(axis=1), keypoints)
         shared = np.zeros((count, keypoints, 6))
         both = weight[:, None] * np.einsum('mij,mi->mj', by_motion, by_depth)
@@ -106,14 +106,14 @@ class Observations:
         coupling = shared.transpose(0, 2, 1).reshape(6 * count, keypoints)
         normal, right = information.copy(), information @ _motion_difference(motions, prior)
         for number in range(count):
-            mine, part = self.neighbor == number, slice(6 * number, 6 * number + 6)
-            rows, weights = by_motion[mine].reshape(-1, 6), np.repeat(weight[mine], 2)
+            is_own, part = self.neighbor == number, slice(6 * number, 6 * number + 6)
+            rows, weights = by_motion[is_own].reshape(-1, 6), np.repeat(weight[is_own], 2)
             normal[part, part] += rows.T @ (weights[:, None] * rows)
-            right[part] += rows.T @ (weights * off[mine].ravel())
+            right[part] += rows.T @ (weights * off[is_own].ravel())
         step = -np.linalg.solve(
-            normal - (coupling / own) @ coupling.T, right - coupling @ (pull / own)
+            normal - (coupling / hessian) @ coupling.T, right - coupling @ (pull / hessian)
         )
-        deeper = rho - (pull + coupling.T @ step) / own
+        deeper = rho - (pull + coupling.T @ step) / hessian
         result = motions.copy()
         for motion, change in zip(result, step.reshape(-1, 6), strict=True):
             motion[:3, 3] += change[:3]
@@ -140,18 +140,18 @@ def odometry_information(motions: np.ndarray, before: int) -> np.ndarray:
     for side in (range(before - 1, -1, -1), range(before, len(motions))):
         last = np.eye(4)
         for position, number in enumerate(side):
-            own = motions[number]
-            step = own @ inverse(last)
+            motion = motions[number]
+            step = motion @ inverse(last)
             length = max(float(np.linalg.norm(step[:3, 3])), MIN_LENGTH)
             variances = [(SHIFT[0] + SHIFT[1] * length) ** 2] * 3 + [TURN**2 * length] * 3
             farther = list(side)[position:]
             effect = np.zeros((len(farther), 6, 6))
             # a turn of the step moves all behind it, about its start
-            effect[:, :3, :3] = effect[:, 3:, 3:] = motions[farther, :3, :3] @ own[:3, :3].T
+            effect[:, :3, :3] = effect[:, 3:, 3:] = motions[farther, :3, :3] @ motion[:3, :3].T
             arm = cross((step[:3, :3] @ last[:3, 3])[None])[0]
             effect[:, :3, 3:] = -effect[:, :3, :3] @ arm
             rows = np.ix_(farther, range(6), farther, range(6))
             covariance[rows] += np.einsum('aij,j,bkj->aibk', effect, variances, effect)
-            last = own
+            last = motion
     size = 6 * len(motions)
     return np.asarray(np.linalg.inv(covariance.reshape(size, size)))

@@ -144,9 +144,9 @@ class EdgeEstimator:
             self._source = pair.source, place_camera
             self._views.clear()
             self._landmarks.clear()
-        own, reach, neighbors = self._landmarks_of(pair, pair.place, place_camera)
-        landmarks = [own]
-        for motion, index in zip(own.motions, neighbors, strict=True):
+        place_landmarks, reach, neighbors = self._landmarks_of(pair, pair.place, place_camera)
+        landmarks = [place_landmarks]
+        for motion, index in zip(place_landmarks.motions, neighbors, strict=True):
             if abs(index - pair.place) <= LANDMARK_RADIUS:
                 beside, _, _ = self._landmarks_of(pair, index, place_camera)
                 landmarks.append(beside.transform(inverse(motion)))
@@ -166,7 +166,7 @@ class EdgeEstimator:
         self, pair: MatchedPair, place: int, camera: Camera
     ) -> tuple[Landmarks, float, list[int]]:
         """Return the landmarks of a place, how far from it they serve (m), and its neighbors."""
-        mount, own = matrices(np.array(camera.mount)), matrices(pair.pose(place))
+        mount, place_pose = matrices(np.array(camera.mount)), matrices(pair.pose(place))
         neighbors, indices, reach = [], [], 0.0
         for index in range(place - NEIGHBORS, place + NEIGHBORS + 1):
             if index == place or not pair.thumbnails.get(index):
@@ -174,7 +174,7 @@ class EdgeEstimator:
             pose, view = pair.pose(index), self._view_of(pair, index, camera)
             if view is None or np.isnan(pose).any():
                 continue
-            motion = inverse(matrices(pose) @ mount) @ own @ mount
+            motion = inverse(matrices(pose) @ mount) @ place_pose @ mount
             baseline = float(np.linalg.norm(motion[:3, 3]))
             if baseline > MIN_BASELINE:
                 neighbors.append((view, motion))

@@ -115,8 +115,8 @@ def triangulate(
 def _observations(place: View, neighbors: Sequence[tuple[View, np.ndarray]]) -> Observations:
     """Match the place with each neighbor."""
     pairs = [mutual_matches(place.descriptors, view.descriptors, RATIO) for view, _ in neighbors]
-    keypoint = np.concatenate([mine for mine, _ in pairs]).astype(np.intp)
-    neighbor = np.repeat(np.arange(len(pairs)), [len(mine) for mine, _ in pairs])
+    keypoint = np.concatenate([keypoints for keypoints, _ in pairs]).astype(np.intp)
+    neighbor = np.repeat(np.arange(len(pairs)), [len(keypoints) for keypoints, _ in pairs])
     rays = np.column_stack([place.rays, np.ones(len(place.rays))])
     view_rays = [view.rays[rows] for (_, rows), (view, _) in zip(pairs, neighbors, strict=True)]
     return Observations(keypoint, neighbor, rays[keypoint], np.concatenate(view_rays))

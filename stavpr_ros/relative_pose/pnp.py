@@ -121,15 +121,15 @@ class _Matches:
 def _match(query: View, landmarks: Sequence[Landmarks]) -> _Matches:
     """Match the query with the landmarks of each place."""
     pairs = [mutual_matches(query.descriptors, place.descriptors, RATIO) for place in landmarks]
-    mine = np.concatenate([own for own, _ in pairs])
+    keypoint = np.concatenate([keypoints for keypoints, _ in pairs])
     points, rays, deviations = (
         np.concatenate(
-            [getattr(own, name)[theirs] for own, (_, theirs) in zip(landmarks, pairs, strict=True)]
+            [getattr(place, name)[m] for place, (_, m) in zip(landmarks, pairs, strict=True)]
         )
         for name in ('points', 'rays', 'deviations')
     )
-    pixels = np.ascontiguousarray(query.rays[mine] * query.focal)
-    return _Matches(mine, pixels, points, rays, deviations, query.focal)
+    pixels = np.ascontiguousarray(query.rays[keypoint] * query.focal)
+    return _Matches(keypoint, pixels, points, rays, deviations, query.focal)
 
 
 def _refine(pairs: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,14 +158,14 @@ def _refine(pairs: _Matches, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray
         slope = -pairs.rays * (pairs.deviations / scale**2)[:, None] @ motion[:3, :3].T
         by_depth = np.einsum('mij,mj->mi', projection, slope)
         weight = 1 / (1 + (off**2).sum(axis=1) + shift**2)
-        own = weight * ((by_depth**2).sum(axis=1) + 1)
+        hessian = weight * ((by_depth**2).sum(axis=1) + 1)
         pull = weight * ((by_depth * off).sum(axis=1) + shift)
         coupling = weight[:, None] * np.einsum('mij,mi->mj', by_pose, by_depth)
         normal = np.einsum('m,mij,mik->jk', weight, by_pose, by_pose)
-        normal -= (coupling / own[:, None]).T @ coupling  # Schur complement
-        right = np.einsum('m,mij,mi->j', weight, by_pose, off) - coupling.T @ (pull / own)
+        normal -= (coupling / hessian[:, None]).T @ coupling  # Schur complement
+        right = np.einsum('m,mij,mi->j', weight, by_pose, off) - coupling.T @ (pull / hessian)
         step = -np.linalg.solve(normal, right)
-        shift -= (pull + coupling @ step) / own
+        shift -= (pull + coupling @ step) / hessian
         change = np.eye(4)
         change[:3, :3], change[:3, 3] = cv2.Rodrigues(step[3:])[0], step[:3]
         motion = change @ motion

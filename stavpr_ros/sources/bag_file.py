@@ -96,7 +96,7 @@ class OpenBag:
             for reader in self.readers:
                 has_index = not isinstance(reader, McapReader) or reader.chunks
                 read = reader.messages if has_index else reader.messages_scan
-                connections = [own for own in reader.connections if own.topic in topics]
+                connections = [row for row in reader.connections if row.topic in topics]
                 if connections:  # none would be all
                     parts.append(read(connections, first if start else None, last))
             for connection, time_ns, raw in merge(*parts, key=lambda row: row[1]):

@@ -81,8 +81,8 @@ def _groups(files: Sequence[Path], top: Path, split: Callable[[Path], tuple[str,
         name, rest = split(file.relative_to(top))
         groups.setdefault(name, {})[file] = tuple(map(int, re.findall(r'\d+', rest)))
     if len(groups) > 1 and '' in groups:  # images without a name are of their folder
-        own = groups.pop('')
-        groups[os.path.relpath(os.path.commonpath([file.parent for file in own]), top)] = own
+        loose = groups.pop('')
+        groups[os.path.relpath(os.path.commonpath([file.parent for file in loose]), top)] = loose
     return groups
 
 
@@ -91,10 +91,10 @@ def _role(path: Path) -> tuple[str, str]:
     folders = [part for part in path.parts[:-1] if _words(part, 0)]
     others = [part for part in path.parts[:-1] if part not in folders]
     rest, words = path.stem, {word for part in folders for word in _words(part, 0)}
-    own = [word for word in _words(rest, 1) if word not in words]
-    for word in [*own, *words]:
+    own_words = [word for word in _words(rest, 1) if word not in words]
+    for word in [*own_words, *words]:
         rest = rest.replace(word, ' ')
-    return '/'.join(filter(None, [*folders, '_'.join(own)])), '/'.join([*others, rest])
+    return '/'.join(filter(None, [*folders, '_'.join(own_words)])), '/'.join([*others, rest])
 
 
 def _words(name: str, counters: int) -> list[str]:
@@ -113,7 +113,7 @@ def _stream(path: Path) -> tuple[str, str]:
 
 
 def _is_stamped(group: dict[Path, tuple[int, ...]]) -> bool:
-    return all(own >= (STAMPS,) for own in group.values())
+    return all(numbers >= (STAMPS,) for numbers in group.values())
 
 
 def _parallel(groups: Groups, count: int, common: float) -> Groups:
@@ -123,7 +123,8 @@ def _parallel(groups: Groups, count: int, common: float) -> Groups:
     :param count: images of the folder.
     :param common: smallest share of the counters of the larger group.
     """
-    large = {name: own for name, own in groups.items() if len(own) >= max(2, MIN_SHARE * count)}
+    min_images = max(2, MIN_SHARE * count)
+    large = {name: group for name, group in groups.items() if len(group) >= min_images}
     several: Groups = {}
     for a, b in combinations(large, 2):
         small, other = sorted((large[a], large[b]), key=len)
@@ -131,7 +132,7 @@ def _parallel(groups: Groups, count: int, common: float) -> Groups:
         min_count = len(small) / 2
         if not (_is_stamped(small) and _is_stamped(other)):
             min_count = max(min_count, common * len(other))
-        if sum(first <= own <= last for own in small.values()) >= min_count:
+        if sum(first <= numbers <= last for numbers in small.values()) >= min_count:
             several |= {a: large[a], b: large[b]}
     return several
 

@@ -158,11 +158,11 @@ class FolderSource:
 
 def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
     """List the images of a folder, and count what is left out; links to folders are ignored."""
-    own: list[Path] = []
+    beside: list[Path] = []
     below: list[Path] = []
 
     def fail(error: OSError) -> None:
-        if not own:  # else the sub-folders are not needed
+        if not beside:  # else the sub-folders are not needed
             raise error
 
     unread: Counter[str] = Counter()
@@ -182,7 +182,7 @@ def _images_of(top: Path) -> tuple[list[Path], Counter[str]]:
         unread['format'] += sum(path.stem not in names for path in others)
         unread['bag'] += sum(path.suffix.lower() in STORAGE_SUFFIXES for path in paths)
         unread['video'] += sum(path.suffix.lower() in VIDEOS for path in paths)
-        (own if Path(name) == top else below).extend(images)
-    is_drive = len(own) * MAX_RATIO > len(below)
-    unread['below' if is_drive else 'beside'] = len(below if is_drive else own)
-    return own if is_drive else below, +unread
+        (beside if Path(name) == top else below).extend(images)
+    is_drive = len(beside) * MAX_RATIO > len(below)
+    unread['below' if is_drive else 'beside'] = len(below if is_drive else beside)
+    return beside if is_drive else below, +unread

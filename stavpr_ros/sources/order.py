@@ -44,7 +44,7 @@ def in_order(files: Sequence[Path], top: Path) -> list[Path]:
     for folder, below in (pair for level in levels.values() for pair in pairwise(level)):
         names.setdefault(folder, set()).add(below.name)
     keys: dict[Path, Any] = {}
-    notes = [_add_keys(keys, folder, sorted(own)) for folder, own in names.items()]
+    notes = [_add_keys(keys, folder, sorted(entries)) for folder, entries in names.items()]
     result = sorted(files, key=lambda file: [keys[path] for path in levels[file][1:]])
     result, note = _by_times(result, '; '.join(filter(None, dict.fromkeys(notes))))
     if note:
@@ -65,9 +65,9 @@ def _add_keys(keys: dict[Path, Any], folder: Path, names: list[str]) -> str:
             or _read_restarted_counter(wholes)
             or (natural, '')
         )
-    own = [*zip(values, natural, strict=True)]
-    keys.update(zip((folder / name for name in names), own, strict=True))
-    return guess if [key for _, key in sorted(own)] != sorted(natural) else ''
+    pairs = [*zip(values, natural, strict=True)]
+    keys.update(zip((folder / name for name in names), pairs, strict=True))
+    return guess if [key for _, key in sorted(pairs)] != sorted(natural) else ''
 
 
 def _read_decimals(signs: Texts, wholes: Texts, fractions: Texts) -> tuple[list[Any], str] | None:

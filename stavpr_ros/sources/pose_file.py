@@ -92,12 +92,12 @@ def _rows_of(
     """Return the row of each image by its name, number or stamp; None = they are not named."""
     keys, image_keys = table.labels, list(images)
     if not keys:
-        own = [0] if columns is None and table.width - 1 in NUMBERS else []
+        ids = [0] if columns is None and table.width - 1 in NUMBERS else []
         if columns is not None:
-            own = [i for i, name in enumerate(names) if i not in columns and KEY.fullmatch(name)]
-        if not own:
+            ids = [i for i, name in enumerate(names) if i not in columns and KEY.fullmatch(name)]
+        if not ids:
             return None
-        keys = [str(key) for key in table.numbers(own[:1])[:, 0].tolist()]
+        keys = [str(key) for key in table.numbers(ids[:1])[:, 0].tolist()]
         numbers = [NUMBER.findall(PureWindowsPath(image).stem) for image in images]
         image_keys = [str(float(number[-1])) if number else '' for number in numbers]
     rows = by_name(image_keys, keys)

@@ -133,11 +133,11 @@ def by_name(names: Sequence[str], keys: Sequence[str]) -> np.ndarray:
     """
     best = np.full(len(names), -1)
     for form in (PureWindowsPath.as_posix, attrgetter('name'), attrgetter('stem')):
-        own, others = ([form(PureWindowsPath(text)) for text in texts] for texts in (names, keys))
-        if len({*own}) < len({*names}) or len({*others}) < len({*keys}):
+        texts, others = ([form(PureWindowsPath(text)) for text in row] for row in (names, keys))
+        if len({*texts}) < len({*names}) or len({*others}) < len({*keys}):
             break  # several files of this name
         row_of = {key: row for row, key in enumerate(others)}
-        rows = np.array([row_of.get(name, -1) for name in own])
+        rows = np.array([row_of.get(name, -1) for name in texts])
         best = max(best, rows, key=lambda candidate: np.count_nonzero(candidate >= 0))
     return best
 
