@@ -60,7 +60,7 @@ class GrowingMap:
         self._session_index: np.ndarray | None = None
         self._session_id = ''  # session of the added places, '' = not named yet
         self._same_as: np.ndarray | None = None
-        self._related: dict[int, int] = {}  # added places that show the same as an earlier one
+        self._relations: dict[int, int] = {}  # added places that show the same as an earlier one
         self.ids: list[str] = []  # '' = none
         self.thumbnails: list[bytes] = []  # small JPEGs, an empty one = none
 
@@ -114,8 +114,8 @@ class GrowingMap:
 
         :param replaces: also where the place is related already.
         """
-        if replaces or place not in self._related:
-            self._related[place] = (
+        if replaces or place not in self._relations:
+            self._relations[place] = (
                 earlier if self._same_as is None else int(self._same_as[earlier])
             )
 
@@ -224,11 +224,11 @@ class GrowingMap:
             features = features[np.arange(self._count)]
         sessions, session_index = self._with_session()
         same_as = self._same_as
-        if same_as is not None or self._related:
+        if same_as is not None or self._relations:
             roots = np.arange(self._count, dtype=np.int32)
             if same_as is not None:
                 roots[: len(same_as)] = same_as
-            roots[list(self._related)] = list(self._related.values())
+            roots[list(self._relations)] = list(self._relations.values())
             same_as = roots
         return Map(
             same_as=same_as,

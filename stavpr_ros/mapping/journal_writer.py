@@ -54,7 +54,7 @@ class JournalWriter:
         self._waiting: list[bytes] = []
         self._first = self._needed = 0  # numbers of the first place, and of the first one needed
         self._dirty = self.failed = self._rebased = self._closing = self._deleting = False
-        self._changed = threading.Condition()
+        self._condition = threading.Condition()
         self._thread = threading.Thread(target=self._run, name='journal', daemon=True)
         self._thread.start()
 
@@ -120,7 +120,7 @@ class JournalWriter:
     def append(self, place: JournalPlace) -> None:
         """Add a place: it is in the file when this returns, and synced a second later."""
         content = frame(place.encode())
-        with self._changed:
+        with self._condition:
             if len(self._ends) == 1 and not self._waiting:
                 self._first = place.number
             full = self.failed and sum(map(len, self._waiting)) > MAX_WAITING
@@ -135,17 +135,17 @@ class JournalWriter:
         :param until: number of the first one that is needed; numbers count places.
         :param base: the map that the others continue now; None = as before.
         """
-        with self._changed:
+        with self._condition:
             self._needed = max(until, self._needed)
             if base is not None:
                 self._base, self._rebased = base, True
-                self._changed.notify()
+                self._condition.notify()
 
     def close(self, delete: bool = False) -> None:
         """Sync everything, or delete the journal, and unlock it."""
-        with self._changed:
+        with self._condition:
             self._closing, self._deleting = True, delete
-            self._changed.notify()
+            self._condition.notify()
         self._thread.join()
         if delete and not self._is_removed():
             self.path.unlink(missing_ok=True)
@@ -170,8 +170,8 @@ class JournalWriter:
         """Sync, and rewrite the file where needed, every second."""
         closing = False
         while not closing:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._rebased, SYNC_PERIOD)
+            with self._condition:
+                self._condition.wait_for(lambda: self._closing or self._rebased, SYNC_PERIOD)
                 if self._deleting:
                     return
                 closing = self._closing
@@ -184,14 +184,14 @@ class JournalWriter:
                 self._rewrite_if_needed()
                 self.failed = bool(self._waiting)
             except (OSError, OutputError) as error:
-                with self._changed:
+                with self._condition:
                     self._report(error)
                     self._dirty = True
                 time.sleep(0 if closing else SYNC_PERIOD)
 
     def _rewrite_if_needed(self) -> None:
         """Make a new file if the base changed, most places are forgotten, or it was removed."""
-        with self._changed:
+        with self._condition:
             # others that are forgotten may still wait
             count = min(max(0, self._needed - self._first), len(self._ends) - 1)
             begin, end = self._ends[count], self._ends[-1]
@@ -205,7 +205,7 @@ class JournalWriter:
             write_at(file, head, 0)
             self._copy(file, begin, end, len(head))
             os.fsync(file)
-            with self._changed:
+            with self._condition:
                 self._copy(file, end, self._ends[-1], len(head) + end - begin)  # came meanwhile
                 if removed:
                     self._log(f'{self.path} was removed: its places are written anew to {path}')

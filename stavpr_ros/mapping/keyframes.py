@@ -184,7 +184,7 @@ class KeyframeSelector:
                     f'{settings.interval:g} s'
                 )
         if settings.needs_poses and self._pose is not None and pose is not None:
-            return self._not_moved(normalize_pose(pose), self._pose)
+            return self._motion_reason(normalize_pose(pose), self._pose)
         return ''
 
     def too_alike(self, image: np.ndarray) -> str:
@@ -218,7 +218,7 @@ class KeyframeSelector:
         self._gray, self._compared = compared[1], None
         self._stamp, self._pose = stamp, pose
 
-    def _not_moved(self, pose: np.ndarray, last: np.ndarray) -> str:
+    def _motion_reason(self, pose: np.ndarray, last: np.ndarray) -> str:
         rules = self.settings
         shift, turn = distance(pose, last), rotation(pose, last)
         far = rules.distance and shift >= rules.distance

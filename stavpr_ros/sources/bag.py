@@ -54,13 +54,13 @@ class BagSource:
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
         self.min_size: tuple[int, int] | None = None
-        self._noted: dict[str, str] = {}  # oddities, by their first words
+        self._notes: dict[str, str] = {}  # oddities, by their first words
         with open_bag(self.path) as bag:
             topics = _topics(bag)
         self.topic = _choose_topic(self.path, topics, topic)
         self.message_type, self._count = topics[self.topic]
         files = self.path.iterdir() if self.path.is_dir() else [self.path]
-        self._most = sum(file.stat().st_size for file in files) // MIN_MESSAGE
+        self._max_count = sum(file.stat().st_size for file in files) // MIN_MESSAGE
 
     def __len__(self) -> int:
         """
@@ -68,7 +68,7 @@ class BagSource:
 
         At most as many as its files have room for: list() reserves memory for so many.
         """
-        return min(max(self._count, 0), self._most)
+        return min(max(self._count, 0), self._max_count)
 
     def __iter__(self) -> Iterator[Frame]:
         """Decode one image after the other."""
@@ -135,7 +135,7 @@ class BagSource:
 
     def _note(self, watch: StreamWatch) -> None:
         for text in watch.oddities():
-            first = self._noted.setdefault(text.split()[0], text)  # later ones have other numbers
+            first = self._notes.setdefault(text.split()[0], text)  # later ones have other numbers
             note_once(f'{self.path}, {self.topic}: {first}')
 
     def _message(self, bag: OpenBag, raw: bytes) -> Any:

@@ -70,7 +70,7 @@ class FolderSource:
         self.on_error = on_error
         self.to_bytes: ToBytes | None = None
         self.min_size: tuple[int, int] | None = None
-        self._counted: set[Path] = set()
+        self._page_files: set[Path] = set()
         try:
             files, self.left_out = _images_of(self.path)
         except OSError as error:
@@ -150,8 +150,8 @@ class FolderSource:
             ) from error
         except ImageError as error:
             raise ImageError(f'{text_of(file)}: {error}', kind=error.kind) from error
-        if file not in self._counted:
-            self._counted.add(file)
+        if file not in self._page_files:
+            self._page_files.add(file)
             self.left_out += Counter(pages=more_images(data))
         return image
 

@@ -53,8 +53,8 @@ class Table:
         in_spreadsheet = self._separator in (';', '\t') and '.' not in (second or first)
         self._point = ',' if in_spreadsheet else '.'  # as German programs write numbers
         names, cells = self._cells(first), self._cells(second or first)
-        self._ended = len(cells) > 1 and not cells[-1]  # a separator ends each line
-        width = len(cells) - self._ended
+        self._ends_with_separator = len(cells) > 1 and not cells[-1]  # a separator ends each line
+        width = len(cells) - self._ends_with_separator
         names = [''] * (width - len(names)) + names
         unnamed = not names[0]
         is_labeled = is_name(cells[0]) or (unnamed and _is_header(names[1:], width - 1, True))
@@ -99,7 +99,7 @@ class Table:
         for number, line in islice(self._lines(), int(self._header), None):
             self.lines.append(number)
             row = line.replace(self._point, '.')
-            row = row.removesuffix(self._separator or '') if self._ended else row
+            row = row.removesuffix(self._separator or '') if self._ends_with_separator else row
             if self._label is not None:
                 cells = row.split(self._separator)
                 self.labels += [cell.strip(' "') for cell in cells[self._label :][:1]]
