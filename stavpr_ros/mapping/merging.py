@@ -9,6 +9,7 @@ from itertools import count
 import numpy as np
 from stavpr_ros.errors import FeatureMismatchError, InputError
 from stavpr_ros.features import LocalFeatures
+from stavpr_ros.mapping.camera import yaw_of
 from stavpr_ros.mapping.place_map import Map, Session
 
 
@@ -53,7 +54,7 @@ def merge_maps(
             if cameras:
                 calibration, (label, yaw) = added.intrinsics or camera, cameras[number]
                 if yaw is None and calibration is not None:
-                    yaw = calibration.yaw
+                    yaw = yaw_of(calibration.mount)
                 added = replace(added, camera=label, yaw=yaw)
             sessions.append(added)
     poses = [
