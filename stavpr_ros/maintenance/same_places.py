@@ -7,6 +7,7 @@ A session is related to the sessions before it, and the end of a closed route to
 """
 
 from dataclasses import replace
+from itertools import pairwise
 import math
 
 import numpy as np
@@ -15,6 +16,7 @@ from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import Map, select_places
 from stavpr_ros.method.localizer import PlaceRecognizer
 from stavpr_ros.method.match import Match
+from stavpr_ros.method.model import MODEL
 from stavpr_ros.method.settings import RecognizerSettings
 from stavpr_ros.progress import Progress
 
@@ -79,10 +81,26 @@ def with_same_places(place_map: Map, first: int = 1) -> Map:
         if not len(earlier):
             continue
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
-        matched = recognize_places(reference, place_map, places)
+        matched = fill_gaps(recognize_places(reference, place_map, places))
         is_matched = matched >= 0
         same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
     return replace(place_map, same_as=same_as.astype(np.int32))
+
+
+def fill_gaps(matched: np.ndarray) -> np.ndarray:
+    """
+    Return the matched places of images in order, those of short gaps by their neighbors.
+
+    Within a window, a camera at a possible speed has not been elsewhere.
+
+    :param matched: of each image, -1 = none, (n,).
+    """
+    filled, images = matched.copy(), np.flatnonzero(matched >= 0)
+    for first, last in pairwise(images.tolist()):
+        start, end, gap = int(matched[first]), int(matched[last]), last - first
+        if gap <= SequenceSettings().length and 0 <= end - start <= max(MODEL.speeds) * gap:
+            filled[first : last + 1] = np.rint(np.linspace(start, end, gap + 1))
+    return filled
 
 
 def _looks_elsewhere(place_map: Map, session: int, other: int) -> bool:

@@ -83,6 +83,7 @@ class ColumnLayout:
         # of each column; in a gap, the place before it, and a position far from all
         before = self.columns.searchsorted(np.arange(self._width), 'right') - 1
         self._places = places[before]
+        self._direction = np.where(before < self._along, 1, -1)
         self._positions = np.full(self._width, -2 * self._width)
         self._positions[self.columns] = self.columns[same_as[places]]
         self._same_as = same_as
@@ -95,9 +96,8 @@ class ColumnLayout:
         """
         if self.columns is None:
             return changes
-        is_along = np.arange(self._width) <= self.columns[self._along - 1]
         later = np.minimum(self._places + 1, self._n - 1)
-        out: np.ndarray = changes[np.where(is_along, self._places, later)]
+        out: np.ndarray = changes[np.where(self._direction > 0, self._places, later)]
         for first in self._firsts if self.lap else ():  # over the seam: as behind it
             out[first + self._n] = out[first + self._n + 1]
         out[self._firsts], out[self.gaps] = 1, 1
@@ -137,7 +137,7 @@ class ColumnLayout:
 
     def direction_of(self, column: int) -> int:
         """Return 1 of a column passed along the map, -1 of one against it."""
-        return 1 if self.columns is None or column <= self.columns[self._along - 1] else -1
+        return 1 if self.columns is None else int(self._direction[column])
 
     def seam_columns(self, path: np.ndarray) -> slice:
         """
@@ -165,10 +165,19 @@ class ColumnLayout:
         return np.asarray(places) if self.columns is None else self.columns[self._same_as[places]]
 
     def around(self, column: int, radius: int) -> np.ndarray:
-        """Return the columns of positions near a column's, as first ones and ends, (m, 2)."""
+        """
+        Return the columns near a column, as first ones and ends, (m, 2).
+
+        These are the columns whose positions are within the radius, and those within it beside
+        a column of the same position: another session has fewer places, or more.
+        """
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
-        near = np.flatnonzero(self._apart(self._positions, self._positions[column]) <= radius)
+        apart = self._apart(self._positions, self._positions[column])
+        is_near = apart <= radius
+        for same in np.flatnonzero(apart <= CLOSE).tolist():
+            is_near[max(same - radius, 0) : same + radius + 1] = True
+        near = np.flatnonzero(is_near)
         ends = np.flatnonzero(np.diff(near) > 1)
         return np.stack([near[np.append(0, ends + 1)], near[np.append(ends, -1)] + 1], axis=1)
 

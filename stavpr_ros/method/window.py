@@ -346,11 +346,12 @@ class FilterWindow(QueryWindow):
         """Return quantities with those that compare the path with straight ones elsewhere."""
         l, at = len(path), int(path[position])
         steps = np.rint(np.outer(STRAIGHT, np.arange(l) - position)).astype(np.int64)
-        near, here = self.layout.around(at, APART), slice(at - CLOSE, at + CLOSE + 1)
-        score, _ = self.filter.best_straight(steps, here, near[:0])
+        near, straight = self.layout.around(at, APART), self.filter.best_straight
+        here = self.layout.around(at, CLOSE)  # in all sessions
+        score = max(straight(steps, slice(*span), near[:0])[0] for span in here.tolist())
         if self._is_route:  # the camera may have passed there several times
             return quantities._replace(lead=max(score, 0.0), images=ROUTE_IMAGES)
-        elsewhere, competitor = self.filter.best_straight(steps, slice(0, self.size), near)
+        elsewhere, competitor = straight(steps, slice(0, self.size), near)
         lead = max(score - max(elsewhere, 0.0), 0.0)
         cells = 0.0 if self.cells is None else self.cells.lead(path, competitor)
         creep = self.change.creep(int(path[0]), int(path[-1]), l)
