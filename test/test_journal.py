@@ -1,15 +1,17 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The journal: every recorded place is on disk, whatever ends the recording."""
+"""The journal: every recorded place is on disk, whatever ends a recording or build_map."""
 
 from dataclasses import asdict, replace
 import json
 import os
 from pathlib import Path
+import re
 import struct
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 import zlib
 
 from fixtures import disk_of
@@ -17,8 +19,11 @@ from map_files import changed
 import numpy as np
 from pipelines import Log, process, save, settings_of
 import pytest
+from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import JournalError, OutputTakenError
-from stavpr_ros.mapping import journal_writer, load_map, save_map
+from stavpr_ros.features import FeatureExtractor, LocalFeatures
+from stavpr_ros.mapping import build_map, journal_writer, KeyframeSettings, load_map, save_map
+from stavpr_ros.mapping.builder import build_journal
 from stavpr_ros.mapping.journal import (
     Base,
     frame,
@@ -28,11 +33,12 @@ from stavpr_ros.mapping.journal import (
     PIECE,
     row_of,
 )
-from stavpr_ros.mapping.journal_map import journals, recover
+from stavpr_ros.mapping.journal_map import journal_map, journals, recover
 from stavpr_ros.mapping.journal_writer import JournalWriter
 from stavpr_ros.mapping.place_map import Place
 from stavpr_ros.pipeline import Pipeline, read_map
 from stavpr_ros.pipeline.saving import recover_maps
+from stavpr_ros.sources.frame import Frame
 
 BYTES = (0, 5, 9, 13, 20, 1500)  # of each part of a record
 
@@ -552,3 +558,104 @@ def test_full_disk_ends_neither_the_recording_nor_the_journal(case, target, tmp_
     places = int(done.stdout.split()[-1])
     assert places == 60 if case == 'room' else 10 < places < 50
     assert stamps(output) == seconds(*range(1, places + 1))
+
+
+# An interrupted build_map continues where it was, in memory that does not grow
+
+EXTRACTOR = FeatureExtractor('gradient')
+
+
+class StopError(Exception):
+    """The work is interrupted."""
+
+
+@pytest.fixture
+def frames(route):
+    return [Frame(image, (i + 1) * 10**9, f'image {i}') for i, image in enumerate(route)]
+
+
+@pytest.fixture
+def poses(frames):
+    poses = np.zeros((len(frames), 7))
+    poses[:, 0], poses[:, 6] = np.arange(len(frames)), 1
+    return poses
+
+
+def until(frames, count):
+    """Yield frames up to a number, and then interrupt the work."""
+    yield from frames[:count]
+    raise StopError
+
+
+@pytest.mark.parametrize('keyframes', [None, KeyframeSettings(distance=1.5)])
+def test_build_journal_interrupted_twice_gives_the_map_of_one_run(
+    frames, poses, tmp_path, keyframes
+):
+    target, journal = tmp_path / 'route.stavpr', tmp_path / 'route.stavpr.journal'
+    options = {'keyframes': keyframes, 'progress': False}
+    for count in (20, 45):
+        with pytest.raises(StopError):
+            build_journal(until(frames, count), EXTRACTOR, target, 'drive', poses, **options)
+    with JournalReader(journal) as reader:
+        assert 15 <= [place.number for place in reader.places()][-1] < 45
+    content = journal.read_bytes()
+    journal.write_bytes(content.replace(content[-20_000:-19_991], bytes(9)))
+    build_journal(frames, EXTRACTOR, target, 'drive', poses, **options)
+    save_map(journal_map(journal), target)
+    assert_equal(target, build_map(frames, EXTRACTOR, poses, **options))
+    assert build_journal(frames, EXTRACTOR, target, 'drive', poses, **options) == journal
+
+
+def test_build_journal_of_another_work_is_refused(frames, tmp_path):
+    target = tmp_path / 'route.stavpr'
+    with pytest.raises(StopError):
+        build_journal(until(frames, 40), EXTRACTOR, target, 'drive', progress=False)
+    projected = FeatureExtractor('gradient', projection=8)
+    for extractor, source in ((EXTRACTOR, 'other'), (projected, 'drive')):
+        with pytest.raises(JournalError, match='is of other images or options'):
+            build_journal(frames, extractor, target, source, progress=False)
+
+
+def test_build_journal_memory_does_not_grow_with_the_places(tmp_path):
+    """Places of 6 kB, 126 MB in all."""
+    n, d, memory = 20_000, 224, []
+    image = np.zeros((96, 128, 3), np.uint8)
+
+    def resident():
+        with open('/proc/self/status') as file:
+            return int(re.search(r'VmRSS:\s+(\d+) kB', file.read())[1]) / 1e3
+
+    def frames():
+        for i in range(n):
+            if i % 1000 == 0:
+                memory.append(resident())
+            yield Frame(image, i, f'{i}')
+
+    class Extractor(SimpleNamespace):
+        def extract(self, images):
+            strips = np.full((7, len(images), d), d**-0.5, np.float32)
+            weights = np.full((7, len(images)), 7**-0.5, np.float32)
+            return LocalFeatures(strips, weights, EXTRACTOR.settings, (14, 2))
+
+    extractor = Extractor(settings=EXTRACTOR.settings, projection=None)
+    journal = build_journal(frames(), extractor, tmp_path / 'x', 'drive', progress=False)
+    memory.append(resident())
+    place_map = journal_map(journal)
+    memory.append(resident())
+    save_map(place_map, tmp_path / 'map.stavpr')
+    memory.append(resident())
+    assert len(place_map) == n
+    assert max(memory) - memory[1] < 60
+
+
+def test_recover_map_of_an_interrupted_build_has_the_places_so_far(frames, tmp_path, capsys):
+    target = tmp_path / 'route.stavpr'
+    with pytest.raises(StopError):
+        build_journal(until(frames, 40), EXTRACTOR, target, 'drive', progress=False)
+    assert map_command.main(['recover', str(tmp_path / 'x')]) == 1
+    assert 'name the map' in capsys.readouterr().err
+    assert map_command.main(['recover', f'{target}.journal']) == 0
+    places = len(load_map(target))
+    assert 15 < places <= 40
+    assert f'{target}: {places} places, {places} of them from' in capsys.readouterr().out
+    assert os.listdir(tmp_path) == ['route.stavpr']

@@ -1,13 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure: bounded memory, exclusion by seconds, resets, against a plain loop."""
+"""Loop closure: a route that grows and is evicted, means of its places, and a reset."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 import math
 
 import numpy as np
-from places import features_of
+from places import features_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
@@ -23,7 +23,8 @@ from stavpr_ros.method.loop_closer import (
     PathConfirmation,
 )
 from stavpr_ros.method.match import Limits, Match, Path, WindowColumns
-from stavpr_ros.method.model import CLOSE
+from stavpr_ros.method.model import CLOSE, DELAY, MEAN_IMAGES, MEAN_PRIOR, NEAREST
+from stavpr_ros.method.place_means import PlaceMeans
 from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare import route_features
 from stavpr_ros.prepare.centering import z_normalized
@@ -385,3 +386,130 @@ def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
     kept = laps[less.first :]
     np.testing.assert_allclose(less.features().strips, kept.strips, atol=0.05, rtol=0)
     np.testing.assert_allclose(less.features().weights, kept.weights, rtol=1e-5, atol=1e-5)
+
+
+# Means of places over the latest images, and loop closure on a new street in a known light
+
+EXCLUDED = 50
+
+
+def expected_means(rows, places):
+    """Return the means by the definition, (places,), of rows that count, oldest first."""
+    weights = (1 - 1 / MEAN_IMAGES) ** np.arange(len(rows))[::-1]
+    known = [np.append(row, np.full(places - len(row), row[-1])) for row in rows]
+    clipped = np.maximum(np.reshape(known, (len(rows), places)), NEAREST)
+    return weights @ clipped / (weights.sum() + MEAN_PRIOR)
+
+
+def test_means_are_weighted_ones_of_earlier_rows_with_unknown_places_as_the_last():
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(0, 2, 3 + i).astype(np.float32) for i in range(12)]
+    means = PlaceMeans()
+    for i, row in enumerate(rows):
+        counted = rows[: max(0, i - DELAY)]
+        less = means.subtracted(row, False)
+        np.testing.assert_allclose(less, row - expected_means(counted, len(row)), atol=1e-5)
+
+
+def test_places_that_are_excluded_count_as_mean_0():
+    means = PlaceMeans()
+    for _ in range(10):
+        means.subtracted(np.array([np.inf, 1.0], np.float32), False)
+    less = means.subtracted(np.array([2.0, 2.0], np.float32), False)
+    assert less[0] == 2
+    assert less[1] < 2
+    assert means.subtracted(np.array([np.inf, 1.0], np.float32), False)[0] == np.inf
+
+
+def test_evicted_places_take_their_means_with_them():
+    rng = np.random.default_rng(2)
+    rows = rng.normal(0, 1, (30, 40)).astype(np.float32)
+    whole, evicted = PlaceMeans(), PlaceMeans()
+    for row in rows:
+        whole.subtracted(row, False)
+        evicted.subtracted(row, False)
+    evicted.evict(7)
+    for row in rows:
+        kept = evicted.subtracted(row[7:], False)
+        np.testing.assert_array_equal(kept, whole.subtracted(row, False)[7:])
+    evicted.evict(33)
+    assert len(evicted.subtracted(np.empty(0, np.float32), False)) == 0
+
+
+def drive_along(strips, noise=0.3):
+    """Return the matches of a route with images of these strips."""
+    features = features_of(strips, noise)
+    closer = LoopCloser(RecognizerSettings(mode='robust'), EXCLUDED, features.settings)
+    return recognize_all(closer, features)
+
+
+def with_shared_content(seed, amount):
+    """Return strips; from place 200 on, all share content with places 60 to 75."""
+    strips = route_strips(seed, 300)
+    shared = amount * np.random.default_rng(seed + 50).standard_normal((7, 1, strips.shape[2]))
+    strips[:, 60:75] += shared
+    strips[:, 200:260] += shared
+    return strips
+
+
+def probable(matches):
+    return sum(match.probability > RecognizerSettings.min_probability for match in matches)
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(monkeypatch, seed):
+    """No place is passed again, then all are."""
+    strips = with_shared_content(seed, 1.6)
+    assert probable(drive_along(strips)) <= 10
+    twice = drive_along(np.concatenate([strips, strips], axis=1))
+    places = [match.path.place for match in twice if match.accepted]
+    off = np.array(places) - np.arange(len(places))
+    assert len(places) > 265
+    assert np.mean(np.abs(off - np.median(off)) <= 4) > 0.95
+    assert probable(drive_along(strips, noise=1.0)) <= 3
+    monkeypatch.setattr(PlaceMeans, 'subtracted', lambda self, z, is_standstill: z)
+    assert probable(drive_along(strips, noise=1.0)) > 8
+
+
+@pytest.mark.parametrize('seed', [0, 3, 4])
+def test_stretch_that_looks_alike_for_less_than_a_window_is_not_closed(seed):
+    matches = drive_along(with_shared_content(seed, 1.8))
+    assert probable(matches) <= 15
+    assert not any(match.accepted or match.late for match in matches)
+
+
+# A loop closer after its reset, as test_golden_streams has the recognizers of maps
+
+N = 120
+ROUTE = route_strips(0, N)
+DRIVE = features_of(np.concatenate([ROUTE[:, :95], route_strips(9, 30), ROUTE[:, 85:]], 1), 0.5, 7)
+DRIVE.strips[:, 70:95] = DRIVE.strips[:, 69:70]  # a stop before the detour
+POSES = np.tile([0.0, 0, 0, 0, 0, 0, 1], (2 * N, 1))
+POSES[:, 0] = 1.1 * np.arange(2 * N)
+
+
+def fields_of(recognizer, features, image):
+    """Return all fields of the match of the next image as text."""
+    match = recognizer.update(features[image : image + 1], (image + 1) * 10**8, POSES[image])
+    return repr([np.asarray(getattr(match, each.name), object).tolist() for each in fields(Match)])
+
+
+def assert_same(one, new, features):
+    pairs = [
+        [fields_of(each, features, image) for each in (one, new)] for image in range(len(features))
+    ]
+    assert [first for first, _ in pairs] == [second for _, second in pairs]
+    assert sum('Status.MATCH' in first for first, _ in pairs) > 10
+
+
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
+def test_loop_closer_after_a_reset_answers_as_a_new_one_on_its_route(precision):
+    """The route stays; another one has the same without any window, by a reset at each image."""
+    options = {'limit': 240, 'precision': precision}
+    one, new = (LoopCloser(RecognizerSettings(), 30, DRIVE.settings, **options) for _ in 'ab')
+    for image in range(len(DRIVE)):
+        fields_of(one, DRIVE, image)
+        fields_of(new, DRIVE, image)
+        new.reset()
+    one.reset()
+    assert_same(one, new, features_of(ROUTE, 0.5, 8))

@@ -1,11 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The set-up behind the Makefile: what it installs and builds; it needs no network."""
+"""The set-up behind the Makefile, and the stored list of the public API."""
 
+import difflib
 from pathlib import Path
 import re
 import sys
 
+from public_api import COMMAND, FILE, public_api
 import pytest
 import setup_venv
 
@@ -56,3 +58,12 @@ def test_extras_are_added_and_kept(recorder):
     installed = re.findall(r'locked/(\w+)\.txt', recorder.commands['pip'])
     assert installed == ['base', 'onnx', 'dev']
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
+
+
+# The public API is that of the stored list: a change of a promised name is visible in review
+
+
+def test_public_api_is_that_of_the_stored_list():
+    stored = FILE.read_text(encoding='utf-8').splitlines()
+    changes = [*difflib.unified_diff(stored, public_api().splitlines(), n=0, lineterm='')]
+    assert not changes, '\n'.join([f'write the changed list by {COMMAND}:', *changes])
