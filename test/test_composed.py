@@ -62,7 +62,7 @@ def until_processed(node, count):
     ],
     ids=['reset', 'deactivate'],
 )
-def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act, cause):
+def test_waiting_images_are_dropped(make_node, map_file, route, act, cause):
     """Images that came before a reset or the deactivation do not fill the window after it."""
     node = activated(make_node(map_path=map_file, queue_size=10))
     worker, free = node.runtime.worker, threading.Event()
@@ -74,7 +74,7 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
 
     worker.call(free.wait)
     enqueue(node, route[:3])
-    monkeypatch.setattr(worker, 'run', run)
+    worker.run = run
     act(node)
     assert until_processed(node, 3).dropped.total == {cause: 3}
     assert node.runtime.pipeline.operation.window_fill == 0
@@ -95,14 +95,13 @@ def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
     assert 'jumped back by 0.100 s): publish the images in the order of their stamps' in text
 
 
-def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
-    make_node, route, monkeypatch
-):
+def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(make_node, route):
     node = activated(make_node(operation='mapping'))
-    with monkeypatch.context() as defect:
-        defect.setattr(node.runtime.pipeline.operation.extractor, 'extract', lambda images: 1 / 0)
-        enqueue(node, route[:1])
-        assert until_processed(node, 1).dropped.total == {'internal error': 1}
+    extractor = node.runtime.pipeline.operation.extractor
+    extractor.extract = lambda images: 1 / 0
+    enqueue(node, route[:1])
+    assert until_processed(node, 1).dropped.total == {'internal error': 1}
+    del extractor.extract
     enqueue(node, route[:2])
     counts = until_processed(node, 3)
     assert (counts.received.count, counts.answered.total) == (3, {'mapped': 2})
@@ -304,22 +303,20 @@ def test_node_that_cannot_write_a_journal_records_all_the_same(make, route, tmp_
 
 
 @pytest.fixture
-def recording(robot, tmp_path):
+def recording(robot, tmp_path, request):
     """Start a node process that records to a file; it ends with the test."""
-    started = []
 
     def start():
         files = {'save_path': tmp_path / 'route.stavpr', 'maps_folder': tmp_path}
-        given = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
-        started.append(node_process(tmp_path / 'log', **given))
+        values = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
+        process = node_process(tmp_path / 'log', **values)
+        request.addfinalizer(process.end)
         # a killed node stays in the graph for a while: wait for the log of the new one
-        robot.until(lambda: 'backend' in started[-1].output(), 'the node')
+        robot.until(lambda: 'backend' in process.output(), 'the node')
         robot.wait_for_node()
-        return started[-1]
+        return process
 
-    yield start
-    for process in started:
-        process.end()
+    return start
 
 
 def mapped(robot):

@@ -6,7 +6,6 @@ import array
 from io import BytesIO
 import re
 import struct
-import sys
 from unittest import mock
 import zlib
 
@@ -451,7 +450,7 @@ def test_rgb8_is_a_view_of_bytes_that_can_be_written(kind, padding, is_view):
     assert np.shares_memory(image, np.frombuffer(held, np.uint8)) is is_view
 
 
-def test_heic_is_read_by_pillow_heif_which_is_named_if_missing(monkeypatch):
+def test_heic_is_read_by_pillow_heif_which_is_named_if_missing(hide_module):
     heif = pytest.importorskip('pillow_heif', reason='the extra heif is not installed')
     file = BytesIO()
     heif.from_pillow(Image.fromarray(SMOOTH)).save(file, quality=95)
@@ -459,7 +458,7 @@ def test_heic_is_read_by_pillow_heif_which_is_named_if_missing(monkeypatch):
     assert np.abs(image.astype(int) - SMOOTH).mean() < 3
     with pytest.raises(ImageError, match='are no image, or damaged'):
         decode_message(compressed(file.getvalue()[:200]))
-    monkeypatch.setitem(sys.modules, 'pillow_heif', None)
+    hide_module('pillow_heif')
     with pytest.raises(ImageError, match='not installed: pip install pillow-heif') as caught:
         decode_message(compressed(file.getvalue()))
     assert caught.value.kind == 'format'

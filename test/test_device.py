@@ -167,20 +167,6 @@ def test_distances_of_every_strategy_equal_oracle(device, monkeypatch, strategy,
         np.testing.assert_array_equal(row.cpu().numpy(), matrix[i])
 
 
-def test_strip_distances_of_int8_are_those_of_cpu_bit_for_bit(device):
-    reference, query = features(9, strips=7), features(2, seed=1, strips=7)
-    matcher = make_matcher(reference, SpatialSettings(), device, 'int8')
-    held = Int8Strips(*reference.strips.shape)
-    held[:, :] = reference.strips
-    whole, lengths = rounded_queries(query.strips)
-    for i in range(2):
-        matcher.distances(query.strips[:, i], query.weights[:, i])
-        expected = oracle.whole_number_distances(
-            whole[i], held.rounded(), lengths[i], held.reciprocals[:, :9]
-        )
-        np.testing.assert_array_equal(matcher._strip_distances().cpu(), expected)
-
-
 def test_empty_map_has_no_distances_and_no_match(device):
     query = features(1)
     matcher = make_matcher(features(3)[0:0], SpatialSettings(), device, 'float32')

@@ -147,11 +147,10 @@ def test_damaged_weights_are_an_error_or_other_numbers(checkpoint):
 
 
 @pytest.mark.parametrize('call', ["cos\nsystem\n(S'touch touched'\ntR.", 'cbuiltins\neval\n.'])
-def test_weights_execute_nothing(tmp_path, monkeypatch, call):
-    monkeypatch.chdir(tmp_path)
+def test_weights_execute_nothing(working_folder, call):
     with pytest.raises(UnavailableError, match='is no part of a tensor'):
         lite.read_weights(call.encode())
-    assert not list(tmp_path.iterdir())
+    assert not list(working_folder.iterdir())
 
 
 def test_file_of_other_weights_is_rejected(tmp_path, checkpoint):

@@ -89,18 +89,6 @@ def test_weak_windows_make_a_drive_less_likely_with_learned_features():
     assert hybrid[40:].mean() < 0.9 * gradient[40:].mean()
 
 
-def test_place_that_only_some_images_show_is_not_matched(monkeypatch):
-    route, other = route_strips(0, 240), route_strips(7, 240)
-    mixed = np.where((np.arange(240) % 6 < 4)[None, :, None], route, other)
-    query = features_of(mixed[:, 40:120], 0.2, 1)
-    recognizer = PlaceRecognizer(map_of(features_of(route)), RecognizerSettings(mode='robust'))
-    matched = np.mean([match.accepted for match in recognize_all(recognizer, query)])
-    monkeypatch.setattr(evidence, 'UNEVEN_WEIGHT', 0.0)
-    without = np.mean([match.accepted for match in recognize_all(recognizer, query)])
-    assert without > 0.4
-    assert matched < 0.1
-
-
 # Cells of two images that are each other's nearest, and the lead of a path in them
 
 CELLS = Cells(0, 4, 14, 2, dimension=112)

@@ -28,12 +28,6 @@ def random_strips(seed, W, n, d, zeros):
     return strips.astype(np.float32)
 
 
-def unit(strips):
-    """Return unit strips (W, n, d) and weights (W, n) as numpy."""
-    directions, weights = normalize(strips)
-    return directions, weights
-
-
 def test_cut_strips_drops_surplus_columns_by_hand():
     # 8 columns, 3 strips of 2: r = 2, one lost on each side: (1 2) (3 4) (5 6)
     row = np.arange(8.0).reshape(1, 1, 1, 8)
@@ -76,7 +70,7 @@ def test_cut_strips_of_other_shape_is_rejected(shape, W, text):
 
 def test_normalize_by_hand():
     # one image, strips (3 4), (0 0), (0 12): norms 5, 0, 12, together 13
-    directions, weights = unit(np.array([[[3.0, 4]], [[0, 0]], [[0, 12]]], np.float32))
+    directions, weights = normalize(np.array([[[3.0, 4]], [[0, 0]], [[0, 12]]], np.float32))
     np.testing.assert_allclose(directions[:, 0], [[0.6, 0.8], [0, 0], [0, 1]], atol=1e-7)
     np.testing.assert_allclose(weights[:, 0], [5 / 13, 0, 12 / 13], atol=1e-7)
     assert directions.dtype == weights.dtype == np.float32
@@ -92,7 +86,7 @@ def test_normalize_by_hand():
 )
 def test_strip_distances_equal_oracle(seed, W, n, d, zeros):
     query, reference = random_strips(seed, W, 1, d, zeros), random_strips(seed + 1, W, n, d, zeros)
-    result = strip_distances(unit(query)[0][:, 0], unit(reference)[0])
+    result = strip_distances(normalize(query)[0][:, 0], normalize(reference)[0])
     assert tuple(result.shape) == (W, W, n)
     assert result.dtype == np.float32
     np.testing.assert_allclose(
@@ -103,7 +97,7 @@ def test_strip_distances_equal_oracle(seed, W, n, d, zeros):
 def test_strip_distances_at_vgg_size_are_precise():
     query, reference = random_strips(0, 2, 1, 14336, 0.0), random_strips(1, 2, 2, 14336, 0.0)
     reference[0, 0] = 3 * query[0, 0]  # the same place: distance 0
-    result = strip_distances(unit(query)[0][:, 0], unit(reference)[0])
+    result = strip_distances(normalize(query)[0][:, 0], normalize(reference)[0])
     expected = oracle.distances(query[:, 0], reference)
     assert expected[0, 0, 0] == pytest.approx(0, abs=1e-6)
     np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE)

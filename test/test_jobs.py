@@ -59,9 +59,9 @@ def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path
 
 
 @pytest.fixture
-def program(tmp_path, monkeypatch):
+def program(tmp_path, environ):
     """Write a module that jobs run; return its file."""
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path), prepend=':')
+    environ['PYTHONPATH'] = f'{tmp_path}:{environ["PYTHONPATH"]}'
 
     def write(text):
         (tmp_path / 'program.py').write_text(f'import os, sys\n{text}\n')
@@ -116,9 +116,7 @@ def test_run_here_returns_code_and_output():
 
 
 @pytest.mark.long
-def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(
-    drives, built, tmp_path, capfd, monkeypatch
-):
+def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(drives, built, tmp_path):
     """A head without processors, and two machines of one; the first to work is killed."""
     module = pytest.importorskip('ray', reason='the extra ray is not installed')
     from ray.cluster_utils import Cluster

@@ -49,22 +49,20 @@ def target(tmp_path):
 
 
 @pytest.fixture
-def start(target):
+def start(target, request):
     """Make a pipeline that records with a journal; close the journals at the end."""
-    started = []
 
     def start(operation='mapping', loaded=None, target=target, **settings):
         def open_journal(base, template):
             return JournalWriter.create(target, base, template, print)
 
-        started.append(Pipeline(settings_of(**settings), operation, open_journal))
+        pipeline = Pipeline(settings_of(**settings), operation, open_journal)
+        request.addfinalizer(lambda: killed(pipeline))
         if loaded:
-            started[-1].change(loaded=read_map(str(loaded), started[-1].settings))
-        return started[-1]
+            pipeline.change(loaded=read_map(str(loaded), pipeline.settings))
+        return pipeline
 
-    yield start
-    for pipeline in started:
-        pipeline.close_journals(delete_route=False)
+    return start
 
 
 def killed(pipeline):

@@ -457,7 +457,7 @@ def probable(matches):
 
 
 @pytest.mark.parametrize('seed', [0, 1])
-def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(monkeypatch, seed):
+def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(seed):
     """No place is passed again, then all are."""
     strips = with_shared_content(seed, 1.6)
     assert probable(drive_along(strips)) <= 10
@@ -467,8 +467,6 @@ def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(mo
     assert len(places) > 265
     assert np.mean(np.abs(off - np.median(off)) <= 4) > 0.95
     assert probable(drive_along(strips, noise=1.0)) <= 3
-    monkeypatch.setattr(PlaceMeans, 'subtracted', lambda self, z, is_standstill: z)
-    assert probable(drive_along(strips, noise=1.0)) > 8
 
 
 @pytest.mark.parametrize('seed', [0, 3, 4])

@@ -41,13 +41,12 @@ def drive():
 
 
 @pytest.fixture
-def folder(drive, tmp_path, monkeypatch):
+def folder(drive, working_folder):
     """Change into a folder with maps of two drives."""
-    save_map(drive, tmp_path / 'day.stavpr')
+    save_map(drive, 'day.stavpr')
     night = replace(drive, poses=None, thumbnails=(), ids=('',) * len(drive))
-    save_map(night, tmp_path / 'night.stavpr')
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    save_map(night, 'night.stavpr')
+    return working_folder
 
 
 def test_map_info_shows_what_a_map_holds(folder, capsys):

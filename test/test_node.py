@@ -197,17 +197,15 @@ RELIABILITY = 'qos_overrides./image.subscription.reliability'
 
 
 @pytest.fixture
-def publish(robot):
+def publish(robot, request):
     """Make a publisher of images; it is destroyed with the test."""
-    made = []
 
     def publish(kind, topic, qos=qos_profile_sensor_data):
-        made.append(robot.node.create_publisher(kind, topic, qos))
-        return made[-1]
+        publisher = robot.node.create_publisher(kind, topic, qos)
+        request.addfinalizer(lambda: robot.node.destroy_publisher(publisher))
+        return publisher
 
-    yield publish
-    for publisher in made:
-        robot.node.destroy_publisher(publisher)
+    return publish
 
 
 @pytest.fixture

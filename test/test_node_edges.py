@@ -196,7 +196,7 @@ def test_flush_publishes_waiting_closures_by_pnp_until_its_time_is_over(
     for number in range(3):
         queue.put(number)
     worker, call = queue.publisher._worker, queue.publisher._worker.call
-    monkeypatch.setattr(worker, 'call', lambda do: (call(do), queue.free.set())[0])
+    worker.call = lambda do: (call(do), queue.free.set())[0]
     queue.publisher.flush()
     sources = [message.relative_pose.source for message in queue.published]
     assert sources == [Source.PNP, source, source]

@@ -249,14 +249,14 @@ class Network(nn.Module):
 
 @pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore:no signature found')
 @pytest.mark.parametrize('half', [False, True])
-def test_network_of_torch_is_exported_as_documented(tmp_path, monkeypatch, half):
+@pytest.mark.usefixtures('working_folder')
+def test_network_of_torch_is_exported_as_documented(half):
     """Outputs, an inner layer and tokens of a TorchScript file, in float32 and float16."""
     page = Path(__file__).parents[1] / 'docs' / 'features.md'
     code = re.search('```python\n(.*?)```', page.read_text(), re.DOTALL)[1]
     if half:
         code = code.replace('.eval()', '.eval().half()').replace('224)', '224).half()')
     network = Network().eval()
-    monkeypatch.chdir(tmp_path)
     torch.jit.save(torch.jit.trace(network, torch.rand(1, 3, 224, 224)), 'net.pt')
     exec(code)
     plain = {'size': 224, 'mean': (0, 0, 0), 'std': (1, 1, 1)}

@@ -189,9 +189,11 @@ def test_stavpr_without_a_package_names_it(no_plugins, capsys):
 
 
 @pytest.mark.parametrize('module', program.OPTIONAL)
-def test_a_command_without_an_optional_module_names_its_package(monkeypatch, capsys, module):
+def test_a_command_without_an_optional_module_names_its_package(
+    hide_module, monkeypatch, capsys, module
+):
     """The module is missing while the command is imported, or while it runs, or a part of it."""
-    monkeypatch.setitem(sys.modules, module, None)
+    hide_module(module)
     package = program.OPTIONAL[module]
     sentence = f'this needs {package}, which is not installed: pip install {package}'
     assert program.run_program('work', partial(import_module, f'{module}.part')) == 1
@@ -211,13 +213,12 @@ def test_a_command_without_an_optional_module_names_its_package(monkeypatch, cap
     ('matplotlib', 'map info --plot map.png monday.stavpr'),
 ])  # fmt: skip
 def test_a_report_without_its_packages_is_refused_before_any_work(
-    monkeypatch, capsys, tmp_path, small_map, module, words
+    hide_module, monkeypatch, capsys, working_folder, small_map, module, words
 ):
-    monkeypatch.chdir(tmp_path)
     save_map(small_map, 'monday.stavpr')
     for name in [each for each in sys.modules if re.match(rf'{module}\b|stavpr_lab.map_p', each)]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, module, None)
+    hide_module(module)
     assert stavpr.main(words.split()) == 1
     assert 'which is not installed: pip install ' in capsys.readouterr().err
 

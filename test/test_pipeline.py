@@ -470,7 +470,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     keyframes = KeyframeSettings(change=0.01)
     pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
     extract = Failing(pipeline.operation.extractor.extract)
-    monkeypatch.setattr(pipeline.operation.extractor, 'extract', extract)
+    pipeline.operation.extractor.extract = extract
     thumbnail = Failing(lambda image: b'')
     monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
     cut_off = message(route[0])

@@ -59,8 +59,8 @@ def test_arguments_of_ros_are_accepted(arguments):
     require_ros_arguments(arguments.split(), BY_NAME)
 
 
-def test_log_directory_that_cannot_be_written_is_named(monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', '/proc/log')
+def test_log_directory_that_cannot_be_written_is_named(environ):
+    environ['ROS_LOG_DIR'] = '/proc/log'
     expected = pytest.raises(UnavailableError, match='/proc/log cannot be written: set ROS_LOG')
     with expected, ros_arguments_checked():
         raise rclpy_implementation.RCLError('failed to initialize logging: no folder')
@@ -221,12 +221,12 @@ def test_node_without_shared_memory_uses_udp(folder, size):
     assert 'config/fastdds_udp.xml' in done.stdout
 
 
-def test_user_without_a_home_has_the_root(monkeypatch):
+def test_user_without_a_home_has_the_root(environ, monkeypatch):
     def unknown(_):
         raise KeyError
 
     for name in ('HOME', 'XDG_DATA_HOME', 'XDG_CACHE_HOME'):
-        monkeypatch.delenv(name, raising=False)
+        environ.pop(name, None)
     monkeypatch.setattr(pwd, 'getpwuid', unknown)
     assert maps_folder('') == Path('/.local/share/stavpr/maps')
     assert maps_folder('~/maps').is_absolute()

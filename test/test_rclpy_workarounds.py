@@ -138,11 +138,11 @@ def test_prompt_executor_calls_back_with_events_of_publishers(node, prompt):
     assert changes == [1]
 
 
-def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt, monkeypatch):
+def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt):
     def destroyed(*_, **__):
         raise rclpy_implementation.InvalidHandle('destroyed')
 
-    monkeypatch.setattr(prompt, 'wait_for_ready_callbacks', destroyed)
+    prompt.wait_for_ready_callbacks = destroyed
     prompt.spin_once(0.1)
 
 

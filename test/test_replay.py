@@ -318,13 +318,12 @@ def test_replay_command_with_keys_loops_over_a_part_of_a_bag(context, tmp_path):
     ],
 )
 def test_replay_command_of_a_part_that_is_missing_fails(
-    tmp_path, capsys, monkeypatch, name, options, error
+    tmp_path, capsys, environ, name, options, error
 ):
     write_odometry(tmp_path / 'bag', [FIRST], images=images(1))
     (tmp_path / 'images').mkdir()
     (tmp_path / 'images/0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
-    monkeypatch.setenv(process.PROFILES_VARIABLE, '')  # what the command sets ends with the test
+    environ[process.PROFILES_VARIABLE] = ''  # what the command sets ends with the test
     assert main([str(tmp_path / name), *options]) == 1
     assert error in capsys.readouterr().err
 
@@ -383,10 +382,10 @@ def subscribe(node):
 
 
 @pytest.fixture
-def replay(monkeypatch, capfd):
+def replay(environ, monkeypatch, capfd):
     """Run the command in this process, which keeps its signal handlers."""
     monkeypatch.setattr('signal.signal', lambda *_: None)
-    monkeypatch.setenv(process.PROFILES_VARIABLE, '')  # set by the command: ends with the test
+    environ[process.PROFILES_VARIABLE] = ''  # set by the command: ends with the test
 
     def run(*arguments):
         code = main([str(argument) for argument in arguments])
@@ -522,13 +521,13 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
     assert stamps == [50, 100, 200]
 
 
-def test_transport_profile_of_the_user_is_kept(monkeypatch):
-    monkeypatch.delenv(process.PROFILES_VARIABLE, raising=False)
+def test_transport_profile_of_the_user_is_kept(environ):
+    environ.pop(process.PROFILES_VARIABLE, None)
     process.prepare_transport()
     profile = ElementTree.parse(os.environ[process.PROFILES_VARIABLE])
     assert int(profile.find('.//{*}segment_size').text) == 32 * 2**20
     assert {kind.text for kind in profile.iterfind('.//{*}type')} == {'SHM', 'UDPv4'}
-    monkeypatch.setenv(process.PROFILES_VARIABLE, 'my_own.xml')
+    environ[process.PROFILES_VARIABLE] = 'my_own.xml'
     process.prepare_transport()
     assert os.environ[process.PROFILES_VARIABLE] == 'my_own.xml'
 
@@ -539,19 +538,17 @@ OLD = '{"stamp": 1, "frame_id": "old"}\n'
 
 
 @pytest.fixture
-def record(robot, tmp_path):
+def record(robot, tmp_path, request):
     """Start the command over an old recording; it is ended with the test."""
-    started = []
-    (tmp_path / 'old.jsonl').write_text(OLD)
+    path = tmp_path / 'old.jsonl'
+    path.write_text(OLD)
 
     def start(*options):
-        path = str(tmp_path / 'old.jsonl')
-        started.append(Process(tmp_path / 'log', 'record', '--output', path, *options))
-        return started[-1]
+        recorder = Process(tmp_path / 'log', 'record', '--output', str(path), *options)
+        request.addfinalizer(recorder.end)
+        return recorder
 
-    yield start
-    for started_process in started:
-        started_process.end()
+    return start
 
 
 @pytest.fixture

@@ -25,17 +25,16 @@ from stavpr_msgs.srv import LoadMap, SaveMap
 
 
 @pytest.fixture
-def run(robot, tmp_path, tmp_path_factory):
+def run(robot, tmp_path, tmp_path_factory, request):
     """Start a node; it is ended with the test."""
-    started = []
 
     def run(options=(), **parameters):
         values = PARAMETERS | {'maps_folder': tmp_path_factory.getbasetemp()} | parameters
-        started.append(node_process(tmp_path / 'node.log', *options, **values))
-        return started[0]
+        process = node_process(tmp_path / 'node.log', *options, **values)
+        request.addfinalizer(process.end)
+        return process
 
     yield run
-    started[0].end()
     robot.wait_for_nobody()
 
 
@@ -171,29 +170,13 @@ def test_documented_program_recognizes_with_two_cameras_and_ends(robot, program,
 # Files and names that are to harm a running node: each is refused, and it goes on
 
 
-@pytest.fixture
-def nodes(robot, tmp_path):
-    """Start nodes as processes of their own; they end with the test."""
-    started = []
-
-    def start(*options, **parameters) -> Process:
-        log = tmp_path / f'log{len(started)}'
-        started.append(node_process(log, *options, **(PARAMETERS | parameters)))
-        robot.until(lambda: 'backend' in started[-1].output(), 'the node')
-        return started[-1]
-
-    yield start
-    for process in started:
-        process.end()
-
-
 def resident(process: Process) -> int:
     """Return the resident memory of a process in MB."""
     lines = Path(f'/proc/{process.popen.pid}/status').read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith('VmRSS')) // 1024
 
 
-def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map_file, tmp_path):
+def test_running_node_refuses_hostile_files_and_goes_on(run, robot, route, map_file, tmp_path):
     """A pipe, a device, a file of holes, a program, names outside: over ROS, one by one."""
     maps, models = tmp_path / 'maps', tmp_path / 'models'
     maps.mkdir()
@@ -212,7 +195,7 @@ def test_running_node_refuses_hostile_files_and_goes_on(nodes, robot, route, map
     (maps / 'program').write_bytes(changed(content, network(sha256=sha256)))
     located = network(sha256=sha256, model=str(program))
     (maps / 'located').write_bytes(changed(content, located))
-    node = nodes(maps_folder=maps, map_path=maps / 'good', model_path=models)
+    node = run(maps_folder=maps, map_path=maps / 'good', model_path=models)
     robot.wait_for_node()
     robot.drive(route[:6])
     before = resident(node)

@@ -150,9 +150,8 @@ def test_mark_saved_in_any_order_counts_the_places_of_each_snapshot(mapping, rou
         ('/maps', '/data', '/maps'),
     ],
 )
-def test_maps_folder_follows_parameter_then_xdg_then_home(parameter, data, folder, monkeypatch):
-    monkeypatch.setenv('XDG_DATA_HOME', data)
-    monkeypatch.setenv('HOME', '/home/robot')
+def test_maps_folder_follows_parameter_then_xdg_then_home(parameter, data, folder, environ):
+    environ |= {'XDG_DATA_HOME': data, 'HOME': '/home/robot'}
     assert maps_folder(parameter) == Path(folder)
 
 

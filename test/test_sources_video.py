@@ -191,9 +191,9 @@ def test_video_that_ends_early_is_reported_once(tmp_path):
         ('raise ImportError', 600, 'needs PyAV, which is not installed: pip install av'),
     ],
 )
-def test_decoder_that_fails_is_an_error(tmp_path, monkeypatch, program, timeout, reason):
+def test_decoder_that_fails_is_an_error(tmp_path, environ, monkeypatch, program, timeout, reason):
     (tmp_path / 'av.py').write_text(program)
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path), prepend=':')
+    environ['PYTHONPATH'] = f'{tmp_path}:{environ["PYTHONPATH"]}'
     monkeypatch.setattr(video, 'TIMEOUT', timeout)
     began = time.monotonic()
     with pytest.raises(SourceError, match=reason):

@@ -78,16 +78,13 @@ class Setup:
 
 
 @pytest.fixture
-def setup(context):
-    made = []
-
+def setup(context, request):
     def setup(**overrides):
-        made.append(Setup(context, **overrides))
-        return made[-1]
+        made = Setup(context, **overrides)
+        request.addfinalizer(made.close)
+        return made
 
-    yield setup
-    for each in made:
-        each.close()
+    return setup
 
 
 def test_subscription_follows_publishers_that_come_and_go(setup):

@@ -6,7 +6,6 @@ Video topics: packets by encoders of PyAV, in substitutes for the messages of ot
 The substitutes are built from the published definitions, in a bag or in this process.
 """
 
-import sys
 from types import SimpleNamespace
 
 from bags import SECOND, writing
@@ -191,10 +190,10 @@ def test_video_in_compressed_images_of_a_bag_is_decoded(tmp_path, codec, encoded
 @pytest.mark.parametrize('image_input', ['compressed'], indirect=True)
 @pytest.mark.parametrize('has_pyav', [True, False])
 def test_node_decodes_video_in_compressed_images(
-    image_input, monkeypatch, encoded, codec, has_pyav
+    image_input, hide_module, encoded, codec, has_pyav
 ):
     if not has_pyav:
-        monkeypatch.setitem(sys.modules, 'av.video.reformatter', None)
+        hide_module('av.video.reformatter')
     for i, packet in enumerate(encoded):
         header, data = Header(stamp=Time(sec=i + 1)), bytes(packet)
         image_input.on_image(CompressedImage(header=header, format=CODECS[codec][1], data=data))

@@ -99,10 +99,9 @@ def localized(map_file, route):
     return pipeline, process(pipeline, route[: LENGTH + 4])[-1]
 
 
-def test_visualization_without_subscribers_publishes_and_draws_nothing(localized, monkeypatch):
+def test_visualization_without_subscribers_publishes_and_draws_nothing(localized):
     pipeline, match = localized
-    recognizer = pipeline.operation.recognizer
-    monkeypatch.setattr(recognizer, 'newest_row', lambda: pytest.fail('not requested'))
+    pipeline.operation.recognizer.newest_row = lambda: pytest.fail('not requested')
     views, publishers = views_of()
     show(views, header(), match, pipeline.operation, 'map')
     views.publish_route(pipeline.places, 'map')
@@ -448,8 +447,8 @@ def test_navigation_on_a_growing_route_publishes_nothing(publishing, route):
     assert not publishing.initial
 
 
-def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+def test_node_with_publish_tf_without_tf2_msgs_explains_it(robot, start, hide_module):
+    hide_module('tf2_msgs.msg')
     start(wait=False, publish_tf=True)
     robot.until_logged('publish_tf requires the package tf2_msgs: install it')
     robot.until_state('unconfigured')

@@ -278,8 +278,8 @@ def test_open_of_missing_or_interrupted_upload_names_remedy(tmp_path, server):
         open_city_map('qdrant://host:1')
 
 
-def test_open_over_http_sends_no_key(monkeypatch):
-    monkeypatch.setenv('QDRANT_API_KEY', 'secret')
+def test_open_over_http_sends_no_key(environ):
+    environ['QDRANT_API_KEY'] = 'secret'
     with pytest.raises(SettingsError, match='would be sent without encryption'):
         open_city_map('qdrant://robots.example:6333/city')
 

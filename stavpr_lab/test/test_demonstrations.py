@@ -240,12 +240,11 @@ def test_run_live_returns_why_the_node_cannot_start(tmp_path, route):
     assert 'copy the file that the map was built with there' in (tmp_path / 'node.log').read_text()
 
 
-def test_domain_is_free_and_its_settings_are_its_own(monkeypatch):
+def test_domain_is_free_and_its_settings_are_its_own(environ, monkeypatch):
     kept = {'ROS_DISTRO': 'jazzy', 'ROS_LOG_DIR': '/log'}
     foreign = {'ROS_DOMAIN_ID': '7', 'ROS_STATIC_PEERS': 'robot', 'RMW_IMPLEMENTATION': 'rmw_none'}
     foreign |= {'FASTRTPS_DEFAULT_PROFILES_FILE': '/none', 'RCUTILS_CONSOLE_OUTPUT_FORMAT': ''}
-    for name, value in (kept | foreign).items():
-        monkeypatch.setenv(name, value)
+    environ |= kept | foreign
     monkeypatch.setattr(live.random, 'sample', lambda *_: [41, 41, 42])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
         participant.bind(('', 7410 + 250 * 41))  # as one that uses domain 41

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Descriptors that other programs computed: files, maps and evaluations of them."""
 
-import sys
-
 from checkpoints import Hostile
 import numpy as np
 import pytest
@@ -112,12 +110,11 @@ BOTH = {'a': SOUND, 'b': SOUND}
         ('cell.mat', CELLS, 'arrays of numbers are none'),
     ],
 )
-def test_read_descriptors_of_other_files_is_rejected(tmp_path, monkeypatch, name, content, words):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / name.partition(':')[0], content)
+def test_read_descriptors_of_other_files_is_rejected(working_folder, name, content, words):
+    write(working_folder / name.partition(':')[0], content)
     with pytest.raises(SourceError, match=words):
-        read_descriptors(f'{tmp_path}/{name}')
-    assert not (tmp_path / 'trap').exists()
+        read_descriptors(f'{working_folder}/{name}')
+    assert not (working_folder / 'trap').exists()
 
 
 @pytest.mark.parametrize(
@@ -189,7 +186,7 @@ def test_read_descriptors_takes_the_only_array_that_can_be_meant(tmp_path, vecto
         np.testing.assert_allclose(features.strips[0], unit(vectors), atol=1e-6)
 
 
-def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, monkeypatch):
+def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, hide_module):
     """HDF5 behind 512 bytes; columns of MATLAB are rows of the file."""
     h5py = pytest.importorskip('h5py', reason='the extra hdf5 is not installed')
     path = tmp_path / 'a.mat'
@@ -210,7 +207,7 @@ def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, monkeypatch):
     np.testing.assert_allclose(features.strips[2, 4], unit(strips[4, 2]), atol=1e-6)
     with pytest.raises(SourceError, match=r'which array\? .* are strips, x: give'):
         read_descriptors(str(path))
-    monkeypatch.setitem(sys.modules, 'h5py', None)
+    hide_module('h5py')
     with pytest.raises(SourceError, match=r'version 7.3 .* -v7, or pip install h5py'):
         read_descriptors(str(path))
 

@@ -75,13 +75,13 @@ class Server:
 
 
 @pytest.fixture
-def server(content, monkeypatch):
-    monkeypatch.setenv('no_proxy', '*')
+def server(content, environ):
+    environ['no_proxy'] = '*'
     server = Server()
     server.body = content
     thread = threading.Thread(target=server.http.serve_forever, kwargs={'poll_interval': 0.01})
     thread.start()
-    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address), raising=False)
+    Tiny.published = PublishedFile(server.address)
     yield server
     server.http.shutdown()
     thread.join()
@@ -126,10 +126,10 @@ def test_download_that_fails_leaves_no_file(server, cache, content, changes, mes
     assert list(cache.iterdir()) == []
 
 
-def test_published_hash_is_checked_in_full(server, cache, content, monkeypatch):
+def test_published_hash_is_checked_in_full(server, cache, content):
     digest = hashlib.sha256(content).hexdigest()
     other = digest[:16] + '0' * 48
-    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256=other))
+    Tiny.published = PublishedFile(server.address, sha256=other)
     fetch(server, cache, content)
     with pytest.raises(UnavailableError, match='it is damaged or another file; delete it'):
         Tiny(PublishedSettings())

@@ -144,21 +144,17 @@ def rover(request, context, route, map_file):
 
 
 @pytest.fixture
-def repeat(context, rover, map_file):
+def repeat(context, rover, map_file, request):
     """Make a node that is spun with the rover; it ends with the test."""
-    made = []
 
     def make(**parameters):
         values = {'map_path': map_file} | FAST | parameters
         node = RepeatNode(context=context, **overrides(**values))
-        made.append(node)
+        request.addfinalizer(lambda: node.is_ending or node.destroy_node())
         rover.executor.add_node(node)
         return node
 
-    yield make
-    for node in made:
-        if not node.is_ending:
-            node.destroy_node()
+    return make
 
 
 def test_goal_is_reached_with_feedback_and_velocities_stop(rover, repeat):
@@ -263,20 +259,6 @@ def test_node_that_is_suspended_goes_on_from_rest(rover, map_file, tmp_path):
     finally:
         process.popen.send_signal(signal.SIGCONT)
         process.end()
-
-
-def test_slow_camera_is_driven_with_stop_and_go_and_half_the_rate_without(rover, repeat):
-    repeat(give_up_after=0.0)
-    rover.begin()
-    rover.every = 2
-    rover.until(lambda: rover.place > 7)
-    assert rover.drives()
-    rover.every = 10
-    rover.until(rover.rests)
-    place, ticks = rover.place, rover.ticks
-    rover.until(lambda: rover.place > place + 1)
-    images = (rover.ticks - ticks) / rover.every
-    assert (rover.place - place) / images < 0.5  # meters between two images
 
 
 def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, repeat):
