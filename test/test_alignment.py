@@ -326,76 +326,69 @@ def test_match_sequence_of_any_memory_layout_changes_nothing():
     np.testing.assert_array_equal(D, before)
 
 
-# Invalid input and settings of the alignments: each error names the value
+# Invalid input and settings: each error names the value
 
 THREE = SequenceSettings(length=3)
+NONE, OF_STRIPS = SpatialSettings(strategy='none'), 7 * np.eye(7)[..., None]
+
+
+def without(value, *shape):
+    """Return distances with one that is no number or too small."""
+    d = np.ones(shape)
+    d.flat[d.size // 2] = value
+    return d
 
 
 @pytest.mark.parametrize(
-    ('call', 'shapes'),
+    ('work', 'distances', 'setting', 'named'),
     [
-        (lambda d: image_distances(d, ADAPTIVE), [(7, 7), (7, 6, 3), (0, 0, 3)]),
-        (lambda D: match_sequence(D, THREE), [(4, 9), (2, 9), (3,), (3, 9, 1)]),
+        *(
+            (image_distances, np.ones(shape), ADAPTIVE, re.escape(str(shape)))
+            for shape in ((7, 7), (7, 6, 3), (0, 0, 3))
+        ),
+        *(
+            (match_sequence, np.ones(shape), THREE, re.escape(str(shape)))
+            for shape in ((4, 9), (2, 9), (3,), (3, 9, 1))
+        ),
+        *(
+            row
+            for dtype in (np.int64, np.float16, bool)
+            for row in (
+                (image_distances, OF_STRIPS.astype(dtype), ADAPTIVE, np.dtype(dtype).name),
+                (match_sequence, np.ones((3, 9), dtype), THREE, np.dtype(dtype).name),
+            )
+        ),
+        *(
+            row
+            for value in (np.nan, -np.inf)
+            for row in (
+                (image_distances, without(value, 7, 7, 100), ADAPTIVE, None),
+                (image_distances, without(value, 7, 7, 100), VANILLA, None),
+                (image_distances, without(value, 7, 7, 100), WINDOW, None),
+                (match_sequence, without(value, 3, 100), THREE, None),
+            )
+        ),
+        (image_distances, np.zeros((5, 5, 2)), SpatialSettings(xi=6), '6.*5'),
+        (image_distances, np.zeros((3, 3, 2)), WINDOW, 'W = 3'),
+        (image_distances, np.zeros((7, 7, 2)), NONE, 'none'),
+        (aligned_index, np.array([(0, 3), (1, 4)], np.int32), 2, '2'),
     ],
 )
-def test_distances_of_other_shape_are_rejected(call, shapes):
-    for shape in shapes:
-        with pytest.raises(InputError, match=re.escape(str(shape))):
-            call(np.ones(shape))
-
-
-@pytest.mark.parametrize('dtype', [np.int64, np.float16, bool])
-def test_distances_of_other_dtype_are_rejected(dtype):
-    with pytest.raises(InputError, match=np.dtype(dtype).name):
-        image_distances(np.zeros((7, 7, 3), dtype), ADAPTIVE)
-    with pytest.raises(InputError, match=np.dtype(dtype).name):
-        match_sequence(np.ones((3, 9), dtype), THREE)
-
-
-@pytest.mark.parametrize('value', [np.nan, -np.inf])
-def test_distances_with_nan_are_rejected(value):
-    d, D = np.ones((7, 7, 100)), np.ones((3, 100))
-    d[3, 2, 77] = D[1, 77] = value
-    for call in (
-        *(lambda s=s: image_distances(d, s) for s in (ADAPTIVE, VANILLA, WINDOW)),
-        lambda: match_sequence(D, THREE),
-    ):
-        with pytest.raises(InputError):
-            call()
+def test_distances_that_do_not_fit_are_rejected(work, distances, setting, named):
+    with pytest.raises((InputError, SettingsError), match=named):
+        work(distances, setting)
 
 
 @pytest.mark.parametrize(
-    ('settings', 'arguments', 'named'),
+    ('settings', 'name', 'value'),
     [
-        (SpatialSettings, {'strategy': 'diagonal'}, 'diagonal'),
-        (SpatialSettings, {'sigma': -0.5}, '-0.5'),
-        (SpatialSettings, {'sigma': math.inf}, 'inf'),
-        (SpatialSettings, {'xi': 0}, '0'),
-        (SpatialSettings, {'xi': 2.5}, '2.5'),
-        (SequenceSettings, {'length': 1}, '1'),
-        (SequenceSettings, {'length': 2.5}, '2.5'),
-        (SequenceSettings, {'beta': 1.0}, '1.0'),
-        (SequenceSettings, {'beta': math.inf}, 'inf'),
+        *((SpatialSettings, 'sigma', value) for value in (-0.5, math.inf)),
+        *((SpatialSettings, 'xi', value) for value in (0, 2.5)),
+        (SpatialSettings, 'strategy', 'diagonal'),
+        *((SequenceSettings, 'length', value) for value in (1, 2.5)),
+        *((SequenceSettings, 'beta', value) for value in (1.0, math.inf)),
     ],
 )
-def test_settings_out_of_range_are_rejected(settings, arguments, named):
-    with pytest.raises(SettingsError, match=re.escape(named)):
-        settings(**arguments)
-
-
-@pytest.mark.parametrize(
-    ('W', 'spatial', 'error', 'named'),
-    [
-        (5, SpatialSettings(xi=6), SettingsError, r'6.*5'),
-        (3, WINDOW, InputError, 'W = 3'),
-        (7, SpatialSettings(strategy='none'), SettingsError, 'none'),
-    ],
-)
-def test_settings_that_do_not_fit_the_strips_are_rejected(W, spatial, error, named):
-    with pytest.raises(error, match=named):
-        image_distances(np.zeros((W, W, 2)), spatial)
-
-
-def test_aligned_index_of_row_not_on_path_is_rejected():
-    with pytest.raises(InputError, match='2'):
-        aligned_index(np.array([(0, 3), (1, 4)], np.int32), 2)
+def test_settings_out_of_range_are_rejected(settings, name, value):
+    with pytest.raises(SettingsError, match=re.escape(str(value))):
+        settings(**{name: value})

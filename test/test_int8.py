@@ -15,7 +15,6 @@ import oracle
 import pytest
 from stavpr_ros.alignment import image_distances, SpatialSettings
 from stavpr_ros.alignment.cpu import int8
-from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.prepare.blocks import converted
@@ -145,13 +144,6 @@ def test_features_rounded_in_blocks_equal_those_rounded_at_once():
     np.testing.assert_array_equal(held.strips.values, at_once.values)
     np.testing.assert_array_equal(held.strips.reciprocals, at_once.reciprocals)
     assert held.strips.values.nbytes < 1.25 * 3 * 600 * 10  # whole quads: 12 for 10 dimensions
-
-
-def test_vertical_alignment_in_int8_is_rejected():
-    with pytest.raises(SettingsError, match="'int8' has no vertical"):
-        make_matcher(
-            features_of(random_strips(7, 4, 8)), SpatialSettings(vertical=True), 'cpu', 'int8'
-        )
 
 
 PROCESSORS = (

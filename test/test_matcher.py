@@ -118,11 +118,6 @@ def test_kernels_of_one_and_two_threads_return_same_bits():
 # ------------------------------------------------ the window
 
 
-def test_make_matcher_of_unknown_precision_is_rejected():
-    with pytest.raises(SettingsError, match="'float16' is unknown: take one of float32, int8"):
-        make_matcher(random_features(7, 4, 8), SpatialSettings(), 'cpu', 'float16')
-
-
 @pytest.mark.parametrize(('places', 'changes', 'precision'), [
     (2_000, {}, 'int8'),
     (1_999, {}, 'float32'),
@@ -211,11 +206,16 @@ def test_vertical_distances_equal_oracle(n, strategy, xi):
     )
 
 
-def test_vertical_alignment_of_other_settings_is_rejected(small_map):
+def test_vertical_alignment_and_precision_of_other_settings_are_rejected(small_map):
     spatial = SpatialSettings(vertical=True)
     with pytest.raises(InputError, match='without projection'):
         PlaceRecognizer(small_map, RecognizerSettings(spatial=spatial))
     with pytest.raises(SettingsError, match='vertical'):
         SpatialSettings('none', vertical=True)
-    with pytest.raises(SettingsError, match='cuda'):
-        make_matcher(features_with_cells(3), spatial, 'cuda', 'float32')
+    for backend, precision, words in (
+        ('cuda', 'float32', 'cuda'),
+        ('cpu', 'int8', "'int8' has no vertical"),
+        ('cpu', 'float16', "'float16' is unknown: take one of float32, int8"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            make_matcher(features_with_cells(3), spatial, backend, precision)

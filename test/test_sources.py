@@ -627,11 +627,8 @@ def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
 
 
 def test_parts_of_a_split_ros1_bag_are_read_by_time(tmp_path):
-    whole = list(records(9))
-    times = [each.time_ns for each in whole]
-    for first in (6, 0, 3):
-        with writing(tmp_path / f'drive_{first}.bag', ros1=True) as bag:
-            write_images(bag, whole[first : first + 3])
+    parts_of_a_ros1_bag(tmp_path)
+    times = [record.time_ns for record in records(9)]
     assert [each.time_ns for each in open_source(tmp_path).records(0.4, 0.3)] == times[4:7]
     assert [each.time_ns for each in read_messages(tmp_path, ['/text'])] == times
 

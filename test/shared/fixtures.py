@@ -299,6 +299,7 @@ def node_of_file(robot, map_file, tmp_path_factory):
     """Start the node that the tests of a file share; see ``running``."""
     from robot import NodeThread
 
+    robot.forget()
     files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
     thread = NodeThread(robot.context, [], files)
     robot.wait_for_node()
