@@ -196,7 +196,7 @@ def test_former_package_warns_and_has_the_names_of_the_method(name, monkeypatch)
     monkeypatch.delitem(sys.modules, name, raising=False)
     with pytest.warns(DeprecationWarning, match=f'{name} is stavpr_ros.method now'):
         former = importlib.import_module(name)
-    assert all(getattr(former, each) is getattr(method, each) for each in method.__all__)
+    assert all(getattr(former, name) is getattr(method, name) for name in method.__all__)
 
 
 @pytest.mark.parametrize('module', CLASSES)

@@ -353,7 +353,7 @@ def test_node_killed_at_a_random_moment_loses_no_published_place(
     assert sum(recover(journal).recorded for journal in journals(path)) > 0
     stamps = [load_map(file).stamps.tolist() for file in sorted(tmp_path.glob('route*.stavpr'))]
     assert {stamp for stamp in published if stamp > begin} <= set().union(*stamps)
-    assert all(each == sorted(set(each)) for each in stamps)
+    assert all(times == sorted(set(times)) for times in stamps)
     assert [name for name in os.listdir(tmp_path) if name.startswith('.')] == []
 
 

@@ -420,7 +420,7 @@ def wrong_claims():
 
 
 CLAIMS = {name: case for name, *case in wrong_claims()}
-REFUSED = CLAIMS | {name: case for each in (wrong_headers, wrong_files) for name, *case in each()}
+REFUSED = CLAIMS | {name: case for make in (wrong_headers, wrong_files) for name, *case in make()}
 
 
 @pytest.mark.parametrize('name', REFUSED)

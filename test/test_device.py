@@ -198,7 +198,7 @@ def test_z_normalized_equals_that_of_cpu(device):
     flat, banned = np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)
     for values in (row, row[:5], flat, banned):
         for counted in (np.ones(len(values), bool), np.arange(len(values)) % 3 > 0):
-            arguments = (torch.from_numpy(each).to(device) for each in (values, counted))
+            arguments = (torch.from_numpy(array).to(device) for array in (values, counted))
             found = z_normalized_on_device(*arguments).cpu()
             np.testing.assert_allclose(found, z_normalized(values, counted=counted), atol=1e-5)
 
@@ -237,7 +237,7 @@ def test_recognizer_equals_that_of_cpu(device, mode, precision, sessions):
     )
     statuses = set()
     for i in range(len(query)):
-        found, expected = (each.update(query[i : i + 1], i + 1) for each in (one, cpu))
+        found, expected = (recognizer.update(query[i : i + 1], i + 1) for recognizer in (one, cpu))
         assert found.status == expected.status
         assert found.window_stamps == expected.window_stamps
         assert found.window_changes == expected.window_changes
@@ -252,7 +252,7 @@ def test_recognizer_equals_that_of_cpu(device, mode, precision, sessions):
             continue
         assert found.path.place == expected.path.place
         np.testing.assert_array_equal(found.path.pairs, expected.path.pairs)
-        places = [[each.place for each in recognizer.ranked(2)] for recognizer in (one, cpu)]
+        places = [[c.place for c in recognizer.ranked(2)] for recognizer in (one, cpu)]
         assert places[0] == places[1]
     assert {Status.WARMING_UP, Status.MATCH} <= statuses
     one.reset()

@@ -88,7 +88,7 @@ def statuses(changes):
 
 def values(part, **changes):
     """Return the values of a part as words key=value."""
-    return [f'{each.key}={each.value}' for each in statuses(changes)[part].values]
+    return [f'{pair.key}={pair.value}' for pair in statuses(changes)[part].values]
 
 
 NEVER = {'age': None}
@@ -255,9 +255,9 @@ def test_statuses_are_in_the_group_of_the_aggregator():
     """Its GenericAnalyzer takes the names that contain one of these texts."""
     path = Path(__file__).parents[1] / 'config' / 'diagnostic_aggregator.yaml'
     (group,) = (
-        each
-        for each in yaml.safe_load(path.read_text())['analyzers']['ros__parameters'].values()
-        if isinstance(each, dict)
+        analyzer
+        for analyzer in yaml.safe_load(path.read_text())['analyzers']['ros__parameters'].values()
+        if isinstance(analyzer, dict)
     )
     assert group['type'] == 'diagnostic_aggregator/GenericAnalyzer'
     names = [status.name for status in statuses({}).values()]

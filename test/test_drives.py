@@ -98,7 +98,7 @@ def test_drive_that_cannot_be_written_stays_in_memory(pipeline, path):
         assert not save_recorded_map(pipeline, at_once, '', log)
     assert 'no space' in log.of('error')
     assert waiting(path) == NAMES[:1]
-    assert [len(each) for each in pipeline.operation.drives] == [*map(len, DRIVES[1:]), 0]
+    assert [len(drive) for drive in pipeline.operation.drives] == [*map(len, DRIVES[1:]), 0]
     assert update_own_map(pipeline, at_once, log)
     assert is_updated(path)
 
@@ -227,4 +227,4 @@ def test_drive_on_another_route_leaves_the_file_as_it_is(robot, start, path):
 def test_images_of_drives_are_kept_up_to_max_places(robot, start, path, updates):
     node = start(map_path=path, update_map=updates, max_places=100)
     robot.drive(ROUTE[:110])
-    assert [len(each) for each in node.runtime.pipeline.operation.take_drives()] == [100] * updates
+    assert [len(d) for d in node.runtime.pipeline.operation.take_drives()] == [100] * updates

@@ -164,10 +164,10 @@ def test_hybrid_strips_have_the_mean_of_both_cosines_and_the_mean_square_of_weig
     parts = [made.extract(IMAGES) for made in (FeatureExtractor('gradient'), learned)]
     found = hybrid.extract(IMAGES)
     assert found.strips.shape == (7, 3, 224 + 12 * 7)
-    cosines = [strips @ strips.transpose(0, 2, 1) for strips in (each.strips for each in parts)]
+    cosines = [strips @ strips.transpose(0, 2, 1) for strips in (part.strips for part in parts)]
     products = found.strips @ found.strips.transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.mean(cosines, axis=0), atol=1e-6)
-    squares = np.mean([each.weights**2 for each in parts], axis=0)
+    squares = np.mean([part.weights**2 for part in parts], axis=0)
     np.testing.assert_allclose(found.weights**2, squares, atol=1e-6)
 
 

@@ -182,7 +182,7 @@ def test_cells_are_compared_on_all_backends(device, precision):
     plain._window.cells = None
     without = recognize_all(plain, query)
     probabilities, same, lower = (
-        np.array([match.probability for match in each[20:]]) for each in (matches, others, without)
+        np.array([match.probability for match in d[20:]]) for d in (matches, others, without)
     )
     np.testing.assert_allclose(same, probabilities, atol=0.02)
     assert (lower < probabilities).all()

@@ -117,7 +117,7 @@ def test_path_follows_images_whose_speed_changes(recognizer, route):
     ]
     assert len(off) > 0.8 * len(places)
     assert np.mean(np.concatenate(off) <= 2) > 0.98
-    assert np.mean([each[0] <= 2 for each in off]) > 0.95
+    assert np.mean([distances[0] <= 2 for distances in off]) > 0.95
 
 
 def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, route):

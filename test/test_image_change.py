@@ -105,7 +105,7 @@ def test_expected_change_below_one_place_is_that_of_a_denser_map(step):
     strips = decaying_strips(300, 0.6)
     dense, sparse = learned(strips), learned(strips[:, ::step])
     places = np.arange(4)
-    found = [expected_change(each / step, *sparse._extended) for each in places]
+    found = [expected_change(place / step, *sparse._extended) for place in places]
     np.testing.assert_allclose(found, dense.curve[places], atol=0.03)
 
 

@@ -254,7 +254,7 @@ def test_flipped_bit_costs_at_most_one_record(small_map, target):
     heads = {at for end in (0, *ends[:-1]) for at in range(end, end + 16)}
     numbers, spread = set(range(4)), range(0, len(content), len(content) // 250)
     with writer.path.open('r+b', buffering=0) as file:
-        for at in heads | {each + int(rng.integers(20)) for each in spread[:-1]}:
+        for at in heads | {at + int(rng.integers(20)) for at in spread[:-1]}:
             os.pwrite(file.fileno(), bytes([content[at] ^ 1 << int(rng.integers(8))]), at)
             lost = set() if at < ends[1] else {np.searchsorted(ends[2:], at, 'right')}
             assert set(places_in(writer.path)) == numbers - lost, at

@@ -24,8 +24,8 @@ from stavpr_ros.compilation import cache_folder, kernel, KERNELS
 def read_only(tmp_path, environ, monkeypatch):
     """Return a folder of kernels that cannot be written; others can be."""
     folder, temporary = tmp_path / 'read_only', tmp_path / 'temporary'
-    for each in (folder, temporary):
-        each.mkdir()
+    for path in (folder, temporary):
+        path.mkdir()
     (folder / 'kernel.nbi').write_text('index')
     is_writable = compilation._is_writable
     monkeypatch.setattr(compilation, '_is_writable', lambda f: f != folder and is_writable(f))

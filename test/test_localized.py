@@ -120,7 +120,7 @@ def test_node_publishes_latched_whether_and_where_the_robot_is_localized(robot, 
     robot.until(lambda: localized[-1].data, 'being localized')
     last = matches[-1].newest_id
     robot.until(lambda: places[-1].data == last, 'the place of the last image')
-    names = [each.data for each in places]
+    names = [message.data for message in places]
     assert all(a != b for a, b in pairwise(names))  # only changes
     assert set(names[1:]) <= {match.newest_id for match in matches[LENGTH - 1 :]}
     late = robot.listen(String, '/stavpr/current_node', LATCHED)
@@ -130,7 +130,7 @@ def test_node_publishes_latched_whether_and_where_the_robot_is_localized(robot, 
     robot.does(Trigger, 'reset')
     robot.until(lambda: not localized[-1].data, 'being lost')
     robot.until(lambda: places[-1].data == 'none', 'no place')
-    assert [each.data for each in localized] == [False, True, False]
+    assert [message.data for message in localized] == [False, True, False]
     assert node.state == 'active'
 
 

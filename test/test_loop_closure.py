@@ -236,7 +236,7 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(eve
             waits = not match.accepted and event != NONE
             assert match.reason == 'its path is not confirmed yet' * waits
             assert not waits or not match.with_probability(1.0).accepted
-            assert all(each.is_late for each in match.late)
+            assert all(late.is_late for late in match.late)
             found += [match, *match.late] if match.accepted else []
             images += 1
     assert [match.last_image for match in found] == closed
@@ -489,13 +489,11 @@ POSES[:, 0] = 1.1 * np.arange(2 * N)
 def fields_of(recognizer, features, image):
     """Return all fields of the match of the next image as text."""
     match = recognizer.update(features[image : image + 1], (image + 1) * 10**8, POSES[image])
-    return repr([np.asarray(getattr(match, each.name), object).tolist() for each in fields(Match)])
+    return repr([np.asarray(getattr(match, f.name), object).tolist() for f in fields(Match)])
 
 
 def assert_same(one, new, features):
-    pairs = [
-        [fields_of(each, features, image) for each in (one, new)] for image in range(len(features))
-    ]
+    pairs = [[fields_of(c, features, image) for c in (one, new)] for image in range(len(features))]
     assert [first for first, _ in pairs] == [second for _, second in pairs]
     assert sum('Status.MATCH' in first for first, _ in pairs) > 10
 

@@ -438,8 +438,8 @@ def header(old, new):
 
 OFFSETS = '"data_offsets":[0,'
 FORMS = [  # a change of the bytes, and what the error names
-    *((version(each), 'has format version') for each in ('3', '1', '2.0', ' 2', '9' * 400)),
-    *((version(each), 'version|no map') for each in (2, None, float('nan'))),
+    *((version(text), 'has format version') for text in ('3', '1', '2.0', ' 2', '9' * 400)),
+    *((version(value), 'version|no map') for value in (2, None, float('nan'))),
     (without_hashes, 'tensor strips has 0 hashes'),
     (lambda content: content + b'\0', r'tensors end at byte \d+, the file at byte \d+'),
     (lambda content: content[:-1], r'tensors end at byte \d+, the file at byte \d+'),

@@ -128,8 +128,8 @@ def test_precision_auto_is_int8_on_large_maps_in_mode_robust(places, changes, pr
     features = replace(features_of(route_strips(0, places, 32)), cells=(4, 2))
     settings, query = RecognizerSettings(**changes), features[50:51]
     auto, as_set = (
-        PlaceRecognizer(map_of(features), settings, precision=each).distances(query)
-        for each in ('auto', precision)
+        PlaceRecognizer(map_of(features), settings, precision=name).distances(query)
+        for name in ('auto', precision)
     )
     np.testing.assert_array_equal(auto, as_set)
     other = 'int8' if precision == 'float32' and 'spatial' not in changes else 'float32'

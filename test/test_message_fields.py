@@ -403,7 +403,7 @@ MAP_INFO: Checks = {
         'in no file (recorded maps)',
         lambda m, d: m.map_id == (d.map_id if m.state == 'loaded' else '')),
     'sessions': ('of the map; empty = unknown',
-        lambda m, d: list(m.sessions) == ([each.id for each in d.places.sessions] if m.state
+        lambda m, d: list(m.sessions) == ([session.id for session in d.places.sessions] if m.state
         == 'loaded' else [])),
     'operation': ('localization, mapping or loop_closure',
         lambda m, d: m.operation == d.operation),
@@ -485,7 +485,7 @@ def running(robot: Robot, drive: Drive, **parameters: Any) -> Iterator[Any]:
         robot.until(lambda: len(candidates) >= count, 'candidates of each match')
         if drive.operation != 'mapping' and drive.x:
             robot.until(
-                lambda: sum(not each.is_late for each in closures) >= count,
+                lambda: sum(not closure.is_late for closure in closures) >= count,
                 'a closure of each match',
             )
         drive.closures, drive.candidates = list(closures), list(candidates)
@@ -659,8 +659,8 @@ def test_drives_show_what_the_fields_distinguish(drives):
         assert drive.closures
     sessions = {match.session for match in robust.matches + paper.matches}
     assert sessions == {'', 'day', 'night'}
-    assert any(each.is_late for each in loop.closures)
-    assert len([each for each in loop.closures if each.relative_pose.is_independent]) > 1
+    assert any(closure.is_late for closure in loop.closures)
+    assert len([closure for closure in loop.closures if closure.relative_pose.is_independent]) > 1
     assert {info.state for info in mapping.infos} >= {'growing', 'full'}
     sources = {m.relative_pose.source for m, _ in published(drives, 'LoopClosure')}
     assert sources >= {RelativePose.ALIGNED, RelativePose.PNP}

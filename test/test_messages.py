@@ -82,7 +82,7 @@ def test_stamps_after_2038_wrap_as_in_the_messages_of_others():
 @pytest.mark.parametrize(('own', 'message'), [(Status, PlaceMatch), (Source, RelativePose)])
 def test_names_equal_the_constants_of_the_message(own, message):
     constants = {name: getattr(message, name) for name in own.__members__}
-    assert constants == {each.name: each.value for each in own}
+    assert constants == {member.name: member.value for member in own}
 
 
 def test_loop_closure_message_needs_a_match(places):

@@ -324,7 +324,7 @@ def test_filter_without_its_oldest_columns_equals_one_of_the_others(moments):
         if image + 1 in moments:
             removed += 60 // len(moments)
             one.evict(60 // len(moments))
-        found, expected = (answers(each, width, min(image + 1, 9)) for each in (one, other))
+        found, expected = (answers(f, width, min(image + 1, 9)) for f in (one, other))
         for x, y in zip(found, expected, strict=True):
             np.testing.assert_allclose(np.roll(x, removed - 60, axis=-1), y, rtol=0, atol=1e-4)
 

@@ -156,7 +156,7 @@ def resting(noise, known=KNOWN):
 def newest_beyond(noise):
     """Return the share of images beyond the map that the window before is accepted for."""
     matches = drive(np.hstack([KNOWN[:, 40:100], OTHER[:, :30]]), noise)[60:]
-    newest = [each.path_probabilities[-1] for each in matches if each.accepted]
+    newest = [match.path_probabilities[-1] for match in matches if match.accepted]
     return np.count_nonzero(np.array(newest) > matches[0].limits.probability) / len(matches)
 
 
@@ -212,7 +212,7 @@ RULES = [
          lambda: places_off(STOP_AND_GO, 3.0, False), 0.15, 1.5),
     Rule('MAX_STEP', in_kernel(path, 'follow', MAX_STEP=1), lambda: matched(FAST, 3), 0.5, 0.1),
     Rule('half at rest', without_half, resting_beyond, 0.1, 0.5),
-    Rule('share of the image', put(window, close_sums=lambda *each: np.ones(len(each[-1]))),
+    Rule('share of the image', put(window, close_sums=lambda *x: np.ones(len(x[-1]))),
          lambda: newest_beyond(6.0), 0.2, 0.33),
     Rule('ON_MAP', put(window, ON_MAP=0.0),
          lambda: matched(KNOWN[:, np.r_[:60, 100:115]], 2.0, 60), 0.85, 0.6),

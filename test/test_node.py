@@ -418,7 +418,7 @@ def test_requests_of_many_clients_wait_and_all_get_a_response(robot, running):
         running.runtime.worker.call(end.wait)
         responses = [client.call_async(Trigger.Request()) for _ in range(200)]
         end.set()
-        robot.until(lambda: all(each.done() for each in responses), 'all responses')
+        robot.until(lambda: all(response.done() for response in responses), 'all responses')
     finally:
         end.set()
         robot.node.destroy_client(client)

@@ -67,7 +67,7 @@ def plain_evidence(query, place):
     for model, (a, b) in enumerate(zip(A, B, strict=True)):
         beside = np.rint((a * centers + b) * abs(centers) * WIDTH / 2 * PARTS) / PARTS
         at = beside[:, None] + np.arange(len(SHIFTS))
-        shown = np.array([plain_mean(*each) for each in zip(means, at, strict=True)])
+        shown = np.array([plain_mean(*block) for block in zip(means, at, strict=True)])
         for k in range(len(SHIFTS)):
             used = shown[~np.isnan(means[:, k]), k]
             if len(used):
@@ -178,7 +178,7 @@ def test_lateral_offset_follows_from_the_expansion_between_places(spacing):
     """With an expansion of 0.06 half widths per meter, 1 m has a parallax of 0.06 f widths."""
     image, damaged = panorama(1), 3
     steps = 0.06 * spacing * (np.arange(8) - 4) * WIDTH / 2
-    places = [describe_columns(forward(image, each)) for each in steps]
+    places = [describe_columns(forward(image, outward)) for outward in steps]
 
     def columns(k):
         if k == damaged:
@@ -214,7 +214,7 @@ def test_crops_of_real_images_by_day_and_night(data_folder):
     for place, query in zip(places[:60], queries[:60], strict=True):
         columns = crop(place, 0)
         both = own.update(crop(query, 0), columns), cropped.update(crop(query, 0.08), columns)
-        if all(each.is_valid for each in both):
+        if all(result.is_valid for result in both):
             errors.append((both[1].shift - both[0].shift + 0.08 / 0.73) * 1024)
     assert len(errors) >= 20
     assert np.sqrt(np.mean(np.square(errors))) < 10

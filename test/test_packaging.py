@@ -216,7 +216,7 @@ def test_a_report_without_its_packages_is_refused_before_any_work(
     hide_module, monkeypatch, capsys, working_folder, small_map, module, words
 ):
     save_map(small_map, 'monday.stavpr')
-    for name in [each for each in sys.modules if re.match(rf'{module}\b|stavpr_lab.map_p', each)]:
+    for name in [n for n in sys.modules if re.match(rf'{module}\b|stavpr_lab.map_p', n)]:
         monkeypatch.delitem(sys.modules, name)
     hide_module(module)
     assert stavpr.main(words.split()) == 1

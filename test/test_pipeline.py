@@ -424,21 +424,21 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
 
     def closing(**changes):
         pipeline = recorded(route, 'loop_closure', **changes)
-        (result,) = (each for each in process(pipeline, route[:12], first=30) if each.match.late)
+        (result,) = (r for r in process(pipeline, route[:12], first=30) if r.match.late)
         return pipeline.places, result
 
     places, result = closing(geometric=check)
     assert result.match.accepted
-    for each in result.match.late:
-        query = places.thumbnail(each.first_image + each.position)
-        found = PlaceVerifier(check).inliers(query, places, each.place)
-        assert each.inliers == found >= 8
+    for late in result.match.late:
+        query = places.thumbnail(late.first_image + late.position)
+        found = PlaceVerifier(check).inliers(query, places, late.place)
+        assert late.inliers == found >= 8
     rejected = {result.match.place, result.match.late[0].place}
     monkeypatch.setattr(PlaceVerifier, 'inliers', lambda *given: 8 * (given[3] not in rejected))
     _, other = closing(geometric=check)
     assert not other.match.accepted
-    left = [each.place for each in result.match.late if each.place not in rejected]
-    assert [each.place for each in other.match.late] == left != []
+    left = [late.place for late in result.match.late if late.place not in rejected]
+    assert [late.place for late in other.match.late] == left != []
 
 
 def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path):
@@ -489,7 +489,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
         with pytest.raises(InputError, match='quaternion of norm 0'):
             pipeline.operation.process(message(image), i, np.zeros(7))
         good, expected = (
-            process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
+            process(p, [image], first=50 + i, poses=True)[0] for p in (pipeline, other)
         )
         for name in ('image_index', 'candidates'):
             assert getattr(good, name) == getattr(expected, name)

@@ -365,8 +365,8 @@ def test_destroyed_managed_node_has_no_services_of_its_life_cycle(node, context)
             }
 
     wait_for('upstream', 'managed')
-    for each in nodes:
-        each.destroy_node()
+    for lifecycle_node in nodes:
+        lifecycle_node.destroy_node()
     wait_for('upstream')
 
 

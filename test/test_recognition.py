@@ -115,13 +115,13 @@ def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, m
     strips = features[:].strips.copy()
     strips[2, 0, 0] = value
     damaged = LocalFeatures(strips, features.weights, features.settings)
-    for each in (one, other):
-        recognize_all(each, features[:3])
+    for localizer in (one, other):
+        recognize_all(localizer, features[:3])
     for call in (one.update, one.distances):
         with pytest.raises(InputError, match='features of the image are not finite'):
             call(damaged[:1])
     for i in range(3, 6):
-        found, expected = (each.update(features[i : i + 1]) for each in (one, other))
+        found, expected = (localizer.update(features[i : i + 1]) for localizer in (one, other))
         assert repr(vars(found)) == repr(vars(expected))
     with pytest.raises(InputError, match='features of the map are not finite'):
         recognizer(replace(small_map, features=damaged))
@@ -185,7 +185,7 @@ def plain(costs, places, count, nms_radius):
 
 def known(candidates):
     """Return place and distance of each: NaN, an unknown probability, equals nothing."""
-    return [(each.place, each.distance) for each in candidates]
+    return [(candidate.place, candidate.distance) for candidate in candidates]
 
 
 def nearest_of(costs, places, distance):

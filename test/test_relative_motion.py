@@ -39,7 +39,7 @@ def corridor(seed=0, noise=0.5):
     rng = np.random.default_rng(seed)
     places = rng.standard_normal((7, N, 32))
     both = places, places + noise * rng.standard_normal(places.shape)
-    return [features_of(each) for each in both]
+    return [features_of(strips) for strips in both]
 
 
 def driven_map(features, positions, **parts):

@@ -45,8 +45,8 @@ def views_of(points, poses, noise=0.0, seed=1):
     rng = np.random.default_rng(seed)
     descriptors = rng.uniform(0, 100, (len(points), 128)).astype(np.float32)
     views = []
-    for each in poses:
-        seen = in_camera(points, each, CAMERA)
+    for base in poses:
+        seen = in_camera(points, base, CAMERA)
         known = seen[:, 2] > 0.5
         rays = seen[known, :2] / seen[known, 2:]
         views.append(
@@ -63,7 +63,7 @@ def in_camera(points, base, camera):
 def motions(poses, center):
     mount = matrices(np.array(FORWARD))
     own = matrices(center) @ mount
-    return [inverse(matrices(each) @ mount) @ own for each in poses]
+    return [inverse(matrices(base) @ mount) @ own for base in poses]
 
 
 def test_triangulate_of_exact_views_returns_the_points():
@@ -143,7 +143,7 @@ def test_triangulate_corrects_the_steps_of_poor_odometry(seed):
     for before, after in pairwise(map(matrices, poses)):
         noise = matrices(pose(*rng.normal(0, (0.04, 0.005, 0.012))))
         measured.append(measured[-1] @ inverse(before) @ after @ noise)
-    wrong = motions([to_poses(each) for each in measured], to_poses(measured[4]))
+    wrong = motions([to_poses(matrix) for matrix in measured], to_poses(measured[4]))
     true = motions(poses, poses[4])
     del views[4:5], wrong[4], true[4]
     place = views_of(points, poses[4:5], noise=0.3, seed=1)[0]
@@ -155,9 +155,7 @@ def test_triangulate_corrects_the_steps_of_poor_odometry(seed):
 
     def turned(found):
         pairs = zip(found, true, strict=True)
-        return [
-            Rotation.from_matrix(each[:3, :3] @ own[:3, :3].T).magnitude() for each, own in pairs
-        ]
+        return [Rotation.from_matrix(m[:3, :3] @ own[:3, :3].T).magnitude() for m, own in pairs]
 
     assert max(aside(landmarks.motions)) < 0.006
     assert np.mean(turned(landmarks.motions)) < np.mean(turned(wrong)) / 3
@@ -201,7 +199,7 @@ def test_mutual_matches_of_floats_agree_with_opencv(ratio):
         if one.distance < ratio * two.distance and back[one.trainIdx][0].trainIdx == one.queryIdx
     ]
     found = mutual_matches(mine, theirs, ratio)
-    assert list(zip(*(each.tolist() for each in found), strict=True)) == expected
+    assert list(zip(*(indices.tolist() for indices in found), strict=True)) == expected
     assert 20 < len(expected) < 60
 
 
@@ -487,7 +485,7 @@ def test_map_file_holds_several_cameras(small_map, tmp_path):
     save_map(merged, tmp_path / 'a.stavpr')
     found = load_map(tmp_path / 'a.stavpr')
     assert found.sessions == merged.sessions
-    assert [(each.camera, each.yaw) for each in found.sessions] == [
+    assert [(session.camera, session.yaw) for session in found.sessions] == [
         ('front', 0.1), ('rear', pytest.approx(math.pi)),
     ]  # fmt: skip
     assert (found.camera_of(n - 1), found.camera_of(n)) == (CAMERA, rear)

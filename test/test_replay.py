@@ -442,7 +442,7 @@ def test_replay_of_a_bag_publishes_its_images(
     subscriber = subscribe(answers=answers)
     status, output, errors = replay(path, *arguments.split())
     assert status == code
-    assert all(each in output + errors for each in words), output + errors
+    assert all(text in output + errors for text in words), output + errors
     assert subscriber.data() == [data[i] for i in received]
     if 'rate' in arguments:
         assert float(output.partition(' in ')[2].partition(' s')[0]) >= 0.4

@@ -23,7 +23,7 @@ def darker(images):
     """Return images of another drive: another crop, another light, noise."""
     dice = np.random.default_rng(3)
     moved = [cv2.resize(image[6:, 6:] // 2, image.shape[1::-1]) for image in images]
-    return [np.uint8(np.clip(each + dice.normal(0, 9, each.shape), 0, 255)) for each in moved]
+    return [np.uint8(np.clip(image + dice.normal(0, 9, image.shape), 0, 255)) for image in moved]
 
 
 def coarse(image):

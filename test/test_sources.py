@@ -66,8 +66,8 @@ class Drive:
 def frames_of(images, topic='/raw', stamped=True):
     """Return the frames that records of a bag become."""
     return [
-        (f'{topic}#{i}', each.stamp_ns if stamped else each.time_ns, pixels(each))
-        for i, each in enumerate(images)
+        (f'{topic}#{i}', record.stamp_ns if stamped else record.time_ns, pixels(record))
+        for i, record in enumerate(images)
     ]
 
 
@@ -249,7 +249,7 @@ def folder_with_pages(path, kind, name):
     others = ['2.png', '3.jpg', '4.tiff', '5.webp']
     for other in others:
         cv2.imwrite(str(path / other), gray(0))
-    frames = [(each, 0, gray(0)) for each in (name, *others)]
+    frames = [(file, 0, gray(0)) for file in (name, *others)]
     return Drive(path, frames, left_out={'pages': 2})
 
 
@@ -355,7 +355,7 @@ DRIVES: list[tuple] = [  # a function that writes files, and its arguments
     (mcap_without_its_index,),
     *((split_bag, suffix, *row) for suffix in ('db3', 'mcap') for row in SPLIT),
     *((compressed_bag, mode, has) for mode in ('FILE', 'MESSAGE', 'STORAGE') for has in (0, 1)),
-    *((folder, name, each) for name in ('drive', 'drive.bag', 'drive.mp4') for each in FOLDERS),
+    *((folder, name, kind) for name in ('drive', 'drive.bag', 'drive.mp4') for kind in FOLDERS),
     *((folder_with_pages, *one.split()) for one in PAGES),
     (folder_of_names_that_are_no_utf8,),
     *((folder_with_a_bad_file, content) for content in BAD_FILES),
@@ -372,7 +372,7 @@ DRIVES: list[tuple] = [  # a function that writes files, and its arguments
 
 def name_of(case):
     """Return the name of a row of a table."""
-    return ' '.join(getattr(each, '__name__', str(each))[:40] for each in case[:3])
+    return ' '.join(getattr(part, '__name__', str(part))[:40] for part in case[:3])
 
 
 @pytest.mark.parametrize('case', DRIVES, ids=name_of)
@@ -383,7 +383,7 @@ def test_files_become_frames(tmp_path, caplog, case):
     source = open_source(drive.path, on_error=errors.append, **drive.options)
     for _ in range(2):
         frames = list(source)
-        assert [frame.identifier for frame in frames] == [each[0] for each in drive.frames]
+        assert [frame.identifier for frame in frames] == [frame[0] for frame in drive.frames]
         stamps = [stamp for _, stamp, _ in drive.frames]
         off = np.subtract([frame.stamp for frame in frames], stamps)
         assert np.abs(off).max() <= (2e6 if drive.lossy else 0)
@@ -396,7 +396,7 @@ def test_files_become_frames(tmp_path, caplog, case):
     if drive.counted:
         assert len(source) == len(drive.frames) + len(drive.errors)
     assert getattr(source, 'left_out', {}) == drive.left_out
-    notes = [each.getMessage() for each in caplog.records if each.name.startswith('stavpr')]
+    notes = [record.getMessage() for record in caplog.records if record.name.startswith('stavpr')]
     assert (len(notes), bool(notes)) == (len({*notes}), bool(drive.note))
     assert re.search(drive.note, '\n'.join(notes))
     if isinstance(source, BagSource):
@@ -629,8 +629,8 @@ def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
 def test_parts_of_a_split_ros1_bag_are_read_by_time(tmp_path):
     parts_of_a_ros1_bag(tmp_path)
     times = [record.time_ns for record in records(9)]
-    assert [each.time_ns for each in open_source(tmp_path).records(0.4, 0.3)] == times[4:7]
-    assert [each.time_ns for each in read_messages(tmp_path, ['/text'])] == times
+    assert [record.time_ns for record in open_source(tmp_path).records(0.4, 0.3)] == times[4:7]
+    assert [record.time_ns for record in read_messages(tmp_path, ['/text'])] == times
 
 
 def test_bag_is_written_by_one_writer_and_over_what_a_killed_one_left(tmp_path):

@@ -139,7 +139,7 @@ def test_no_session_of_a_merged_map_goes(first):
     for day in range(1, 5):
         drive = built(OTHER if day == 2 else ROUTE, day)
         place_map, version = updated(place_map, drive, version, f'day {day}')
-    assert [each.id for each in place_map.sessions] == ['a', 'b', 'c', 'day 2', 'day 3', 'day 4']
+    assert [s.id for s in place_map.sessions] == ['a', 'b', 'c', 'day 2', 'day 3', 'day 4']
 
 
 def test_drive_over_less_than_half_of_the_route_changes_nothing(first, two):
@@ -291,7 +291,7 @@ def test_map_with_more_drives_keeps_three_after_the_next_update(path, first):
     opened, drive = FileVersion.of(path), built(OTHER[:40] + ROUTE[40:], 6)
     version = update_file(path, opened, load_map(path), drive, '6')
     assert (version.number, version.base_places) == (6, 200)
-    assert [each.id for each in load_map(path).sessions] == ['first', '4', '5', '6']
+    assert [session.id for session in load_map(path).sessions] == ['first', '4', '5', '6']
     assert roll_back(path).number == 5
 
 
@@ -353,7 +353,7 @@ def test_old_versions_are_deleted(path, first, monkeypatch):
         changed(path, later, Version('', changes=(f'{day}',)))
     files = sorted(Path(f'{path}.history').glob('*.stavpr'))
     assert len(files) == 2
-    assert [each.changes for each in versions.versions(path)][:3] == [('3',), ('2',), ('1',)]
+    assert [version.changes for version in versions.versions(path)][:3] == [('3',), ('2',), ('1',)]
     with pytest.raises(InputError, match='is no version'):
         roll_back(path, versions.versions(path)[2].map_id)
 

@@ -33,8 +33,8 @@ def drives():
     views = np.stack([wall[:, 8 * i : 8 * i + 80] for i in range(IMAGES)])
     noise = rng.normal(0, 2, views.shape)
     return [
-        np.clip(LOW + 5.5 * each, 0, 65535).astype(np.uint16)
-        for each in (views, 0.8 * views + 20 + noise)
+        np.clip(LOW + 5.5 * shades, 0, 65535).astype(np.uint16)
+        for shades in (views, 0.8 * views + 20 + noise)
     ]
 
 
@@ -141,7 +141,7 @@ def test_pipeline_finds_the_range_before_its_first_place(drives, thermal_map, op
         pipeline.operation.process(raw(image), (i + 1) * 10**9)
         for i, image in enumerate(drives[0])
     ]
-    assert {each.match.status for each in results[:20]} == {Status.NOT_READY}
+    assert {result.match.status for result in results[:20]} == {Status.NOT_READY}
     assert results[4].match.reason == 'images of 16 bits, 5 of 20 for their range'
     places = pipeline.places
     assert (len(places), places.settings) == (IMAGES - 20, thermal_map.settings)

@@ -84,14 +84,14 @@ def check(found, missing=()):
 
 @pytest.mark.parametrize('kind', [FFMPEG, FOXGLOVE])
 def test_each_packet_is_an_image_from_the_first_key_frame_on(encoded, codec, kind):
-    messages = [message_of(each, kind, codec, i) for i, each in enumerate(encoded)]
+    messages = [message_of(packet, kind, codec, i) for i, packet in enumerate(encoded)]
     check(decoded(VideoStream(), messages))
     late = decoded(VideoStream(), messages[3:])
     check([*IMAGES[:3], *late], dict.fromkeys(range(3, GOP), NO_KEY_FRAME))
 
 
 def test_lost_packets_are_counted_and_their_key_frame_is_awaited(encoded, codec):
-    messages = [message_of(each, FFMPEG, codec, i) for i, each in enumerate(encoded)]
+    messages = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(encoded)]
     stream = VideoStream()
     found = decoded(stream, messages[:6] + messages[8:])
     check([*found[:6], *IMAGES[6:8], *found[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
@@ -114,7 +114,7 @@ def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch
             message.data[where] = random.integers(0, 256, where.size)
             message.data = message.data[: random.integers(0, message.data.size + 1)]
             decoded(stream, [message])
-    good = [message_of(each, FFMPEG, codec, i) for i, each in enumerate(encoded)]
+    good = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(encoded)]
     check(decoded(stream, good))
     bad = message_of(encoded[0], FFMPEG, codec, 0, width=100_000, height=100_000)
     assert decoded(stream, [bad]) == ['too large']
@@ -128,11 +128,11 @@ def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch
 
 def test_image_that_ffmpeg_conceals_is_damaged(route):
     messages = [
-        message_of(each, FOXGLOVE, 'libx264', i)
-        for i, each in enumerate(packets(route[:6], 'libx264', 5))
+        message_of(packet, FOXGLOVE, 'libx264', i)
+        for i, packet in enumerate(packets(route[:6], 'libx264', 5))
     ]
     messages[2].data = messages[2].data[: messages[2].data.size // 2]
-    found = [each if isinstance(each, str) else '' for each in decoded(VideoStream(), messages)]
+    found = [image if isinstance(image, str) else '' for image in decoded(VideoStream(), messages)]
     assert found == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
 
 
@@ -166,7 +166,7 @@ def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded
     assert (source.message_type, len(source)) == (name, COUNT - 1)
     frames = list(source)
     if name == FFMPEG:  # the other one does not report that a packet is missing
-        assert [each.kind for each in errors] == 2 * [NO_KEY_FRAME]
+        assert [error.kind for error in errors] == 2 * [NO_KEY_FRAME]
         left = [*range(7), *range(10, COUNT)]
         assert [frame.stamp for frame in frames] == [(i + 1) * SECOND for i in left]
         for i, frame in zip(left, frames, strict=True):
@@ -197,7 +197,7 @@ def test_node_decodes_video_in_compressed_images(
     for i, packet in enumerate(encoded):
         header, data = Header(stamp=Time(sec=i + 1)), bytes(packet)
         image_input.on_image(CompressedImage(header=header, format=CODECS[codec][1], data=data))
-    assert [each.header.stamp.sec for each in image_input.passed] == list(range(1, COUNT + 1))
+    assert [image.header.stamp.sec for image in image_input.passed] == list(range(1, COUNT + 1))
     if has_pyav:
         check(list(map(decode_message, image_input.passed)))
     else:
@@ -218,7 +218,7 @@ def test_bag_of_another_transport_has_a_remedy_and_damaged_messages_are_errors(t
             bag.write_bytes('/video', FOXGLOVE, SECOND, content)
     errors = []
     assert list(BagSource(tmp_path / 'damaged', on_error=errors.append)) == []
-    assert [each.kind for each in errors] == 3 * ['damaged']
+    assert [error.kind for error in errors] == 3 * ['damaged']
 
 
 @pytest.fixture
@@ -239,7 +239,7 @@ def test_node_subscribes_below_the_topic_of_images_and_counts_lost_packets(
         if i == 2:  # faster than max_rate: decoded, since the next ones depend on it
             message.header.stamp = Time(sec=2, nanosec=1)
         images.on_image(message)
-    assert [each.header.stamp.sec for each in queue] == [1, 2, 4, 6, 7]
+    assert [image.header.stamp.sec for image in queue] == [1, 2, 4, 6, 7]
     check([*IMAGES[:3], decode_message(queue[2]), IMAGES[4], *map(decode_message, queue[3:])])
     assert len(images.rejected) == 1
     images._on_lost(3)  # by the middleware, the one above among them

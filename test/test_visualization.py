@@ -465,7 +465,7 @@ def test_example_of_bridges_publishes_a_pose_at_the_start_and_on_each_request(ro
     start()
     ids = (robot.until_map(state='loaded').map_id, '0123456789abcdef')
     programs = [
-        subprocess.Popen([*command, '-p', f'map_id:="{each}"'], env=environment()) for each in ids
+        subprocess.Popen([*command, '-p', f'map_id:="{i}"'], env=environment()) for i in ids
     ]
     try:
         robot.until(lambda: requests.get_subscription_count() == len(ids), 'both programs')

@@ -193,7 +193,7 @@ def test_recognizer_after_a_reset_answers_as_a_new_one(city, query):
     drive(one, query)
     one.reset()
     for found, expected in zip(drive(one, query), drive(new, query), strict=True):
-        values = [vars(each) | {'path': vars(each.path)} for each in (found, expected)]
+        values = [vars(match) | {'path': vars(match.path)} for match in (found, expected)]
         np.testing.assert_equal(*values)
     stores[0].cut = True
     one.reset()

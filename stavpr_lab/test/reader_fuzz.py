@@ -168,5 +168,5 @@ def attack(reader: str, files: int, seed: int) -> None:
 
 
 if __name__ == '__main__':
-    for each in sys.argv[3:] or READERS:
-        attack(each, int(sys.argv[1]), int(sys.argv[2]))
+    for reader in sys.argv[3:] or READERS:
+        attack(reader, int(sys.argv[1]), int(sys.argv[2]))

@@ -113,7 +113,7 @@ def test_benchmarks_import_only_what_the_packages_have():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('stavpr_'):
                 module = importlib.import_module(node.module)
-                for name in (each.name for each in node.names):
+                for name in (alias.name for alias in node.names):
                     try:
                         hasattr(module, name) or importlib.import_module(f'{node.module}.{name}')
                     except ImportError:

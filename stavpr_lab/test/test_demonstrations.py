@@ -170,7 +170,7 @@ REASONS = {'odometry ends: meters after it': 'no odometry', 'the camera ends': '
 BRIDGE = 'the bridge: other images, without a match'
 
 
-@pytest.mark.parametrize('name', [n for n, each in blind.FAILURES.items() if not is_slow(each)])
+@pytest.mark.parametrize('name', [n for n, f in blind.FAILURES.items() if not is_slow(f)])
 @pytest.mark.parametrize(('spacing', 'rate'), LIMITS)
 def test_robot_stops_within_the_stated_meters_for_good(name, spacing, rate):
     for phase in (0.0, 0.3, 0.6, 0.95):
@@ -349,7 +349,7 @@ def test_heading_on_the_other_lane_at_dusk_in_rain():
     )
     estimator, errors = OffsetFilter(), []
     for k in range(len(along)):
-        columns = [describe_columns(each[k].image) for each in (other, taught)]
+        columns = [describe_columns(traverse[k].image) for traverse in (other, taught)]
         offset = estimator.update(*columns)
         truth = taught.camera(k)[2] - other.camera(k)[2]
         errors.append((offset.heading(FOCAL) - truth, math.atan(offset.shift / FOCAL) - truth))

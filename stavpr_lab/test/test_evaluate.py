@@ -347,7 +347,7 @@ def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
     left, top, width, height = data['box']
     assert 0 < left < left + width < 1
     assert 0 < top < top + height < 1
-    shown = next(each for each in data['pairs'] if each['right'])
+    shown = next(row for row in data['pairs'] if row['right'])
     assert shown['recorded'] == [shown['image'], shown['place']]
     assert data['places'][str(shown['place'])].startswith('data:image/jpeg')
     results = read_json((folder / 'results.json').read_text())

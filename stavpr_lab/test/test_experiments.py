@@ -100,11 +100,11 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     """Queries that are shifted to the side have different numbers in every configuration."""
     images = route_images(40)
     shifted = {'map': images, 'query': [np.roll(image, 60, axis=1) for image in images]}
-    sources = [FolderSource(write_images(tmp_path / name, each)) for name, each in shifted.items()]
+    sources = [FolderSource(write_images(tmp_path / name, v)) for name, v in shifted.items()]
     truth = GroundTruth.identity(40, 40, 1)
     experiment = DatasetExperiment(Dataset(*sources, truth, 1), 'gradient', None)
     extractor = FeatureExtractor('gradient')
-    place_map, query = (build_map(each, extractor, progress=False) for each in sources)
+    place_map, query = (build_map(source, extractor, progress=False) for source in sources)
     settings = RecognizerSettings(1.0, mode='paper')
     plain = evaluate_on_map(place_map, query.features, truth, settings)
     columns = {column.name: column for preset in PRESETS.values() for column in preset}

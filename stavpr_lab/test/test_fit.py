@@ -60,4 +60,4 @@ def test_evidence_is_replayed_as_it_is_computed():
         elif not early[i]:
             newest = expected[i]
             of_drive.add(own)
-    np.testing.assert_allclose([fit_windows.probability(each) for each in scores], expected)
+    np.testing.assert_allclose([fit_windows.probability(score) for score in scores], expected)

@@ -88,7 +88,7 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
     launch, types = load(name), {}
     for node in launch.start():
         renamed = OTHER_NAMES if node.executable == 'pose_graph' else {}
-        table = {renamed.get(n, n): each for n, each in TABLES.get(node.executable, {}).items()}
+        table = {renamed.get(n, n): d for n, d in TABLES.get(node.executable, {}).items()}
         types = {**table, **types, 'use_sim_time': False}
     given = {n: TEXTS[type(types[n])][0] for n in launch.arguments if n in types}
     own = {'replay': REPLAY, 'multi_camera': {'cameras'}}.get(name, set())
@@ -112,7 +112,7 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
                 text = repr(TEXTS[type(types[argument])][1])
                 assert (repr(value.first), value.value_type) == (text, kind), argument
         assert {topic: words(to) for topic, to in node.remappings} == {
-            **{each: f'${{{each}}}' for each in ('image', 'odom', 'camera_info')},
+            **{topic: f'${{{topic}}}' for topic in ('image', 'odom', 'camera_info')},
             'image/compressed': '${image}/compressed',
         }
         assert words(node.namespace) == '${namespace}' + '/front' * (name == 'multi_camera')

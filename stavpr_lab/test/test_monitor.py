@@ -146,9 +146,9 @@ def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
     for _ in range(3):  # on a busy machine, the events may come after the page's budget of time
         shown, _ = (
             subprocess.check_output(
-                [CHROMIUM, *options, *each, page.as_uri()], text=True, timeout=100
+                [CHROMIUM, *options, *output, page.as_uri()], text=True, timeout=100
             )
-            for each in outputs
+            for output in outputs
         )
         now = re.search(r'<div id="now"[^>]*>[^<]*', shown)[0]
         if 'no image yet' not in now:
@@ -259,7 +259,7 @@ def test_monitor_without_a_node_refuses_commands(context, history):
 def test_monitor_survives_messages_of_other_nodes(context, history):
     node = rclpy.create_node('lonely', context=context)
     Monitor(node, 'nobody', history)
-    receive = {each.topic_name: each.callback for each in node.subscriptions}
+    receive = {s.topic_name: s.callback for s in node.subscriptions}
     receive['/nobody/match'](PlaceMatch(status=200, probability=math.nan))
     for data in (b'', b'12345'):
         receive['/nobody/distances'](Image(data=data))

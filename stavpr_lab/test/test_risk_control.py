@@ -78,7 +78,7 @@ def test_made_drives_leave_each_place_out_once():
     assert [len(drive.images) for drive in drives][:3] == [130, 260, 65]
     assert not any(drive.removed for drive in drives)
     assert first.removed == ((0, 40), (120, 130))
-    kept = np.bincount(np.concatenate([each.places for each in (first, second, third)]))
+    kept = np.bincount(np.concatenate([drive.places for drive in (first, second, third)]))
     assert kept.tolist() == [2] * 130
     assert not any(drive.removed for drive in made_drives(GroundTruth.identity(40, 40), 40))
 

@@ -42,7 +42,7 @@ FAST = {'max_acceleration': 100.0, 'max_speed': 2.0}
 
 
 def overrides(**values):
-    return {'parameter_overrides': [Parameter(name, value=each) for name, each in values.items()]}
+    return {'parameter_overrides': [Parameter(name, value=v) for name, v in values.items()]}
 
 
 class Rover:

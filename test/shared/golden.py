@@ -228,8 +228,8 @@ def plain(value: Any) -> Any:
         return value.name
     if is_dataclass(value):
         skipped = {'image', 'stages'}  # pixels that were given, and times
-        rows = [(each.name, getattr(value, each.name)) for each in fields(value)]
-        return {name: plain(each) for name, each in rows if name not in skipped}
+        rows = [(row.name, getattr(value, row.name)) for row in fields(value)]
+        return {name: plain(part) for name, part in rows if name not in skipped}
     if isinstance(value, np.ndarray):
         return [str(value.dtype), value.tolist()]
     if isinstance(value, np.generic):
@@ -239,7 +239,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, tuple) and hasattr(value, '_fields'):
         return {name: plain(getattr(value, name)) for name in value._fields}
     if hasattr(value, '__iter__') and not isinstance(value, str | dict):
-        return [plain(each) for each in value]
+        return [plain(part) for part in value]
     return value
 
 
@@ -272,7 +272,7 @@ def row_of(result: ImageResult) -> list[Any]:
         result.image_index,
         match.inliers >= 20,
         None if math.isnan(value) else round(value, 5),
-        [[each.place, round(each.probability, 5)] for each in match.late],
+        [[late.place, round(late.probability, 5)] for late in match.late],
     ]
 
 

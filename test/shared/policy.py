@@ -14,6 +14,6 @@ def allowed(node: str) -> dict[str, set[str]]:
     names: dict[str, set[str]] = {}
     for group in profile:
         (right,) = group.attrib
-        found = {each.text.replace('~', f'/{node}') for each in group if each.text}
+        found = {rule.text.replace('~', f'/{node}') for rule in group if rule.text}
         names[right] = names.get(right, set()) | found
     return names

@@ -208,7 +208,7 @@ class Robot:
         called = time.time_ns()
         self._array_times.clear()
         # the first may have been made before this was called
-        self.until(lambda: sum(each > called for each in self._array_times) >= 2, 'diagnostics')
+        self.until(lambda: sum(t > called for t in self._array_times) >= 2, 'diagnostics')
         status = next(s for s in self.arrays[-1].status if s.name.endswith(part))
         return {pair.key: pair.value for pair in status.values}
 
