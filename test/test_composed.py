@@ -33,7 +33,7 @@ def set_parameter(node, name, value):
     return node.set_parameters([Parameter(name, value=value)])[0]
 
 
-def activated(node):
+def activate(node):
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     return node
 
@@ -64,7 +64,7 @@ def until_processed(node, count):
 )
 def test_waiting_images_are_dropped(make_node, map_file, route, act, cause):
     """Images that came before a reset or the deactivation do not fill the window after it."""
-    node = activated(make_node(map_path=map_file, queue_size=10))
+    node = activate(make_node(map_path=map_file, queue_size=10))
     worker, free = node.runtime.worker, threading.Event()
 
     def run(function):
@@ -83,7 +83,7 @@ def test_waiting_images_are_dropped(make_node, map_file, route, act, cause):
 def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
     make_node, map_file, route, capfd
 ):
-    node = activated(make_node(map_path=map_file))
+    node = activate(make_node(map_path=map_file))
     for tenths in (60, 61, 1, 2, 3):  # a clock is set
         node.runtime.intake.images.on_image(image_message(route[0], tenths * SECOND // 10))
     assert 'in a row' not in capfd.readouterr().err
@@ -96,7 +96,7 @@ def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
 
 
 def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(make_node, route):
-    node = activated(make_node(operation='mapping'))
+    node = activate(make_node(operation='mapping'))
     extractor = node.runtime.pipeline.operation.extractor
     extractor.extract = lambda images: 1 / 0
     enqueue(node, route[:1])
@@ -114,7 +114,7 @@ def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(make_
 def test_shutdown_of_ros_before_the_node_saves_the_map(make_node, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path, before = tmp_path / 'route.stavpr', set(threading.enumerate())
-    node = activated(make_node(operation='mapping', save_path=str(path), queue_size=100))
+    node = activate(make_node(operation='mapping', save_path=str(path), queue_size=100))
     enqueue(node, route[:20])
     while not len(node.runtime.pipeline.places):
         node.runtime.worker.run(lambda: None)
@@ -138,7 +138,7 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make_node, 
 def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = activated(
+    node = activate(
         make_node(map_path=map_file, relative_pose='none', odometry_error=0.0, **topic)
     )
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
@@ -147,7 +147,7 @@ def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
-    node = activated(make_node(map_path=map_file, relative_pose='none', odometry_error=0.0))
+    node = activate(make_node(map_path=map_file, relative_pose='none', odometry_error=0.0))
     assert node.count_subscribers('/odom') == 0
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
@@ -155,14 +155,14 @@ def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
     node.set_operation('mapping')
     assert node.count_subscribers('/odom') == 1
     assert node.trigger_deactivate() == node.trigger_cleanup() == SUCCESS
-    other = activated(make_node(relative_pose='aligned'))
+    other = activate(make_node(relative_pose='aligned'))
     assert other.count_subscribers('/odom') == 0
     other.load_map(map_file)  # with poses: for edges
     assert other.count_subscribers('/odom') == 1
 
 
 def test_place_has_the_pose_at_the_stamp_of_its_image_until_a_restart(make_node, route):
-    node = activated(make_node(operation='mapping', keyframe_distance=0.1))
+    node = activate(make_node(operation='mapping', keyframe_distance=0.1))
     trajectory = node.runtime.intake.odometry.trajectory
     for seconds in (1, 2):
         trajectory.add(seconds * SECOND, np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0]))
@@ -319,7 +319,7 @@ def recording(robot, tmp_path, request):
     return start
 
 
-def mapped(robot):
+def places_of(robot):
     """Return the stamps of the images that were published as places."""
     recorded = PlaceMatch.MAPPED, PlaceMatch.MATCH
     places = [match for match in robot.answers if match.status in recorded]
@@ -340,16 +340,16 @@ def test_node_killed_at_a_random_moment_loses_no_published_place(
     published, begin = set(), robot.stamp
     for _ in range(kills):
         process, first = recording(), robot.stamp + SECOND
-        published |= mapped(robot)  # of the killed node, received late
+        published |= places_of(robot)  # of the killed node, received late
         robot.forget()
         for image in route[: random_.randrange(1, 20)]:
             robot.stamp += SECOND
             robot.publisher.publish(image_message(image, robot.stamp))
         count = random_.randrange(1, 1 + (robot.stamp - first) // SECOND + 1)
-        robot.until(lambda count=count: len(mapped(robot)) >= count, 'some places')
+        robot.until(lambda count=count: len(places_of(robot)) >= count, 'some places')
         process.popen.kill()
         process.wait()
-        published |= mapped(robot)
+        published |= places_of(robot)
     assert sum(recover(journal).recorded for journal in journals(path)) > 0
     stamps = [load_map(file).stamps.tolist() for file in sorted(tmp_path.glob('route*.stavpr'))]
     assert {stamp for stamp in published if stamp > begin} <= set().union(*stamps)

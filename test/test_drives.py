@@ -24,7 +24,7 @@ from stavpr_ros.pipeline.saving import (
     take_up_earlier_drives,
     update_own_map,
 )
-from test_upkeep import built, OTHER, ROUTE
+from test_upkeep import build, OTHER, ROUTE
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 DRIVES = [
@@ -42,7 +42,7 @@ class Killed(BaseException):
 def recorded(tmp_path_factory):
     """Return a map, and three drives of a pipeline on it."""
     path = tmp_path_factory.mktemp('recorded') / 'route.stavpr'
-    save_map(built(ROUTE), path)
+    save_map(build(ROUTE), path)
     pipeline = localizing(str(path), update_map=True, sequence=SequenceSettings(20))
     for number, drive in enumerate(DRIVES):
         process(pipeline, drive, first=1_700_000_000 + 1000 * number)
@@ -131,7 +131,7 @@ def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path)
         update_own_map(pipeline, at_once, Log())
     folder = Path(f'{path}.history/drives')
     (folder / 'drive 1.stavpr').write_bytes(b'cut off')
-    save_map(built(OTHER), folder / 'drive 2.stavpr')
+    save_map(build(OTHER), folder / 'drive 2.stavpr')
     log = Log()
     take_up_earlier_drives(path, log)
     assert 'drive 1 does not update' in log.of('error')

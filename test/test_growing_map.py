@@ -46,7 +46,7 @@ def where(i):
     return np.array([i, 2 * i, 3, 0, 0, 0.6, 0.8])
 
 
-def grown(count, limit=100):
+def grow_map(count, limit=100):
     """Return a map of count places; every third has no pose, every second no thumbnail."""
     made = GrowingMap(EXTRACTOR.settings, None, limit)
     for i in range(count):
@@ -80,7 +80,7 @@ def assert_holds(made, numbers):
 
 
 def test_growing_map_at_its_limit_is_full():
-    made = grown(18, 18)
+    made = grow_map(18, 18)
     with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, evict'):
         add(made, 18)
     assert_holds(made, range(18))
@@ -88,7 +88,7 @@ def test_growing_map_at_its_limit_is_full():
 
 
 def test_snapshot_is_independent_of_map():
-    made = grown(3)
+    made = grow_map(3)
     snapshot = made.snapshot()
     assert_holds(snapshot, range(3))
     made.features.strips[:] = 0
@@ -101,7 +101,7 @@ def test_snapshot_is_independent_of_map():
 
 def test_snapshot_saved_and_loaded_continues(tmp_path):
     """Poses of some places, thumbnails of some places."""
-    save_map(grown(7).snapshot(), tmp_path / 'map')
+    save_map(grow_map(7).snapshot(), tmp_path / 'map')
     loaded = load_map(tmp_path / 'map')
     assert_holds(loaded, range(7))
     assert loaded.pose(3) is None
@@ -161,7 +161,7 @@ def test_growing_map_equals_plain_list(steps):
     ],
 )
 def test_add_with_error_changes_nothing(count, arguments, error, words):
-    made = grown(count)
+    made = grow_map(count)
     with pytest.raises(error, match=words):
         made.add(*arguments)
     if count:

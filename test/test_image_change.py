@@ -27,7 +27,7 @@ def plain_change(a, b):
     return 1 - np.mean([1.0 if not x.any() and not y.any() else x @ y for x, y in pairs])
 
 
-def learned(strips):
+def learn(strips):
     n = strips.shape[1]
     change, changes = ImageChange(n, 20), PlaceChanges(n, MAX_LAG)
     changes.add(strips)
@@ -52,12 +52,12 @@ def test_curve_is_mean_change_of_places_apart():
         np.mean([plain_change(strips[:, y], strips[:, y - apart]) for y in range(apart, 40)])
         for apart in range(1, MAX_LAG + 1)
     ]
-    np.testing.assert_allclose(learned(strips).curve, expected, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(learn(strips).curve, expected, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize('places', [0, 1, 3])
 def test_curve_beyond_short_map_is_that_of_unrelated_images(places):
-    curve = learned(drive_strips(places)).curve
+    curve = learn(drive_strips(places)).curve
     np.testing.assert_array_equal(curve[max(places, 1) :], 1)
     assert curve[0] == 0
     assert (curve[1 : max(places, 1)] < 1).all()
@@ -66,13 +66,13 @@ def test_curve_beyond_short_map_is_that_of_unrelated_images(places):
 def test_learn_newest_of_each_place_equals_learn():
     strips = drive_strips(30)
     curve = learned_on_route(strips, 32).curve
-    np.testing.assert_allclose(curve, learned(strips).curve, rtol=1e-5)
+    np.testing.assert_allclose(curve, learn(strips).curve, rtol=1e-5)
 
 
 def test_next_query_is_change_from_image_before():
     strips = drive_strips(3)
     strips[1, :2] = strips[2, 1] = 0
-    change = learned(drive_strips(9))
+    change = learn(drive_strips(9))
     assert change.next_query(strips[:, 0]) == 1
     found = change.next_query(strips[:, 1])
     assert found == pytest.approx(plain_change(strips[:, 0], strips[:, 1]), abs=1e-6)
@@ -82,7 +82,7 @@ def test_next_query_is_change_from_image_before():
 
 
 def test_standstill_and_weight_are_relative_to_neighboring_places():
-    change = learned(drive_strips(200))
+    change = learn(drive_strips(200))
     near = change.curve[1]
     assert change.is_standstill(0.99 * STANDSTILL * near)
     assert not change.is_standstill(1.01 * STANDSTILL * near)
@@ -103,14 +103,14 @@ def decaying_strips(places, similarity, seed=0):
 @pytest.mark.parametrize('step', [2, 3])
 def test_expected_change_below_one_place_is_that_of_a_denser_map(step):
     strips = decaying_strips(300, 0.6)
-    dense, sparse = learned(strips), learned(strips[:, ::step])
+    dense, sparse = learn(strips), learn(strips[:, ::step])
     places = np.arange(4)
     found = [expected_change(place / step, *sparse._extended) for place in places]
     np.testing.assert_allclose(found, dense.curve[places], atol=0.03)
 
 
 def test_expected_change_is_the_curve_at_whole_places_and_never_decreases():
-    change = learned(drive_strips(300))
+    change = learn(drive_strips(300))
     found = [expected_change(places, *change._extended) for places in np.linspace(0, 30, 301)]
     np.testing.assert_allclose(found[: 10 * MAX_LAG + 1 : 10], change.curve)
     assert (np.diff(found) >= 0).all()
@@ -119,7 +119,7 @@ def test_expected_change_is_the_curve_at_whole_places_and_never_decreases():
 @pytest.mark.parametrize('noise', [0.0, 0.5])
 def test_excess_is_of_motion_and_not_of_noise(noise):
     rng = np.random.default_rng(2)
-    change, query = learned(decaying_strips(300, 0.6)), decaying_strips(60, 0.6, seed=1)
+    change, query = learn(decaying_strips(300, 0.6)), decaying_strips(60, 0.6, seed=1)
     query += noise / 20 * rng.standard_normal(query.shape).astype(np.float32)
     query /= np.linalg.norm(query, axis=2, keepdims=True)
     for i in range(query.shape[1]):
@@ -134,7 +134,7 @@ def test_creep_is_of_a_path_that_moves_less_than_the_camera():
     strips, query = decaying_strips(300, 0.6), decaying_strips(60, 0.6, seed=1)
     alike = (1 - 0.3) * strips[:, 100:101] + 0.3 * strips[:, 100:200]
     strips[:, 100:200] = alike / np.linalg.norm(alike, axis=2, keepdims=True)
-    change = learned(strips)
+    change = learn(strips)
     assert change.creep(20, 39, 20) == 0  # of no image
     for i in range(query.shape[1]):
         change.next_query(query[:, i])
@@ -148,7 +148,7 @@ def test_equal_places_do_not_count_unless_few_would():
     strips = drive_strips(60)
     strips[:, 21:25] = strips[:, 20:21]
     expected = np.isin(np.arange(60), range(21, 25), invert=True)
-    change, route = learned(strips), learned_on_route(strips, 60)
+    change, route = learn(strips), learned_on_route(strips, 60)
     np.testing.assert_array_equal(change.distinct(60), expected)
     np.testing.assert_array_equal(route.distinct(60), expected)
     change.evict(22)
@@ -165,7 +165,7 @@ def probable_at(place, n):
 def test_dark_stretch_is_where_places_of_map_are_equal_or_soon_will_be():
     strips = drive_strips(60)
     strips[:, 30:41] = 0  # 31..40 equal the one before
-    change = learned(strips)
+    change = learn(strips)
     dark = [change.is_dark_stretch(probable_at(place, 60)) for place in range(60)]
     assert dark == [30 + STRETCH - LOOK_AHEAD < place <= 40 for place in range(60)]
     assert not change.is_dark_stretch(np.zeros(60))
@@ -198,7 +198,7 @@ def noisy(strips, seed=0):
     return features_of(strips / norms, NOISE / D**0.5, seed)
 
 
-def matched(recognizer, features):
+def match(recognizer, features):
     """Return the place of each image that has a match, by image."""
     matches = [recognizer.update(features[i : i + 1]) for i in range(len(features))]
     return {
@@ -216,8 +216,8 @@ def test_unknown_route_is_not_matched_with_a_map_that_has_a_standstill():
     strips, places = with_stop(route(1))
     place_map = map_of(noisy(strips))
     for seed in range(2, 6):
-        assert not matched(PlaceRecognizer(place_map, robust()), noisy(route(seed)))
-    found = matched(PlaceRecognizer(place_map, robust()), noisy(route(1), 9))
+        assert not match(PlaceRecognizer(place_map, robust()), noisy(route(seed)))
+    found = match(PlaceRecognizer(place_map, robust()), noisy(route(1), 9))
     assert len(found) > PLACES - 60
     assert all(abs(places[place] - image) <= 2 for image, place in found.items())
 
@@ -225,7 +225,7 @@ def test_unknown_route_is_not_matched_with_a_map_that_has_a_standstill():
 def test_query_is_matched_during_a_long_standstill_and_after_it():
     place_map = map_of(noisy(route(1)))
     query, places = with_stop(route(1, light=1, strength=0.8), images=1000)
-    found = matched(PlaceRecognizer(place_map, robust()), noisy(query, 9))
+    found = match(PlaceRecognizer(place_map, robust()), noisy(query, 9))
     assert len(found) > len(places) - 60
     assert all(abs(place - places[image]) <= 2 for image, place in found.items())
 
@@ -253,7 +253,7 @@ def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():
     unknown = np.concatenate([route(seed) for seed in (2, 3)], axis=1)
     strips = np.concatenate([first, unknown, route(1)], axis=1)
     closer = LoopCloser(robust(), 30, FeatureSettings('gradient', None, 7))
-    found = {i: place for i, place in matched(closer, noisy(strips)).items() if i >= STOP}
+    found = {i: place for i, place in match(closer, noisy(strips)).items() if i >= STOP}
     back = first.shape[1] + unknown.shape[1]
     assert min(found) >= back
     assert len(found) > PLACES - 60

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import zlib
 
 from fixtures import disk_of
-from map_files import changed
+from map_files import alter
 import numpy as np
 from pipelines import Log, process, save, settings_of
 import pytest
@@ -57,7 +57,7 @@ def start(target, request):
             return JournalWriter.create(target, base, template, print)
 
         pipeline = Pipeline(settings_of(**settings), operation, open_journal)
-        request.addfinalizer(lambda: killed(pipeline))
+        request.addfinalizer(lambda: kill(pipeline))
         if loaded:
             pipeline.change(loaded=read_map(str(loaded), pipeline.settings))
         return pipeline
@@ -65,7 +65,7 @@ def start(target, request):
     return start
 
 
-def killed(pipeline):
+def kill(pipeline):
     """Leave the journal as a killed process does: it is written, and no longer locked."""
     pipeline.close_journals(delete_route=False)
 
@@ -130,7 +130,7 @@ def test_journal_of_version_2_with_vectors_is_recovered(written, small_map, targ
     """They are in the map of its header, and behind the strips of each place but the last."""
     section = {'vectors': {'version': 1, 'required': False, 'data': None}}
     with JournalReader(written) as reader:
-        template = changed(
+        template = alter(
             reader.template_content,
             lambda manifest: manifest['sections'].update(section),
             vectors__vectors=np.ones((1, 2), np.float32),
@@ -196,7 +196,7 @@ def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path,
     assert len(writes) >= 23  # header, places, and the rewritten ones
 
 
-def scaled(place, **factors):
+def scale(place, **factors):
     factors = {name: getattr(place.features, name) * factors[name] for name in factors}
     return place._replace(features=replace(place.features, **factors))
 
@@ -212,9 +212,9 @@ def scaled(place, **factors):
         lambda record, place: frame(b'short'),
         lambda record, place: frame(place.encode()[:-2000]),
         lambda record, place: frame(place.encode().replace(b'place 30', b'place \xff0')),
-        lambda record, place: scaled(place, strips=1e30),
-        lambda record, place: scaled(place, strips=np.nan),
-        lambda record, place: scaled(place, weights=-1),
+        lambda record, place: scale(place, strips=1e30),
+        lambda record, place: scale(place, strips=np.nan),
+        lambda record, place: scale(place, weights=-1),
         lambda record, place: place._replace(place=Place(pose=np.ones(7))),
         lambda record, place: place._replace(place=Place(stamp=2**62)),
         lambda record, place: place._replace(thumbnail=b'no image'),
@@ -377,7 +377,7 @@ def test_saving_deletes_the_journal_and_later_places_open_another(start, route, 
     save(pipeline, target)
     assert journals(target) == []
     process(pipeline, route[3:5], first=3)
-    killed(pipeline)
+    kill(pipeline)
     assert recover(journals(target)[0]).recorded == 2
     assert stamps(target) == seconds(1, 2, 3, 4, 5)  # in the file that was continued
     assert os.listdir(target.parent) == ['route.stavpr']
@@ -391,7 +391,7 @@ def test_saving_while_places_are_recorded_keeps_those_in_the_journal(start, rout
     save_map(snapshot.places, target)
     snapshot.mark_saved(str(target))
     process(pipeline, route[5:6], first=5)
-    killed(pipeline)
+    kill(pipeline)
     result = recover(journals(target)[0])
     assert (result.places, result.recorded) == (6, 3)
     assert stamps(target) == seconds(1, 2, 3, 4, 5, 6)
@@ -402,14 +402,14 @@ def test_kill_between_saving_and_the_journal_duplicates_nothing(start, route, ta
     process(pipeline, route[:3])
     save_map(pipeline.snapshot().places, target)  # and the process is killed
     process(pipeline, route[3:4], first=3)
-    killed(pipeline)
+    kill(pipeline)
     assert recover(journals(target)[0]).path == str(target)
     assert stamps(target) == seconds(1, 2, 3, 4)
 
     pipeline = start(loaded=target)
     process(pipeline, route[4:6], first=4)
     save_map(pipeline.snapshot().places, target, force=True)
-    killed(pipeline)
+    kill(pipeline)
     assert recover(journals(target)[0]).places == 6
     assert stamps(target) == seconds(1, 2, 3, 4, 5, 6)
     assert os.listdir(target.parent) == ['route.stavpr']
@@ -423,7 +423,7 @@ def test_recover_without_the_map_that_was_continued_keeps_the_places(
     save_map(small_map, base)
     pipeline = start(loaded=base)
     process(pipeline, route[:4], first=100)
-    killed(pipeline)
+    kill(pipeline)
     if change == 'another':
         save_map(load_map(base), tmp_path / 'copy.stavpr')
         save_map(replace(small_map, stamps=small_map.stamps + 1), base, force=True)
@@ -441,7 +441,7 @@ def test_recover_beside_another_map_takes_a_numbered_name(start, small_map, rout
     save_map(small_map, target)
     pipeline = start()
     process(pipeline, route[:4], first=100)
-    killed(pipeline)
+    kill(pipeline)
     assert recover(journals(target)[0]).path == str(target.with_stem('route-2'))
     assert (len(load_map(target)), len(load_map(target.with_stem('route-2')))) == (60, 4)
 
@@ -452,7 +452,7 @@ def test_journal_of_a_second_recording_takes_a_numbered_name(start, route, targe
     process(second, route[:3])
     names = [path.name for path in journals(target)]
     assert sorted(names) == ['route-2.stavpr.journal', 'route.stavpr.journal']
-    killed(first)
+    kill(first)
     log = Log()
     assert recover_maps(target, log) == str(target)  # and that of the living one stays
     assert 'written by a running program' in log.lines[1][1]
@@ -467,7 +467,7 @@ def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch)
     (path,) = journals(target)
     # of 9,000 a place; rewritten by the thread that syncs
     wait_until(lambda: os.path.getsize(path) <= 600_000)
-    killed(pipeline)
+    kill(pipeline)
     result = recover(path)
     found = load_map(result.path)
     n = len(held)
@@ -507,7 +507,7 @@ def test_removed_journal_is_reported_and_written_anew(start, route, tmp_path, ca
     wait_until(journal_of(target).exists)
     wait_until(lambda: 'was removed: its places are written anew' in capsys.readouterr().out)
     process(pipeline, route[6:9], first=6)
-    killed(pipeline)
+    kill(pipeline)
     assert recover(journals(target)[0]).recorded == 9
     assert stamps(target) == seconds(*range(1, 10))
 

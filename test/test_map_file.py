@@ -14,8 +14,8 @@ import socket
 
 from conftest import route_images
 from map_examples import example_files, example_map, VERSION2
-from map_files import changed, network, parts_of, version2
-from map_fuzz import hand_made, mutated, use, use_file
+from map_files import alter, network, parts_of, version2
+from map_fuzz import hand_made, mutate, use, use_file
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
@@ -99,7 +99,7 @@ def test_error_risks_are_replaced_in_a_file_that_stays_the_same_map(example, sav
     def without_recordings(manifest):
         del manifest['sections']['error_risks']['data']['recordings']
 
-    path.write_bytes(changed(path.read_bytes(), without_recordings))
+    path.write_bytes(alter(path.read_bytes(), without_recordings))
     assert (load_map(path).map_id, load_map(path).error_risks) == (map_id, risks)
     path.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
     with pytest.raises(MapFileError, match='do not match their hash'):
@@ -206,7 +206,7 @@ def test_vectors_of_an_older_map_are_ignored(saved, example, tmp_path, caplog):
 
     old, new = tmp_path / 'old', tmp_path / 'new'
     vectors = np.zeros((24, 5), np.float32)
-    old.write_bytes(changed(saved.read_bytes(), older, vectors__vectors=vectors))
+    old.write_bytes(alter(saved.read_bytes(), older, vectors__vectors=vectors))
     save_map(open_map(old), new)
     assert np.array_equal(load_map(old).features.strips, example.features.strips)
     assert load_map(new).settings == load_map(old).settings
@@ -219,7 +219,7 @@ def test_unknown_section_is_ignored_unless_it_is_required(saved, example, requir
     sections = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}
     words = np.arange(9, dtype=np.uint8)
     content = saved.read_bytes()
-    saved.write_bytes(changed(content, lambda m: m.update(sections=sections), codes__words=words))
+    saved.write_bytes(alter(content, lambda m: m.update(sections=sections), codes__words=words))
     if required:
         with pytest.raises(MapFileError, match='requires section codes, version 3'):
             load_map(saved)
@@ -463,12 +463,12 @@ FORMS = [  # a change of the bytes, and what the error names
 ]
 
 
-def made(number, rows):
-    return [(number, partial(changed, change=one, **parts), text) for parts, one, text in rows]
+def rows_of(number, rows):
+    return [(number, partial(alter, change=one, **parts), text) for parts, one, text in rows]
 
 
 @pytest.mark.parametrize(('number', 'change', 'text'), [
-    *made(0, HAND_MADE), *made(1, STATISTICS), *((0, change, text) for change, text in FORMS)
+    *rows_of(0, HAND_MADE), *rows_of(1, STATISTICS), *((0, change, text) for change, text in FORMS)
 ])  # fmt: skip
 def test_damaged_or_hand_made_file_is_rejected_by_name(originals, tmp_path, number, change, text):
     (tmp_path / 'map').write_bytes(change(originals[number]))
@@ -478,7 +478,7 @@ def test_damaged_or_hand_made_file_is_rejected_by_name(originals, tmp_path, numb
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-@pytest.mark.parametrize('change', [mutated, hand_made])
+@pytest.mark.parametrize('change', [mutate, hand_made])
 def test_file_of_any_content_is_rejected_or_works(originals, tmp_path, change):
     """Damage changes nothing of a map that loads; reader_fuzz.py tries more of them."""
     rng, path, refused = random.Random(os.environ.get('CI') and 0), tmp_path / 'map', 0
@@ -491,7 +491,7 @@ def test_file_of_any_content_is_rejected_or_works(originals, tmp_path, change):
             refused += 1
         else:
             assert change is hand_made or path.read_bytes() == originals[i % 2]
-    assert 0 < refused < 150 or change is mutated
+    assert 0 < refused < 150 or change is mutate
 
 
 def test_stored_features_are_an_array_like_those_in_memory(example, saved):

@@ -9,7 +9,7 @@ from unittest.mock import patch
 from evaluation_commands import write_images
 from fixtures import route_images
 from map_examples import example_map
-from map_files import changed
+from map_files import alter
 import numpy as np
 import pytest
 from stavpr_ros.commands.build_map import main as build_map_main
@@ -99,7 +99,7 @@ def change_file(path, change=lambda section: None, **parts):
         name if name == 'strips' else f'statistics/{name}': array for name, array in parts.items()
     }
     path.write_bytes(
-        changed(path.read_bytes(), lambda m: change(m['sections']['statistics']), **named)
+        alter(path.read_bytes(), lambda m: change(m['sections']['statistics']), **named)
     )
 
 

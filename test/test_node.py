@@ -233,11 +233,11 @@ def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
     assert robot.show_at(6.1, route[5], degrees=40).status in (WARMING_UP, MATCH)
     assert 'no odometry' in robot.show(route[7], 3600 * SECOND).reason  # another clock
 
-    def compared():
+    def is_compared():
         robot.odometry.publish(Odometry(header=Header(stamp=Time(sec=1))))
         return 'without odometry at their stamps' in robot.diagnostics['input'].message
 
-    robot.until(compared, 'a remark on the stamps')
+    robot.until(is_compared, 'a remark on the stamps')
     robot.until_diagnosed('input', WARN, 'has stopped')
     robot.set(keyframe_distance=0.0, keyframe_angle_deg=0.0)
     robot.until(lambda: not robot.odometry.get_subscription_count(), 'the end of odometry')
@@ -306,12 +306,12 @@ def test_incompatible_publishers_are_reported(robot, start, publish, route):
     robot.publisher = robot.node.create_publisher(Image, 'image', RELIABLE)
     robot.wait_for_node()
 
-    def reported():
+    def is_reported():
         robot.show(route[0])
         warning = '1 publisher refused for QoS, while images of others arrive'
         return warning in robot.diagnostics['input'].message
 
-    robot.until(reported, 'a warning')
+    robot.until(is_reported, 'a warning')
     assert robot.counts('input')['publishers_refused'] == '1'
     robot.node.destroy_publisher(unreliable)
     robot.until(lambda: robot.counts('input')['publishers_refused'] == '0', 'no refusal')
@@ -431,11 +431,11 @@ def test_node_draws_match_images_for_a_subscriber_only(robot, running, route, mo
     assert calls == []
     drawn = robot.listen(Image, '/stavpr/match_image')
 
-    def received():
+    def is_received():
         robot.show(route[4])
         return bool(drawn)
 
-    robot.until(received, 'an image')
+    robot.until(is_received, 'an image')
     match = robot.drive(route[5:10])[-1]
     robot.until(lambda: drawn[-1].header == match.header, 'the last image')
     image = np.frombuffer(drawn[-1].data, np.uint8).reshape(drawn[-1].height, -1, 3)

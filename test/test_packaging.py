@@ -61,7 +61,7 @@ def distribution(package: str) -> setuptools.Distribution:
         return distutils.core.run_setup('setup.py', stop_after='init')
 
 
-def imported(folder: Path) -> set[str]:
+def imported_names(folder: Path) -> set[str]:
     """Return the top-level names that the Python files of a folder import, wherever they do."""
     names = set()
     for path in folder.rglob('*.py'):
@@ -77,14 +77,14 @@ def manifest(path: Path) -> ElementTree.Element:
     return ElementTree.parse(path / 'package.xml').getroot()
 
 
-def declared(package: str, *tags: str) -> set[str]:
+def declared_names(package: str, *tags: str) -> set[str]:
     root = manifest(PACKAGES[package])
     return {element.text for tag in tags for element in root.findall(tag)}
 
 
 def imports_of(package: str) -> set[str]:
     """Return what a package imports besides itself."""
-    return imported(PACKAGES[package] / package) - {package}
+    return imported_names(PACKAGES[package] / package) - {package}
 
 
 @each_package
@@ -102,12 +102,12 @@ def test_every_imported_distribution_is_required(package):
 @each_package
 def test_every_imported_ros_package_is_dependency(package):
     folder = PACKAGES[package]
-    run = imports_of(package) | imported(folder / 'launch')
+    run = imports_of(package) | imported_names(folder / 'launch')
     needed = {ROS_PACKAGES.get(name, name) for name in run if ROS.fullmatch(name)}
-    assert needed - declared(package, 'exec_depend', 'depend') == set()
-    tests = {name for name in imported(folder / 'test') if ROS.fullmatch(name)}
+    assert needed - declared_names(package, 'exec_depend', 'depend') == set()
+    tests = {name for name in imported_names(folder / 'test') if ROS.fullmatch(name)}
     tests -= INTERFACES.keys()  # built by the tests
-    assert tests - declared(package, 'exec_depend', 'depend', 'test_depend') == set()
+    assert tests - declared_names(package, 'exec_depend', 'depend', 'test_depend') == set()
 
 
 def test_versions_agree():

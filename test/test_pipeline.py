@@ -17,7 +17,7 @@ from pipelines import (
     message,
     MIN_PROBABILITY,
     process,
-    recorded,
+    record,
     SECOND,
     settings_of,
     stamps_of,
@@ -181,7 +181,7 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_matched_pair_has_the_distances_of_the_window(operation, route):
     """Bit for bit, of late matches as well."""
-    pipeline = recorded(route, operation)
+    pipeline = record(route, operation)
     matches, rows, earlier = [], [], 0
     for i, image in enumerate(route[:30]):
         (result,) = process(pipeline, [image], first=i, poses=True)
@@ -211,7 +211,7 @@ def test_matched_pair_has_the_distances_of_the_window(operation, route):
 
 def test_matched_pair_of_the_newest_images_alone_is_of_these(route):
     """After a jump, while images from before it are in the window."""
-    pipeline = recorded(route, 'localization', 60, sequence=SequenceSettings(12))
+    pipeline = record(route, 'localization', 60, sequence=SequenceSettings(12))
     pipeline.change(replace(pipeline.settings, min_probability=0.5))
     process(pipeline, route[5:22], first=5, poses=True)
     lengths = []
@@ -336,7 +336,7 @@ CONFIRMED = 11  # images after which its path is confirmed
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_min_probability_and_candidates_change_with_a_full_window(operation, route):
-    pipeline = recorded(route, operation, candidates=3)
+    pipeline = record(route, operation, candidates=3)
     result = process(pipeline, route[:CONFIRMED])[-1]
     assert (result.match.status, len(result.candidates)) == (Status.MATCH, 3)
     assert result.candidates[0].place == result.match.path.place
@@ -374,7 +374,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
-    pipeline = recorded(route, operation, candidates=2, mode='paper', threshold=1.0)
+    pipeline = record(route, operation, candidates=2, mode='paper', threshold=1.0)
     assert {result.match.inliers for result in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
@@ -423,7 +423,7 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
     check = GeometricSettings(min_inliers=8)
 
     def closing(**changes):
-        pipeline = recorded(route, 'loop_closure', **changes)
+        pipeline = record(route, 'loop_closure', **changes)
         (result,) = (r for r in process(pipeline, route[:12], first=30) if r.match.late)
         return pipeline.places, result
 
@@ -468,7 +468,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     Each image fails before it is valid: if it counted as a keyframe, it would then be skipped.
     """
     keyframes = KeyframeSettings(change=0.01)
-    pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
+    pipeline, other = (record(route, operation, keyframes=keyframes) for _ in range(2))
     extract = Failing(pipeline.operation.extractor.extract)
     pipeline.operation.extractor.extract = extract
     thumbnail = Failing(lambda image: b'')
@@ -502,7 +502,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_reset_empties_the_window_and_keeps_the_places(operation, route):
-    pipeline = recorded(route, operation, keyframes=KeyframeSettings(change=0.01))
+    pipeline = record(route, operation, keyframes=KeyframeSettings(change=0.01))
     process(pipeline, route[:LENGTH])
     assert pipeline.operation.window_fill == LENGTH
     places = len(pipeline.places)

@@ -93,11 +93,11 @@ def prompt(node, context):
 def test_prompt_executor_of_a_waiting_callback_submits_it_once(node, prompt, monkeypatch):
     ran, submissions, submit = [], [], ThreadPoolExecutor.submit
 
-    def counted(pool, function, *arguments):
+    def count(pool, function, *arguments):
         submissions.append(arguments)
         return submit(pool, function, *arguments)
 
-    monkeypatch.setattr(ThreadPoolExecutor, 'submit', counted)
+    monkeypatch.setattr(ThreadPoolExecutor, 'submit', count)
     node.create_timer(0.0, lambda: ran.append(1))
     for _ in range(20):
         prompt.spin_once(timeout_sec=0.05)
@@ -139,10 +139,10 @@ def test_prompt_executor_calls_back_with_events_of_publishers(node, prompt):
 
 
 def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt):
-    def destroyed(*_, **__):
+    def raise_destroyed(*_, **__):
         raise rclpy_implementation.InvalidHandle('destroyed')
 
-    prompt.wait_for_ready_callbacks = destroyed
+    prompt.wait_for_ready_callbacks = raise_destroyed
     prompt.spin_once(0.1)
 
 
@@ -250,11 +250,11 @@ def lost_response(context, node, monkeypatch):
         service = node.create_service(Trigger, '/lost', handle)
         send = service.send_response
 
-        def counted(response, header):
+        def count(response, header):
             attempts.append(header)
             return send(response, header)
 
-        service.send_response = counted
+        service.send_response = count
         prepare(service)
         qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         client = other.create_client(Trigger, '/lost', qos_profile=qos)

@@ -183,7 +183,7 @@ def plain(costs, places, count, nms_radius):
     return taken
 
 
-def known(candidates):
+def pairs_of(candidates):
     """Return place and distance of each: NaN, an unknown probability, equals nothing."""
     return [(candidate.place, candidate.distance) for candidate in candidates]
 
@@ -213,7 +213,7 @@ def test_ranked_candidates_equal_plain_loop(case):
     layout = ColumnLayout(nms_radius=nms_radius)
     found = layout.ranked(nearest, WindowSequences(costs, places), count)
     expected = plain(costs.tolist(), places.tolist(), count, nms_radius)
-    assert known(found) == [(int(places[i]), float(costs[i])) for i in expected]
+    assert pairs_of(found) == [(int(places[i]), float(costs[i])) for i in expected]
     np.testing.assert_array_equal(costs, before)
 
 

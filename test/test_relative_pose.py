@@ -153,12 +153,12 @@ def test_triangulate_corrects_the_steps_of_poor_odometry(seed):
         steps = np.array(found)[:, :3, 3]
         return np.abs(steps / np.linalg.norm(steps, axis=1)[:, None])[:, 0]
 
-    def turned(found):
+    def turns(found):
         pairs = zip(found, true, strict=True)
         return [Rotation.from_matrix(m[:3, :3] @ own[:3, :3].T).magnitude() for m, own in pairs]
 
     assert max(aside(landmarks.motions)) < 0.006
-    assert np.mean(turned(landmarks.motions)) < np.mean(turned(wrong)) / 3
+    assert np.mean(turns(landmarks.motions)) < np.mean(turns(wrong)) / 3
 
 
 def test_odometry_information_of_two_steps_is_that_of_their_composition():
@@ -212,7 +212,7 @@ MOUNTED = replace(CAMERA, mount=(0.4, -0.2, 1.1, *FORWARD[3:]))
 DISTORTED = replace(CAMERA, model='plumb_bob', distortion=(-0.2, 0.05, 0.001, -0.001, 0.0))
 
 
-def projected(points, distortion):
+def project(points, distortion):
     """Return the pixels of points in the camera, (m, 3), by OpenCV, (m, 2)."""
     zero = np.zeros(3)
     return cv2.projectPoints(points, zero, zero, MATRIX, np.array(distortion))[0][:, 0]
@@ -227,7 +227,7 @@ def render(points, textures, base, camera):
         z = seen[i, 2]
         if z < 1:
             continue
-        flat = projected(seen[i][None], camera.distortion or (0.0,) * 5)
+        flat = project(seen[i][None], camera.distortion or (0.0,) * 5)
         (u, v), side = flat.ravel(), 200 * 0.9 / z
         if not (-50 < u < width + 50 and -50 < v < height + 50):
             continue
@@ -248,7 +248,7 @@ def scene(camera, query, seed=0):
     thumbnails = {i: encode_thumbnail(render(points, textures, poses[i], camera)) for i in near}
     true = matrices(poses[PLACE]) @ matrices(query)
     image = thumbnail_of(render(points, textures, to_poses(true), camera))
-    return MatchedPair(object(), PLACE, image, *driven(), 0, poses, thumbnails)
+    return MatchedPair(object(), PLACE, image, *drive(), 0, poses, thumbnails)
 
 
 def turned_mount(mount, yaw):
@@ -256,7 +256,7 @@ def turned_mount(mount, yaw):
     return to_poses(matrices(pose(0, yaw=yaw)) @ matrices(np.array(mount)))
 
 
-def driven(ahead=0.0, speed=1.0, middle=5):
+def drive(ahead=0.0, speed=1.0, middle=5):
     """
     Return poses of the window, the middle's position, and distances to the places.
 
@@ -288,7 +288,7 @@ def test_edge_of_images_is_the_pose_between_the_bases(camera):
 @pytest.mark.parametrize('speed', [1.0, -1.0])
 def test_edge_of_a_rear_camera_is_turned(speed):
     """It sees from behind, on the way back, what the front camera of the map saw."""
-    pair = replace(plain_pair(*driven(0.4, speed), direction=int(speed)), relative_yaw=math.pi)
+    pair = replace(plain_pair(*drive(0.4, speed), direction=int(speed)), relative_yaw=math.pi)
     for method, source in (('auto', Source.ALIGNED), ('none', Source.NONE)):
         edge = EdgeEstimator(method).estimate(pair, None, None)
         assert edge.source is source
@@ -363,7 +363,7 @@ def test_edge_without_what_pnp_needs_names_it(changes, cameras, source, words):
         for i in range(-TRIANGULATION_RADIUS, TRIANGULATION_RADIUS + 1)
     }
     poses = np.array([pose(i * SPACING) for i in range(PLACES)])
-    pair = MatchedPair(object(), PLACE, flat, *driven(), 0, poses, thumbnails)
+    pair = MatchedPair(object(), PLACE, flat, *drive(), 0, poses, thumbnails)
     edge = EdgeEstimator().estimate(replace(pair, **changes), *cameras)
     assert edge.source is source
     assert words in edge.reason
@@ -379,7 +379,7 @@ def plain_pair(query_poses, middle, distances, poses=None, direction=1):
 @pytest.mark.parametrize('speed', [0.5, 0.91, 1.0, 1.6, -1.0])
 @pytest.mark.parametrize('ahead', [-0.7, 0.0, 0.3, 2.2])
 def test_align_finds_the_offset_at_any_speed(speed, ahead):
-    edge = align(plain_pair(*driven(ahead, speed), direction=1 if speed > 0 else -1))
+    edge = align(plain_pair(*drive(ahead, speed), direction=1 if speed > 0 else -1))
     assert (edge.source, edge.reason) == (Source.ALIGNED, '')
     np.testing.assert_allclose(edge.pose[:3], [ahead * SPACING, 0, 0], atol=0.06)
     along, across = edge.covariance[0, 0], edge.covariance[1, 1]
@@ -387,7 +387,7 @@ def test_align_finds_the_offset_at_any_speed(speed, ahead):
 
 
 def test_align_leaves_out_images_without_odometry_and_places_that_are_not_compared():
-    query_poses, middle, distances = driven(0.5)
+    query_poses, middle, distances = drive(0.5)
     query_poses[2:4] = np.nan
     distances[2:4] = -5
     distances[:, :4] = np.inf
@@ -404,7 +404,7 @@ def test_align_follows_the_track_of_the_places_in_a_bend():
     steps = np.column_stack([np.cos(turns), np.sin(turns)])
     corners = np.concatenate([[[0, 0]], np.cumsum(steps, axis=0)[:-1]])
     poses = np.array([pose(*at, yaw) for at, yaw in zip(corners, turns, strict=True)])
-    edge = align(plain_pair(*driven(2.0), poses))
+    edge = align(plain_pair(*drive(2.0), poses))
     expected = to_poses(inverse(matrices(poses[PLACE])) @ matrices(poses[PLACE + 2]))
     np.testing.assert_allclose(edge.pose, expected, atol=0.06)
     direction = expected[:3] / np.linalg.norm(expected[:3])
@@ -417,7 +417,7 @@ def test_independent_edges_are_apart(method):
     estimator, source, found = EdgeEstimator(method), object(), []
     poses = np.array([pose(i * SPACING) for i in range(60)])
     for place in range(15, 45):
-        query_poses, middle, distances = driven()
+        query_poses, middle, distances = drive()
         near = np.full((LENGTH, 60), 2.0)
         near[:, place - PLACE : place - PLACE + PLACES] = distances
         pair = MatchedPair(source, place, None, query_poses, middle, near, 0, poses, {})
@@ -447,7 +447,7 @@ def test_rays_are_without_distortion(model, coefficients):
     if model == 'equidistant':
         pixels = cv2.fisheye.distortPoints(rays[:, None], MATRIX, np.array(coefficients))[:, 0]
     else:
-        pixels = projected(np.column_stack([rays, np.ones(3)]), coefficients)
+        pixels = project(np.column_stack([rays, np.ones(3)]), coefficients)
     camera = replace(CAMERA, model=model, distortion=coefficients)
     np.testing.assert_allclose(camera.rays(pixels, *SIZE), rays, atol=1e-4)
 

@@ -595,11 +595,11 @@ def test_record_on_a_full_disk_ends_with_whole_lines(record, robot, publisher, t
     recording(robot, process)
     resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))
 
-    def ended():
+    def has_ended():
         publisher.publish(PlaceMatch(reason='x' * 200))
         return process.popen.poll() is not None
 
-    robot.until(ended, 'the end')
+    robot.until(has_ended, 'the end')
     lines = path.read_text().splitlines(keepends=True)
     assert len(lines) > 3
     assert all(json.loads(line)['reason'] == 'x' * 200 for line in lines)

@@ -14,7 +14,7 @@ import subprocess
 import sys
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from map_files import changed, network
+from map_files import alter, network
 import numpy as np
 from processes import environment, node_process, Process, TIMEOUT
 import pytest
@@ -148,13 +148,13 @@ def test_documented_program_recognizes_with_two_cameras_and_ends(robot, program,
     matches = {c: robot.listen(PlaceMatch, f'/{c}/stavpr/match', RELIABLE) for c in CAMERAS}
     publishers = {c: robot.node.create_publisher(Image, f'/{c}/image', RELIABLE) for c in CAMERAS}
 
-    def discovered():  # an empty image or its match may be lost before
+    def is_discovered():  # an empty image or its match may be lost before
         for camera in CAMERAS:
             if not matches[camera]:
                 publishers[camera].publish(Image())
         return all(matches.values())
 
-    robot.until(discovered, 'both nodes')
+    robot.until(is_discovered, 'both nodes')
     for number, image in enumerate(route, 1):
         message = image_message(image, robot.stamp + number * SECOND)
         for publisher in publishers.values():
@@ -192,9 +192,9 @@ def test_running_node_refuses_hostile_files_and_goes_on(run, robot, route, map_f
     program = models / 'network.pth'
     program.write_bytes(pickle.dumps(print))
     sha256 = hashlib.sha256(program.read_bytes()).hexdigest()
-    (maps / 'program').write_bytes(changed(content, network(sha256=sha256)))
+    (maps / 'program').write_bytes(alter(content, network(sha256=sha256)))
     located = network(sha256=sha256, model=str(program))
-    (maps / 'located').write_bytes(changed(content, located))
+    (maps / 'located').write_bytes(alter(content, located))
     node = run(maps_folder=maps, map_path=maps / 'good', model_path=models)
     robot.wait_for_node()
     robot.drive(route[:6])

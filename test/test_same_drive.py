@@ -13,7 +13,7 @@ from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
 from stavpr_ros.mapping import build_map, load_map, open_map, save_map
 from stavpr_ros.mapping.versions import current_version
 from stavpr_ros.sources import open_source
-from test_upkeep import built
+from test_upkeep import build
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 ROUTE, OTHER = route_images(150), route_images(60, 5)
@@ -67,7 +67,7 @@ def test_the_map_itself_is_no_drive(path, tmp_path, capsys):
 
 
 def row(images, day=0, name='monday'):
-    return rows_of(built(images, day), name)[0]
+    return rows_of(build(images, day), name)[0]
 
 
 def test_drives_of_other_times_or_more_images_are_other_drives(data_folder):

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The SROS 2 policy allows the node exactly what it does, and others no more than they need."""
 
-from policy import allowed, POLICY
+from policy import names_of, POLICY
 import pytest
 from rclpy.parameter import Parameter
 from stavpr_ros.ros.node import PlaceRecognitionNode
@@ -31,12 +31,12 @@ def test_policy_of_the_node_is_what_it_uses(context, transport):
     names['subscribe'].add('/clock')  # with use_sim_time
     names['publish'] |= {'/tf', '/initialpose', '/bond'}  # with publish_tf, and for Nav2
     names['subscribe'].add('/bond')
-    assert names == {'request': set(), **allowed('stavpr')}
+    assert names == {'request': set(), **names_of('stavpr')}
 
 
 def test_policy_of_the_others_fits_the_node():
     node, operator, reader, sensors = (
-        allowed(name) for name in ('stavpr', 'stavpr_operator', 'stavpr_reader', 'stavpr_sensors')
+        names_of(name) for name in ('stavpr', 'stavpr_operator', 'stavpr_reader', 'stavpr_sensors')
     )
     for other in (operator, reader):
         names = {name.replace('/stavpr_operator/', '/stavpr/') for name in other['subscribe']}

@@ -452,7 +452,7 @@ def cut_off(path, kind, share):
     return file
 
 
-def replaced(path, kind, old, new):
+def replace_bytes(path, kind, old, new):
     file = file_of_kind(path, kind)
     file.write_bytes(file.read_bytes().replace(old, new, 1 if kind == 'mcap' else -1))
     return file
@@ -521,7 +521,7 @@ REFUSED: list[tuple] = [  # pattern of the error, a function that writes files, 
     (r'no images.*/text .std_msgs/msg/String, 0 messages', bag_of_texts),
     (r'2 image topics, choose one .* /raw .*, /rear ', bags_of_two_topics),
     *((SECOND_FILE, bag_with_another_file, storage) for storage in ('sqlite3', 'mcap')),
-    ("is an MCAP of profile 'ros1': expected ros2", replaced, 'mcap', b'ros2', b'ros1'),
+    ("is an MCAP of profile 'ros1': expected ros2", replace_bytes, 'mcap', b'ros2', b'ros1'),
     *((r'\.(db3|bag)', cut_off, kind, s) for kind in ('sqlite3', 'ros1') for s in (0, 0.3, 0.99)),
     *((r'\.mcap', cut_off, 'mcap', share) for share in (0, 0.3)),
     ('has no images', cut_off, 'mcap', 0.01),
@@ -538,7 +538,7 @@ REFUSED: list[tuple] = [  # pattern of the error, a function that writes files, 
     (LISTED.format(30), videos_of_two_drives, None, RATE, CREATED),
     ('has videos and images: expected one kind', video_beside, '1.jpg', b'an image'),
     (r'2\.mp4 is damaged', video_beside, '2.mp4', b'damaged'),
-    ('frames of more than 64000000 pixels', replaced, 'avi', SIZE, HUGE),
+    ('frames of more than 64000000 pixels', replace_bytes, 'avi', SIZE, HUGE),
     *((NO_VIDEO, playlist, content) for content in (b'', b'no video' * 99)),
     (NOT_DECODED, playlist, b'ffconcat version 1.0\nfile other.mp4\n'),
     (NOT_DECODED, playlist, b'#EXTM3U\nother.mp4\n'),

@@ -16,15 +16,15 @@ from stavpr_ros.sources.bag import ODOMETRY, read_odometry
 from stavpr_ros.sources.pose_file import read_poses
 
 
-def passed(*stamps_and_x, **options):
+def trajectory_of(*stamps_and_x, **options):
     """Return a trajectory with a pose at each of these seconds and x."""
     trajectory = Trajectory(**options)
     for seconds, x in stamps_and_x:
-        trajectory.add(round(seconds * SECOND), turned(0, x=x))
+        trajectory.add(round(seconds * SECOND), turn(0, x=x))
     return trajectory
 
 
-def turned(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
+def turn(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
     """Return a pose at x, turned about an axis."""
     half = math.radians(degrees) / 2
     return np.array([x, 0, 0, *(math.sin(half) * part for part in axis), math.cos(half)])
@@ -32,18 +32,18 @@ def turned(degrees, x=0.0, axis=(0.0, 0.0, 1.0)):
 
 def test_trajectory_outside_its_poses_or_across_a_long_gap_returns_none():
     assert Trajectory().at(SECOND) is None
-    trajectory = passed((2, 1), (3, 2), timeout=0.5)
+    trajectory = trajectory_of((2, 1), (3, 2), timeout=0.5)
     for stamp, x in ((0, None), (2 * SECOND - 1, None), (3_500_000_000, 2), (3_500_000_001, None)):
         pose = trajectory.at(stamp)
         assert (pose if pose is None else pose[0]) == x
-    trajectory = passed((1, 1), (6, 6), (12, 12), timeout=0.5)
+    trajectory = trajectory_of((1, 1), (6, 6), (12, 12), timeout=0.5)
     assert (trajectory.at(2 * SECOND)[0], trajectory.at(12 * SECOND)[0]) == (2, 12)
     assert trajectory.at(7 * SECOND) is None
 
 
 def test_trajectory_returns_copies():
     trajectory = Trajectory()
-    pose = turned(0, x=1)
+    pose = turn(0, x=1)
     trajectory.add(SECOND, pose)
     pose[:] = 7
     for stamp in (SECOND, SECOND + 1):
@@ -52,15 +52,15 @@ def test_trajectory_returns_copies():
 
 
 def test_trajectory_sorts_late_and_replaces_equal_stamps():
-    trajectory = passed((1.0, 0), (2.0, 10), (1.5, 8), (2.0, 12), timeout=0.5)
+    trajectory = trajectory_of((1.0, 0), (2.0, 10), (1.5, 8), (2.0, 12), timeout=0.5)
     assert len(trajectory) == 3
     assert (trajectory.at(1_250_000_000)[0], trajectory.at(1_750_000_000)[0]) == (4, 10)
 
 
 def test_trajectory_after_clock_jump_starts_over():
-    trajectory = passed((10, 0), (11, 0), (10.5, 0), timeout=0.5)
+    trajectory = trajectory_of((10, 0), (11, 0), (10.5, 0), timeout=0.5)
     assert len(trajectory) == 3
-    trajectory.add(10_499_999_999, turned(0, x=5))
+    trajectory.add(10_499_999_999, turn(0, x=5))
     assert len(trajectory) == 1
     assert trajectory.at(11 * SECOND) is None
     assert trajectory.at(10_500_000_000)[0] == 5
@@ -69,12 +69,12 @@ def test_trajectory_after_clock_jump_starts_over():
 def test_trajectory_keeps_at_most_capacity():
     trajectory = Trajectory(capacity=16)
     for i in range(1, 1001):
-        trajectory.add(i, turned(0, x=i))
+        trajectory.add(i, turn(0, x=i))
         assert len(trajectory) <= 16
         assert len(trajectory) >= min(i, 14)
         assert trajectory.at(i)[0] == i
     assert trajectory.at(1000 - 17) is None
-    one = passed((1, 0), (2, 2), capacity=1)
+    one = trajectory_of((1, 0), (2, 2), capacity=1)
     assert (len(one), one.at(2 * SECOND)[0]) == (1, 2)
 
 
@@ -91,13 +91,13 @@ def test_trajectory_keeps_at_most_capacity():
 )
 def test_trajectory_with_invalid_pose_changes_nothing(pose, words):
     trajectory = Trajectory()
-    trajectory.add(2 * SECOND, turned(0))
+    trajectory.add(2 * SECOND, turn(0))
     with pytest.raises(InputError, match=words):
         trajectory.add(1, np.array(pose))  # so early that it would clear the trajectory
     assert len(trajectory) == 1
     assert trajectory.at(2 * SECOND) is not None
     with pytest.raises(InputError, match='stamp 0'):
-        trajectory.add(0, turned(0))
+        trajectory.add(0, turn(0))
 
 
 def test_trajectory_normalizes_quaternions():
@@ -109,11 +109,11 @@ def test_trajectory_normalizes_quaternions():
 def test_distance_and_rotation_by_hand():
     a = np.array([1, 2, 3, 0, 0, 0, 1.0])
     assert distance(a, np.array([1, 5, 7, 0, 0, 0, 1.0])) == 5
-    assert rotation(turned(10), turned(10)) == 0
-    assert rotation(turned(10), -turned(10)) == 0  # the same rotation
+    assert rotation(turn(10), turn(10)) == 0
+    assert rotation(turn(10), -turn(10)) == 0  # the same rotation
     for angle in (1e-6, 0.5, 90, 179.999):
-        assert rotation(turned(20), turned(20 + angle)) == pytest.approx(angle, rel=1e-6)
-    assert rotation(turned(-100), turned(100)) == pytest.approx(160)
+        assert rotation(turn(20), turn(20 + angle)) == pytest.approx(angle, rel=1e-6)
+    assert rotation(turn(-100), turn(100)) == pytest.approx(160)
 
 
 @given(
@@ -126,7 +126,7 @@ def test_distance_and_rotation_by_hand():
 def test_trajectory_turns_evenly_on_shorter_arc(first, angle, part, flip, axis):
     """After a part of the time between two poses, that part of the rotation."""
     axis = np.array(axis) / np.linalg.norm(axis)
-    start = turned(first, x=-4, axis=(0.6, 0, 0.8))
+    start = turn(first, x=-4, axis=(0.6, 0, 0.8))
 
     def after(degrees):
         turn = Rotation.from_rotvec(degrees * axis, degrees=True)
@@ -174,7 +174,7 @@ def test_read_odometry_of_what_is_no_odometry_fails(tmp_path, stamps, name, topi
 
 
 def test_from_arrays_counts_invalid_poses_unless_all_are():
-    poses = np.array([np.zeros(7), turned(0), np.full(7, np.nan), turned(90)])
+    poses = np.array([np.zeros(7), turn(0), np.full(7, np.nan), turn(90)])
     trajectory = Trajectory.from_arrays(np.array([1, 2, 3, 4]), poses)
     assert (len(trajectory), trajectory.rejected) == (2, 2)
     with pytest.raises(InputError, match='pose number 0 and all before: pose'):

@@ -60,7 +60,7 @@ def message_of(packet, kind, codec, i, **changes):
     return SimpleNamespace(**fields | changes)
 
 
-def decoded(stream, messages):
+def decode(stream, messages):
     """Return the image of each message, or the kind of its error."""
     found = []
     for message in messages:
@@ -85,22 +85,22 @@ def check(found, missing=()):
 @pytest.mark.parametrize('kind', [FFMPEG, FOXGLOVE])
 def test_each_packet_is_an_image_from_the_first_key_frame_on(encoded, codec, kind):
     messages = [message_of(packet, kind, codec, i) for i, packet in enumerate(encoded)]
-    check(decoded(VideoStream(), messages))
-    late = decoded(VideoStream(), messages[3:])
+    check(decode(VideoStream(), messages))
+    late = decode(VideoStream(), messages[3:])
     check([*IMAGES[:3], *late], dict.fromkeys(range(3, GOP), NO_KEY_FRAME))
 
 
 def test_lost_packets_are_counted_and_their_key_frame_is_awaited(encoded, codec):
     messages = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(encoded)]
     stream = VideoStream()
-    found = decoded(stream, messages[:6] + messages[8:])
+    found = decode(stream, messages[:6] + messages[8:])
     check([*found[:6], *IMAGES[6:8], *found[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
     assert stream.lost == 2
-    decoded(stream, messages)  # the publisher has started again
+    decode(stream, messages)  # the publisher has started again
     assert stream.lost == 2
     for i, message in enumerate(messages):
         message.pts = 33_333 * i  # microseconds
-    check(decoded(other := VideoStream(), messages))
+    check(decode(other := VideoStream(), messages))
     assert other.lost == 0
 
 
@@ -113,17 +113,17 @@ def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch
             where = random.integers(0, message.data.size, 1 + i % 7)
             message.data[where] = random.integers(0, 256, where.size)
             message.data = message.data[: random.integers(0, message.data.size + 1)]
-            decoded(stream, [message])
+            decode(stream, [message])
     good = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(encoded)]
-    check(decoded(stream, good))
+    check(decode(stream, good))
     bad = message_of(encoded[0], FFMPEG, codec, 0, width=100_000, height=100_000)
-    assert decoded(stream, [bad]) == ['too large']
+    assert decode(stream, [bad]) == ['too large']
     bad = message_of(encoded[0], FFMPEG, codec, 0, encoding='av1')
-    assert decoded(stream, [bad]) == ['encoding']
+    assert decode(stream, [bad]) == ['encoding']
     monkeypatch.setattr(files, 'MAX_PIXELS', WIDTH * HEIGHT - 1)  # what the parameters claim
     for message in good[:2]:
         message.width = message.height = 1
-    assert decoded(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]
+    assert decode(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]
 
 
 def test_image_that_ffmpeg_conceals_is_damaged(route):
@@ -132,7 +132,7 @@ def test_image_that_ffmpeg_conceals_is_damaged(route):
         for i, packet in enumerate(packets(route[:6], 'libx264', 5))
     ]
     messages[2].data = messages[2].data[: messages[2].data.size // 2]
-    found = [image if isinstance(image, str) else '' for image in decoded(VideoStream(), messages)]
+    found = [image if isinstance(image, str) else '' for image in decode(VideoStream(), messages)]
     assert found == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
 
 

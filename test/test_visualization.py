@@ -19,7 +19,7 @@ from fixtures import route_images
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 import numpy as np
-from pipelines import at, LENGTH, localizing, message, process, recorded, SECOND
+from pipelines import at, LENGTH, localizing, message, process, record, SECOND
 from processes import environment, TIMEOUT
 import pytest
 from rclpy.qos import qos_profile_services_default
@@ -144,7 +144,7 @@ def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
 
 
 def test_visualization_of_loop_closures_connects_query_and_place(route):
-    pipeline = recorded(route, 'loop_closure')
+    pipeline = record(route, 'loop_closure')
     views, publishers = views_of('markers', 'map_path')
     matches = process(pipeline, route[:30], first=30, poses=True)
     for i, match in enumerate(matches):
@@ -181,7 +181,7 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
 
 
 def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
-    pipeline = recorded(route, count=30)
+    pipeline = record(route, count=30)
     views, publishers = views_of('map_path')
     for i in range(30, 60):
         (match,) = process(pipeline, route[i : i + 1], i, True)
@@ -294,13 +294,13 @@ def test_node_publishes_for_viewers_and_navigation(robot, start, route):
 ABOUT = Surroundings('map', odometry_frame='odom')
 
 
-def posed(x, y, degrees):
+def pose_of(x, y, degrees):
     return np.array([x, y, 0, *Rotation.from_euler('z', degrees, degrees=True).as_quat()])
 
 
 def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
-    place, odometry = posed(5, 2, 90), posed(1, 0, 0)
-    np.testing.assert_allclose(map_to_odometry(place, odometry), posed(5, 1, 90), atol=1e-12)
+    place, odometry = pose_of(5, 2, 90), pose_of(1, 0, 0)
+    np.testing.assert_allclose(map_to_odometry(place, odometry), pose_of(5, 1, 90), atol=1e-12)
     # the odometry's frame in the map, then the robot in that: the robot in the map
     rng = np.random.default_rng(0)
     place, odometry = (
@@ -311,7 +311,7 @@ def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
 
 
 def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
-    poses = np.tile(posed(0, 0, 30), (len(small_map), 1))
+    poses = np.tile(pose_of(0, 0, 30), (len(small_map), 1))
     poses[:, 0] = np.arange(len(poses))
     places = replace(small_map, poses=poses)
     path = match_module.Path(np.column_stack([np.arange(4), np.arange(10, 6, -1)]), 9)
@@ -319,7 +319,7 @@ def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
     message = matched_pose_message(Outcome(header(0), result, places, Surroundings('map')))
     o = message.pose.pose.orientation
     assert message.pose.pose.position.x == 7
-    assert abs(np.array([o.x, o.y, o.z, o.w]) @ posed(0, 0, 210)[3:]) == pytest.approx(1)
+    assert abs(np.array([o.x, o.y, o.z, o.w]) @ pose_of(0, 0, 210)[3:]) == pytest.approx(1)
     assert message.pose.covariance[35] == 0.01
 
 

@@ -353,11 +353,11 @@ def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route
     assert last.status == PlaceMatch.MATCH
     assert abs(last.newest_index - 44) <= 1
 
-    def reported():
+    def is_reported():
         status = robot.diagnostics['map']
         return status.level == DiagnosticStatus.WARN and 'Qdrant server' in status.message
 
-    robot.until(reported, 'the finding on the map')
+    robot.until(is_reported, 'the finding on the map')
 
 
 def test_load_map_service_rejects_addresses(robot, start, server):

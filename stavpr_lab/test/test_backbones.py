@@ -49,7 +49,7 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
-def standardized(images: list[np.ndarray], size: int) -> torch.Tensor:
+def standardize(images: list[np.ndarray], size: int) -> torch.Tensor:
     """Prepare images as the networks were trained, step by step in float64: (n, 3, size, size)."""
     small = np.stack(
         [cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR) for image in images]
@@ -82,7 +82,7 @@ def test_densenet161_equals_second_implementation(densenet_file, densenet_parame
     ours = backbone_class('densenet161_places365')(settings).feature_maps(images)
     doubles = {name: value.double() for name, value in densenet_parameters.items()}
     assert ours.shape == (2, 1488, 3, 3)
-    assert_same(ours, networks.densenet161_layer10(doubles, standardized(images, 96)))
+    assert_same(ours, networks.densenet161_layer10(doubles, standardize(images, 96)))
 
 
 def test_vgg16_equals_second_implementation(vgg_file, vgg_parameters):
@@ -94,7 +94,7 @@ def test_vgg16_equals_second_implementation(vgg_file, vgg_parameters):
         name: value.double() for name, value in vgg_parameters.items() if 'features' in name
     }
     assert ours.shape == (3, 512, 4, 4)
-    assert_same(ours, networks.vgg16_pool4(doubles, standardized(images, 64)))
+    assert_same(ours, networks.vgg16_pool4(doubles, standardize(images, 64)))
 
 
 def test_vgg16_fc6_by_hand():
@@ -264,7 +264,7 @@ def write(folder, layout, p, whitening=True):
     return path
 
 
-def convolved(x, kernels, shift):
+def convolve(x, kernels, shift):
     """Correlate (H, W, in) with (out, in, 3, 3) in float64, zeros around it."""
     maps = [
         sum(correlate2d(x[..., c], k[c].astype(np.float64), 'same') for c in range(len(k)))
@@ -273,7 +273,7 @@ def convolved(x, kernels, shift):
     return np.stack(maps, axis=-1) + shift
 
 
-def pooled(x):
+def pool(x):
     return x.reshape(len(x) // 2, 2, len(x) // 2, 2, -1).max(axis=(1, 3))
 
 
@@ -284,10 +284,10 @@ def oracle(image, p, layout, whitening=True):
     if not matlab:
         x = (x - (0.485, 0.456, 0.406)) / (0.229, 0.224, 0.225)
     for i, (kernel, shift) in enumerate(zip(p['kernels'], p['biases'], strict=True)):
-        x = convolved(x, kernel, shift)
+        x = convolve(x, kernel, shift)
         if i < 12:
             x = np.maximum(x, 0)
-            x = pooled(x) if i in np.cumsum(STAGES) - 1 else x
+            x = pool(x) if i in np.cumsum(STAGES) - 1 else x
     b = p['b'] if 'v2' in layout else np.zeros(K)
     V = np.zeros((K, D))
     for values in x.reshape(-1, D):

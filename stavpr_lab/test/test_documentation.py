@@ -67,12 +67,12 @@ def run(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     monkeypatch.setattr('stavpr_ros.signals.signal.signal', lambda *_: None)
 
-    def printed(work, *arguments):
+    def capture(work, *arguments):
         with contextlib.suppress(SystemExit):  # of --help
             work(*arguments)
         return capsys.readouterr().out
 
-    return printed
+    return capture
 
 
 def test_readme_python_example_runs(run):

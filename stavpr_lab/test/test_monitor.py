@@ -209,7 +209,7 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
     start()
     monitor = Monitor(robot.node, '/stavpr', history)
 
-    def shown():
+    def view():
         return history.since(0, TIMEOUT)[1]
 
     def command(name, value=''):
@@ -220,17 +220,17 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
         return results[0]
 
     with history.viewer():
-        robot.until(lambda: shown().get('state') == 'active', 'the state')
-        robot.until(lambda: 'route' in shown(), 'the route')
+        robot.until(lambda: view().get('state') == 'active', 'the state')
+        robot.until(lambda: 'route' in view(), 'the route')
         robot.drive(route[: LENGTH + 3])
         shown_images = cycle(route)
 
         def complete():
             robot.show(next(shown_images))
-            return history.image and 'pose' in shown() and shown()['samples'][-1]['row']
+            return history.image and 'pose' in view() and view()['samples'][-1]['row']
 
         robot.until(complete, 'an image, a pose and distances')
-    parts = shown()
+    parts = view()
     assert parts['map']['places'] == len(parts['route']) == 60
     match = next(sample for sample in parts['samples'] if sample['status'] == 'match')
     assert match['probability'] > 0.05
@@ -239,10 +239,10 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
     robot.until(lambda: monitor._images is None, 'no subscription without a page')
     assert command('reset') == 'the window is empty'
     assert command('stop') == 'deactivate: done'
-    robot.until(lambda: shown()['state'] == 'inactive', 'the state')
+    robot.until(lambda: view()['state'] == 'inactive', 'the state')
     assert command('start') == 'activate: done'
     assert command('operation', 'mapping') == 'operation mapping'
-    robot.until(lambda: shown()['map']['operation'] == 'mapping', 'the operation')
+    robot.until(lambda: view()['map']['operation'] == 'mapping', 'the operation')
     with pytest.raises(StavprError, match='expected start, stop, reset or operation'):
         monitor.command('explode', '')
 

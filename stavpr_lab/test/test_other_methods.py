@@ -222,7 +222,7 @@ def traverses(data_folder):
     return features
 
 
-def evaluated(reference, query, truth):
+def evaluate(reference, query, truth):
     """Best F1, and the precision at the default threshold."""
     found = evaluate_on_map(map_of(reference), query, truth, SETTINGS)
     accepted = accepted_counts(found.results.accepted, found.correct, truth.has_match)
@@ -232,13 +232,13 @@ def evaluated(reference, query, truth):
 def test_gardens_point_at_every_speed_is_recognized(traverses):
     reference, query = traverses('gardens_point/day_left'), traverses('gardens_point/day_right')
     truth = GroundTruth.identity(200, 200, 2)
-    f1, precision = evaluated(reference, query, truth)
+    f1, precision = evaluate(reference, query, truth)
     print(f'Gardens Point, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
     assert f1 >= 0.99
     assert precision >= 0.95
     for kind in ('2x', '0.5x', 'vary', 'stop'):
         indices = DriveChanges.named(kind, 200).images(200)
-        f1, precision = evaluated(reference, query[indices], truth.select(indices))
+        f1, precision = evaluate(reference, query[indices], truth.select(indices))
         print(f'Gardens Point {kind}: F1 {f1:.4f}, precision {precision:.4f}')
         assert f1 >= 0.95
         assert precision >= 0.93
@@ -246,7 +246,7 @@ def test_gardens_point_at_every_speed_is_recognized(traverses):
 
 def test_corridor_is_recognized(traverses, data_folder):
     truth = GroundTruth.from_file(data_folder / 'corridor' / 'ground_truth.csv', 111, 111, 0)
-    f1, precision = evaluated(traverses('corridor/ref'), traverses('corridor/query'), truth)
+    f1, precision = evaluate(traverses('corridor/ref'), traverses('corridor/query'), truth)
     print(f'corridor, robust, gradient: F1 {f1:.4f}, precision {precision:.4f}')
     assert f1 >= 0.95
     assert precision >= 0.95

@@ -4,7 +4,7 @@
 
 from bags import SECOND, write_odometry
 import numpy as np
-from policy import allowed
+from policy import names_of
 from processes import Process
 import pytest
 from stavpr_msgs.msg import PlaceMatch
@@ -44,7 +44,7 @@ def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last)
     robot.node.create_publisher(PlaceMatch, '/stavpr/match', 1)
     process = Process(tmp_path / 'log', *arguments)
 
-    def used(right: str) -> set[str]:
+    def names_in_use(right: str) -> set[str]:
         if (node, '/') not in robot.node.get_node_names_and_namespaces():
             return set()
         names = getattr(robot.node, f'get_{KINDS[right]}_names_and_types_by_node')(node, '/')
@@ -53,14 +53,14 @@ def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last)
     try:
         robot.until(
             lambda: (
-                last[1] in used(last[0])
-                and allowed(node)['publish'] - used('publish') <= BY_OPTIONS_OR_DATA
+                last[1] in names_in_use(last[0])
+                and names_of(node)['publish'] - names_in_use('publish') <= BY_OPTIONS_OR_DATA
             ),
             f'{last[1]} and all publishers of {node}',
         )
         for right in KINDS:
-            names = allowed(node).get(right, set())
-            names_here = {name.replace('/robot/', '/stavpr/') for name in used(right)}
+            names = names_of(node).get(right, set())
+            names_here = {name.replace('/robot/', '/stavpr/') for name in names_in_use(right)}
             assert names_here <= names, right
     finally:
         process.end()

@@ -11,7 +11,7 @@ from domain import DOMAIN
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from policy import allowed
+from policy import names_of
 from processes import Process, TIMEOUT
 import pytest
 import rclpy
@@ -390,7 +390,7 @@ def test_security_policy_allows_what_the_nodes_use(context, repeat, tmp_path, na
         right: {topic for topic, _ in names if '/_action/' not in topic}
         for right, names in (('publish', published), ('subscribe', subscribed), ('reply', replied))
     }
-    rights = allowed(name)
+    rights = names_of(name)
     assert rights.pop('execute', {'/repeat'}) == {'/repeat'}
     optional = {'/clock', '/image/compressed', '/cmd_vel', '/odom'}
     assert {r: n - optional for r, n in rights.items()} == {

@@ -72,7 +72,7 @@ def array_of(part: tuple[str, list[int], bytes]) -> np.ndarray:
     return np.frombuffer(part[2], dtype).reshape(part[1]).copy()
 
 
-def changed(content: bytes, change: Callable | None = None, **parts: np.ndarray | None) -> bytes:
+def alter(content: bytes, change: Callable | None = None, **parts: np.ndarray | None) -> bytes:
     """
     Return a file with another manifest, and other parts.
 

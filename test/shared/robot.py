@@ -196,11 +196,11 @@ class Robot:
     def until_map(self, **fields: object) -> MapInfo:
         """Wait until the last ``~/map_info`` has these fields, and return it."""
 
-        def published() -> bool:
+        def is_published() -> bool:
             last = self.infos[-1] if self.infos else None
             return last is not None and all(getattr(last, name) == fields[name] for name in fields)
 
-        self.until(published, f'map_info with {fields}')
+        self.until(is_published, f'map_info with {fields}')
         return self.infos[-1]
 
     def counts(self, part: str) -> dict[str, str]:
@@ -319,7 +319,7 @@ class Robot:
         responses: list[Any] = []
         attempts = 0
 
-        def responded() -> bool:
+        def has_responded() -> bool:
             nonlocal attempts
             if attempts % RESEND == 0 and probe.service_is_ready():
                 responses.append(probe.call_async(GetState.Request()))
@@ -327,7 +327,7 @@ class Robot:
             return any(response.done() for response in responses)
 
         try:
-            self.until(responded, 'a response of the node')
+            self.until(has_responded, 'a response of the node')
         finally:
             self.node.destroy_client(probe)
 
@@ -354,10 +354,10 @@ class Robot:
     def until_diagnosed(self, part: str, level: bytes, words: str = '') -> DiagnosticStatus:
         """Wait for a level and words of a part: input, map, recognition, processing."""
 
-        def reported() -> bool:
+        def is_reported() -> bool:
             status = self.diagnostics.get(part)
             return status is not None and status.level == level and words in status.message
 
         self.diagnostics.pop(part, None)
-        self.until(reported, f'diagnostics of {part} at level {level!r} with {words!r}')
+        self.until(is_reported, f'diagnostics of {part} at level {level!r} with {words!r}')
         return self.diagnostics[part]
