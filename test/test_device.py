@@ -17,6 +17,7 @@ from stavpr_ros.method.columns import ColumnLayout
 from stavpr_ros.method.device import DeviceLmDtwWindow, z_normalized_on_device
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
 from stavpr_ros.method.settings import RobustOptions
+from stavpr_ros.prepare import device_matcher
 from stavpr_ros.prepare.centering import z_normalized
 from stavpr_ros.prepare.matcher import make_matcher
 import torch
@@ -153,8 +154,8 @@ def expected_row(reference, query, i, settings, precision):
         ('none', None),
     ],
 )
-def test_distances_of_every_strategy_equal_oracle(device, monkeypatch, strategy, xi, precision):
-    monkeypatch.setattr('stavpr_ros.prepare.device_matcher.WIDENED', 3 * W * D)
+def test_distances_of_every_strategy_equal_oracle(device, set_constants, strategy, xi, precision):
+    set_constants(device_matcher, WIDENED=3 * W * D)
     reference, query = features(7, zero=[(1, 2)]), features(4, seed=1, zero=[(0, 0)])
     settings = SpatialSettings(strategy, 0.7, xi)
     matcher = make_matcher(reference, settings, device, precision)

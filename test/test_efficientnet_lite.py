@@ -209,14 +209,14 @@ def test_map_recognizes_its_images_and_finds_its_network(
 
 
 @pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
-def test_missing_wheel_is_an_error_with_the_remedy(model_folders, monkeypatch, kind):
-    monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
+def test_missing_wheel_is_an_error_with_the_remedy(model_folders, set_constants, kind):
+    set_constants(lite, WHEEL='no_such_package')
     with pytest.raises(UnavailableError, match='pip install no-such-package; or copy the file'):
         FeatureExtractor(kind)
 
 
-def test_file_is_looked_up_in_both_folders(network, model_folders, monkeypatch):
-    monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
+def test_file_is_looked_up_in_both_folders(network, model_folders, set_constants):
+    set_constants(lite, WHEEL='no_such_package')
     for folder in reversed(model_folders):
         folder.mkdir(parents=True)
         (folder / FILE).write_bytes(network.read_bytes())
@@ -249,7 +249,9 @@ sys.exit(bool({'torch', 'onnx'} & set(sys.modules)))"""
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
-def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(network, monkeypatch):
+def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(
+    network, monkeypatch, set_constants
+):
     threads = []
     start = Network._start
     monkeypatch.setattr(onnx, 'thread_limit', lambda: 2)
@@ -261,7 +263,7 @@ def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(network, monkeyp
     monkeypatch.setattr(Network, '_start', record)
     features = [extractor(network).extract(IMAGES)]
     assert threads == [1]
-    monkeypatch.setattr(onnx, 'FAST', 0.0)
+    set_constants(onnx, FAST=0.0)
     features.append(extractor(network).extract(IMAGES))
     assert threads == [1, 1, 2]
     np.testing.assert_array_equal(features[0].strips, features[1].strips)

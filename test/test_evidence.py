@@ -178,14 +178,8 @@ def test_cells_are_compared_on_all_backends(device, precision):
     one = PlaceRecognizer(map_of(places), settings)
     matches = recognize_all(one, query)
     others = recognize_all(PlaceRecognizer(map_of(places), settings, device, precision), query)
-    plain = PlaceRecognizer(map_of(places), settings)
-    plain._window.cells = None
-    without = recognize_all(plain, query)
-    probabilities, same, lower = (
-        np.array([match.probability for match in d[20:]]) for d in (matches, others, without)
-    )
+    probabilities, same = ([m.probability for m in drive[20:]] for drive in (matches, others))
     np.testing.assert_allclose(same, probabilities, atol=0.02)
-    assert (lower < probabilities).all()
 
 
 # The probability that an error rate chooses, by the built-in table or the risks of a map

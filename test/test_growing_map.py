@@ -8,6 +8,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
+from places import poses_at
 import pytest
 from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
@@ -30,9 +31,9 @@ W, D = 7, 14
 
 
 @pytest.fixture(autouse=True)
-def little_room(monkeypatch):
+def little_room(set_constants):
     """Borders are crossed by a few places."""
-    monkeypatch.setattr(growing_map, 'ROOM', 4)
+    set_constants(growing_map, ROOM=4)
 
 
 def features(i, d=D, settings=EXTRACTOR.settings, count=1):
@@ -194,21 +195,15 @@ def traverse(images, seconds=1):
     return [Frame(image, (i + 1) * seconds * SECOND, f'{i}') for i, image in enumerate(images)]
 
 
-def straight(count):
-    poses = np.zeros((count, 7))
-    poses[:, 0], poses[:, 6] = np.arange(count), 1
-    return poses
-
-
 def test_build_map_with_wrong_poses_fails(route):
     frames, extractor = traverse(route[:20]), GRADIENT
     for count in (19, 21):
         with pytest.raises(InputError, match=f'{count} poses for 20 images'):
-            build_map(frames, extractor, straight(count), progress=False)
+            build_map(frames, extractor, poses_at(range(count)), progress=False)
     with pytest.raises(InputError, match='shape'):
-        build_map(frames, extractor, straight(20)[:, :6], progress=False)
+        build_map(frames, extractor, poses_at(range(20))[:, :6], progress=False)
     for bad in ([1, 2, 0, 0, 0, 0, 0], [1, 2, 0, 0, 0, 0, np.nan]):
-        poses = straight(20)
+        poses = poses_at(range(20))
         poses[7] = bad
         with pytest.raises(InputError, match=r"image 7 '7': pose \[1.0, 2.0"):
             build_map(frames, extractor, poses, progress=False)

@@ -18,6 +18,7 @@ from fixtures import disk_of
 from map_files import alter
 import numpy as np
 from pipelines import Log, process, save, settings_of
+from places import poses_at
 import pytest
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.errors import JournalError, OutputTakenError
@@ -144,9 +145,11 @@ def test_journal_of_version_2_with_vectors_is_recovered(written, small_map, targ
     assert caplog.messages == [f'the vectors of whole images in {written} are ignored']
 
 
-def test_fault_at_every_write_loses_no_synced_place(small_map, target, tmp_path, monkeypatch):
+def test_fault_at_every_write_loses_no_synced_place(
+    small_map, target, tmp_path, monkeypatch, set_constants
+):
     """Copies of the journal without a write, with half of it, and with zeros in its stead."""
-    monkeypatch.setattr(journal_writer, 'SYNC_PERIOD', 0.01)
+    set_constants(journal_writer, SYNC_PERIOD=0.01)
     journal, places = journal_of(target), list(places_of(small_map))[:20]
     number = appended = synced = forgotten = 0
     writes, pwrite, fsync = [], os.pwrite, os.fsync
@@ -459,8 +462,8 @@ def test_journal_of_a_second_recording_takes_a_numbered_name(start, route, targe
     assert [path.name for path in journals(target)] == ['route-2.stavpr.journal']
 
 
-def test_journal_of_a_route_follows_evictions(start, route, target, monkeypatch):
-    monkeypatch.setattr(journal_writer, 'SLACK', 0)
+def test_journal_of_a_route_follows_evictions(start, route, target, set_constants):
+    set_constants(journal_writer, SLACK=0)
     pipeline = start('loop_closure', exclude_places=1, max_places=24)
     process(pipeline, [route[i % 60] for i in range(130)])
     held = pipeline.snapshot().places
@@ -572,11 +575,7 @@ def frames(route):
     return [Frame(image, (i + 1) * 10**9, f'image {i}') for i, image in enumerate(route)]
 
 
-@pytest.fixture
-def poses(frames):
-    poses = np.zeros((len(frames), 7))
-    poses[:, 0], poses[:, 6] = np.arange(len(frames)), 1
-    return poses
+POSES = poses_at(range(60))
 
 
 def until(frames, count):
@@ -586,22 +585,20 @@ def until(frames, count):
 
 
 @pytest.mark.parametrize('keyframes', [None, KeyframeSettings(distance=1.5)])
-def test_build_journal_interrupted_twice_gives_the_map_of_one_run(
-    frames, poses, tmp_path, keyframes
-):
+def test_build_journal_interrupted_twice_gives_the_map_of_one_run(frames, tmp_path, keyframes):
     target, journal = tmp_path / 'route.stavpr', tmp_path / 'route.stavpr.journal'
     options = {'keyframes': keyframes, 'progress': False}
     for count in (20, 45):
         with pytest.raises(StopError):
-            build_journal(until(frames, count), EXTRACTOR, target, 'drive', poses, **options)
+            build_journal(until(frames, count), EXTRACTOR, target, 'drive', POSES, **options)
     with JournalReader(journal) as reader:
         assert 15 <= [place.number for place in reader.places()][-1] < 45
     content = journal.read_bytes()
     journal.write_bytes(content.replace(content[-20_000:-19_991], bytes(9)))
-    build_journal(frames, EXTRACTOR, target, 'drive', poses, **options)
+    build_journal(frames, EXTRACTOR, target, 'drive', POSES, **options)
     save_map(journal_map(journal), target)
-    assert_equal(target, build_map(frames, EXTRACTOR, poses, **options))
-    assert build_journal(frames, EXTRACTOR, target, 'drive', poses, **options) == journal
+    assert_equal(target, build_map(frames, EXTRACTOR, POSES, **options))
+    assert build_journal(frames, EXTRACTOR, target, 'drive', POSES, **options) == journal
 
 
 def test_build_journal_of_another_work_is_refused(frames, tmp_path):

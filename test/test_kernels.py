@@ -119,10 +119,10 @@ def _sum(a, b):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, set_constants):
     """Return a folder in which kernels are kept, an empty one."""
-    monkeypatch.setattr(numba.config, 'CACHE_DIR', str(tmp_path / 'kernels'))
-    monkeypatch.setattr(kernel_cache, 'failures', {})
+    set_constants(numba.config, CACHE_DIR=str(tmp_path / 'kernels'))
+    set_constants(kernel_cache, failures={})
     return tmp_path / 'kernels'
 
 
@@ -258,8 +258,8 @@ def test_nothing_is_compiled_after_warm(tmp_path, route):
     assert compiled[1] == '[]'
 
 
-def test_warm_fails_where_the_cache_cannot_be_written(monkeypatch, capsys):
+def test_warm_fails_where_the_cache_cannot_be_written(set_constants, capsys):
     failures = {kernel_cache.WRITE_FAILED: '[Errno 28] No space left on device'}
-    monkeypatch.setattr(kernel_cache, 'failures', failures)
+    set_constants(kernel_cache, failures=failures)
     assert warm.main([]) == 1
     assert 'cannot be written: [Errno 28] No space left' in capsys.readouterr().err

@@ -364,9 +364,9 @@ def test_loop_closer_of_invalid_settings_is_rejected(laps):
 
 
 @pytest.mark.parametrize('limit', [None, 90])
-def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
+def test_settled_route_in_int8_matches_as_in_float32(laps, set_constants, limit):
     """Rounded once, by the mean and the whitening of the day it settled; an eighth is evicted."""
-    monkeypatch.setattr(route_features, 'SETTLED', 150)
+    set_constants(route_features, SETTLED=150)
     full = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
     less = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit, precision='int8')
     matched, settled = 0, min(150, limit or 150)

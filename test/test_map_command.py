@@ -12,6 +12,7 @@ import cv2
 from map_examples import example_map
 from map_files import parts_of, version2
 import numpy as np
+from places import poses_at
 import pytest
 from stavpr_ros.commands import map as map_command
 from stavpr_ros.commands.map import main
@@ -152,8 +153,7 @@ def test_map_compact_prints_what_it_drops(folder, drive, capsys):
 def test_duplicates_where_the_robot_moved_are_kept(drive):
     stops = np.array([0, *[1] * 9, *range(2, 24)])
     dark = select_places(drive, stops)
-    poses = np.zeros((len(stops), 7))
-    poses[:, 6], poses[:, 0] = 1, np.arange(len(stops))
+    poses = poses_at(range(len(stops)))
     assert len(without_duplicates(replace(dark, poses=poses))) == len(stops)
     poses[2:6, 0] = poses[1, 0] + 0.02
     assert len(without_duplicates(replace(dark, poses=poses))) == len(stops) - 4

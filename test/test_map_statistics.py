@@ -27,9 +27,9 @@ SETTINGS = RecognizerSettings(mode='robust')
 
 
 @pytest.fixture(autouse=True)
-def small_maps(monkeypatch):
+def small_maps(set_constants):
     """Keep the statistics of small maps, too."""
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
+    set_constants(prepared_map, MIN_PLACES=1)
 
 
 @pytest.fixture(scope='module')
@@ -88,8 +88,8 @@ def test_several_threads_learn_the_same_as_one(place_map):
         np.testing.assert_array_equal(array, found[1][name])
 
 
-def test_small_map_keeps_none(place_map, monkeypatch):
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 601)
+def test_small_map_keeps_none(place_map, set_constants):
+    set_constants(prepared_map, MIN_PLACES=601)
     assert statistics_of_map(place_map) is None
 
 

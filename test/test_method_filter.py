@@ -26,12 +26,12 @@ NAN, INF = float('nan'), float('inf')
 
 
 @pytest.fixture(params=['arrays', 'cpu', 'cuda'][: 2 + (not why_no_cuda())])
-def make(request, monkeypatch):
+def make(request, set_constants):
     """Return a function that makes a filter: of arrays, and of tensors on each device."""
     if request.param == 'arrays':
         return PlaceFilter
     module = pytest.importorskip('stavpr_ros.method.device', exc_type=ImportError)
-    monkeypatch.setattr(module, 'PLACES_AT_ONCE', 32)
+    set_constants(module, PLACES_AT_ONCE=32)
     return partial(module.DevicePlaceFilter, device=request.param)
 
 

@@ -254,7 +254,7 @@ RULES = [
 def test_each_rule_has_a_drive_that_is_worse_without_it(rule, monkeypatch):
     sign = 1 if rule.with_rule > rule.without else -1
     if rule.name != 'CREEP':  # white noise, which shows what the other rules do, is creep as well
-        monkeypatch.setattr(evidence, 'CREEP', 0.0)
+        put(evidence, CREEP=0.0)(monkeypatch)
     assert sign * rule.drive() >= sign * rule.with_rule
     rule.off(monkeypatch)
     assert sign * rule.drive() <= sign * rule.without

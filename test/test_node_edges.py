@@ -190,9 +190,9 @@ def test_oldest_closures_are_dropped_in_order_while_too_many_wait(queue):
 
 @pytest.mark.parametrize(('seconds', 'source'), [(60.0, Source.PNP), (0.0, Source.DROPPED)])
 def test_flush_publishes_waiting_closures_by_pnp_until_its_time_is_over(
-    queue, monkeypatch, seconds, source
+    queue, set_constants, seconds, source
 ):
-    monkeypatch.setattr(edges, 'FLUSH_TIME', seconds)
+    set_constants(edges, FLUSH_TIME=seconds)
     for number in range(3):
         queue.put(number)
     worker, call = queue.publisher._worker, queue.publisher._worker.call

@@ -76,10 +76,10 @@ def test_services_while_a_map_is_loaded_are_served(robot, start, route, tmp_path
         assert robot.transition('cleanup')
 
 
-def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, disk, monkeypatch):
+def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, disk, set_constants):
     start(map_path='')
     disk.clear()
-    monkeypatch.setattr(map_loading, 'LOAD_TIMEOUT', 0.1)
+    set_constants(map_loading, LOAD_TIMEOUT=0.1)
     message = robot.refuses(LoadMap, 'load_map', path=str(tmp_path / 'slow.stavpr'))
     disk.set()
     assert message == f'{tmp_path}/slow.stavpr was not read within 0.1 s: copy it to a faster disk'
@@ -398,9 +398,9 @@ def test_node_after_a_failed_configuration_can_be_configured(
     robot.until_diagnosed('map', DiagnosticStatus.OK, '60 places of')
 
 
-def test_node_without_its_map_frees_it(robot, node, map_file, monkeypatch):
+def test_node_without_its_map_frees_it(robot, node, map_file, set_constants):
     """By cleanup, and by another map, even if its hashes are compared for hours."""
-    monkeypatch.setattr(map_loading, 'REST', 1e9)
+    set_constants(map_loading, REST=1e9)
     configure(robot, map_file)
     places = weakref.ref(node.runtime.pipeline.places)
     assert robot.transition('cleanup')

@@ -165,11 +165,11 @@ def test_end_process_waits_for_no_thread_and_second_signal_is_ignored():
 
 
 @pytest.fixture
-def bag(tmp_path, monkeypatch):
+def bag(tmp_path, set_constants):
     """Return a bag; temporary files cannot be made any more."""
     images = np.random.default_rng(0).integers(0, 256, (24, 48, 64, 3), np.uint8)
     write_bag(tmp_path / 'bag', '/image', map(ImageRecord.of_image, images, range(1, 25)))
-    monkeypatch.setattr(tempfile, 'tempdir', '/proc/none')
+    set_constants(tempfile, tempdir='/proc/none')
     return tmp_path / 'bag'
 
 

@@ -272,8 +272,8 @@ def test_service_of_upstream_with_an_unmatched_client_drops_the_response(lost_re
     assert len(lost_response()) == 1
 
 
-def test_service_with_an_unmatched_client_repeats_the_response(lost_response, monkeypatch):
-    monkeypatch.setattr(rclpy_workarounds, 'RESPONSE_TIMEOUT', 0.5)
+def test_service_with_an_unmatched_client_repeats_the_response(lost_response, set_constants):
+    set_constants(rclpy_workarounds, RESPONSE_TIMEOUT=0.5)
     assert len(lost_response(repeat_responses)) > 2
 
 

@@ -16,6 +16,7 @@ from stavpr_ros.mapping import encode_thumbnail, load_map, merge_maps, save_map,
 from stavpr_ros.mapping.camera import Camera, FORWARD
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.method.verification import mutual_matches
+from stavpr_ros.relative_pose import estimator
 from stavpr_ros.relative_pose.bundle import odometry_information, SHIFT, TURN
 from stavpr_ros.relative_pose.estimator import APART, EdgeEstimator
 from stavpr_ros.relative_pose.landmarks import Landmarks, triangulate, View
@@ -306,12 +307,12 @@ def test_edge_of_a_rear_camera_is_turned(speed):
 
 
 @pytest.mark.parametrize('method', ['auto', 'pnp'])
-def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, monkeypatch):
+def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, set_constants):
     """Images of another place, and a query farther away than the neighbors of the place."""
     other = scene(CAMERA, pose(0), seed=9)
     pair = replace(scene(CAMERA, pose(0)), query=other.query)
     far = scene(CAMERA, pose(0.5))
-    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.REACH', 0.1)
+    set_constants(estimator, REACH=0.1)
     for case, words in ((pair, 'fewer than 14'), (far, 'more than 0.4 m from the place')):
         edge = EdgeEstimator(method).estimate(case, CAMERA, CAMERA)
         assert (edge.source, edge.has_pose, edge.independent) == (Source.REFUTED, False, False)
@@ -319,8 +320,8 @@ def test_edge_that_keypoints_do_not_confirm_has_no_pose(method, monkeypatch):
         assert edge.inliers >= 0
 
 
-def test_edge_that_keypoints_do_not_determine_has_no_pose(monkeypatch):
-    monkeypatch.setattr('stavpr_ros.relative_pose.estimator.MAX_DEVIATION', 0.02)
+def test_edge_that_keypoints_do_not_determine_has_no_pose(set_constants):
+    set_constants(estimator, MAX_DEVIATION=0.02)
     edge = EdgeEstimator().estimate(scene(CAMERA, pose(0.5)), CAMERA, CAMERA)
     assert (edge.source, edge.has_pose, edge.inliers >= MIN_INLIERS) == (
         Source.REFUTED, False, True,

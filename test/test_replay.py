@@ -134,15 +134,12 @@ class Received:
     def __init__(self, node, *topics, qos=1000):
         self.messages, self.changed = [], threading.Condition()
         for message_type, topic in topics:
-            node.create_subscription(message_type, topic, self._keep(topic), qos)
+            node.create_subscription(message_type, topic, partial(self.receive, topic), qos)
 
-    def _keep(self, topic):
-        def keep(message):
-            with self.changed:
-                self.messages.append((topic, message))
-                self.changed.notify_all()
-
-        return keep
+    def receive(self, topic, message):
+        with self.changed:
+            self.messages.append((topic, message))
+            self.changed.notify_all()
 
     def wait(self, enough):
         with self.changed:
@@ -337,26 +334,22 @@ def every(images):
     return True
 
 
-class Subscriber:
+class Subscriber(Received):
     """Subscribes to images with best effort and publishes a match of each."""
 
     def __init__(self, node, answers=every):
         self.answers = answers  # decides from the images received so far
-        self.images = []
-        self.changed = threading.Condition()
         self.publisher = node.create_publisher(PlaceMatch, '~/match', 10)
-        node.create_subscription(Image, 'image', self.receive, BEST_EFFORT)
+        super().__init__(node, (Image, 'image'), qos=BEST_EFFORT)
 
-    def receive(self, image):
-        with self.changed:
-            self.images.append(image)
-            self.changed.notify_all()
+    def receive(self, topic, image):
+        super().receive(topic, image)
         if self.answers(self.images):
             self.publisher.publish(PlaceMatch(header=image.header))
 
-    def wait_for(self, count):
-        with self.changed:
-            assert self.changed.wait_for(lambda: len(self.images) >= count, TIMEOUT)
+    @property
+    def images(self):
+        return self.of('image')
 
     def data(self):
         return [bytes(image.data) for image in self.images]
@@ -500,7 +493,7 @@ def test_replay_after_a_signal_ends_at_once(tmp_path, subscribe, sent):
     try:
         lines = iter(process.stderr.readline, '')
         assert any('the next image is due in 60 s' in line for line in lines)
-        subscriber.wait_for(1)
+        subscriber.wait(bool)
         process.send_signal(sent)
         _, errors = process.communicate(timeout=TIMEOUT)
     finally:

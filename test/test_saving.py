@@ -37,8 +37,8 @@ def test_save_recorded_map_writes_unsaved_places_once(mapping, route, tmp_path):
     assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
 
 
-def test_saved_map_of_a_long_recording_has_statistics(mapping, tmp_path, monkeypatch):
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 7)
+def test_saved_map_of_a_long_recording_has_statistics(mapping, tmp_path, set_constants):
+    set_constants(prepared_map, MIN_PLACES=7)
     at_the_end(mapping, tmp_path / 'route.stavpr')
     assert open_map(tmp_path / 'route.stavpr').features.statistics is not None
 

@@ -191,10 +191,12 @@ def test_video_that_ends_early_is_reported_once(tmp_path):
         ('raise ImportError', 600, 'needs PyAV, which is not installed: pip install av'),
     ],
 )
-def test_decoder_that_fails_is_an_error(tmp_path, environ, monkeypatch, program, timeout, reason):
+def test_decoder_that_fails_is_an_error(
+    tmp_path, environ, set_constants, program, timeout, reason
+):
     (tmp_path / 'av.py').write_text(program)
     environ['PYTHONPATH'] = f'{tmp_path}:{environ["PYTHONPATH"]}'
-    monkeypatch.setattr(video, 'TIMEOUT', timeout)
+    set_constants(video, TIMEOUT=timeout)
     began = time.monotonic()
     with pytest.raises(SourceError, match=reason):
         open_source(write_video(tmp_path / 'phone.mp4', colored_images(1)))

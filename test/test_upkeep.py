@@ -13,6 +13,7 @@ import sys
 from evaluation_commands import write_images
 from fixtures import route_images
 import numpy as np
+from places import poses_at
 import pytest
 from stavpr_ros.commands.map import main
 from stavpr_ros.errors import InputError, OutputError, StavprError
@@ -53,9 +54,7 @@ def build(images, day=0, poses=None, thumbnails=False):
 
 @pytest.fixture(scope='module')
 def first():
-    poses = np.zeros((len(ROUTE), 7))
-    poses[:, 0], poses[:, 6] = np.arange(len(ROUTE)), 1
-    return build(ROUTE, poses=poses)
+    return build(ROUTE, poses=poses_at(range(len(ROUTE))))
 
 
 @pytest.fixture(scope='module')
@@ -67,8 +66,7 @@ def rebuilt():
 @pytest.fixture(scope='module')
 def around():
     """Return a drive that leaves the map at place 80, and comes back at 90."""
-    poses = np.zeros((240, 7))
-    poses[:, 1], poses[:, 6] = np.arange(240), 1  # of another frame
+    poses = poses_at(range(240))[:, [1, 0, *range(2, 7)]]  # of another frame
     return build([*ROUTE[:80], *BYPASS, *ROUTE[90:180]], 2, poses)
 
 
@@ -346,8 +344,8 @@ def test_map_that_another_program_has_replaced_stays(path, first, rebuilt):
     assert path.read_bytes() == other
 
 
-def test_old_versions_are_deleted(path, first, monkeypatch):
-    monkeypatch.setattr(versions, 'KEPT', 2)
+def test_old_versions_are_deleted(path, first, set_constants):
+    set_constants(versions, KEPT=2)
     for day in range(1, 4):
         later = replace(first, stamps=first.stamps + day)
         save_next(path, later, Version('', changes=(f'{day}',)))

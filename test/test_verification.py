@@ -92,7 +92,7 @@ def test_inliers_of_two_depths_count_both(method):
     assert check.inliers(one, other) > 1.5 * check.inliers(one, shuffled)
 
 
-def test_inliers_without_common_geometry_are_few(monkeypatch):
+def test_inliers_without_common_geometry_are_few(set_constants):
     """The same small patches, each elsewhere: they match, but not as one scene."""
     rng = np.random.default_rng(0)
     one, other = texture(4), texture(5)
@@ -101,8 +101,7 @@ def test_inliers_without_common_geometry_are_few(monkeypatch):
     for cell, place, patch in zip(cells, rng.permutation(len(cells)), patches, strict=False):
         for image, (y, x) in ((one, cell), (other, cells[place])):
             image[y + 10 : y + 70, x + 10 : x + 70] = patch
-    monkeypatch.setattr(verification, 'FEATURES', 2000)
-    monkeypatch.setattr(verification, 'WIDTH', 640)
+    set_constants(verification, FEATURES=2000, WIDTH=640)
     assert Pairs().inliers(one, one) > 800
     assert Pairs().inliers(one, other) < 150
 

@@ -104,7 +104,7 @@ def test_lost_packets_are_counted_and_their_key_frame_is_awaited(encoded, codec)
     assert other.lost == 0
 
 
-def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch):
+def test_bad_packets_are_errors_of_their_images_only(encoded, codec, set_constants):
     stream, random = VideoStream(), np.random.default_rng(0)
     for kind in (FFMPEG, FOXGLOVE):
         for i, packet in enumerate(encoded * 4):
@@ -120,7 +120,7 @@ def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch
     assert decode(stream, [bad]) == ['too large']
     bad = message_of(encoded[0], FFMPEG, codec, 0, encoding='av1')
     assert decode(stream, [bad]) == ['encoding']
-    monkeypatch.setattr(files, 'MAX_PIXELS', WIDTH * HEIGHT - 1)  # what the parameters claim
+    set_constants(files, MAX_PIXELS=WIDTH * HEIGHT - 1)  # what the parameters claim
     for message in good[:2]:
         message.width = message.height = 1
     assert decode(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]

@@ -28,9 +28,9 @@ PEAKS = Peaks(1e9, 1e10)
 
 
 @pytest.mark.slow
-def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
+def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch, set_constants):
     monkeypatch.setattr(peaks, 'measure_peaks', lambda *_: PEAKS)
-    monkeypatch.setattr(matching, 'CITY', 200)
+    set_constants(matching, CITY=200)
     given = '--sizes 50 300 --dimensions 224 --seconds 0.001 --no-memory --commit abc'
     assert matching.main([*given.split(), '--output', str(tmp_path)]) == 0
     (path,) = tmp_path.glob('matching-*.json')

@@ -142,10 +142,9 @@ def test_read_tables_of_many_programs(tmp_path, text):
 @pytest.mark.parametrize(
     'array', ['<f2', '>f4', 'f8', 'i1', 'u8', 'fortran', 'huge', 'tiny', 'huge32', 'tiny32']
 )
-def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, monkeypatch):
+def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, set_constants):
     """Squares of float32 overflow from 1e19 on: rows are scaled before."""
-    monkeypatch.setattr(descriptors, 'AT_ONCE', 16)
-    monkeypatch.setattr(descriptors, 'MAPPED', 0)
+    set_constants(descriptors, AT_ONCE=16, MAPPED=0)
     whole = np.round(vectors * 8)  # -128 fits into i1
     whole -= whole.min() + (128 if array == 'i1' else 0)
     scale = {'huge': 1e200, 'tiny': 1e-200, 'huge32': 1e30, 'tiny32': 1e-30}.get(array, 1)
@@ -157,9 +156,9 @@ def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, monkeyp
     np.testing.assert_allclose(features.strips[0], unit(whole.astype('f8')), atol=1e-6)
 
 
-def test_read_descriptors_of_bits_has_hamming_distances(tmp_path, monkeypatch):
+def test_read_descriptors_of_bits_has_hamming_distances(tmp_path, set_constants):
     """Of vectors and of strips; other arrays are rejected."""
-    monkeypatch.setattr(descriptors, 'AT_ONCE', 4)
+    set_constants(descriptors, AT_ONCE=4)
     bits = np.random.default_rng(2).integers(0, 2, (6, 3, 16))
     for name, array, own in (
         ('vectors', np.packbits(bits.reshape(6, 48), axis=1), bits.reshape(6, 1, 48)),

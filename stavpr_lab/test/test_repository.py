@@ -37,7 +37,7 @@ class Recorder:
 
 
 @pytest.fixture
-def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
+def recorder(tmp_path: Path, monkeypatch, set_constants) -> Recorder:
     """Record in a checkout in which nothing is installed and every requirement is ``fake``."""
     for name in ('requirements/locked', 'stavpr_msgs', 'stavpr_ros'):
         (tmp_path / name).mkdir(parents=True)
@@ -45,7 +45,7 @@ def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
         (tmp_path / 'requirements' / f'{name}.txt').write_text('fake==1\n')
     (tmp_path / 'requirements' / 'constraints.txt').touch()
     recorder = Recorder(tmp_path)
-    monkeypatch.setattr(setup_venv, 'ROOT', tmp_path)
+    set_constants(setup_venv, ROOT=tmp_path)
     monkeypatch.setattr(setup_venv, 'machine_problems', list)
     monkeypatch.setattr(setup_venv, 'run_logged', recorder)
     return recorder

@@ -129,12 +129,12 @@ def traverses(tmp_path_factory):
 
 
 @pytest.fixture
-def command(traverses, tmp_path, monkeypatch, runner):
+def command(traverses, tmp_path, set_constants, runner):
     """Return the path of a copy of the map, and a function that evaluates the query on it."""
     path, run = tmp_path / 'route.stavpr', runner(evaluate)
     path.write_bytes((traverses / 'route.stavpr').read_bytes())
     pair = ['--map', path, '--query', traverses / 'query', '--truth', 'identity']
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
+    set_constants(prepared_map, MIN_PLACES=1)
     return path, lambda *options: run(*pair, '--sequence-length', 5, *options)
 
 

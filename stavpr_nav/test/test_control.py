@@ -59,9 +59,9 @@ def test_taught_velocities_are_repeated_from_third_image_on():
 
 
 @pytest.fixture
-def proportional(monkeypatch):
+def proportional(set_constants):
     """Leave out the integral of the law."""
-    monkeypatch.setattr(follower, 'INTEGRAL', 1e9)
+    set_constants(follower, INTEGRAL=1e9)
 
 
 @pytest.mark.usefixtures('proportional')

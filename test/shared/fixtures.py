@@ -101,14 +101,14 @@ def route() -> list[np.ndarray]:
 @pytest.fixture(scope='session')
 def small_map(route):
     """Return a map of the synthetic route, with all optional parts of a map."""
+    from places import poses_at
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map
     from stavpr_ros.sources.frame import Frame
 
     frames = [Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route)]
-    poses = np.zeros((len(route), 7))
-    poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
-    return build_map(frames, FeatureExtractor('gradient', projection=64), poses, progress=False)
+    extractor = FeatureExtractor('gradient', projection=64)
+    return build_map(frames, extractor, poses_at(range(len(route))), progress=False)
 
 
 @pytest.fixture(scope='module')
@@ -147,6 +147,17 @@ def working_folder(tmp_path):
 def hide_module(monkeypatch):
     """Return a function that lets a module be not installed."""
     return lambda name: monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.fixture
+def set_constants(monkeypatch):
+    """Return a function that gives constants of a module other values for the test."""
+
+    def set_constants(module, **values):
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
+
+    return set_constants
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ import re
 from typing import Any
 
 import numpy as np
+from places import poses_at
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, descriptor_map, Map, merge_maps
@@ -56,13 +57,6 @@ def views(
         image = image + rng.integers(-noise, noise + 1, image.shape)
         images.append(np.clip(image, 0, 255).astype(np.uint8))
     return images
-
-
-def poses_at(positions: Any) -> np.ndarray:
-    """Return poses x = position, (m, 7)."""
-    poses = np.zeros((len(positions), 7))
-    poses[:, 0], poses[:, 6] = positions, 1
-    return poses
 
 
 def map_of(images: list[np.ndarray], poses: np.ndarray | None = None) -> Map:

@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 from fixtures import route_images
 import numpy as np
+from places import poses_at
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, Map, save_map, Session
@@ -27,8 +28,7 @@ def example_map(projection: int | None = None) -> Map:
     frames = [
         Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route_images(PLACES))
     ]
-    poses = np.zeros((PLACES, 7))
-    poses[:, 0], poses[:, 6] = np.arange(PLACES), 1
+    poses = poses_at(range(PLACES))
     place_map = build_map(frames, extractor, poses, progress=False, thumbnail_width=32)
     poses[3] = np.nan
     return dataclasses.replace(
