@@ -158,7 +158,7 @@ class Round:
         self.due = {stamp: at for stamp, at in self.due.items() if not condition(stamp)}
 
     def found(self) -> set[int]:
-        """Return the stamps in all maps, and in those of the journals."""
+        """Return the stamps in all maps, recovered ones too."""
         for journal in journals(self.target):
             recover(journal)
         maps = [load_map(path) for path in self.maps.glob('*.stavpr')]

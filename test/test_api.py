@@ -34,7 +34,7 @@ ROUTE = route_images(40)
 
 
 def wide(images):
-    """Return gray images of 16 bits of which few are used, as of a thermal camera."""
+    """Return gray images that use few of 16 bits, as a thermal camera does."""
     return [29_000 + 5 * image[..., 1].astype(np.uint16) for image in images]
 
 

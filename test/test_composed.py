@@ -184,7 +184,7 @@ def test_save_path_that_cannot_be_written_is_rejected(make_node, tmp_path):
 
 
 def test_limit_of_threads_can_be_removed(make_node):
-    """The limit of OpenCV holds for the process, that of numba for the worker."""
+    """OpenCV has one limit for the process, numba one for the worker."""
     limit_threads(0)
     before = numba.get_num_threads(), cv2.getNumThreads()
     node = make_node(threads=1)

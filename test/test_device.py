@@ -113,7 +113,7 @@ def test_starts_of_default_window_equal_oracle(device):
 
 
 def features(n, seed=0, strips=W, zero=()):
-    """Features of n images, unit norm; those of ``zero`` (strip, image) are all zeros."""
+    """Return unit-norm features of n images, with all zeros at ``zero`` (strip, image)."""
     rng = np.random.default_rng(seed)
     x = rng.random((strips, n, D), np.float32) - np.float32(0.2)
     x /= np.linalg.norm(x, axis=2, keepdims=True)

@@ -237,7 +237,7 @@ def standing(strips, images=60, seed=0):
 
 
 def test_match_of_a_standing_camera_is_kept():
-    """Its path is that of the images before the stop, and then only of the place."""
+    """Its path has the images before the stop, and then only the place."""
     known = route_strips(0, PLACES)
     settings = RecognizerSettings(mode='robust', min_probability=0.9)
     query = standing(known[:, 40:80])

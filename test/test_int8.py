@@ -77,7 +77,7 @@ def test_strip_distances_equal_oracle_bit_for_bit(W, n, d, seed):
 
 @pytest.mark.parametrize(('n', 'd'), [(1, 5), (9, 30), (300, 1000)])
 def test_vectors_equal_single_strips_bit_for_bit(n, d):
-    """The kernel of one vector an image, and that of strips."""
+    """The kernel for one vector an image, and the kernel for strips."""
     reference, queries = random_strips(1, n, d), random_strips(1, 2, d, seed=10)
     held = converted(features_of(reference), rounds=True).strips
     out = np.empty((2, n), np.float32)

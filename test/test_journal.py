@@ -91,7 +91,7 @@ def seconds(*values):
 
 
 def assert_equal(path, place_map):
-    """Compare all parts of the map in a file with those of a map."""
+    """Compare all parts of the map in a file with a map."""
     found = load_map(path)
     assert found.settings == place_map.settings
     for name in ('strips', 'weights'):
@@ -457,7 +457,7 @@ def test_journal_of_a_second_recording_takes_a_numbered_name(start, route, targe
     assert sorted(names) == ['route-2.stavpr.journal', 'route.stavpr.journal']
     kill(first)
     log = Log()
-    assert recover_maps(target, log) == str(target)  # and that of the living one stays
+    assert recover_maps(target, log) == str(target)  # and the living one keeps its own
     assert 'written by a running program' in log.lines[1][1]
     assert [path.name for path in journals(target)] == ['route-2.stavpr.journal']
 

@@ -141,7 +141,7 @@ def test_map_compact_prints_what_it_drops(folder, drive, capsys):
     standing = replace(select_places(drive, stops), poses=None)
     twice = merge_maps([standing, standing], ['day', 'night'])
     same_as = np.arange(len(twice), dtype=np.int32)
-    same_as[len(stops) + 8] = 5  # the stop of one session is that of the other
+    same_as[len(stops) + 8] = 5  # both sessions stop at one place
     save_map(replace(twice, same_as=same_as), 'stops.stavpr')
     assert main(['compact', 'stops.stavpr', 'driven.stavpr', '--drop-duplicates']) == 0
     assert '26 of 74 places dropped' in capsys.readouterr().out

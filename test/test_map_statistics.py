@@ -113,7 +113,7 @@ def test_statistics_of_other_features_are_learned_again_and_logged(place_map, tm
     assert 'map compact' in note
     reversed_map = load_map(path)
     assert found == answers(reversed_map, 'float32')[0]
-    # what is written again has those of these features
+    # a map that is written again has statistics of its own features
     save(opened, tmp_path / 'again')
     assert open_map(tmp_path / 'again').features.statistics is not None
 

@@ -283,7 +283,7 @@ def test_states_move_back(make, moment):
 
 
 def test_move_back_is_of_those_columns_alone(make):
-    """Paths behind them go on; those of a block at their border are followed on both sides."""
+    """Paths behind them go on; a block at their border is followed on both sides."""
     one, other = make(2000, 9), make(2000, 9)
     for z in drive(np.random.default_rng(0), 2000, 12, 1500, 0.33):
         one.update(z)
@@ -317,7 +317,7 @@ def test_filter_without_its_oldest_columns_equals_one_of_the_others(moments):
     gap, width = np.array([70]), 150
     one, other = PlaceFilter(width, 9, gaps=gap), PlaceFilter(width, 9, gaps=gap - 60)
     z, removed = drive(np.random.default_rng(0), width, 30, 72), 0
-    z[:, :60] = np.inf  # of columns that go; those of the other filter follow the last ones
+    z[:, :60] = np.inf  # columns that go; in the other filter, they follow the last ones
     for image, row in enumerate(z):
         one.update(np.roll(row, -removed))
         other.update(np.roll(row, -60))

@@ -70,7 +70,7 @@ def alike(share, first=0, end=PLACES):
 
 
 def stretch(period, count, share=0.0):
-    """Return images of which so many of a period are of the map's road, others by a share."""
+    """Return images: so many of a period show the map's road, others a share of it."""
     return np.where(IMAGES % period < count, KNOWN, alike(share))[:, 40:120]
 
 

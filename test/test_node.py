@@ -256,7 +256,7 @@ def test_a_rule_that_skips_every_image_is_a_warning_and_so_is_the_missing_map(ro
 def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(
     robot, start, publish, stranger, route
 ):
-    """The topic with odometry is named, not that of a pose graph; a topic of another type too."""
+    """The topic with odometry is named, no topic of a pose graph; one of another type too."""
     publish(Odometry, '/pose_graph/odometry')
     publish(TransformStamped, '/pose_graph/map_to_odom')
     start('-r', 'odom:=/wheel', keyframe_distance=1.0)

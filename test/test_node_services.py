@@ -243,7 +243,7 @@ def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
 
 
 def test_relocalize_returns_the_last_match_with_candidates_and_pose(robot, start, route):
-    """As many as requested, or as parameter candidates; the pose is that of ~/pose."""
+    """As many as requested, or as parameter candidates; the pose is published on ~/pose."""
     poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
     start(candidates=3, **PAPER)
     match = robot.drive(route[30 : 30 + LENGTH])[-1]

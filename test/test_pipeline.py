@@ -319,7 +319,7 @@ def test_change_of_operation_that_fails_changes_nothing(map_file, route):
 def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline = Pipeline(settings_of(), 'loop_closure')
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    # the map file is not that of the route
+    # the route has no file
     assert (len(pipeline.places), pipeline.save_state.path) == (0, '')
     assert pipeline.operation.extractor.settings.projection is not None
     pipeline.change(operation='localization')

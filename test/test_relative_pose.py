@@ -240,7 +240,7 @@ def render(points, textures, base, camera):
 
 
 def scene(camera, query, seed=0):
-    """Return the pair of a query, by its pose in that of the place, and the place PLACE."""
+    """Return the pair of the place PLACE and a query, whose pose is relative to it."""
     rng = np.random.default_rng(seed)
     points = np.add(points_ahead(260, seed), [PLACE * SPACING - 5, 0, 0])
     textures = rng.integers(0, 255, (len(points), 12, 12, 3), dtype=np.uint8)
@@ -428,7 +428,7 @@ def test_independent_edges_are_apart(method):
 
 
 def test_rays_of_a_thumbnail_are_those_of_the_image():
-    """Pixel centers of an image of half the size lie between those of the image."""
+    """Pixel centers of an image of half the size lie between pixel centers of the image."""
     points = np.array([[0.0, 0.0], [79.5, 59.5], [100.25, 10.75]])
     small = CAMERA.rays(points, 160, 120)
     np.testing.assert_allclose(small, CAMERA.rays(points * 2 + 0.5, 320, 240))

@@ -50,7 +50,7 @@ FIRST = 100 * SECOND
 
 
 def images(count, gap=SECOND):
-    """One image a second from second 100 on, its stamp that of the odometry beside it."""
+    """Return one image a second from second 100 on, stamped as the odometry beside it."""
     pixels = np.zeros((2, 3, 3), np.uint8)
     return [ImageRecord.of_image(pixels + i, FIRST + i * gap) for i in range(count)]
 

@@ -198,7 +198,7 @@ def test_map_with_impossible_relations_is_rejected(town, same_as, message):
 
 
 def test_calibration_stays_with_its_route_only(town):
-    """It is that of drives on these places: others, or a session without the rest, have none."""
+    """Drives on these places made it: others, or a session without the rest, have none."""
     risks = ErrorRisks('robust', 1, (0.5,), (0.0,))
     one = replace(town[0], error_risks=risks)
     assert merge_maps([one, one], ['a', 'b']).error_risks is None

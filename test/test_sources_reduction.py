@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Large images are reduced while they are decoded; results stay those of whole images."""
+"""Large images are reduced while they are decoded; results are as with whole images."""
 
 from functools import partial
 

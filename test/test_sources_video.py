@@ -49,7 +49,7 @@ def encode(path, name, codec, **options):
 
 
 def interlace(path, codec):
-    """One of two fields, of which the other is as after a fast motion."""
+    """Write a video of two fields; the second one looks as after a fast motion."""
     images = np.full((6, HEIGHT, WIDTH, 3), 40, np.uint8)
     images[:, 1::2] = 200
     options = {'flags': '+ildct+ilme', 'x264-params': 'tff=1', 'qmin': '1', 'qmax': '1'}
@@ -90,7 +90,7 @@ def variable_rate(path):
 def time_that_falls(path):
     """Write one that is continued by the rate."""
     file = write_video(path / 'phone.mkv', colored_images(3), 'mjpeg', pixels='yuvj420p')
-    # SimpleBlock, track 1: the time of the third becomes that of the first
+    # SimpleBlock, track 1: the third gets the time of the first
     content = file.read_bytes()
     third = content.index(b'\x81\x00\x43')
     file.write_bytes(content[:third] + b'\x81\x00\x00' + content[third + 3 :])

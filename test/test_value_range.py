@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of 16 bits of which few are used, as of thermal cameras: one range for a map."""
+"""Images that use few of 16 bits, as thermal cameras make: one range for a map."""
 
 from dataclasses import replace
 

@@ -39,7 +39,7 @@ VIEWS = {
 
 
 class Thumbnails:
-    """Places of which thumbnails are known, and how often each was read."""
+    """Thumbnails of places, and a list of the places that were read."""
 
     def __init__(self, images):
         self.images, self.read = images, []

@@ -223,7 +223,7 @@ def test_bag_of_another_transport_has_a_remedy_and_damaged_messages_are_errors(t
 
 @pytest.fixture
 def installed(monkeypatch):
-    """Make a class of messages known to the node, as that of packets."""
+    """Let the node have a class of messages for packets."""
     monkeypatch.setattr(ros_input, 'message_class', lambda name: CompressedImage)
 
 

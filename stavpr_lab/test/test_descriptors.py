@@ -54,7 +54,7 @@ def test_read_descriptors_of_each_kind_of_file(tmp_path, vectors, kind):
 
 @pytest.mark.parametrize('kind', ['npy', 'npz:b', 'mat'])
 def test_read_descriptors_of_strips_keeps_their_order(tmp_path, kind):
-    """Strip j of image i is row [i, j]; weights are norms over that of the image."""
+    """Strip j of image i is row [i, j]; weights are norms over the norm of the image."""
     array = np.random.default_rng(1).standard_normal((6, 3, 5)).astype(np.float32)
     features = read_descriptors(save(tmp_path, kind, array))
     assert features.strips.shape == (3, 6, 5)

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation: examples and tutorials run, names exist, numbers are those of the results."""
+"""The documentation: examples and tutorials run, names exist, numbers equal the results."""
 
 import contextlib
 import json

@@ -84,7 +84,7 @@ def test_launch_file_without_a_package_that_it_needs_starts_nothing(load, name, 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
-    """All are given at once; names and types are those of the tables of the nodes."""
+    """All are given at once; names and types are in the tables of the nodes."""
     launch, types = load(name), {}
     for node in launch.start():
         renamed = OTHER_NAMES if node.executable == 'pose_graph' else {}

@@ -63,7 +63,7 @@ def test_error_rate_and_recall_by_hand():
 
 @pytest.mark.parametrize('run_length', [1, 40])
 def test_interval_has_the_width_of_independent_runs(run_length):
-    """4000 images, half of them wrong in runs: the deviation is that of the number of runs."""
+    """4000 images, half of them wrong in runs: the deviation follows from the number of runs."""
     runs = 4000 // run_length
     right = np.repeat(np.random.default_rng(5).permutation(np.arange(runs) % 2), run_length)
     ranking = Ranking(np.where(right, np.arange(4000), -1)[:, None], np.where(right, 0.1, np.inf))

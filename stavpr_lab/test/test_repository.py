@@ -60,7 +60,7 @@ def test_extras_are_added_and_kept(recorder):
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
 
 
-# The public API is that of the stored list: a change of a promised name is visible in review
+# The public API equals the stored list: a change of a promised name is visible in review
 
 
 def test_public_api_is_that_of_the_stored_list():

@@ -21,7 +21,7 @@ PLACES = 24
 
 
 def example_map(projection: int | None = None) -> Map:
-    """Return a map of 24 places in two sessions, 32 dimensions or those of a projection."""
+    """Return a map of 24 places in two sessions, of 32 dimensions or projected."""
     extractor = FeatureExtractor(
         'gradient', GradientSettings(32, cell=8, orientations=4, logarithm=False), 2, projection
     )

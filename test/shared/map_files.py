@@ -29,7 +29,7 @@ def hashes(content: bytes) -> list[str]:
 
 
 def version2(manifest: dict, tensors: dict, metadata: dict | None = None) -> bytes:
-    """Put a file together; metadata replaces that of the header."""
+    """Put a file together; ``metadata`` replaces entries of its header."""
     listed = {
         name: {'dtype': dtype, 'shape': shape, 'sha256': hashes(content)}
         for name, (dtype, shape, content) in tensors.items()

@@ -243,7 +243,7 @@ class Robot:
         A matched publisher does not imply a matched subscriber on the other side, and a
         best-effort one loses earlier images: so empty images are sent until one has a match.
 
-        :param publisher: another one than that of the robot, of messages of a kind.
+        :param publisher: of messages of a kind, in place of the publisher of the robot.
         """
         publisher = publisher or self.publisher
         self.until(lambda: publisher.get_subscription_count() > 0, 'the node')
@@ -313,7 +313,7 @@ class Robot:
         Wait until the node has discovered the endpoints made so far.
 
         It has when it responds to a client that was made after them. A request of that client may
-        be lost, so it is repeated: the service may be that of a previous node.
+        be lost, so it is repeated: a previous node may have the service.
         """
         probe = self.node.create_client(GetState, '/stavpr/get_state')
         responses: list[Any] = []
