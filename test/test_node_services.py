@@ -94,13 +94,14 @@ def test_services_and_parameters_name_files_in_the_maps_folder_only(
     secret.write_text('export PATH\n')
     (folder / 'link').symlink_to(secret)
     (folder / 'outside').symlink_to(tmp_path)
+    (folder / 'zero').symlink_to('/dev/zero')
     start(maps_folder=str(folder))
     own = str(folder / 'own.stavpr')
     assert robot.does(SaveMap, 'save_map', path='own.stavpr').message == f'60 places to {own}'
     loaded = robot.does(LoadMap, 'load_map', path='own.stavpr')
     assert (loaded.message, loaded.map.path) == (f'60 places from {own}', own)
     assert robot.does(LoadMap, 'load_map', path=own).success
-    for path in (map_file, str(secret), '../.bashrc', 'link', 'outside/.bashrc', '.'):
+    for path in (map_file, str(secret), '../.bashrc', 'link', 'zero', 'outside/.bashrc', '.'):
         for kind, name, fields in (
             (LoadMap, 'load_map', {}),
             (SaveMap, 'save_map', {'overwrite': True}),
