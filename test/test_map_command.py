@@ -64,10 +64,7 @@ def test_map_info_shows_what_a_map_holds(folder, capsys):
         'a route of 23 m', 'to 2023-11-14 22:13:44 UTC',
     ):  # fmt: skip
         assert text in shown
-
-
-def test_map_info_shows_stamps_that_are_no_dates_in_seconds(folder, capsys):
-    save_map(example_map(), 'both.stavpr')
+    save_map(both, 'both.stavpr', force=True)  # its stamps are no dates
     assert main(['info', 'both.stavpr']) == 0
     shown = capsys.readouterr().out
     assert 's to 24.0 s\n' in shown

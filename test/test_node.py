@@ -332,7 +332,7 @@ def test_invalid_qos_override_is_an_error(robot, start):
     robot.until_logged('certain')
 
 
-# One node for all tests: rates, gaps and jumps of stamps, invalid images, its neighbors
+# One node for the tests below: rates, gaps and jumps of stamps, invalid images, its neighbors
 
 
 def test_max_rate_skips_images_by_their_stamps(robot, running, route):

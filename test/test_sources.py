@@ -623,7 +623,7 @@ def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
             open_source(folder)
 
 
-# Bags: written, recorded by others, damaged; see also test_sources.py
+# Bags that are written, recorded by others or damaged
 
 
 def test_parts_of_a_split_ros1_bag_are_read_by_time(tmp_path):
