@@ -49,15 +49,15 @@ def random_distances(seed, shape, levels=None):
 def test_image_distances_equal_oracle(device, strategy, strips, xi, n, sigma, levels):
     d = random_distances(strips, (strips, strips, n), levels)
     settings = SpatialSettings(strategy, sigma, xi)
-    found = spatial_alignment(strips, settings, device)(torch.from_numpy(d).to(device))
+    result = spatial_alignment(strips, settings, device)(torch.from_numpy(d).to(device))
     expected = oracle.image_distances(d, strategy, sigma, xi, np.float32)
-    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result.cpu().numpy(), expected, rtol=0, atol=1e-6)
 
 
 def test_published_figure(device):
     d = torch.from_numpy(oracle.GOLDEN[:, :, None].astype(np.float32)).to(device)
-    found = spatial_alignment(7, SpatialSettings(), device)(d).item()
-    assert found == pytest.approx(0.28724851, abs=1e-6)
+    result = spatial_alignment(7, SpatialSettings(), device)(d).item()
+    assert result == pytest.approx(0.28724851, abs=1e-6)
 
 
 @pytest.mark.parametrize('radius', [0, 3])
@@ -84,15 +84,15 @@ def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned, ra
         twin.push(row, row, t)
         if t + 1 < l:
             continue
-        (found, sequences), (expected, _) = window.match(), twin.match()
+        (result, sequences), (expected, _) = window.match(), twin.match()
         q, m = oracle.match_sequence(rows[t + 1 - l : t + 1], beta, np.float32)
         answer = oracle.best_match(q, m, radius)
-        np.testing.assert_equal(vars(found), vars(expected))
+        np.testing.assert_equal(vars(result), vars(expected))
         if answer is None:
-            assert found.place < 0
+            assert result.place < 0
             continue
-        assert (found.first, found.last) == (answer.start, answer.last)
-        assert found.distance == answer.distance
+        assert (result.first, result.last) == (answer.start, answer.last)
+        assert result.distance == answer.distance
         costs, middles = sequences()[:2]
         np.testing.assert_array_equal(costs, q)
         m = np.where(np.isfinite(q), m, 0)
@@ -200,8 +200,8 @@ def test_z_normalized_equals_that_of_cpu(device):
     for values in (row, row[:5], flat, banned):
         for counted in (np.ones(len(values), bool), np.arange(len(values)) % 3 > 0):
             arguments = (torch.from_numpy(array).to(device) for array in (values, counted))
-            found = z_normalized_on_device(*arguments).cpu()
-            np.testing.assert_allclose(found, z_normalized(values, counted=counted), atol=1e-5)
+            result = z_normalized_on_device(*arguments).cpu()
+            np.testing.assert_allclose(result, z_normalized(values, counted=counted), atol=1e-5)
 
 
 def drive_map(sessions):
@@ -238,21 +238,23 @@ def test_recognizer_equals_that_of_cpu(device, mode, precision, sessions):
     )
     statuses = set()
     for i in range(len(query)):
-        found, expected = (recognizer.update(query[i : i + 1], i + 1) for recognizer in (one, cpu))
-        assert found.status == expected.status
-        assert found.window_stamps == expected.window_stamps
-        assert found.window_changes == expected.window_changes
+        result, expected = (
+            recognizer.update(query[i : i + 1], i + 1) for recognizer in (one, cpu)
+        )
+        assert result.status == expected.status
+        assert result.window_stamps == expected.window_stamps
+        assert result.window_changes == expected.window_changes
         statuses.add(expected.status)
         np.testing.assert_allclose(one.newest_row(), cpu.newest_row(), atol=2e-5)
         if expected.path.place < 0:
             continue
-        assert found.distance == pytest.approx(expected.distance, abs=1e-5)
+        assert result.distance == pytest.approx(expected.distance, abs=1e-5)
         if mode == 'robust':
-            assert found.probability == pytest.approx(expected.probability, abs=1e-5)
+            assert result.probability == pytest.approx(expected.probability, abs=1e-5)
         if not expected.accepted:
             continue
-        assert found.path.place == expected.path.place
-        np.testing.assert_array_equal(found.path.pairs, expected.path.pairs)
+        assert result.path.place == expected.path.place
+        np.testing.assert_array_equal(result.path.pairs, expected.path.pairs)
         places = [[c.place for c in recognizer.ranked(2)] for recognizer in (one, cpu)]
         assert places[0] == places[1]
     assert {Status.WARMING_UP, Status.MATCH} <= statuses

@@ -103,12 +103,12 @@ def extractor(path, kind='efficientnet_lite1', **changes):
 def test_network_equals_torch_layer_by_layer(network):
     settings = settings_class('efficientnet_lite1')(model=str(network))
     images = [np.random.default_rng(i).integers(0, 256, (SIZE, SIZE, 3), np.uint8) for i in (1, 2)]
-    found = EfficientNetLite1(settings).feature_maps(images)
+    result = EfficientNetLite1(settings).feature_maps(images)
     x = (np.stack(images).astype(np.float32) - 127) / 128
     with torch.no_grad():
         expected = reference(random_weights(), torch.from_numpy(x.transpose(0, 3, 1, 2))).numpy()
     assert expected.shape == (2, 12, 7, 7)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * abs(expected).max())
+    np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE * abs(expected).max())
 
 
 @pytest.fixture(scope='module')
@@ -162,19 +162,19 @@ def test_file_of_other_weights_is_rejected(tmp_path, checkpoint):
 def test_hybrid_strips_have_the_mean_of_both_cosines_and_the_mean_square_of_weights(network):
     learned, hybrid = extractor(network), extractor(network, 'hybrid')
     parts = [made.extract(IMAGES) for made in (FeatureExtractor('gradient'), learned)]
-    found = hybrid.extract(IMAGES)
-    assert found.strips.shape == (7, 3, 224 + 12 * 7)
+    result = hybrid.extract(IMAGES)
+    assert result.strips.shape == (7, 3, 224 + 12 * 7)
     cosines = [strips @ strips.transpose(0, 2, 1) for strips in (part.strips for part in parts)]
-    products = found.strips @ found.strips.transpose(0, 2, 1)
+    products = result.strips @ result.strips.transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.mean(cosines, axis=0), atol=1e-6)
     squares = np.mean([part.weights**2 for part in parts], axis=0)
-    np.testing.assert_allclose(found.weights**2, squares, atol=1e-6)
+    np.testing.assert_allclose(result.weights**2, squares, atol=1e-6)
 
 
 def test_hybrid_of_a_black_image_has_learned_features_only(network):
-    found = extractor(network, 'hybrid').extract([np.zeros((50, 50, 3), np.uint8)])
-    assert not found.strips[..., :224].any()
-    np.testing.assert_allclose(np.linalg.norm(found.strips, axis=2), 1, atol=1e-6)
+    result = extractor(network, 'hybrid').extract([np.zeros((50, 50, 3), np.uint8)])
+    assert not result.strips[..., :224].any()
+    np.testing.assert_allclose(np.linalg.norm(result.strips, axis=2), 1, atol=1e-6)
 
 
 def test_hybrid_is_not_pooled(network):

@@ -186,8 +186,8 @@ def test_cells_are_compared_on_all_backends(device, precision):
 
 
 def test_smaller_error_rates_choose_greater_probabilities():
-    found = [least_probability(rate) for rate in np.geomspace(0.1, 0.005, 30)]
-    assert (np.diff(found) > 0).all()
+    result = [least_probability(rate) for rate in np.geomspace(0.1, 0.005, 30)]
+    assert (np.diff(result) > 0).all()
 
 
 @pytest.mark.parametrize('rate', [0.0, 0.001, 1.0, -0.1, float('nan')])

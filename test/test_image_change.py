@@ -74,9 +74,9 @@ def test_next_query_is_change_from_image_before():
     strips[1, :2] = strips[2, 1] = 0
     change = learn(drive_strips(9))
     assert change.next_query(strips[:, 0]) == 1
-    found = change.next_query(strips[:, 1])
-    assert found == pytest.approx(plain_change(strips[:, 0], strips[:, 1]), abs=1e-6)
-    assert found == pytest.approx(change_between(strips[:, 1], strips[:, 0]))
+    result = change.next_query(strips[:, 1])
+    assert result == pytest.approx(plain_change(strips[:, 0], strips[:, 1]), abs=1e-6)
+    assert result == pytest.approx(change_between(strips[:, 1], strips[:, 0]))
     change.reset()
     assert change.next_query(strips[:, 2]) == 1
 
@@ -105,15 +105,15 @@ def test_expected_change_below_one_place_is_that_of_a_denser_map(step):
     strips = decaying_strips(300, 0.6)
     dense, sparse = learn(strips), learn(strips[:, ::step])
     places = np.arange(4)
-    found = [expected_change(place / step, *sparse._extended) for place in places]
-    np.testing.assert_allclose(found, dense.curve[places], atol=0.03)
+    result = [expected_change(place / step, *sparse._extended) for place in places]
+    np.testing.assert_allclose(result, dense.curve[places], atol=0.03)
 
 
 def test_expected_change_is_the_curve_at_whole_places_and_never_decreases():
     change = learn(drive_strips(300))
-    found = [expected_change(places, *change._extended) for places in np.linspace(0, 30, 301)]
-    np.testing.assert_allclose(found[: 10 * MAX_LAG + 1 : 10], change.curve)
-    assert (np.diff(found) >= 0).all()
+    result = [expected_change(places, *change._extended) for places in np.linspace(0, 30, 301)]
+    np.testing.assert_allclose(result[: 10 * MAX_LAG + 1 : 10], change.curve)
+    assert (np.diff(result) >= 0).all()
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.5])
@@ -217,17 +217,17 @@ def test_unknown_route_is_not_matched_with_a_map_that_has_a_standstill():
     place_map = map_of(noisy(strips))
     for seed in range(2, 6):
         assert not match(PlaceRecognizer(place_map, robust()), noisy(route(seed)))
-    found = match(PlaceRecognizer(place_map, robust()), noisy(route(1), 9))
-    assert len(found) > PLACES - 60
-    assert all(abs(places[place] - image) <= 2 for image, place in found.items())
+    result = match(PlaceRecognizer(place_map, robust()), noisy(route(1), 9))
+    assert len(result) > PLACES - 60
+    assert all(abs(places[place] - image) <= 2 for image, place in result.items())
 
 
 def test_query_is_matched_during_a_long_standstill_and_after_it():
     place_map = map_of(noisy(route(1)))
     query, places = with_stop(route(1, light=1, strength=0.8), images=1000)
-    found = match(PlaceRecognizer(place_map, robust()), noisy(query, 9))
-    assert len(found) > len(places) - 60
-    assert all(abs(place - places[image]) <= 2 for image, place in found.items())
+    result = match(PlaceRecognizer(place_map, robust()), noisy(query, 9))
+    assert len(result) > len(places) - 60
+    assert all(abs(place - places[image]) <= 2 for image, place in result.items())
 
 
 def standing(strips, images=60, seed=0):
@@ -253,11 +253,11 @@ def test_route_with_a_standstill_is_closed_where_it_comes_back_alone():
     unknown = np.concatenate([route(seed) for seed in (2, 3)], axis=1)
     strips = np.concatenate([first, unknown, route(1)], axis=1)
     closer = LoopCloser(robust(), 30, FeatureSettings('gradient', None, 7))
-    found = {i: place for i, place in match(closer, noisy(strips)).items() if i >= STOP}
+    result = {i: place for i, place in match(closer, noisy(strips)).items() if i >= STOP}
     back = first.shape[1] + unknown.shape[1]
-    assert min(found) >= back
-    assert len(found) > PLACES - 60
-    assert all(abs(places[place] - (image - back)) <= 2 for image, place in found.items())
+    assert min(result) >= back
+    assert len(result) > PLACES - 60
+    assert all(abs(places[place] - (image - back)) <= 2 for image, place in result.items())
 
 
 def test_change_weights_are_small_at_standstills_alone():

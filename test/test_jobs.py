@@ -102,8 +102,8 @@ def test_job_names_and_arguments():
     assert job_names(['a/monday.bag', 'b/tuesday/', 'c.mat:x']) == ['monday', 'tuesday', 'c']
     with pytest.raises(SettingsError, match="'monday'"):
         job_names(['a/monday.bag', 'b/monday'])
-    given = ['--input', 'a', 'b', '--every', '2', '--output', 'c', '--ray', 'auto', '--force']
-    assert other_arguments(given, '--input') == ['--every', '2', '--force']
+    options = ['--input', 'a', 'b', '--every', '2', '--output', 'c', '--ray', 'auto', '--force']
+    assert other_arguments(options, '--input') == ['--every', '2', '--force']
     with pytest.raises(SettingsError, match='--processes 0'):
         run_jobs([], 0, None)
 
@@ -146,8 +146,8 @@ def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(drives, built, 
     assert out.count(': done') == 6
     from stavpr_ros.mapping import open_map
 
-    found = [open_map(tmp_path / 'maps' / f'{Path(one).name}.stavpr').map_id for one in inputs]
-    assert found == ids(built) * 3
+    result = [open_map(tmp_path / 'maps' / f'{Path(one).name}.stavpr').map_id for one in inputs]
+    assert result == ids(built) * 3
 
 
 # What commands show: progress on terminals and in log files, and columns of their help

@@ -92,13 +92,13 @@ def seconds(*values):
 
 def assert_equal(path, place_map):
     """Compare all parts of the map in a file with a map."""
-    found = load_map(path)
-    assert found.settings == place_map.settings
+    result = load_map(path)
+    assert result.settings == place_map.settings
     for name in ('strips', 'weights'):
-        assert np.array_equal(getattr(found.features, name), getattr(place_map.features, name))
-    np.testing.assert_array_equal(found.stamps, place_map.stamps)
-    np.testing.assert_array_equal(found.poses, place_map.poses)
-    assert (found.ids, found.thumbnails) == (place_map.ids, place_map.thumbnails)
+        assert np.array_equal(getattr(result.features, name), getattr(place_map.features, name))
+    np.testing.assert_array_equal(result.stamps, place_map.stamps)
+    np.testing.assert_array_equal(result.poses, place_map.poses)
+    assert (result.ids, result.thumbnails) == (place_map.ids, place_map.thumbnails)
 
 
 def places_of(place_map):
@@ -190,10 +190,10 @@ def test_fault_at_every_write_loses_no_synced_place(
         for content in (cut, cut + written[: n // 2], cut + bytes(n), cut + bytes(8)):
             journal_of(copy).write_bytes(content)
             try:
-                found = stamps(recover(journal_of(copy)).path)
+                result = stamps(recover(journal_of(copy)).path)
             except JournalError:
-                found = []
-            assert set(small_map.stamps[first:count].tolist()) <= set(found)
+                result = []
+            assert set(small_map.stamps[first:count].tolist()) <= set(result)
             for path in tmp_path.glob('copy*'):
                 path.unlink()
     assert len(writes) >= 23  # header, places, and the rewritten ones
@@ -472,11 +472,11 @@ def test_journal_of_a_route_follows_evictions(start, route, target, set_constant
     wait_until(lambda: os.path.getsize(path) <= 600_000)
     kill(pipeline)
     result = recover(path)
-    found = load_map(result.path)
+    output = load_map(result.path)
     n = len(held)
-    assert n <= len(found) < 80
-    assert found.stamps[-n:].tolist() == held.stamps.tolist()
-    assert np.allclose(found.features.strips[:, -n:], held.features.strips, atol=1e-6)
+    assert n <= len(output) < 80
+    assert output.stamps[-n:].tolist() == held.stamps.tolist()
+    assert np.allclose(output.features.strips[:, -n:], held.features.strips, atol=1e-6)
 
 
 def test_changes_keep_the_journal_of_unsaved_places(start, small_map, route, target, tmp_path):

@@ -104,9 +104,9 @@ def test_positions_are_those_of_the_route_whatever_session_shows_them():
 
 
 def test_robot_is_lost_after_images_or_meters_without_a_match():
-    found = [SURE, *[UNSURE] * 3]
-    assert states(*found, NONE, NONE, UNSURE, NONE, NONE, NONE)[3:] == [*[True] * 6, False]
-    far = states(*found, NONE, UNSURE, NONE, NONE, positions=[0, 1, 2, 3, 7.9, 8, 12, 13])
+    start = [SURE, *[UNSURE] * 3]
+    assert states(*start, NONE, NONE, UNSURE, NONE, NONE, NONE)[3:] == [*[True] * 6, False]
+    far = states(*start, NONE, UNSURE, NONE, NONE, positions=[0, 1, 2, 3, 7.9, 8, 12, 13])
     assert far[3:] == [True, True, True, True, False]
 
 

@@ -99,8 +99,8 @@ class PlainCloser:
             return None
         window = np.stack(self.rows)
         window[:, :first] = np.inf
-        found = match_sequence(window, self.settings.sequence)
-        return best_match(found, self.settings.nms_radius)
+        result = match_sequence(window, self.settings.sequence)
+        return best_match(result, self.settings.nms_radius)
 
 
 @pytest.mark.parametrize(
@@ -124,20 +124,20 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
             assert answer.path.place < 0
             continue
         answered += 1
-        found = answer.path
-        assert (found.first, found.last, found.place) == (
+        result = answer.path
+        assert (result.first, result.last, result.place) == (
             expected.first,
             expected.last,
             expected.middle,
         )
-        assert found.second_best == expected.second_best_index
+        assert result.second_best == expected.second_best_index
         np.testing.assert_array_equal(
-            [found.distance, found.second_best_distance],
+            [result.distance, result.second_best_distance],
             [expected.distance, expected.second_best_distance],
         )
-        assert answer.path.pairs[:, 1].min() == found.first >= closer.first
-        assert answer.path.pairs[-1].tolist() == [sequence.length - 1, found.last]
-        assert found.last < i + 1 - exclude
+        assert answer.path.pairs[:, 1].min() == result.first >= closer.first
+        assert answer.path.pairs[-1].tolist() == [sequence.length - 1, result.last]
+        assert result.last < i + 1 - exclude
     assert answered > 270
     assert closer.first > 0
 
@@ -162,13 +162,13 @@ def test_late_matches_close_what_was_not_certain_at_first():
         if match.accepted:
             closed.append(i - (length - 1) + middle)
         assert match.accepted or not match.late
-        for found in match.late:
-            assert (found.status, found.is_late) == (Status.MATCH, True)
-            assert found.position == (0 if found.is_oldest else middle)
-            assert abs(int(found.path.pairs[found.position, 1]) - found.place) <= CLOSE
-            late[found.first_image + found.position] = found.place
-            oldest += found.is_oldest
-            closed.append(found.first_image + found.position)
+        for result in match.late:
+            assert (result.status, result.is_late) == (Status.MATCH, True)
+            assert result.position == (0 if result.is_oldest else middle)
+            assert abs(int(result.path.pairs[result.position, 1]) - result.place) <= CLOSE
+            late[result.first_image + result.position] = result.place
+            oldest += result.is_oldest
+            closed.append(result.first_image + result.position)
     assert len(closed) == len(set(closed))
     assert len(late) > oldest >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
@@ -211,7 +211,7 @@ PLACE = 8
 def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(events, closed):
     """Those before are late; a number moves the place, and ``evict`` evicts the one before."""
     paths, columns = PathConfirmation(SHORT.length), WindowColumns(0, np.zeros((1, 1)))
-    found, images, place, first, at_rest = [], 0, PLACE, 0, False
+    result, images, place, first, at_rest = [], 0, PLACE, 0, False
     for event in events:
         if event == 'reset':
             paths.reset()
@@ -237,9 +237,9 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(eve
             assert match.reason == 'its path is not confirmed yet' * waits
             assert not waits or not match.with_probability(1.0).accepted
             assert all(late.is_late for late in match.late)
-            found += [match, *match.late] if match.accepted else []
+            result += [match, *match.late] if match.accepted else []
             images += 1
-    assert [match.last_image for match in found] == closed
+    assert [match.last_image for match in result] == closed
 
 
 def test_exclude_seconds_leaves_young_places_out(laps):

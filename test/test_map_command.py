@@ -327,10 +327,10 @@ def test_compact_reduces_map_to_principal_components(whole, tmp_path, capsys):
     saved, compact, smaller = (str(tmp_path / name) for name in ('whole', 'compact', 'smaller'))
     save_map(whole, saved)
     assert map_command.main(['compact', saved, compact, '--pca', f'{D}']) == 0
-    found = load_map(compact)
-    assert isinstance(found, Map)
-    assert found.features.strips.shape == (7, 30, D)
-    assert found.projection.name == f'principal components 224 -> {D} of 30 places'
+    result = load_map(compact)
+    assert isinstance(result, Map)
+    assert result.features.strips.shape == (7, 30, D)
+    assert result.projection.name == f'principal components 224 -> {D} of 30 places'
     assert map_command.main(['compact', compact, smaller, '--pca', '4']) == 0
     assert load_map(smaller).dimension == 4
     assert 'strips of 6 dimensions become 4' in capsys.readouterr().out

@@ -64,13 +64,13 @@ def assert_same(a: Map, b: Map) -> None:
 
 @pytest.mark.parametrize('read', [load_map, open_map])
 def test_saved_map_is_read_as_it_was(example, saved, read):
-    found = read(saved)
-    assert_same(found, example)
-    assert np.array_equal(found.features.strips, example.features.strips)
-    assert found.features.cells == example.features.cells == (4, 2)
-    assert (found.session(11).name, found.session(12).id) == ('morning', 'b')
-    assert found.thumbnails[1:3] == example.thumbnails[1:3]
-    use(found)
+    result = read(saved)
+    assert_same(result, example)
+    assert np.array_equal(result.features.strips, example.features.strips)
+    assert result.features.cells == example.features.cells == (4, 2)
+    assert (result.session(11).name, result.session(12).id) == ('morning', 'b')
+    assert result.thumbnails[1:3] == example.thumbnails[1:3]
+    use(result)
 
 
 def test_map_id_is_that_of_the_content(example, saved, tmp_path):
@@ -91,10 +91,10 @@ def test_error_risks_are_replaced_in_a_file_that_stays_the_same_map(example, sav
         ErrorRisks('m', 1, (0.6,), (0.0,)),
     ):
         assert save_error_risks(risks, path, True) == map_id
-        found = load_map(path)
-        assert (found.map_id, found.error_risks) == (map_id, risks)
-        assert_same(found, dataclasses.replace(example, error_risks=risks))
-    assert save_map(found, tmp_path / 'again') == map_id
+        result = load_map(path)
+        assert (result.map_id, result.error_risks) == (map_id, risks)
+        assert_same(result, dataclasses.replace(example, error_risks=risks))
+    assert save_map(result, tmp_path / 'again') == map_id
 
     def without_recordings(manifest):
         del manifest['sections']['error_risks']['data']['recordings']

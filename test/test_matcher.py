@@ -190,7 +190,7 @@ def test_vertical_distances_equal_oracle(n, strategy, xi):
     reference, query = features_with_cells(n), features_with_cells(2, seed=1)
     spatial = SpatialSettings(strategy, 1.0, xi, vertical=True)
     matcher = CpuMatcher(reference, spatial)
-    found = matcher.distance_matrix(query.strips, query.weights)
+    result = matcher.distance_matrix(query.strips, query.weights)
     x = cut_cells(query.strips, (4, 2)).astype(np.float64)
     y = cut_cells(reference.strips, (4, 2)).astype(np.float64)
     for image in sorted({0, n // 2, n - 1}):
@@ -200,9 +200,9 @@ def test_vertical_distances_equal_oracle(n, strategy, xi):
                 cells = 1 - x[4 * i : 4 * i + 4, 1] @ y[4 * j : 4 * j + 4, image].T
                 d[i, j] = oracle.align_images(cells, strategy)
         expected = oracle.align_images(d, strategy, xi=xi)
-        assert found[1, image] == pytest.approx(expected, abs=2e-6)
+        assert result[1, image] == pytest.approx(expected, abs=2e-6)
     np.testing.assert_array_equal(
-        matcher.distances(query.strips[:, 1], query.weights[:, 1]), found[1]
+        matcher.distances(query.strips[:, 1], query.weights[:, 1]), result[1]
     )
 
 

@@ -74,9 +74,9 @@ def test_opened_map_outlives_its_name(path, small_map, change):
     ],
 )
 def test_resident_memory_is_that_of_the_features(operation, mode, n, d):
-    found = memory.measure_memory(operation, mode, 'float32', n, d)
-    assert found.feature_bytes == 4 * 7 * n * d
-    assert 0.9 < found.ratio < 1 + ALLOWANCE / found.feature_bytes
+    result = memory.measure_memory(operation, mode, 'float32', n, d)
+    assert result.feature_bytes == 4 * 7 * n * d
+    assert 0.9 < result.ratio < 1 + ALLOWANCE / result.feature_bytes
 
 
 @pytest.mark.long

@@ -166,9 +166,9 @@ def test_paths_in_a_wide_map_equal_equations(make, seed):
     for z in drive(rng, width, 15, first=(30, 190, 385)[seed], speed=1.3):
         one.update(z)
         plain.update(z)
-    found, expected = one.beliefs(12), plain.beliefs(12)
-    assert 0 < len(found.columns) < width
-    np.testing.assert_allclose(dense(found, width), expected, rtol=0, atol=5e-3)
+    result, expected = one.beliefs(12), plain.beliefs(12)
+    assert 0 < len(result.columns) < width
+    np.testing.assert_allclose(dense(result, width), expected, rtol=0, atol=5e-3)
 
 
 @pytest.mark.parametrize('speeds', [tuple(0.25 * v for v in range(17)), (0.0, 16.0)])
@@ -177,8 +177,8 @@ def test_many_and_fast_speeds_follow_the_camera(make, speeds):
     for z in drive(np.random.default_rng(2), 2500, 20, 900, speeds[-1], 0):
         one.update(np.where(z == -3, -6, z).astype(np.float32))
     beliefs = one.beliefs(12)
-    found = beliefs.columns[beliefs.probabilities.argmax(axis=1)]
-    np.testing.assert_array_equal(found, places[-12:])
+    result = beliefs.columns[beliefs.probabilities.argmax(axis=1)]
+    np.testing.assert_array_equal(result, places[-12:])
 
 
 def test_power_is_that_of_numpy_up_to_the_steepest():
@@ -277,9 +277,9 @@ def test_states_move_back(make, moment):
         laps = one.by_place().reshape(2, 100)
         np.testing.assert_allclose(laps.sum(axis=0), other.by_place(), rtol=1e-4, atol=1e-6)
         if image + 1 >= moment:
-            found = dense(one.beliefs(min(image + 1, 9)), 200).reshape(-1, 2, 100).sum(axis=1)
+            result = dense(one.beliefs(min(image + 1, 9)), 200).reshape(-1, 2, 100).sum(axis=1)
             expected = dense(other.beliefs(min(image + 1, 9)), 100)
-            np.testing.assert_allclose(found, expected, rtol=0, atol=5e-3)
+            np.testing.assert_allclose(result, expected, rtol=0, atol=5e-3)
 
 
 def test_move_back_is_of_those_columns_alone(make):
@@ -324,8 +324,8 @@ def test_filter_without_its_oldest_columns_equals_one_of_the_others(moments):
         if image + 1 in moments:
             removed += 60 // len(moments)
             one.evict(60 // len(moments))
-        found, expected = (answers(f, width, min(image + 1, 9)) for f in (one, other))
-        for x, y in zip(found, expected, strict=True):
+        result, expected = (answers(f, width, min(image + 1, 9)) for f in (one, other))
+        for x, y in zip(result, expected, strict=True):
             np.testing.assert_allclose(np.roll(x, removed - 60, axis=-1), y, rtol=0, atol=1e-4)
 
 

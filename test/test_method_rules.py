@@ -58,8 +58,8 @@ def without_half(patch):
     show, half = FilterWindow._show, (LENGTH + 1) // 2
 
     def show_half(self, l, position=None):
-        found = show(self, l, position)
-        return found._replace(probability=1.0) if (l, position) == (half, None) else found
+        result = show(self, l, position)
+        return result._replace(probability=1.0) if (l, position) == (half, None) else result
 
     patch.setattr(FilterWindow, '_show', show_half)
 
@@ -112,11 +112,11 @@ def places_off(places, noise, whole_path):
 
 def probable_place(query, known=KNOWN, every=1, first=10, reach=2, **settings):
     """Return the mean probability of the place of every such image, from 40 on."""
-    one, found = recognizer(known, **settings), []
+    one, result = recognizer(known, **settings), []
     for i in range(len(query)):
         one.update(query[i : i + 1])
-        found.append(one.place_probabilities()[40 + i - reach : 41 + i + reach].sum())
-    return np.mean(found[first::every])
+        result.append(one.place_probabilities()[40 + i - reach : 41 + i + reach].sum())
+    return np.mean(result[first::every])
 
 
 def invert():

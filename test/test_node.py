@@ -260,8 +260,8 @@ def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(
     publish(Odometry, '/pose_graph/odometry')
     publish(TransformStamped, '/pose_graph/map_to_odom')
     start('-r', 'odom:=/wheel', keyframe_distance=1.0)
-    found = 'nothing is published on /wheel, odometry is on /odom: remap odom'
-    robot.until_diagnosed('input', WARN, found)
+    message = 'nothing is published on /wheel, odometry is on /odom: remap odom'
+    robot.until_diagnosed('input', WARN, message)
     stranger.create_publisher(Image, '/wheel', 1)
     robot.until_diagnosed('input', WARN, 'sensor_msgs/msg/Image is published on /wheel, odometry')
     robot.set(keyframe_distance=0.0)

@@ -106,8 +106,8 @@ def test_registers_of_tokens_are_excluded_or_rejected(saved):
     pads, large = np.array((0, 5, 0, 0, 0, 0)), np.float32(1e6)
     path = saved(*nodes, s=np.array((0, 8, 64)), pads=pads, large=large)
     expected = extractor(path, 'y', strips=4).extract(IMAGES)
-    found = extractor(path, 'tokens', strips=4, prefix_tokens=5).extract(IMAGES)
-    np.testing.assert_array_equal(found.strips, expected.strips)
+    result = extractor(path, 'tokens', strips=4, prefix_tokens=5).extract(IMAGES)
+    np.testing.assert_array_equal(result.strips, expected.strips)
     with pytest.raises(
         SettingsError, match=r'68 without the first 1: .*prefix_tokens = 5 leaves 8'
     ):
@@ -271,9 +271,9 @@ def test_network_of_torch_is_exported_as_documented(half):
         ('/norm/LayerNormalization_output_0', tokens),
     ):
         settings = settings_class('onnx')(model='net.onnx', layer=layer, **plain)
-        found = backbone_class('onnx')(settings).feature_maps(IMAGES)
+        result = backbone_class('onnx')(settings).feature_maps(IMAGES)
         tolerance = 2e-2 if half else 1e-5
-        np.testing.assert_allclose(found, expected, atol=tolerance, rtol=tolerance)
+        np.testing.assert_allclose(result, expected, atol=tolerance, rtol=tolerance)
 
 
 CUDA, TENSORRT, CPU = (f'{name}ExecutionProvider' for name in ('CUDA', 'Tensorrt', 'CPU'))

@@ -113,8 +113,8 @@ def test_invalid_values_are_rejected_by_name(values, words):
 
 def test_paths_are_absolute_and_expanded(environ, working_folder):
     environ['HOME'] = '/home/robot'
-    given = {'map_path': '~/a.stavpr', 'save_path': 'b.stavpr', 'model_path': '~/net.onnx'}
-    settings = node_settings(DEFAULTS | given)
+    options = {'map_path': '~/a.stavpr', 'save_path': 'b.stavpr', 'model_path': '~/net.onnx'}
+    settings = node_settings(DEFAULTS | options)
     assert settings.map_path == '/home/robot/a.stavpr'
     assert settings.save_path == str(working_folder / 'b.stavpr')
     assert settings.pipeline.model_path == '/home/robot/net.onnx'

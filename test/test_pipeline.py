@@ -431,8 +431,8 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
     assert result.match.accepted
     for late in result.match.late:
         query = places.thumbnail(late.first_image + late.position)
-        found = PlaceVerifier(check).inliers(query, places, late.place)
-        assert late.inliers == found >= 8
+        output = PlaceVerifier(check).inliers(query, places, late.place)
+        assert late.inliers == output >= 8
     rejected = {result.match.place, result.match.late[0].place}
     monkeypatch.setattr(PlaceVerifier, 'inliers', lambda *given: 8 * (given[3] not in rejected))
     _, other = closing(geometric=check)
@@ -511,8 +511,8 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     # the first equals the last keyframe
     matches = process(pipeline, route[4 : 4 + LENGTH], first=100)
     waiting = statuses(matches).count(Status.WARMING_UP)
-    found = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
-    assert statuses(matches) == [Status.WARMING_UP] * waiting + [found] * (5 - waiting)
+    result = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
+    assert statuses(matches) == [Status.WARMING_UP] * waiting + [result] * (5 - waiting)
     assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 4
     assert matches[-1].match.window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':

@@ -74,10 +74,10 @@ def test_triangulate_of_exact_views_returns_the_points():
     around = [0, 1, 3, 4]
     neighbors = list(zip([views[i] for i in around], motions([poses[i] for i in around], poses[2]),
                          strict=True))  # fmt: skip
-    found = triangulate(views[2], neighbors, 2)
-    assert len(found.points) > 140  # others are far ahead, without parallax
+    result = triangulate(views[2], neighbors, 2)
+    assert len(result.points) > 140  # others are far ahead, without parallax
     true = in_camera(points, poses[2], CAMERA)
-    away = np.linalg.norm(found.points[:, None] - true, axis=2).min(axis=1)
+    away = np.linalg.norm(result.points[:, None] - true, axis=2).min(axis=1)
     assert away.max() < 1e-3
 
 
@@ -88,12 +88,12 @@ def test_deviations_of_landmarks_fit_the_errors_of_their_depths(seed):
     poses = [pose(x) for x in (0, -3, -2, -1, 1, 2, 3)]
     views = views_of(points, poses, noise)
     neighbors = list(zip(views[1:], motions(poses[1:], poses[0]), strict=True))
-    found = triangulate(views[0], neighbors, 3)
+    result = triangulate(views[0], neighbors, 3)
     exact = views_of(points, poses)[0]
-    rows = [np.flatnonzero((exact.descriptors == own).all(1))[0] for own in found.descriptors]
+    rows = [np.flatnonzero((exact.descriptors == own).all(1))[0] for own in result.descriptors]
     true = in_camera(points, poses[0], CAMERA)
     depths = true[true[:, 2] > 0.5][rows, 2]
-    errors = (found.points[:, 2] / depths - 1) / found.deviations / noise
+    errors = (result.points[:, 2] / depths - 1) / result.deviations / noise
     assert len(errors) > 100
     assert 0.5 < np.median(np.abs(errors)) / 0.6745 < 1.5
 
@@ -110,10 +110,10 @@ def test_pnp_with_noisy_depths_is_unbiased_and_its_covariance_fits_the_errors():
         measured = np.maximum(rho + noise * sigma * dice.normal(size=120), 0.002)
         points, descriptors = rays / measured[:, None], dice.random((120, 128), np.float32)
         own = Landmarks(points, points, sigma / measured, descriptors, np.empty((0, 4, 4)))
-        found = solve_pnp(View(seen, descriptors, focal), [own])
-        turn = Rotation.from_matrix(found.matrix[:3, :3]).as_rotvec()
-        errors.append(np.concatenate([found.matrix[:3, 3] - (1, 0, 0), turn]))
-        squares.append(errors[-1] @ np.linalg.solve(noise**2 * found.covariance, errors[-1]))
+        result = solve_pnp(View(seen, descriptors, focal), [own])
+        turn = Rotation.from_matrix(result.matrix[:3, :3]).as_rotvec()
+        errors.append(np.concatenate([result.matrix[:3, 3] - (1, 0, 0), turn]))
+        squares.append(errors[-1] @ np.linalg.solve(noise**2 * result.covariance, errors[-1]))
     assert np.abs(np.mean(errors, axis=0)[:3]).max() < 0.02
     assert 4 < np.mean(squares) < 8
 
@@ -199,8 +199,8 @@ def test_mutual_matches_of_floats_agree_with_opencv(ratio):
         for one, two in ahead
         if one.distance < ratio * two.distance and back[one.trainIdx][0].trainIdx == one.queryIdx
     ]
-    found = mutual_matches(mine, theirs, ratio)
-    assert list(zip(*(indices.tolist() for indices in found), strict=True)) == expected
+    result = mutual_matches(mine, theirs, ratio)
+    assert list(zip(*(indices.tolist() for indices in result), strict=True)) == expected
     assert 20 < len(expected) < 60
 
 
@@ -415,15 +415,15 @@ def test_align_follows_the_track_of_the_places_in_a_bend():
 @pytest.mark.parametrize('method', ['auto', 'aligned'])
 def test_independent_edges_are_apart(method):
     """Of edges at every place, each tenth is independent."""
-    estimator, source, found = EdgeEstimator(method), object(), []
+    estimator, source, result = EdgeEstimator(method), object(), []
     poses = np.array([pose(i * SPACING) for i in range(60)])
     for place in range(15, 45):
         query_poses, middle, distances = drive()
         near = np.full((LENGTH, 60), 2.0)
         near[:, place - PLACE : place - PLACE + PLACES] = distances
         pair = MatchedPair(source, place, None, query_poses, middle, near, 0, poses, {})
-        found.append(estimator.estimate(pair, None, None).independent)
-    assert np.flatnonzero(found).tolist() == list(range(0, 30, APART[Source.ALIGNED]))
+        result.append(estimator.estimate(pair, None, None).independent)
+    assert np.flatnonzero(result).tolist() == list(range(0, 30, APART[Source.ALIGNED]))
     assert not EdgeEstimator('none').estimate(pair, None, None).independent
 
 
@@ -484,13 +484,13 @@ def test_map_file_holds_several_cameras(small_map, tmp_path):
     maps = replace(small_map, camera=CAMERA), replace(small_map, camera=rear)
     merged = merge_maps(maps, ['front', 'rear'], [('front', 0.1), ('rear', None)])
     save_map(merged, tmp_path / 'a.stavpr')
-    found = load_map(tmp_path / 'a.stavpr')
-    assert found.sessions == merged.sessions
-    assert [(session.camera, session.yaw) for session in found.sessions] == [
+    result = load_map(tmp_path / 'a.stavpr')
+    assert result.sessions == merged.sessions
+    assert [(session.camera, session.yaw) for session in result.sessions] == [
         ('front', 0.1), ('rear', pytest.approx(math.pi)),
     ]  # fmt: skip
-    assert (found.camera_of(n - 1), found.camera_of(n)) == (CAMERA, rear)
-    assert with_same_places(found).same_as.tolist() == list(range(2 * n))  # they look elsewhere
+    assert (result.camera_of(n - 1), result.camera_of(n)) == (CAMERA, rear)
+    assert with_same_places(result).same_as.tolist() == list(range(2 * n))  # they look elsewhere
     alike = merge_maps(maps, ['front', 'rear'])
     assert alike.camera_of(n) == rear
     assert with_same_places(alike).same_as[n:].tolist() == list(range(n))

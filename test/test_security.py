@@ -12,8 +12,8 @@ BOTH_CAMERAS = {'/image', *(f'/image/{name}' for name in ('compressed', 'ffmpeg'
 
 @pytest.mark.parametrize('transport', ['raw', 'compressed'])
 def test_policy_of_the_node_is_what_it_uses(context, transport):
-    given = {'autostart': False, 'operation': 'mapping', 'image_transport': transport}
-    overrides = [Parameter(name, value=value) for name, value in given.items()]
+    options = {'autostart': False, 'operation': 'mapping', 'image_transport': transport}
+    overrides = [Parameter(name, value=value) for name, value in options.items()]
     node = PlaceRecognitionNode(context=context, parameter_overrides=overrides)
     try:
         assert node.trigger_configure() == node.trigger_activate()
@@ -25,7 +25,7 @@ def test_policy_of_the_node_is_what_it_uses(context, transport):
         }
     finally:
         node.destroy_node()
-    names = {right: {name for name, _ in found} for right, found in used.items()}
+    names = {right: {name for name, _ in result} for right, result in used.items()}
     if names['subscribe'] & BOTH_CAMERAS:  # one of them at a time
         names['subscribe'] |= BOTH_CAMERAS
     names['subscribe'].add('/clock')  # with use_sim_time

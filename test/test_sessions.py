@@ -62,8 +62,8 @@ def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
     assert {layout_of(place_map, 20).columns for place_map in (town[0], one)} == {None}
     query = features_of(route(0), 1.0, 9)[10:50]
-    for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
-        assert repr(found) == repr(expected)
+    for result, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
+        assert repr(result) == repr(expected)
     here = recognizer(town[0])
     here.update(query[:1])
     assert here.place_probabilities().shape == (PLACES,)

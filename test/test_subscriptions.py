@@ -23,8 +23,8 @@ class Setup:
     """A subscription and its publishers; ``received`` holds the numbers of the images."""
 
     def __init__(self, context, **overrides):
-        given = [Parameter(name, value=value) for name, value in overrides.items()]
-        self.node = ManagedNode('subscriber', context=context, parameter_overrides=given)
+        options = [Parameter(name, value=value) for name, value in overrides.items()]
+        self.node = ManagedNode('subscriber', context=context, parameter_overrides=options)
         self.cameras = rclpy.create_node('cameras', context=context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)

@@ -86,8 +86,8 @@ def test_thermal_images_match_by_the_range_of_the_map(thermal_map, folders, capl
     loaded = load_map(path)
     assert loaded.settings == thermal_map.settings
     query = extract_features(open_source(folders[1]), loaded.extractor(), progress=False)
-    found = matches(loaded, query)
-    assert len(found) > IMAGES / 2
+    result = matches(loaded, query)
+    assert len(result) > IMAGES / 2
     again = build_map(open_source(folders[0]), FeatureExtractor('gradient'), progress=False)
     assert again.settings == thermal_map.settings
     assert caplog.text.count(f'images of 16 bits: their values {low} to {high}') == 1

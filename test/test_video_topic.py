@@ -62,15 +62,15 @@ def message_of(packet, kind, codec, i, **changes):
 
 def decode(stream, messages):
     """Return the image of each message, or the kind of its error."""
-    found = []
+    result = []
     for message in messages:
         image = stream.read(message)
         assert image.header.stamp.sec
         try:
-            found.append(decode_message(image))
+            result.append(decode_message(image))
         except ImageError as error:
-            found.append(error.kind)
-    return found
+            result.append(error.kind)
+    return result
 
 
 def check(found, missing=()):
@@ -93,8 +93,8 @@ def test_each_packet_is_an_image_from_the_first_key_frame_on(encoded, codec, kin
 def test_lost_packets_are_counted_and_their_key_frame_is_awaited(encoded, codec):
     messages = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(encoded)]
     stream = VideoStream()
-    found = decode(stream, messages[:6] + messages[8:])
-    check([*found[:6], *IMAGES[6:8], *found[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
+    result = decode(stream, messages[:6] + messages[8:])
+    check([*result[:6], *IMAGES[6:8], *result[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
     assert stream.lost == 2
     decode(stream, messages)  # the publisher has started again
     assert stream.lost == 2
@@ -132,13 +132,13 @@ def test_image_that_ffmpeg_conceals_is_damaged(route):
         for i, packet in enumerate(packets(route[:6], 'libx264', 5))
     ]
     messages[2].data = messages[2].data[: messages[2].data.size // 2]
-    found = [image if isinstance(image, str) else '' for image in decode(VideoStream(), messages)]
-    assert found == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
+    result = [image if isinstance(image, str) else '' for image in decode(VideoStream(), messages)]
+    assert result == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
 
 
 def test_b_frames_are_refused_with_the_remedy():
-    found = packets(IMAGES, b_frames=2)
-    message = message_of(found[0], FOXGLOVE, 'libx264', 0)
+    result = packets(IMAGES, b_frames=2)
+    message = message_of(result[0], FOXGLOVE, 'libx264', 0)
     with pytest.raises(ImageError, match='max_b_frames: 0'):
         VideoStream().read(message).decode()
 

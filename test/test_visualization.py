@@ -306,8 +306,8 @@ def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
     place, odometry = (
         np.concatenate([rng.normal(size=3), Rotation.random(rng=rng).as_quat()]) for _ in range(2)
     )
-    found = matrices(map_to_odometry(place, odometry)) @ matrices(odometry)
-    np.testing.assert_allclose(found, matrices(place), atol=1e-12)
+    result = matrices(map_to_odometry(place, odometry)) @ matrices(odometry)
+    np.testing.assert_allclose(result, matrices(place), atol=1e-12)
 
 
 def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
@@ -325,11 +325,11 @@ def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
 
 def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():
     tilted = Rotation.from_euler('ZYX', [40, 20, 10], degrees=True).as_quat()
-    given = PoseWithCovarianceStamped()
-    given.pose.pose = pose_message(np.array([1, 2, 3, *tilted]))
-    given.pose.covariance[::7] = [0.01, 4.0, 0.3, 0.3, 0.3, 0.01]
-    given.pose.covariance[1] = given.pose.covariance[6] = 0.2
-    flat = planar(given).pose
+    message = PoseWithCovarianceStamped()
+    message.pose.pose = pose_message(np.array([1, 2, 3, *tilted]))
+    message.pose.covariance[::7] = [0.01, 4.0, 0.3, 0.3, 0.3, 0.01]
+    message.pose.covariance[1] = message.pose.covariance[6] = 0.2
+    flat = planar(message).pose
     position, o = flat.pose.position, flat.pose.orientation
     assert (position.x, position.y, position.z) == (1, 2, 0)
     assert math.degrees(2 * math.atan2(o.z, o.w)) == pytest.approx(40)

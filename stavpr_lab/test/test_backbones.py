@@ -103,10 +103,10 @@ def test_vgg16_fc6_by_hand():
     network.features = nn.Identity()
     network.classifier = nn.Sequential(nn.Linear(2 * 49, 4), nn.ReLU(), nn.Dropout())
     maps = torch.rand(3, 2, 14, 14)
-    found = VGG16Fc6.up_to_layer(network)(maps.to(memory_format=torch.channels_last))
+    result = VGG16Fc6.up_to_layer(network)(maps.to(memory_format=torch.channels_last))
     weight, bias = network.classifier[0].weight, network.classifier[0].bias
     means = maps.reshape(3, 2, 7, 2, 7, 2).mean(dim=(3, 5)).reshape(3, 98)
-    torch.testing.assert_close(found, torch.relu(means @ weight.T + bias))
+    torch.testing.assert_close(result, torch.relu(means @ weight.T + bias))
     assert VGG16Fc6.published.name == 'vgg16-397923af.pth'
 
 
@@ -315,9 +315,9 @@ def vector(path, image, **changes):
 @pytest.mark.parametrize('layout', LAYOUTS)
 def test_netvlad_of_each_layout_equals_its_equations(tmp_path, numbers, image, layout):
     path = write(tmp_path, layout, numbers)
-    found = vector(path, image)
-    assert found.shape == (OUT,)
-    np.testing.assert_allclose(found, oracle(image, numbers, layout), atol=1e-5)
+    result = vector(path, image)
+    assert result.shape == (OUT,)
+    np.testing.assert_allclose(result, oracle(image, numbers, layout), atol=1e-5)
     whole = vector(path, image, whitening=False)
     assert whole.shape == (K * D,)
     expected = oracle(image, numbers, layout, whitening=False)

@@ -117,10 +117,10 @@ def test_center_line_ahead_of_closed_street_agrees_with_poses(image):
     across, _, turned = traverse.camera(number)
     yaw += turned  # the camera is turned in the street
     forward, right = np.array([np.cos(yaw), np.sin(yaw)]), np.array([np.sin(yaw), -np.cos(yaw)])
-    found = [x, y] + ahead[:, :1] * forward + (ahead[:, 1:2] - across) * right
+    result = [x, y] + ahead[:, :1] * forward + (ahead[:, 1:2] - across) * right
     line = RingWorld(5).center_line
     cells = (int(along / CELL) + 1 + np.arange(80)) % (len(line) - 1)
-    assert np.abs(found - line[cells, :2]).max() < 1e-3  # the ends meet to 0.2 mm
+    assert np.abs(result - line[cells, :2]).max() < 1e-3  # the ends meet to 0.2 mm
 
 
 DAYS = Days(

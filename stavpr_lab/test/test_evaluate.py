@@ -91,16 +91,16 @@ def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_pat
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
-    found = numbers(*pair(folders), '--mode', 'paper', '--tolerance', 1)
-    assert all(found[kind]['average_precision'] > 0.9 for kind in KINDS)
-    assert found['sequence']['queries'] == PLACES
-    assert found['sequence_without_ends']['queries'] == PLACES - 19
+    result = numbers(*pair(folders), '--mode', 'paper', '--tolerance', 1)
+    assert all(result[kind]['average_precision'] > 0.9 for kind in KINDS)
+    assert result['sequence']['queries'] == PLACES
+    assert result['sequence_without_ends']['queries'] == PLACES - 19
     expected = {'mode': 'paper', 'tolerance': 1, 'strategy': 'adaptive', 'exclude_places': None}
-    assert expected.items() <= found['settings'].items()
-    assert 'gradient' in found['settings']['features']
-    assert found['times']['total_s'] > 0
-    assert found['calibration'] is None  # mode paper declares no probabilities
-    assert not {'false_alarm_rate', 'default_threshold'} & found.keys()
+    assert expected.items() <= result['settings'].items()
+    assert 'gradient' in result['settings']['features']
+    assert result['times']['total_s'] > 0
+    assert result['calibration'] is None  # mode paper declares no probabilities
+    assert not {'false_alarm_rate', 'default_threshold'} & result.keys()
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     """Every image through the recognizer, windows assigned to their middles, best F1."""
     options = [*options, '--mode', 'paper', '--warp', '2x', '--tolerance', 2]
     options += ['--sequence-length', 8, '--beta', 1.5]
-    found = numbers(*pair(folders), '--query', folders / 'shifted', *options)
+    result = numbers(*pair(folders), '--query', folders / 'shifted', *options)
     extractor = FeatureExtractor('gradient')
     place_map = build_map(open_source(folders / 'map'), extractor, progress=False)
     query = build_map(open_source(folders / 'shifted'), extractor, progress=False).features[::2]
@@ -121,15 +121,15 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     matches, true = image_matches(recognize_all(recognizer, query), 8), np.arange(0, PLACES, 2)
     correct = np.abs(matches.places - true) <= 2
     best = best_f1(matches.distances, correct)
-    assert found['sequence']['f1'] == best.f1
-    assert found['sequence']['threshold'] == pytest.approx(best.threshold, abs=1e-6)
-    assert found['sequence']['recall_at_1'] == np.mean(correct)
+    assert result['sequence']['f1'] == best.f1
+    assert result['sequence']['threshold'] == pytest.approx(best.threshold, abs=1e-6)
+    assert result['sequence']['recall_at_1'] == np.mean(correct)
     distances = recognizer.distances(query)
     single = best_f1(distances.min(axis=1), np.abs(distances.argmin(axis=1) - true) <= 2)
-    assert found['single']['f1'] == single.f1
+    assert result['single']['f1'] == single.f1
     ends = slice(3, PLACES // 2 - 4)
     inner = best_f1(matches.distances[ends], correct[ends])
-    assert found['sequence_without_ends']['f1'] == inner.f1
+    assert result['sequence_without_ends']['f1'] == inner.f1
 
 
 def test_evaluate_with_unknown_images_counts_false_alarms(folders, numbers):
@@ -152,8 +152,8 @@ def test_evaluate_with_crop_equals_images_cropped_before(folders, numbers, tmp_p
         return write_images(tmp_path / name, [image[:, columns] for image in images])
 
     first, second = crop('map', slice(128 - 38)), crop('query', slice(13, None))
-    found = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
-    assert found == numbers(*pair(folders), '--map', first, '--query', second)['sequence']
+    result = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
+    assert result == numbers(*pair(folders), '--map', first, '--query', second)['sequence']
 
 
 def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run):
@@ -180,8 +180,8 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     images = route_images(24)
     for name in ('summer', 'winter'):
         write_images(tmp_path / 'nordland' / name, images)
-    found = numbers('--dataset', f'nordland={tmp_path}')
-    assert (found['settings']['tolerance'], found['sequence']['f1']) == (3, 1)
+    result = numbers('--dataset', f'nordland={tmp_path}')
+    assert (result['settings']['tolerance'], result['sequence']['f1']) == (3, 1)
     source, saved = open_source(tmp_path / 'nordland' / 'winter'), tmp_path / 'unknown.stavpr'
     save_map(build_map(source, FeatureExtractor('gradient', projection=32), progress=False), saved)
     options = ['--dataset', f'nordland={tmp_path}', '--features', 'gradient']
@@ -196,9 +196,9 @@ def test_evaluate_with_a_ground_truth_file_has_tolerance_zero(folders, numbers, 
     options = [*pair(folders), '--truth', pairs]
     exact = numbers(*options)['single']
     assert (exact['recall_at_1'], exact['queries_with_match']) == (0, PLACES - 2)
-    found = numbers(*options, '--tolerance', 2)
-    assert found['single']['recall_at_1'] == 1
-    decision = found['decision']  # the last two images are named by no pair: nothing is wrong
+    result = numbers(*options, '--tolerance', 2)
+    assert result['single']['recall_at_1'] == 1
+    decision = result['decision']  # the last two images are named by no pair: nothing is wrong
     assert (decision['images_with_truth'], decision['wrongly_matched']) == (PLACES - 2, 0)
     assert decision['matched_with_truth'] < decision['matched'] <= decision['images'] == PLACES
 
@@ -229,10 +229,10 @@ def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
     cv2.imwrite(str(tmp_path / 'truth.png'), truth)
     options = ['--query', query, '--truth', tmp_path / 'truth.png', '--loop-closure']
     options += ['--mode', 'paper']
-    found = numbers(*options, '--tolerance', 1, '--exclude-places', 25)
-    assert found['sequence']['queries_with_match'] == 40
-    assert found['single']['recall_at_1'] == 1
-    assert found['sequence']['f1'] > 0.7
+    result = numbers(*options, '--tolerance', 1, '--exclude-places', 25)
+    assert result['sequence']['queries_with_match'] == 40
+    assert result['single']['recall_at_1'] == 1
+    assert result['sequence']['f1'] > 0.7
     # map and ground truth end at the same image
     assert numbers(*options, '--exclude-places', 40)['single']['recall_at_1'] > 0.8
     beyond = numbers(*options, '--exclude-places', 41)['single']
@@ -259,20 +259,20 @@ def report(run, tmp_path):
 def test_evaluate_with_places_removed_counts_unseen_images(folders, report, tmp_path, mode):
     """Without places 20 .. 39, images 25 .. 34 are more than five places from the map."""
     options = ['--mode', mode, '--remove-from-map', '20:40', '--remove-from-map', '50:53']
-    found, rows, text = report(*pair(folders), *options, '--tolerance', 0)
-    assert (found['places'], found['images']) == (PLACES - 23, PLACES)
-    assert found['sequence']['queries_with_match'] == PLACES - 23
+    result, rows, text = report(*pair(folders), *options, '--tolerance', 0)
+    assert (result['places'], result['images']) == (PLACES - 23, PLACES)
+    assert result['sequence']['queries_with_match'] == PLACES - 23
     assert [int(row['true_place']) for row in rows[:60:10]] == [0, 10, -1, -1, 20, -1]
     accepted = [int(row['accepted']) for row in rows]
     matched = sum(accepted[25:35])
-    assert found['unseen'] == [
+    assert result['unseen'] == [
         {'first': 20, 'last': 40, 'images': 10, 'matched': matched},
         {'first': 50, 'last': 53, 'images': 0, 'matched': 0},
     ]
     assert f'20 .. 39: {matched} of 10 unseen images matched' in text
     right = [int(row['sequence_right']) for row in rows]
     wrong = sum(a and not r for a, r in zip(accepted, right, strict=True))
-    decision, threshold = found['decision'], found['sequence']['threshold']
+    decision, threshold = result['decision'], result['sequence']['threshold']
     assert (decision['matched'], decision['wrongly_matched']) == (sum(accepted), wrong)
     assert decision['rule'] == ('default' if mode == 'robust' else 'best F1')
     rate, (low, high) = decision['error_rate'], decision['error_rate_interval']
@@ -291,26 +291,26 @@ def test_evaluate_with_places_removed_counts_unseen_images(folders, report, tmp_
 def test_evaluate_combines_drive_options(folders, report):
     """Reversed at double speed with a stop: the removed places are unseen, the others found."""
     options = ['--speed', 2, '--stop', '30:12', '--reverse', '--remove-from-map', '20:40']
-    found, rows, _ = report(*pair(folders), *options, '--mode', 'paper', '--tolerance', 0)
+    result, rows, _ = report(*pair(folders), *options, '--mode', 'paper', '--tolerance', 0)
     images = [*range(0, 30, 2), *[30] * 13, *range(32, PLACES, 2)][::-1]
     assert [int(row['recorded_image']) for row in rows] == images
     assert rows[0]['identifier'] == '058.png'
     number = {place: i for i, place in enumerate([*range(20), *range(40, PLACES)])}
     assert [int(row['true_place']) for row in rows] == [number.get(i, -1) for i in images]
-    assert [stretch['images'] for stretch in found['unseen']] == [13 + len((26, 28, 32, 34))]
-    assert found['single']['recall_at_1'] == 1
-    assert found['settings']['remove_from_map'] == [[20, 40]]
+    assert [stretch['images'] for stretch in result['unseen']] == [13 + len((26, 28, 32, 34))]
+    assert result['single']['recall_at_1'] == 1
+    assert result['settings']['remove_from_map'] == [[20, 40]]
 
 
 def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, report, tmp_path):
-    found, rows, text = report(*pair(folders))
-    calibration = found['calibration']
+    result, rows, text = report(*pair(folders))
+    calibration = result['calibration']
     declared = sum(row['probability'] != 'nan' for row in rows)
-    early = found['decision']['early_matched']
+    early = result['decision']['early_matched']
     assert calibration['images'] == declared + early > declared
     assert f'{early} early matches, 0 of them wrongly' in text
     # a node has the first match with the early ones, and none for the end of the last window
-    online, matched = (found['decision'][name] for name in ('online_matched', 'matched'))
+    online, matched = (result['decision'][name] for name in ('online_matched', 'matched'))
     assert early < online < matched == len(rows)
     assert f'(online: {online}, when each image comes)' in text
     error = calibration['expected_calibration_error']
@@ -418,15 +418,15 @@ def test_evaluate_without_truth_reports_matches_of_unequal_traverses(folders, ru
     assert code == 0, errors
     assert output.splitlines()[0] == 'elsewhere on the map map, no ground truth'
     assert 'matched, default: ' in output
-    found = read_json((tmp_path / 'report' / 'results.json').read_text())
+    result = read_json((tmp_path / 'report' / 'results.json').read_text())
     counts = {'matched', 'early_matched', 'online_matched'}
-    assert found['decision'].keys() == {'rule', 'images', *counts}
-    assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & found.keys()
+    assert result['decision'].keys() == {'rule', 'images', *counts}
+    assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & result.keys()
     with (tmp_path / 'report' / 'answers.csv').open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 40
     assert {rows[0][name] for name in ('true_place', 'sequence_right', 'in_map')} == {''}
-    assert sum(int(row['accepted']) for row in rows) == found['decision']['matched']
+    assert sum(int(row['accepted']) for row in rows) == result['decision']['matched']
     page = (tmp_path / 'report' / 'report.html').read_text()
     assert 'no ground truth</h1>' in page
     assert not re.search('the ground truth</h2>|All numbers|Yellow is', page)
@@ -441,13 +441,13 @@ def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data
     folder = data_folder / 'rtabmap_hallway_loop'
     options = ['--loop-closure', '--exclude-places', 20, '--sequence-length', 10]
     options += ['--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp']
-    found = numbers(*options)
-    assert found['sequence']['recall_at_1'] > 0.8
-    assert found['default_threshold']['threshold'] == 0.5  # 1 - min_probability
-    assert found['decision']['precision'] == found['default_threshold']['precision'] == 1
+    result = numbers(*options)
+    assert result['sequence']['recall_at_1'] > 0.8
+    assert result['default_threshold']['threshold'] == 0.5  # 1 - min_probability
+    assert result['decision']['precision'] == result['default_threshold']['precision'] == 1
     late = numbers(*options, '--late-closures')
     assert late['decision']['precision'] == 1
-    assert late['decision']['recall'] > found['decision']['recall']
+    assert late['decision']['recall'] > result['decision']['recall']
 
 
 def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):

@@ -109,7 +109,7 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     plain = evaluate_on_map(place_map, query.features, truth, settings)
     columns = {column.name: column for preset in PRESETS.values() for column in preset}
     metrics = {name: experiment.evaluate(column) for name, column in columns.items()}
-    numbers = {name: found.to_json() for name, found in metrics.items() if found is not None}
+    numbers = {name: result.to_json() for name, result in metrics.items() if result is not None}
     assert numbers['sta_vpr'] == plain.sequence.to_json()
     assert numbers['spatial'] == plain.single.to_json()
     different = ('no_alignment', 'temporal', 'sta_vpr_fast', 'grp', 'ra', 'vanilla', 'robust')

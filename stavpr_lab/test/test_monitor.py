@@ -272,10 +272,10 @@ def test_monitor_executable_serves_the_page_until_a_signal(tmp_path):
     try:
         address = re.compile(r'monitor of /stavpr: open http://127.0.0.1:(\d+)/')
         end = threading.Event()
-        while not (found := address.search(process.output())):
+        while not (result := address.search(process.output())):
             assert process.popen.poll() is None
             end.wait(0.05)
-        connection = HTTPConnection('127.0.0.1', int(found[1]), timeout=TIMEOUT)
+        connection = HTTPConnection('127.0.0.1', int(result[1]), timeout=TIMEOUT)
         connection.request('GET', '/events')
         assert b'not found' in connection.getresponse().readline()
         assert process.stop(signal.SIGINT) == 0  # with a page open

@@ -146,12 +146,12 @@ def test_agreement_equals_plain_loops(seed):
 
 def test_cubes_equal_plain_loops():
     maps = random_maps(2, 3, 5)
-    found = cubes(maps, 3)
-    assert found.shape == (2, 9, 27)
+    result = cubes(maps, 3)
+    assert result.shape == (2, 9, 27)
     columns = maps / maps.norm(dim=1, keepdim=True)
     for n, y, x in np.ndindex(2, 3, 3):
         cells = [columns[n, :, y + dy, x + dx] for dy in range(3) for dx in range(3)]
-        np.testing.assert_allclose(found[n, 3 * y + x], torch.cat(cells), atol=1e-6)
+        np.testing.assert_allclose(result[n, 3 * y + x], torch.cat(cells), atol=1e-6)
     with pytest.raises(InputError, match='at least 9 x 9'):
         cubes(maps, 9)
 
@@ -224,9 +224,9 @@ def traverses(data_folder):
 
 def evaluate(reference, query, truth):
     """Best F1, and the precision at the default threshold."""
-    found = evaluate_on_map(map_of(reference), query, truth, SETTINGS)
-    accepted = accepted_counts(found.results.accepted, found.correct, truth.has_match)
-    return found.sequence.best.f1, accepted.precision
+    result = evaluate_on_map(map_of(reference), query, truth, SETTINGS)
+    accepted = accepted_counts(result.results.accepted, result.correct, truth.has_match)
+    return result.sequence.best.f1, accepted.precision
 
 
 def test_gardens_point_at_every_speed_is_recognized(traverses):

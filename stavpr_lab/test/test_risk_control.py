@@ -99,14 +99,14 @@ def wrong_blocks(declared):
 @pytest.mark.parametrize(('blocks', 'rate'), [(10, 0.1), (30, 0.2)])
 def test_error_rate_of_a_new_block_is_kept_in_the_mean(blocks, rate):
     """The mean of as many blocks alone would choose a probability that does not keep it."""
-    rng, found = np.random.default_rng(0), []
+    rng, result = np.random.default_rng(0), []
     for _ in range(1500):
         declared = 1 / (1 + np.exp(-rng.uniform(-1.5, 6.5, blocks + 1)))
         risks, new = wrong_blocks(declared[:-1]), declared[-1]
         by_mean = PROBABILITIES[np.argmax(np.array(risks.risks) / blocks <= rate)]
-        found.append((new > least_probability(rate, risks), new > by_mean))
-    kept, by_mean = np.mean(found, axis=0)
-    error = 3 * np.sqrt(rate * (1 - rate) / len(found))
+        result.append((new > least_probability(rate, risks), new > by_mean))
+    kept, by_mean = np.mean(result, axis=0)
+    error = 3 * np.sqrt(rate * (1 - rate) / len(result))
     assert rate / 2 < kept <= rate + error / 3
     assert by_mean > rate + error
 
@@ -158,8 +158,8 @@ def test_calibration_in_a_map_is_that_of_max_error(command, traverses, tmp_path)
     ):
         code, output, errors = run(*options, '--json', tmp_path / 'out.json', '--force')
         assert (code, 'not kept by the calibration' in output) == (0, is_noted), errors
-        found = read_json((tmp_path / 'out.json').read_text())['default_threshold']
-        assert found['threshold'] == pytest.approx(1 - probability)
+        result = read_json((tmp_path / 'out.json').read_text())['default_threshold']
+        assert result['threshold'] == pytest.approx(1 - probability)
     assert least_probability(0.2, risks) != pytest.approx(least_probability(0.2))
     content = path.read_bytes()
     code, output, errors = run('--calibrate', 'add')  # the same recording counts once

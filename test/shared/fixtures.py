@@ -193,8 +193,8 @@ def runner(monkeypatch, capsys):
             return code, *capsys.readouterr()
 
         def fails(code, words, *arguments):
-            found, _, errors = run(*arguments)
-            assert (found, words in errors) == (code, True), errors
+            status, _, errors = run(*arguments)
+            assert (status, words in errors) == (code, True), errors
 
         run.fails = fails  # expects an exit code, and words in the errors
         return run

@@ -14,6 +14,6 @@ def names_of(node: str) -> dict[str, set[str]]:
     names: dict[str, set[str]] = {}
     for group in profile:
         (right,) = group.attrib
-        found = {rule.text.replace('~', f'/{node}') for rule in group if rule.text}
-        names[right] = names.get(right, set()) | found
+        texts = {rule.text.replace('~', f'/{node}') for rule in group if rule.text}
+        names[right] = names.get(right, set()) | texts
     return names
