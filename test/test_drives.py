@@ -39,7 +39,7 @@ class Killed(BaseException):
 
 
 @pytest.fixture(scope='module')
-def recorded(tmp_path_factory):
+def recording(tmp_path_factory):
     """Return a map, and three drives of a pipeline on it."""
     path = tmp_path_factory.mktemp('recorded') / 'route.stavpr'
     save_map(build(ROUTE), path)
@@ -51,15 +51,15 @@ def recorded(tmp_path_factory):
 
 
 @pytest.fixture
-def path(recorded, tmp_path):
-    return str(shutil.copy(recorded[0], tmp_path))
+def path(recording, tmp_path):
+    return str(shutil.copy(recording[0], tmp_path))
 
 
 @pytest.fixture
-def pipeline(path, recorded):
+def pipeline(path, recording):
     """Return a pipeline on the map, after the drives."""
     pipeline = localizing(path, update_map=True, sequence=SequenceSettings(20))
-    pipeline.operation.return_drives([*recorded[1]])
+    pipeline.operation.return_drives([*recording[1]])
     return pipeline
 
 

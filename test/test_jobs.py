@@ -36,7 +36,7 @@ def ids(folder):
 
 
 @pytest.fixture(scope='module')
-def built(drives, tmp_path_factory):
+def map_folder(drives, tmp_path_factory):
     """Build maps of both, one by one."""
     folder = tmp_path_factory.mktemp('maps')
     for name, drive in zip(NAMES, drives, strict=True):
@@ -46,7 +46,7 @@ def built(drives, tmp_path_factory):
 
 
 @pytest.mark.long
-def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path, capfd):
+def test_build_map_of_several_inputs_equals_maps_of_each(drives, map_folder, tmp_path, capfd):
     options = ['--no-thumbnails', '--processes', '2']
     output = ['--output', str(tmp_path / 'maps')]
     assert build_map.main(['--input', *drives, *output, *options]) == 0
@@ -55,7 +55,7 @@ def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path
     assert '--- tuesday: done' in text
     assert '30 of 30 images became places' in text
     assert '%|' not in text
-    assert ids(tmp_path / 'maps') == ids(built)
+    assert ids(tmp_path / 'maps') == ids(map_folder)
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_run_here_returns_code_and_output():
 
 
 @pytest.mark.long
-def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(drives, built, tmp_path):
+def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(drives, map_folder, tmp_path):
     """A head without processors, and two machines of one; the first to work is killed."""
     module = pytest.importorskip('ray', reason='the extra ray is not installed')
     from ray.cluster_utils import Cluster
@@ -147,7 +147,7 @@ def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(drives, built, 
     from stavpr_ros.mapping import open_map
 
     result = [open_map(tmp_path / 'maps' / f'{Path(one).name}.stavpr').map_id for one in inputs]
-    assert result == ids(built) * 3
+    assert result == ids(map_folder) * 3
 
 
 # What commands show: progress on terminals and in log files, and columns of their help

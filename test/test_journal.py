@@ -108,7 +108,7 @@ def places_of(place_map):
 
 
 @pytest.fixture
-def written(small_map, target):
+def journal_path(small_map, target):
     """Write a journal of a whole map; return its path."""
     writer = JournalWriter.create(target, Base(), small_map, print)
     for place in places_of(small_map):
@@ -120,17 +120,17 @@ def written(small_map, target):
 # ----------------------------------------------------------------------------------------- files
 
 
-def test_recover_returns_every_part_of_every_place(written, small_map, target):
-    result = recover(written)
+def test_recover_returns_every_part_of_every_place(journal_path, small_map, target):
+    result = recover(journal_path)
     assert (result.path, result.places, result.recorded) == (str(target), 60, 60)
     assert_equal(target, small_map)
     assert os.listdir(target.parent) == ['route.stavpr']
 
 
-def test_journal_of_version_2_with_vectors_is_recovered(written, small_map, target, caplog):
+def test_journal_of_version_2_with_vectors_is_recovered(journal_path, small_map, target, caplog):
     """They are in the map of its header, and behind the strips of each place but the last."""
     section = {'vectors': {'version': 1, 'required': False, 'data': None}}
-    with JournalReader(written) as reader:
+    with JournalReader(journal_path) as reader:
         template = alter(
             reader.template_content,
             lambda manifest: manifest['sections'].update(section),
@@ -139,10 +139,10 @@ def test_journal_of_version_2_with_vectors_is_recovered(written, small_map, targ
     end = row_of(small_map.features).itemsize
     *records, last = [place.encode() for place in places_of(small_map)]
     frames = [frame(record[:end] + bytes(8) + record[end:]) for record in records]
-    written.write_bytes(b''.join([header_with(), frame(template), *frames, frame(last)]))
-    assert recover(written).places == 60
+    journal_path.write_bytes(b''.join([header_with(), frame(template), *frames, frame(last)]))
+    assert recover(journal_path).places == 60
     assert_equal(target, small_map)
-    assert caplog.messages == [f'the vectors of whole images in {written} are ignored']
+    assert caplog.messages == [f'the vectors of whole images in {journal_path} are ignored']
 
 
 def test_fault_at_every_write_loses_no_synced_place(
@@ -225,16 +225,16 @@ def scale(place, **factors):
         lambda record, place: place._replace(number=28),  # in another order
     ],
 )
-def test_damage_costs_one_place_and_the_journal_is_kept(written, small_map, target, damage):
-    content, log = written.read_bytes(), Log()
-    with JournalReader(written) as reader:
+def test_damage_costs_one_place_and_the_journal_is_kept(journal_path, small_map, target, damage):
+    content, log = journal_path.read_bytes(), Log()
+    with JournalReader(journal_path) as reader:
         ends = [reader.end, *(reader.end for _ in reader.places())]
     record = damage(content[ends[30] : ends[31]], list(places_of(small_map))[30])
     record = record if isinstance(record, bytes) else frame(record.encode())
-    written.write_bytes(content[: ends[30]] + record + content[ends[31] :])
+    journal_path.write_bytes(content[: ends[30]] + record + content[ends[31] :])
     assert recover_maps(target, log) == str(target)
     assert stamps(target) == seconds(*range(1, 31), *range(32, 61))
-    kept = target.with_name(f'{written.name}.damaged')
+    kept = target.with_name(f'{journal_path.name}.damaged')
     assert f'{kept} is kept' in log.of('error')
     assert set(os.listdir(target.parent)) == {target.name, kept.name}
     assert recover_maps(target, log) == ''  # the next start
@@ -281,33 +281,33 @@ def claim(length):
     [MAGIC, MAGIC + bytes(4), claim(2**24), claim(2**24) + bytes(5000), frame(b'x')],
     ids=['magic', 'short magic', 'claims', 'spread claims', 'records'],
 )
-def test_whole_records_between_any_bytes_are_read_in_linear_time(written, inserted):
-    content = written.read_bytes()
-    with JournalReader(written) as reader:
+def test_whole_records_between_any_bytes_are_read_in_linear_time(journal_path, inserted):
+    content = journal_path.read_bytes()
+    with JournalReader(journal_path) as reader:
         middle = [reader.end for _ in reader.places()][29]
     inserted *= 2 * 10**6 // len(inserted)
-    written.write_bytes(content[:middle] + inserted + content[middle:] + inserted)
+    journal_path.write_bytes(content[:middle] + inserted + content[middle:] + inserted)
     before = bytes_read()
-    assert places_in(written) == list(range(60))
-    assert bytes_read() - before <= 2 * (written.stat().st_size + PIECE)
+    assert places_in(journal_path) == list(range(60))
+    assert bytes_read() - before <= 2 * (journal_path.stat().st_size + PIECE)
 
 
-def test_journal_with_half_a_header_is_resumed_and_mended(written):
-    content = written.read_bytes()
-    with JournalReader(written) as reader:
+def test_journal_with_half_a_header_is_resumed_and_mended(journal_path):
+    content = journal_path.read_bytes()
+    with JournalReader(journal_path) as reader:
         begin = reader.begin
     for at in (50, begin - 50):
-        written.write_bytes(content[:at] + bytes(9) + content[at + 9 :])
-        writer, last = JournalWriter.resume(JournalReader(written), print)
+        journal_path.write_bytes(content[:at] + bytes(9) + content[at + 9 :])
+        writer, last = JournalWriter.resume(JournalReader(journal_path), print)
         writer.close()
-        assert (last, written.read_bytes()) == (59, content)
+        assert (last, journal_path.read_bytes()) == (59, content)
 
 
-def test_journal_that_ends_with_zeros_and_a_hole_is_read_at_once(written):
-    with written.open('ab') as file:
+def test_journal_that_ends_with_zeros_and_a_hole_is_read_at_once(journal_path):
+    with journal_path.open('ab') as file:
         file.write(bytes(10**6))
         file.truncate(2**40)
-    with JournalReader(written) as reader:
+    with JournalReader(journal_path) as reader:
         assert len(list(reader.places())) == 60
         assert 'no whole record' in reader.problem
 
@@ -362,13 +362,13 @@ def test_recover_what_is_no_file_or_in_use_fails(small_map, target, tmp_path):
         recover(writer.path)
 
 
-def test_recover_to_a_file_that_exists_fails_and_keeps_both(written, small_map, tmp_path):
+def test_recover_to_a_file_that_exists_fails_and_keeps_both(journal_path, small_map, tmp_path):
     path = tmp_path / 'other.stavpr'
     save_map(small_map, path)
     with pytest.raises(OutputTakenError, match='exists already'):
-        recover(written, path)
-    assert written.exists()
-    assert recover(written, tmp_path / 'new.stavpr').places == 60
+        recover(journal_path, path)
+    assert journal_path.exists()
+    assert recover(journal_path, tmp_path / 'new.stavpr').places == 60
 
 
 # -------------------------------------------------------------------------------------- recording

@@ -55,7 +55,7 @@ def spin_until(executor, done):
 
 
 @pytest.fixture
-def submitted(monkeypatch):
+def submitted_tasks(monkeypatch):
     """Collect what executors submit to pools whose threads never begin."""
     tasks = []
 
@@ -68,15 +68,15 @@ def submitted(monkeypatch):
 
 
 def test_multi_threaded_executor_of_upstream_submits_a_waiting_callback_again(
-    node, context, submitted
+    node, context, submitted_tasks
 ):
     executor = MultiThreadedExecutor(2, context=context)
     executor.add_node(node)
     node.create_timer(0.0, lambda: None)
     for _ in range(20):
         executor.spin_once(timeout_sec=0.05)
-    assert len(submitted) > len({id(task) for task in submitted})
-    for task in submitted:
+    assert len(submitted_tasks) > len({id(task) for task in submitted_tasks})
+    for task in submitted_tasks:
         task()
     executor.shutdown()
 
@@ -150,7 +150,7 @@ def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt):
 
 
 @pytest.fixture
-def received(node, context):
+def reception(node, context):
     """Return what `callback` raises errors for, events of matches, and the subscription."""
     messages, matches = queue.Queue(), queue.Queue()
 
@@ -166,8 +166,8 @@ def received(node, context):
     return messages, matches, subscription
 
 
-def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, received, capfd):
-    messages, matches, _ = received
+def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, reception, capfd):
+    messages, matches, _ = reception
     publisher = node.create_publisher(Int32, 'received', 10)
     assert matches.get(timeout=60) == 1
     for number in range(2):
@@ -181,8 +181,8 @@ def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, 
 
 
 @pytest.mark.parametrize('by', ['subscription', 'node', 'context'])
-def test_receiver_of_a_destroyed_subscription_node_or_context_ends(context, received, by, node):
-    messages, _, subscription = received
+def test_receiver_of_a_destroyed_subscription_node_or_context_ends(context, reception, by, node):
+    messages, _, subscription = reception
     publisher = node.create_publisher(Int32, 'received', 10)
     while messages.empty():  # until the thread waits, and is matched
         publisher.publish(Int32(data=1))
@@ -220,8 +220,8 @@ def test_receiver_that_is_destroyed_by_its_callback_or_during_it_ends(node, cont
     assert not receiver.is_alive()
 
 
-def test_executor_does_not_wait_for_a_received_subscription(received, prompt):
-    *_, subscription = received
+def test_executor_does_not_wait_for_a_received_subscription(reception, prompt):
+    *_, subscription = reception
     assert not any(map(prompt.can_execute, (subscription, *subscription.event_handlers)))
 
 
@@ -314,16 +314,16 @@ def test_service_with_another_error_raises_it_at_once():
 
 
 @pytest.fixture
-def managed(context):
+def managed_node(context):
     node = ManagedNode('managed', context=context)
     yield node
     node.destroy_node()
 
 
-def test_services_of_a_managed_node_repeat_responses(managed):
-    names = {service.srv_name.rpartition('/')[2] for service in managed.services}
+def test_services_of_a_managed_node_repeat_responses(managed_node):
+    names = {service.srv_name.rpartition('/')[2] for service in managed_node.services}
     assert {'change_state', 'get_state', 'set_parameters'} <= names
-    for service in managed.services:
+    for service in managed_node.services:
         assert service.send_response.__name__ == 'send_repeatedly', service.srv_name
 
 
@@ -337,11 +337,11 @@ def test_lifecycle_node_of_upstream_raises_at_an_invalid_transition(context):
     node.destroy_node()
 
 
-def test_managed_node_at_an_invalid_transition_stays_in_its_state(managed):
-    assert not managed.advance(managed.trigger_activate)
-    assert managed.state == 'unconfigured'
-    assert managed.advance(managed.trigger_configure)
-    assert managed.state == 'inactive'
+def test_managed_node_at_an_invalid_transition_stays_in_its_state(managed_node):
+    assert not managed_node.advance(managed_node.trigger_activate)
+    assert managed_node.state == 'unconfigured'
+    assert managed_node.advance(managed_node.trigger_configure)
+    assert managed_node.state == 'inactive'
 
 
 def test_managed_node_destroyed_before_a_transition_logs_no_error(context, capfd):

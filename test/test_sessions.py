@@ -274,7 +274,7 @@ def test_folder_of_maps_with_different_features_names_both(tmp_path, small_map):
         read_map(str(tmp_path), settings_of())
 
 
-def extending(map_file, target, **changes):
+def extend(map_file, target, **changes):
     def open_journal(base, template):
         return JournalWriter.create(target, base, template, print)
 
@@ -284,17 +284,17 @@ def extending(map_file, target, **changes):
 
 
 @pytest.fixture
-def recorded(map_file, route, tmp_path):
+def recording(map_file, route, tmp_path):
     """Record a session that begins in the middle of the map; return pipeline, results, target."""
     target = tmp_path / 'route.stavpr'
-    pipeline = extending(map_file, target, **SURE_SETTINGS)
+    pipeline = extend(map_file, target, **SURE_SETTINGS)
     results = process(pipeline, [*route[20:40], *UPSTAIRS[:20]], first=100, poses=True)
     yield pipeline, results, target
     pipeline.close_journals(delete_route=True)
 
 
-def test_session_on_a_map_is_recorded_and_matched(recorded, map_file, route):
-    pipeline, results, _ = recorded
+def test_session_on_a_map_is_recorded_and_matched(recording, map_file, route):
+    pipeline, results, _ = recording
     images = [*route[20:40], *UPSTAIRS[:20]]
     localized = process(localizing(map_file, **SURE_SETTINGS), images, first=100)
     n = len(pipeline.operation.reference)
@@ -310,8 +310,8 @@ def test_session_on_a_map_is_recorded_and_matched(recorded, map_file, route):
     assert (pair.source, pair.place) == (pipeline.operation.reference, results[15].match.place)
 
 
-def test_session_on_a_map_is_related_to_its_places(recorded, map_file, tmp_path):
-    pipeline, results, _ = recorded
+def test_session_on_a_map_is_related_to_its_places(recording, map_file, tmp_path):
+    pipeline, results, _ = recording
     save(pipeline, tmp_path / 'both.stavpr')
     both = load_map(tmp_path / 'both.stavpr')
     n = len(pipeline.operation.reference)
@@ -334,8 +334,8 @@ def test_session_on_a_map_is_related_to_its_places(recorded, map_file, tmp_path)
 
 
 @pytest.mark.parametrize('was_saved', [False, True])
-def test_killed_session_on_a_map_becomes_or_stays_a_session_of_the_map(recorded, was_saved):
-    pipeline, _, target = recorded
+def test_killed_session_on_a_map_becomes_or_stays_a_session_of_the_map(recording, was_saved):
+    pipeline, _, target = recording
     if was_saved:
         save(pipeline, target)
         process(pipeline, UPSTAIRS[20:23], first=140)
@@ -348,13 +348,13 @@ def test_killed_session_on_a_map_becomes_or_stays_a_session_of_the_map(recorded,
 
 
 def test_session_on_a_map_is_recorded_without_a_threshold_of_mode_paper(map_file, tmp_path, route):
-    pipeline = extending(map_file, tmp_path / 'a.stavpr', mode='paper', threshold=None)
+    pipeline = extend(map_file, tmp_path / 'a.stavpr', mode='paper', threshold=None)
     assert {result.match.status for result in process(pipeline, route[:LENGTH])} == {Status.MAPPED}
     pipeline.close_journals(delete_route=True)
 
 
 def test_full_map_records_no_further_place(map_file, tmp_path, route):
-    pipeline = extending(map_file, tmp_path / 'a.stavpr', max_places=62)
+    pipeline = extend(map_file, tmp_path / 'a.stavpr', max_places=62)
     results = process(pipeline, route[:4], first=100)
     assert [result.match.status for result in results[2:]] == [Status.NOT_READY] * 2
     assert pipeline.operation.map_state == 'full'

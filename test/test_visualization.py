@@ -93,14 +93,14 @@ def header(i=0):
 
 
 @pytest.fixture
-def localized(map_file, route):
+def localization(map_file, route):
     """Return a pipeline whose window is matched, and the match of the last image."""
     pipeline = localizing(map_file)
     return pipeline, process(pipeline, route[: LENGTH + 4])[-1]
 
 
-def test_visualization_without_subscribers_publishes_and_draws_nothing(localized):
-    pipeline, match = localized
+def test_visualization_without_subscribers_publishes_and_draws_nothing(localization):
+    pipeline, match = localization
     pipeline.operation.recognizer.newest_row = lambda: pytest.fail('not requested')
     views, publishers = views_of()
     show(views, header(), match, pipeline.operation, 'map')
@@ -110,8 +110,8 @@ def test_visualization_without_subscribers_publishes_and_draws_nothing(localized
     assert not views.needs_candidates
 
 
-def test_visualization_of_a_match_publishes_routes_and_markers(localized):
-    pipeline, result = localized
+def test_visualization_of_a_match_publishes_routes_and_markers(localization):
+    pipeline, result = localization
     match = result.match
     assert match.accepted
     views, publishers = views_of('map_path', 'matched_path', 'markers')
@@ -134,8 +134,8 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
     assert len({marker.id for marker in shown}) == len(shown)
 
 
-def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
-    pipeline, _ = localized
+def test_visualization_of_an_image_without_a_match_shows_no_place(localization):
+    pipeline, _ = localization
     views, publishers = views_of(*TOPICS)
     show(views, header(), ImageResult(Match(Status.DROPPED, 'because')), pipeline.operation, 'map')
     assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
@@ -192,8 +192,8 @@ def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     assert 5 < len(sizes) < 20
 
 
-def test_visualization_of_distances_is_the_newest_row(localized):
-    pipeline, match = localized
+def test_visualization_of_distances_is_the_newest_row(localization):
+    pipeline, match = localization
     views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
     show(views, header(), match, pipeline.operation, 'map')
     (row,) = publishers.messages('distances')
@@ -268,12 +268,12 @@ def test_node_publishes_for_viewers_and_navigation(robot, start, route):
     topics = set(re.findall(r'"(/stavpr/[a-z_/]+)', json.dumps(foxglove)))
     assert len(topics) >= 7
 
-    def published():
+    def topic_types():
         return dict(robot.node.get_publisher_names_and_types_by_node('stavpr', '/'))
 
-    robot.until(lambda: topics <= published().keys(), f'publishers of {sorted(topics)}')
+    robot.until(lambda: topics <= topic_types().keys(), f'publishers of {sorted(topics)}')
     for topic, kind in named:
-        assert published()[topic] == [kind]
+        assert topic_types()[topic] == [kind]
 
     def panels(part):
         return {part} if isinstance(part, str) else panels(part['first']) | panels(part['second'])
