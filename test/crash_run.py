@@ -140,12 +140,12 @@ class Round:
             self.robot.until(client.service_is_ready, 'the service')
             responses = [client.call_async(Trigger.Request()) for _ in range(CALLS)]
             end = time.monotonic() + 10
-            while not all(each.done() for each in responses) and time.monotonic() < end:
+            while not all(response.done() for response in responses) and time.monotonic() < end:
                 self.robot.executor.spin_once(timeout_sec=0.05)
         finally:
             node.destroy_client(client)
         self.counts['calls'] += CALLS
-        self.counts['calls without response'] += sum(not each.done() for each in responses)
+        self.counts['calls without response'] += sum(not response.done() for response in responses)
 
     def postpone(self) -> None:
         """Require what is in no file, now and for a while, only after this while."""
@@ -158,11 +158,11 @@ class Round:
         self.due = {stamp: at for stamp, at in self.due.items() if not condition(stamp)}
 
     def found(self) -> set[int]:
-        """Return the stamps in all maps, and in those of the journals."""
+        """Return the stamps in all maps, recovered ones too."""
         for journal in journals(self.target):
             recover(journal)
         maps = [load_map(path) for path in self.maps.glob('*.stavpr')]
-        return {int(stamp) for each in maps for stamp in each.stamps}
+        return {int(stamp) for place_map in maps for stamp in place_map.stamps}
 
 
 def main(hours: float, seed: int) -> None:
@@ -172,11 +172,11 @@ def main(hours: float, seed: int) -> None:
         robot = Robot()
         try:
             with tempfile.TemporaryDirectory() as folder:
-                each = Round(robot, rng, counts, Path(folder))
+                lives = Round(robot, rng, counts, Path(folder))
                 try:
-                    each.run()
+                    lives.run()
                 finally:
-                    each.node.popen.kill()
+                    lives.node.popen.kill()
         finally:
             robot.close()
         counts['rounds'] += 1

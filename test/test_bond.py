@@ -112,9 +112,9 @@ def test_bond_that_the_manager_ends_is_acknowledged_and_stays_silent(node):
     assert not any(node.active()[2:])
 
 
-def test_bond_is_off_without_a_period_or_its_package(node, monkeypatch):
+def test_bond_is_off_without_a_period_or_its_package(node, hide_module):
     assert make_bond(node, 0.0, is_managed=True) is None
-    monkeypatch.setitem(sys.modules, 'bond.msg', None)
+    hide_module('bond.msg')
     assert make_bond(node, 0.25, is_managed=False) is None
     assert not node.warnings
     assert make_bond(node, 0.25, is_managed=True) is None

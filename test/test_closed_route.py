@@ -67,7 +67,7 @@ def test_camera_is_recognized_in_both_directions(against):
 def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
     """Whose features are twice in memory: the same probabilities, of half the distances."""
     maps = [map_of(view(seed, 0.6)) for seed in (0, 5)[:sessions]]
-    there_and_back = [*maps, *(map_of(each.features[::-1]) for each in maps[::-1])]
+    there_and_back = [*maps, *(map_of(place_map.features[::-1]) for place_map in maps[::-1])]
     same_as = np.arange(sessions * N, dtype=np.int32)
     twice = replace(
         merge_maps(there_and_back, 'abcd'[: 2 * sessions]),
@@ -77,7 +77,7 @@ def test_filter_is_that_of_a_map_with_each_session_reversed(sessions):
     query = features_of(strips, 1.0, 9)
     # statistics of other samples
     options = RobustOptions(mean_centering=False, whitening=False)
-    settings, forward = (replace(each, mode=options) for each in (BOTH, FORWARD))
+    settings, forward = (replace(settings, mode=options) for settings in (BOTH, FORWARD))
     both = recognize(merge_maps(maps, 'ab'[:sessions]), query, settings)
     for match, expected in zip(both, recognize(twice, query, forward), strict=True):
         assert match.status is expected.status
@@ -206,7 +206,7 @@ def test_candidates_on_both_sides_of_the_seam_are_neighbors(closed_map):
     query = laps(60, LAP + 30, 1.5, 2)
     for i in range(len(query)):
         one.update(query[i : i + 1])
-        places = closed_map.same_as[[each.place for each in one.ranked(4)]]
+        places = closed_map.same_as[[candidate.place for candidate in one.ranked(4)]]
         between = np.abs(np.subtract.outer(places, places))[~np.eye(len(places), dtype=bool)]
         apart += np.minimum(between, LAP - between).tolist()
     assert min(apart) > LAP_FORWARD.nms_radius

@@ -33,7 +33,7 @@ def set_parameter(node, name, value):
     return node.set_parameters([Parameter(name, value=value)])[0]
 
 
-def activated(node):
+def activate(node):
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     return node
 
@@ -62,9 +62,9 @@ def until_processed(node, count):
     ],
     ids=['reset', 'deactivate'],
 )
-def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act, cause):
+def test_waiting_images_are_dropped(make_node, map_file, route, act, cause):
     """Images that came before a reset or the deactivation do not fill the window after it."""
-    node = activated(make_node(map_path=map_file, queue_size=10))
+    node = activate(make_node(map_path=map_file, queue_size=10))
     worker, free = node.runtime.worker, threading.Event()
 
     def run(function):
@@ -74,7 +74,7 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
 
     worker.call(free.wait)
     enqueue(node, route[:3])
-    monkeypatch.setattr(worker, 'run', run)
+    worker.run = run
     act(node)
     assert until_processed(node, 3).dropped.total == {cause: 3}
     assert node.runtime.pipeline.operation.window_fill == 0
@@ -83,7 +83,7 @@ def test_waiting_images_are_dropped(make_node, map_file, route, monkeypatch, act
 def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
     make_node, map_file, route, capfd
 ):
-    node = activated(make_node(map_path=map_file))
+    node = activate(make_node(map_path=map_file))
     for tenths in (60, 61, 1, 2, 3):  # a clock is set
         node.runtime.intake.images.on_image(image_message(route[0], tenths * SECOND // 10))
     assert 'in a row' not in capfd.readouterr().err
@@ -95,14 +95,13 @@ def test_images_swapped_in_time_are_a_warning_and_one_jump_is_none(
     assert 'jumped back by 0.100 s): publish the images in the order of their stamps' in text
 
 
-def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
-    make_node, route, monkeypatch
-):
-    node = activated(make_node(operation='mapping'))
-    with monkeypatch.context() as defect:
-        defect.setattr(node.runtime.pipeline.operation.extractor, 'extract', lambda images: 1 / 0)
-        enqueue(node, route[:1])
-        assert until_processed(node, 1).dropped.total == {'internal error': 1}
+def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(make_node, route):
+    node = activate(make_node(operation='mapping'))
+    extractor = node.runtime.pipeline.operation.extractor
+    extractor.extract = lambda images: 1 / 0
+    enqueue(node, route[:1])
+    assert until_processed(node, 1).dropped.total == {'internal error': 1}
+    del extractor.extract
     enqueue(node, route[:2])
     counts = until_processed(node, 3)
     assert (counts.received.count, counts.answered.total) == (3, {'mapped': 2})
@@ -115,7 +114,7 @@ def test_image_that_fails_by_a_defect_is_counted_and_the_next_is_processed(
 def test_shutdown_of_ros_before_the_node_saves_the_map(make_node, context, route, tmp_path):
     """As with plain `rclpy.spin` and an interrupt; no thread is left."""
     path, before = tmp_path / 'route.stavpr', set(threading.enumerate())
-    node = activated(make_node(operation='mapping', save_path=str(path), queue_size=100))
+    node = activate(make_node(operation='mapping', save_path=str(path), queue_size=100))
     enqueue(node, route[:20])
     while not len(node.runtime.pipeline.places):
         node.runtime.worker.run(lambda: None)
@@ -139,7 +138,7 @@ def test_operation_of_the_service_lasts_until_the_next_configuration(make_node, 
 def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
     """Live parameters are applied; the error is logged and in the diagnostics."""
     topic = {'qos_overrides./odom.subscription.reliability': 'certain'}
-    node = activated(
+    node = activate(
         make_node(map_path=map_file, relative_pose='none', odometry_error=0.0, **topic)
     )
     assert set_parameter(node, 'keyframe_distance', 1.0).successful
@@ -148,7 +147,7 @@ def test_failed_odometry_subscription_is_the_problem(make_node, map_file):
 
 
 def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
-    node = activated(make_node(map_path=map_file, relative_pose='none', odometry_error=0.0))
+    node = activate(make_node(map_path=map_file, relative_pose='none', odometry_error=0.0))
     assert node.count_subscribers('/odom') == 0
     for distance, count in ((1.0, 1), (2.0, 1), (0.0, 0)):
         assert set_parameter(node, 'keyframe_distance', distance).successful
@@ -156,14 +155,14 @@ def test_odometry_is_subscribed_while_it_is_needed(make_node, map_file):
     node.set_operation('mapping')
     assert node.count_subscribers('/odom') == 1
     assert node.trigger_deactivate() == node.trigger_cleanup() == SUCCESS
-    other = activated(make_node(relative_pose='aligned'))
+    other = activate(make_node(relative_pose='aligned'))
     assert other.count_subscribers('/odom') == 0
     other.load_map(map_file)  # with poses: for edges
     assert other.count_subscribers('/odom') == 1
 
 
 def test_place_has_the_pose_at_the_stamp_of_its_image_until_a_restart(make_node, route):
-    node = activated(make_node(operation='mapping', keyframe_distance=0.1))
+    node = activate(make_node(operation='mapping', keyframe_distance=0.1))
     trajectory = node.runtime.intake.odometry.trajectory
     for seconds in (1, 2):
         trajectory.add(seconds * SECOND, np.array([10 * seconds, 0, 0, 0, 0, 0, 1.0]))
@@ -185,7 +184,7 @@ def test_save_path_that_cannot_be_written_is_rejected(make_node, tmp_path):
 
 
 def test_limit_of_threads_can_be_removed(make_node):
-    """The limit of OpenCV holds for the process, that of numba for the worker."""
+    """OpenCV has one limit for the process, numba one for the worker."""
     limit_threads(0)
     before = numba.get_num_threads(), cv2.getNumThreads()
     node = make_node(threads=1)
@@ -304,25 +303,23 @@ def test_node_that_cannot_write_a_journal_records_all_the_same(make, route, tmp_
 
 
 @pytest.fixture
-def recording(robot, tmp_path):
+def recording(robot, tmp_path, request):
     """Start a node process that records to a file; it ends with the test."""
-    started = []
 
     def start():
         files = {'save_path': tmp_path / 'route.stavpr', 'maps_folder': tmp_path}
-        given = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
-        started.append(node_process(tmp_path / 'log', **given))
+        values = PARAMETERS | {'operation': 'mapping', 'queue_size': 1000} | files
+        process = node_process(tmp_path / 'log', **values)
+        request.addfinalizer(process.end)
         # a killed node stays in the graph for a while: wait for the log of the new one
-        robot.until(lambda: 'backend' in started[-1].output(), 'the node')
+        robot.until(lambda: 'backend' in process.output(), 'the node')
         robot.wait_for_node()
-        return started[-1]
+        return process
 
-    yield start
-    for process in started:
-        process.end()
+    return start
 
 
-def mapped(robot):
+def places_of(robot):
     """Return the stamps of the images that were published as places."""
     recorded = PlaceMatch.MAPPED, PlaceMatch.MATCH
     places = [match for match in robot.answers if match.status in recorded]
@@ -343,20 +340,20 @@ def test_node_killed_at_a_random_moment_loses_no_published_place(
     published, begin = set(), robot.stamp
     for _ in range(kills):
         process, first = recording(), robot.stamp + SECOND
-        published |= mapped(robot)  # of the killed node, received late
+        published |= places_of(robot)  # of the killed node, received late
         robot.forget()
         for image in route[: random_.randrange(1, 20)]:
             robot.stamp += SECOND
             robot.publisher.publish(image_message(image, robot.stamp))
         count = random_.randrange(1, 1 + (robot.stamp - first) // SECOND + 1)
-        robot.until(lambda count=count: len(mapped(robot)) >= count, 'some places')
+        robot.until(lambda count=count: len(places_of(robot)) >= count, 'some places')
         process.popen.kill()
         process.wait()
-        published |= mapped(robot)
+        published |= places_of(robot)
     assert sum(recover(journal).recorded for journal in journals(path)) > 0
     stamps = [load_map(file).stamps.tolist() for file in sorted(tmp_path.glob('route*.stavpr'))]
     assert {stamp for stamp in published if stamp > begin} <= set().union(*stamps)
-    assert all(each == sorted(set(each)) for each in stamps)
+    assert all(times == sorted(set(times)) for times in stamps)
     assert [name for name in os.listdir(tmp_path) if name.startswith('.')] == []
 
 

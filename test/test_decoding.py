@@ -6,7 +6,6 @@ import array
 from io import BytesIO
 import re
 import struct
-import sys
 from unittest import mock
 import zlib
 
@@ -19,13 +18,13 @@ import pytest
 from raw_images import (
     BAYER,
     CHANNELS,
-    compressed,
-    encoded,
+    encode,
+    file_message,
     is_deep,
     mosaic,
     noise,
     packed_yuv,
-    padded,
+    pad_rows,
     PAIRS,
     raw,
     YUV,
@@ -95,7 +94,7 @@ def raw_messages():
     yield 'bgr8 without its last padding', raw('bgr8', 3, 4, step, data[:-5]), rgb, 0
     for name, suffix in (('MJPEG', '.jpg'), ('png', '.png')):
         rgb = np.full((8, 8, 3), 90, np.uint8)
-        yield f'raw with a file, {name}', raw(name, 8, 8, 0, encoded(suffix, rgb)), rgb, 2
+        yield f'raw with a file, {name}', raw(name, 8, 8, 0, encode(suffix, rgb)), rgb, 2
 
 
 def bayer_messages():
@@ -106,11 +105,11 @@ def bayer_messages():
             for color in ((200, 0, 0), (10, 120, 230)):
                 rgb = np.full((height, width, 3), color, np.uint8)
                 for big, padding in ((False, 0), (True, 3)):
-                    step, data = padded(mosaic(name, rgb, big), padding)
+                    step, data = pad_rows(mosaic(name, rgb, big), padding)
                     message = raw(name, height, width, step, data, big)
                     yield f'{name} {height}x{width} {color[0]} {padding}', message, rgb, 0
         scene = rng.integers(0, 256, (8, 9, 3), np.uint8)
-        step, data = padded(mosaic(name, scene), 0)
+        step, data = pad_rows(mosaic(name, scene), 0)
         yield f'{name} of noise', raw(name, 8, 9, step, data), bilinear(name, scene), 1
     for name in YUV:
         rows, columns = (1, 1) if name == 'nv24' else (1, 2) if name in PAIRS else (2, 2)
@@ -129,23 +128,23 @@ def plain_files():
     rgb = np.random.default_rng(0).integers(0, 256, (11, 13, 3), np.uint8)
     for suffix in ('.png', '.bmp', '.tiff', '.ppm', '.webp'):
         lossless = [cv2.IMWRITE_WEBP_QUALITY, 101] * (suffix == '.webp')
-        yield suffix, compressed(encoded(suffix, rgb, *lossless)), rgb, 0
+        yield suffix, file_message(encode(suffix, rgb, *lossless)), rgb, 0
     transparent = np.dstack([rgb[..., ::-1], rgb[..., :1]])
     content = cv2.imencode('.png', transparent)[1].tobytes()
-    yield 'transparent', compressed(content), rgb, 0
+    yield 'transparent', file_message(content), rgb, 0
     for name in ('jpeg', 'rgb8; jpeg compressed bgr8', '16UC1; png compressed ', 'h264'):
-        yield f'PNG named {name}', compressed(encoded('.png', rgb), name), rgb, 0
+        yield f'PNG named {name}', file_message(encode('.png', rgb), name), rgb, 0
     for extra in (b'\0', b'\n' * 8, b'\x7f\xff\xff\xffextra data'):
-        message = compressed(encoded('.png', NOISE) + extra)
+        message = file_message(encode('.png', NOISE) + extra)
         yield f'PNG, behind its end {extra}', message, NOISE, 0
     gray = np.dstack([np.arange(20, dtype=np.uint8).reshape(4, 5)] * 3)
-    yield 'PGM', compressed(b'P5 5 4 255 ' + gray[..., 0].tobytes(), 'pgm'), gray, 0
+    yield 'PGM', file_message(b'P5 5 4 255 ' + gray[..., 0].tobytes(), 'pgm'), gray, 0
     for name in BAYER:
         for suffix in ('.png', '.tiff'):
             deep = is_deep(name)
             seen = mosaic(name, SCENE).view(np.uint16 if deep else np.uint8)
             transport = f'{name}; {suffix[1:]} compressed {"" if deep else name}'
-            yield f'{name} {suffix}', compressed(encoded(suffix, seen), transport), SCENE, 0
+            yield f'{name} {suffix}', file_message(encode(suffix, seen), transport), SCENE, 0
     gray = mosaic('bayer_rggb8', SCENE)
     for transport in (
         'bayer_rggb8; jpeg compressed mono8',
@@ -154,7 +153,7 @@ def plain_files():
         'bayer_none8; png compressed ',
         'mono8; png compressed ',
     ):
-        message = compressed(encoded('.png', gray), transport)
+        message = file_message(encode('.png', gray), transport)
         yield f'no mosaic, {transport}', message, np.dstack([gray] * 3), 0
 
 
@@ -163,20 +162,20 @@ def deep_files():
     for suffix in ('.png', '.tiff', '.pgm', '.ppm'):
         shape = (30, 40) if suffix == '.pgm' else (30, 40, 3)
         values = np.random.default_rng(0).integers(0, 65536, shape).astype(np.uint16)
-        data = encoded(suffix, values)
+        data = encode(suffix, values)
         expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-        yield f'16 bits {suffix}', compressed(data), expected, 0
+        yield f'16 bits {suffix}', file_message(data), expected, 0
     for kind, channels in (('P5', 1), ('P6', 3)):
         for most in (1, 100, 255, 4095, 65535):
             values = np.linspace(0, most, 120 * 160 * channels).round()
             values = values.reshape(120, 160, channels)
             expected = np.broadcast_to(values * (255 / most), (120, 160, 3))
-            yield f'{kind} of {most}', compressed(pnm(kind, values, most)), expected, 1
+            yield f'{kind} of {most}', file_message(pnm(kind, values, most)), expected, 1
     gray = np.tile(np.linspace(0, 1, 160, dtype=np.float32), (120, 1))
     expected = np.repeat((np.round(gray * 65535).astype(np.uint16) >> 8)[..., None], 3, axis=2)
     for compression in TIFF_COMPRESSIONS:
         for values in (gray, np.round(gray * 65535).astype(np.int32)):
-            message = compressed(tiff(values, compression=compression))
+            message = file_message(tiff(values, compression=compression))
             yield f'TIFF of {values.dtype} {compression}', message, expected, 0
 
 
@@ -202,7 +201,7 @@ def turned_files():
     }  # fmt: skip
     for name in ('JPEG', 'PNG', 'PNG late', 'TIFF', 'WEBP', 'WEBP prefixed'):
         for turn in range(10):
-            message = compressed(with_turn(name, turn))
+            message = file_message(with_turn(name, turn))
             yield f'{name} {turn}', message, turns.get(turn, SMOOTH), 20 * (name == 'JPEG')
 
 
@@ -233,8 +232,8 @@ def jpegs():
 
     The first has a thumbnail. Those of noise have every two bytes in their own data, too.
     """
-    plain = encoded('.jpg', np.full((64, 64, 3), (200, 100, 30), np.uint8))
-    small = encoded('.jpg', np.zeros((8, 8, 3), np.uint8))
+    plain = encode('.jpg', np.full((64, 64, 3), (200, 100, 30), np.uint8))
+    small = encode('.jpg', np.zeros((8, 8, 3), np.uint8))
     segment = b'\xff\xe1' + (len(small) + 2).to_bytes(2, 'big') + small
     yield 'thumbnail', plain[:2] + segment + plain[2:]
     for name, options in (
@@ -243,7 +242,7 @@ def jpegs():
         ('restarts', [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]),
     ):
         image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
-        yield name, encoded('.jpg', image, *options)
+        yield name, encode('.jpg', image, *options)
     file = BytesIO()
     first, second = (Image.new('RGB', (64, 64), color) for color in ((200, 100, 30), (0, 0, 0)))
     first.save(file, 'MPO', save_all=True, append_images=[second])
@@ -258,16 +257,16 @@ def whole_jpegs():
         tails = [b'', bytes(50), *FILM]
         contents = [data + tail for tail in tails] + [data[:-1], data[:-2]]
         for i, content in enumerate(contents):
-            yield f'JPEG {name} {i}', compressed(content), expected, 0
+            yield f'JPEG {name} {i}', file_message(content), expected, 0
 
 
 def mosaic_that_opencv_does_not_read():
-    content = bytearray(encoded('.tiff', np.arange(96, dtype=np.uint8).reshape(8, 12)))
+    content = bytearray(encode('.tiff', np.arange(96, dtype=np.uint8).reshape(8, 12)))
     content[78] = 0
     del content[114:]
     gray = np.asarray(Image.open(BytesIO(content)).convert('L'))
     expected = decode_message(raw('bayer_rggb8', 8, 12, 12, gray.tobytes()))
-    message = compressed(bytes(content), 'bayer_rggb8; png compressed ')
+    message = file_message(bytes(content), 'bayer_rggb8; png compressed ')
     yield 'mosaic that OpenCV does not read', message, expected, 0
 
 
@@ -354,7 +353,7 @@ def wrong_files():
         ('PNG', b'\x89PNG\r\n\x1a\n', '8 bytes are no image'),
         ('start of JPEG', b'\xff\xd8\xff\xe0', '4 bytes are no image'),
         ('video', bytes([0, 0, 0, 1, 0x67] * 4), "format 'h264': 20 bytes are no image"),
-        ('PNG cut off', encoded('.png', NOISE)[:-30], damaged),
+        ('PNG cut off', encode('.png', NOISE)[:-30], damaged),
         (
             'wider than OpenCV reads',
             b'P5 2000000 1 255 ' + bytes(2_000_000),
@@ -366,14 +365,19 @@ def wrong_files():
             for most in (1, 100, 255, 4095, 65535)
         ),
     ):
-        yield name, compressed(data, 'h264'), 'damaged', text
+        yield name, file_message(data, 'h264'), 'damaged', text
     for name, data in jpegs():
         end = data.index(b'\xff\xd9') if name == 'MPO' else len(data)
         restarts = [mark.end() for mark in re.finditer(b'\xff[\xd0-\xd7]', data)]
         middle = [len(data) // 2, *restarts] if len(data) > 4000 else []
         for at in (end - 20, end - 60, *middle):
-            yield f'JPEG {name} at {at}', compressed(data[:at]), 'cut off', 'is cut off: expected'
-    png = encoded('.png', np.zeros((4, 4), np.uint8))  # an image: only the name is wrong
+            yield (
+                f'JPEG {name} at {at}',
+                file_message(data[:at]),
+                'cut off',
+                'is cut off: expected',
+            )
+    png = encode('.png', np.zeros((4, 4), np.uint8))  # an image: only the name is wrong
     for transport in (
         '16UC1; compressedDepth rvl',
         'compressedDepth',
@@ -383,33 +387,33 @@ def wrong_files():
         ' 16SC1 ; png',
     ):
         text = f'{re.escape(repr(transport))} is depth or measurements, not an image'
-        yield f'{transport!r}', compressed(png, transport), 'depth', text
+        yield f'{transport!r}', file_message(png, transport), 'depth', text
     gray = np.tile(np.linspace(0, 1, 160, dtype=np.float32), (120, 1))
     counts = np.round(gray * 65535).astype(np.int32)
     for i, values in enumerate((gray * 300, gray - 1, gray * np.nan, counts * 2, -counts)):
         for compression in TIFF_COMPRESSIONS:
             content = tiff(values, compression=compression)
             name = f'TIFF without a range {i} {compression}'
-            yield name, compressed(content), 'depth', 'TIFF with values from'
+            yield name, file_message(content), 'depth', 'TIFF with values from'
 
 
 def wrong_claims():
     """Yield files whose header claims more than is there: OpenCV would allocate it first."""
-    png, ihdr = encoded('.png', NOISE), 8 + 8  # bytes before the size
+    png, ihdr = encode('.png', NOISE), 8 + 8  # bytes before the size
     for size, text in (
         ((9000, 8000), '9000x8000 pixels: expected at most 64000000'),
         ((20_000, 10_000), 'expected at most 64000000'),  # Pillow refuses by itself
     ):
         head = struct.pack('>II', *size) + png[ihdr + 8 : ihdr + 13]
         content = png[: ihdr - 8] + chunk(b'IHDR', head) + png[ihdr + 17 :]
-        yield f'PNG of {size}', compressed(content), 'too large', text
+        yield f'PNG of {size}', file_message(content), 'too large', text
     first = ihdr + 17  # the chunk behind the header's
     for length in (2**31 - 1, 2**32 - 1, 1000):
         content = png[:first] + length.to_bytes(4, 'big') + png[first + 4 : 500]
         text = 'is damaged or cut off'
-        yield f'PNG, chunk of {length}', compressed(content), 'damaged', text
+        yield f'PNG, chunk of {length}', file_message(content), 'damaged', text
         for size in (9, 8, 4):  # the last, incomplete chunk
-            message = compressed(content[: first + size])
+            message = file_message(content[: first + size])
             yield f'PNG, {size} bytes of a chunk of {length}', message, 'damaged', 'damaged'
     for tags in ({278: 2**23}, {322: 16, 323: 2**23}):
         data = bytearray(tiff(NOISE, tiffinfo={278: 3}))
@@ -417,11 +421,11 @@ def wrong_claims():
         for i, (tag, value) in enumerate(tags.items()):
             struct.pack_into('<HHII', data, strips + 12 * i, tag, 4, 1, value)
         text = 'x8388608 pixels: expected at most'
-        yield f'TIFF of tags {tags}', compressed(bytes(data)), 'too large', text
+        yield f'TIFF of tags {tags}', file_message(bytes(data)), 'too large', text
 
 
 CLAIMS = {name: case for name, *case in wrong_claims()}
-REFUSED = CLAIMS | {name: case for each in (wrong_headers, wrong_files) for name, *case in each()}
+REFUSED = CLAIMS | {name: case for make in (wrong_headers, wrong_files) for name, *case in make()}
 
 
 @pytest.mark.parametrize('name', REFUSED)
@@ -451,17 +455,17 @@ def test_rgb8_is_a_view_of_bytes_that_can_be_written(kind, padding, is_view):
     assert np.shares_memory(image, np.frombuffer(held, np.uint8)) is is_view
 
 
-def test_heic_is_read_by_pillow_heif_which_is_named_if_missing(monkeypatch):
+def test_heic_is_read_by_pillow_heif_which_is_named_if_missing(hide_module):
     heif = pytest.importorskip('pillow_heif', reason='the extra heif is not installed')
     file = BytesIO()
     heif.from_pillow(Image.fromarray(SMOOTH)).save(file, quality=95)
-    image = decode_message(compressed(file.getvalue()))
+    image = decode_message(file_message(file.getvalue()))
     assert np.abs(image.astype(int) - SMOOTH).mean() < 3
     with pytest.raises(ImageError, match='are no image, or damaged'):
-        decode_message(compressed(file.getvalue()[:200]))
-    monkeypatch.setitem(sys.modules, 'pillow_heif', None)
+        decode_message(file_message(file.getvalue()[:200]))
+    hide_module('pillow_heif')
     with pytest.raises(ImageError, match='not installed: pip install pillow-heif') as caught:
-        decode_message(compressed(file.getvalue()))
+        decode_message(file_message(file.getvalue()))
     assert caught.value.kind == 'format'
 
 
@@ -473,12 +477,12 @@ SUFFIXES = ['.jpg', '.png', '.bmp', '.tiff', '.pgm', '.webp']
 def damaged_files(draw):
     """Return messages with a file, some of its bytes changed, and its end cut off."""
     gray = np.arange(96, dtype=np.uint8).reshape(8, 12)
-    content = bytearray(encoded(draw(st.sampled_from(SUFFIXES)), gray))
+    content = bytearray(encode(draw(st.sampled_from(SUFFIXES)), gray))
     for _ in range(draw(st.integers(1, 8))):
         content[draw(st.integers(0, len(content) - 1))] = draw(st.integers(0, 255))
     del content[draw(st.integers(0, len(content))) :]
     transport = draw(st.sampled_from(TRANSPORTS) | st.text(max_size=20))
-    return compressed(bytes(content), transport)
+    return file_message(bytes(content), transport)
 
 
 raw_garbage = st.builds(

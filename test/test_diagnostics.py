@@ -88,7 +88,7 @@ def statuses(changes):
 
 def values(part, **changes):
     """Return the values of a part as words key=value."""
-    return [f'{each.key}={each.value}' for each in statuses(changes)[part].values]
+    return [f'{pair.key}={pair.value}' for pair in statuses(changes)[part].values]
 
 
 NEVER = {'age': None}
@@ -181,10 +181,10 @@ CASES = {
     [(part, *case) for part, cases in CASES.items() for case in cases],
 )
 def test_part_in_each_state_has_its_level_and_message(part, level, phrase, changes):
-    found = statuses(changes)
-    status = found.pop(part)
+    result = statuses(changes)
+    status = result.pop(part)
     assert (status.level, phrase in status.message) == (level, True), status.message
-    assert {other.level for other in found.values()} == {OK}  # one cause, one finding
+    assert {other.level for other in result.values()} == {OK}  # one cause, one finding
 
 
 @pytest.mark.parametrize(
@@ -199,10 +199,10 @@ def test_part_in_each_state_has_its_level_and_message(part, level, phrase, chang
 def test_parts_of_an_inactive_node_are_ok(state, remedy):
     """Whatever would be wrong with an active node."""
     wrong = NO_MAP | FULL | ODOMETRY | {'age': 60.0, 'publishers': 0, 'missing': 'threshold'}
-    found = statuses(wrong | {'state': state})
-    assert {status.level for status in found.values()} == {OK}
-    del found['map']
-    assert {status.message for status in found.values()} == {
+    result = statuses(wrong | {'state': state})
+    assert {status.level for status in result.values()} == {OK}
+    del result['map']
+    assert {status.message for status in result.values()} == {
         f'{state}: no image is processed{remedy}'
     }
 
@@ -255,9 +255,9 @@ def test_statuses_are_in_the_group_of_the_aggregator():
     """Its GenericAnalyzer takes the names that contain one of these texts."""
     path = Path(__file__).parents[1] / 'config' / 'diagnostic_aggregator.yaml'
     (group,) = (
-        each
-        for each in yaml.safe_load(path.read_text())['analyzers']['ros__parameters'].values()
-        if isinstance(each, dict)
+        analyzer
+        for analyzer in yaml.safe_load(path.read_text())['analyzers']['ros__parameters'].values()
+        if isinstance(analyzer, dict)
     )
     assert group['type'] == 'diagnostic_aggregator/GenericAnalyzer'
     names = [status.name for status in statuses({}).values()]

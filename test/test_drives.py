@@ -1,8 +1,9 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded drives are on the disk until they are in the map, whatever ends the program."""
+"""Parameter update_map: drives are on the disk until they are in the file of the map."""
 
 from pathlib import Path
+import re
 import shutil
 import signal
 from unittest.mock import patch
@@ -12,6 +13,7 @@ from pipelines import localizing, Log, process
 from processes import node_process
 import pytest
 from robot import PARAMETERS
+from stavpr_msgs.srv import SaveMap
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.errors import OutputError
 from stavpr_ros.mapping import load_map, save_map, versions
@@ -22,7 +24,7 @@ from stavpr_ros.pipeline.saving import (
     take_up_earlier_drives,
     update_own_map,
 )
-from test_upkeep import built, OTHER, ROUTE
+from test_upkeep import build, OTHER, ROUTE
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 DRIVES = [
@@ -37,10 +39,10 @@ class Killed(BaseException):
 
 
 @pytest.fixture(scope='module')
-def recorded(tmp_path_factory):
+def recording(tmp_path_factory):
     """Return a map, and three drives of a pipeline on it."""
     path = tmp_path_factory.mktemp('recorded') / 'route.stavpr'
-    save_map(built(ROUTE), path)
+    save_map(build(ROUTE), path)
     pipeline = localizing(str(path), update_map=True, sequence=SequenceSettings(20))
     for number, drive in enumerate(DRIVES):
         process(pipeline, drive, first=1_700_000_000 + 1000 * number)
@@ -49,15 +51,15 @@ def recorded(tmp_path_factory):
 
 
 @pytest.fixture
-def path(recorded, tmp_path):
-    return str(shutil.copy(recorded[0], tmp_path))
+def path(recording, tmp_path):
+    return str(shutil.copy(recording[0], tmp_path))
 
 
 @pytest.fixture
-def pipeline(path, recorded):
+def pipeline(path, recording):
     """Return a pipeline on the map, after the drives."""
     pipeline = localizing(path, update_map=True, sequence=SequenceSettings(20))
-    pipeline.operation.return_drives([*recorded[1]])
+    pipeline.operation.return_drives([*recording[1]])
     return pipeline
 
 
@@ -96,7 +98,7 @@ def test_drive_that_cannot_be_written_stays_in_memory(pipeline, path):
         assert not save_recorded_map(pipeline, at_once, '', log)
     assert 'no space' in log.of('error')
     assert waiting(path) == NAMES[:1]
-    assert [len(each) for each in pipeline.operation.drives] == [*map(len, DRIVES[1:]), 0]
+    assert [len(drive) for drive in pipeline.operation.drives] == [*map(len, DRIVES[1:]), 0]
     assert update_own_map(pipeline, at_once, log)
     assert is_updated(path)
 
@@ -129,7 +131,7 @@ def test_drive_that_teaches_nothing_or_is_damaged_stops_no_other(pipeline, path)
         update_own_map(pipeline, at_once, Log())
     folder = Path(f'{path}.history/drives')
     (folder / 'drive 1.stavpr').write_bytes(b'cut off')
-    save_map(built(OTHER), folder / 'drive 2.stavpr')
+    save_map(build(OTHER), folder / 'drive 2.stavpr')
     log = Log()
     take_up_earlier_drives(path, log)
     assert 'drive 1 does not update' in log.of('error')
@@ -187,3 +189,42 @@ def test_all_drives_are_in_the_map_after_a_kill_during_the_update(robot, path, t
         node.end()
         again.end()
     assert is_updated(path)
+
+
+# Parameter update_map: drives of a node in localization become part of the file of its map
+
+REBUILT = [*ROUTE[:80], *OTHER[:60], *ROUTE[140:]]
+
+
+def test_drives_update_the_file_by_save_map_and_at_the_end(robot, start, path):
+    start(map_path=path, update_map=True, sequence_length=20)
+    robot.drive(REBUILT)
+    response = robot.does(SaveMap, 'save_map')
+    assert response.places == len(load_map(path)) == 2 * len(ROUTE)
+    assert 'which load_map reads' in response.message
+    learned = current_version(path)
+    assert learned.map_id == load_map(path).map_id
+    assert re.fullmatch(r'drive 20\d\d-.*', learned.drive)  # its stamps are not dated
+    assert 'stays as it is' in robot.refuses(SaveMap, 'save_map')  # nothing was driven since
+    robot.drive(ROUTE[:150])
+    assert robot.transition('deactivate')
+    robot.until_logged(f'updates {path}')
+    assert current_version(path).map_id == load_map(path).map_id
+    assert current_version(path).parent == learned.map_id
+    assert len(load_map(path)) == 2 * len(ROUTE) + 150
+
+
+def test_drive_on_another_route_leaves_the_file_as_it_is(robot, start, path):
+    before = Path(path).read_bytes()
+    start(map_path=path, update_map=True, sequence_length=20)
+    robot.drive(OTHER)
+    assert 'stays as it is' in robot.refuses(SaveMap, 'save_map')
+    robot.until_logged(f'does not update {path}')
+    assert Path(path).read_bytes() == before
+
+
+@pytest.mark.parametrize('updates', [False, True])
+def test_images_of_drives_are_kept_up_to_max_places(robot, start, path, updates):
+    node = start(map_path=path, update_map=updates, max_places=100)
+    robot.drive(ROUTE[:110])
+    assert [len(d) for d in node.runtime.pipeline.operation.take_drives()] == [100] * updates

@@ -103,12 +103,12 @@ def extractor(path, kind='efficientnet_lite1', **changes):
 def test_network_equals_torch_layer_by_layer(network):
     settings = settings_class('efficientnet_lite1')(model=str(network))
     images = [np.random.default_rng(i).integers(0, 256, (SIZE, SIZE, 3), np.uint8) for i in (1, 2)]
-    found = EfficientNetLite1(settings).feature_maps(images)
+    result = EfficientNetLite1(settings).feature_maps(images)
     x = (np.stack(images).astype(np.float32) - 127) / 128
     with torch.no_grad():
         expected = reference(random_weights(), torch.from_numpy(x.transpose(0, 3, 1, 2))).numpy()
     assert expected.shape == (2, 12, 7, 7)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE * abs(expected).max())
+    np.testing.assert_allclose(result, expected, rtol=0, atol=TOLERANCE * abs(expected).max())
 
 
 @pytest.fixture(scope='module')
@@ -147,11 +147,10 @@ def test_damaged_weights_are_an_error_or_other_numbers(checkpoint):
 
 
 @pytest.mark.parametrize('call', ["cos\nsystem\n(S'touch touched'\ntR.", 'cbuiltins\neval\n.'])
-def test_weights_execute_nothing(tmp_path, monkeypatch, call):
-    monkeypatch.chdir(tmp_path)
+def test_weights_execute_nothing(working_folder, call):
     with pytest.raises(UnavailableError, match='is no part of a tensor'):
         lite.read_weights(call.encode())
-    assert not list(tmp_path.iterdir())
+    assert not list(working_folder.iterdir())
 
 
 def test_file_of_other_weights_is_rejected(tmp_path, checkpoint):
@@ -163,19 +162,19 @@ def test_file_of_other_weights_is_rejected(tmp_path, checkpoint):
 def test_hybrid_strips_have_the_mean_of_both_cosines_and_the_mean_square_of_weights(network):
     learned, hybrid = extractor(network), extractor(network, 'hybrid')
     parts = [made.extract(IMAGES) for made in (FeatureExtractor('gradient'), learned)]
-    found = hybrid.extract(IMAGES)
-    assert found.strips.shape == (7, 3, 224 + 12 * 7)
-    cosines = [strips @ strips.transpose(0, 2, 1) for strips in (each.strips for each in parts)]
-    products = found.strips @ found.strips.transpose(0, 2, 1)
+    result = hybrid.extract(IMAGES)
+    assert result.strips.shape == (7, 3, 224 + 12 * 7)
+    cosines = [strips @ strips.transpose(0, 2, 1) for strips in (part.strips for part in parts)]
+    products = result.strips @ result.strips.transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.mean(cosines, axis=0), atol=1e-6)
-    squares = np.mean([each.weights**2 for each in parts], axis=0)
-    np.testing.assert_allclose(found.weights**2, squares, atol=1e-6)
+    squares = np.mean([part.weights**2 for part in parts], axis=0)
+    np.testing.assert_allclose(result.weights**2, squares, atol=1e-6)
 
 
 def test_hybrid_of_a_black_image_has_learned_features_only(network):
-    found = extractor(network, 'hybrid').extract([np.zeros((50, 50, 3), np.uint8)])
-    assert not found.strips[..., :224].any()
-    np.testing.assert_allclose(np.linalg.norm(found.strips, axis=2), 1, atol=1e-6)
+    result = extractor(network, 'hybrid').extract([np.zeros((50, 50, 3), np.uint8)])
+    assert not result.strips[..., :224].any()
+    np.testing.assert_allclose(np.linalg.norm(result.strips, axis=2), 1, atol=1e-6)
 
 
 def test_hybrid_is_not_pooled(network):
@@ -210,14 +209,14 @@ def test_map_recognizes_its_images_and_finds_its_network(
 
 
 @pytest.mark.parametrize('kind', ['efficientnet_lite1', 'hybrid'])
-def test_missing_wheel_is_an_error_with_the_remedy(model_folders, monkeypatch, kind):
-    monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
+def test_missing_wheel_is_an_error_with_the_remedy(model_folders, set_constants, kind):
+    set_constants(lite, WHEEL='no_such_package')
     with pytest.raises(UnavailableError, match='pip install no-such-package; or copy the file'):
         FeatureExtractor(kind)
 
 
-def test_file_is_looked_up_in_both_folders(network, model_folders, monkeypatch):
-    monkeypatch.setattr(lite, 'WHEEL', 'no_such_package')
+def test_file_is_looked_up_in_both_folders(network, model_folders, set_constants):
+    set_constants(lite, WHEEL='no_such_package')
     for folder in reversed(model_folders):
         folder.mkdir(parents=True)
         (folder / FILE).write_bytes(network.read_bytes())
@@ -250,7 +249,9 @@ sys.exit(bool({'torch', 'onnx'} & set(sys.modules)))"""
     subprocess.run([sys.executable, '-c', code], check=True)
 
 
-def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(network, monkeypatch):
+def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(
+    network, monkeypatch, set_constants
+):
     threads = []
     start = Network._start
     monkeypatch.setattr(onnx, 'thread_limit', lambda: 2)
@@ -262,7 +263,7 @@ def test_fast_network_takes_one_thread_and_a_slow_one_the_limit(network, monkeyp
     monkeypatch.setattr(Network, '_start', record)
     features = [extractor(network).extract(IMAGES)]
     assert threads == [1]
-    monkeypatch.setattr(onnx, 'FAST', 0.0)
+    set_constants(onnx, FAST=0.0)
     features.append(extractor(network).extract(IMAGES))
     assert threads == [1, 1, 2]
     np.testing.assert_array_equal(features[0].strips, features[1].strips)

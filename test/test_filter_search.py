@@ -80,20 +80,20 @@ def test_match_is_path_and_second_best_of_its_window(recognizer, route):
     for answer in answers[: LENGTH - 1]:
         assert answer.status is Status.WARMING_UP or answer.probability > EARLY
     for i, answer in enumerate(answers[LENGTH + 3 :], LENGTH + 3):
-        found, path = answer.path, answer.path.pairs
+        result, path = answer.path, answer.path.pairs
         assert answer.status is Status.MATCH
         assert path.shape == (LENGTH, 2)
         assert path[:, 0].tolist() == list(range(LENGTH))
         assert (np.diff(path[:, 1]) >= 0).all()
         assert path.min() >= 0
         assert path[:, 1].max() < PLACES
-        assert (path[0, 1], path[-1, 1]) == (found.first, found.last)
-        assert abs(path[MIDDLE, 1] - found.place) <= 2
+        assert (path[0, 1], path[-1, 1]) == (result.first, result.last)
+        assert abs(path[MIDDLE, 1] - result.place) <= 2
         assert np.abs(path[:, 1] - np.arange(20 + i - LENGTH + 1, 20 + i + 1)).max() <= 4
-        assert answer.distance == found.distance == 1 - answer.probability
-        assert 0 <= found.distance <= found.second_best_distance or found.second_best < 0
-        if found.second_best >= 0:
-            assert abs(found.second_best - found.place) > 10
+        assert answer.distance == result.distance == 1 - answer.probability
+        assert 0 <= result.distance <= result.second_best_distance or result.second_best < 0
+        if result.second_best >= 0:
+            assert abs(result.second_best - result.place) > 10
         ranked = recognizer.ranked(3)
         assert [c.place for c in ranked[1:2]] in ([], [answers[-1].path.second_best])
 
@@ -117,7 +117,7 @@ def test_path_follows_images_whose_speed_changes(recognizer, route):
     ]
     assert len(off) > 0.8 * len(places)
     assert np.mean(np.concatenate(off) <= 2) > 0.98
-    assert np.mean([each[0] <= 2 for each in off]) > 0.95
+    assert np.mean([distances[0] <= 2 for distances in off]) > 0.95
 
 
 def test_places_of_path_have_probabilities_that_scale_the_match(recognizer, route):

@@ -1,17 +1,29 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The growing map: places added and evicted, errors without effect."""
+"""Maps that are built of images or keyframes, or grow place by place; errors without effect."""
 
 import dataclasses
+import threading
 
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
+from places import poses_at
 import pytest
-from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.errors import FeatureMismatchError, ImageError, InputError, SettingsError
 from stavpr_ros.features import FeatureExtractor, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
-from stavpr_ros.mapping import encode_thumbnail, growing_map, GrowingMap, load_map, save_map
+from stavpr_ros.mapping import (
+    build_map,
+    encode_thumbnail,
+    growing_map,
+    GrowingMap,
+    KeyframeSettings,
+    load_map,
+    save_map,
+    Trajectory,
+)
+from stavpr_ros.sources.frame import Frame
 
 # 7 x 7 cells, one column a strip
 EXTRACTOR = FeatureExtractor('gradient', GradientSettings(28, cell=4, orientations=2))
@@ -19,9 +31,9 @@ W, D = 7, 14
 
 
 @pytest.fixture(autouse=True)
-def little_room(monkeypatch):
+def little_room(set_constants):
     """Borders are crossed by a few places."""
-    monkeypatch.setattr(growing_map, 'ROOM', 4)
+    set_constants(growing_map, ROOM=4)
 
 
 def features(i, d=D, settings=EXTRACTOR.settings, count=1):
@@ -35,7 +47,7 @@ def where(i):
     return np.array([i, 2 * i, 3, 0, 0, 0.6, 0.8])
 
 
-def grown(count, limit=100):
+def grow_map(count, limit=100):
     """Return a map of count places; every third has no pose, every second no thumbnail."""
     made = GrowingMap(EXTRACTOR.settings, None, limit)
     for i in range(count):
@@ -69,7 +81,7 @@ def assert_holds(made, numbers):
 
 
 def test_growing_map_at_its_limit_is_full():
-    made = grown(18, 18)
+    made = grow_map(18, 18)
     with pytest.raises(InputError, match=r'full, it has 18 places: raise its limit, evict'):
         add(made, 18)
     assert_holds(made, range(18))
@@ -77,7 +89,7 @@ def test_growing_map_at_its_limit_is_full():
 
 
 def test_snapshot_is_independent_of_map():
-    made = grown(3)
+    made = grow_map(3)
     snapshot = made.snapshot()
     assert_holds(snapshot, range(3))
     made.features.strips[:] = 0
@@ -90,7 +102,7 @@ def test_snapshot_is_independent_of_map():
 
 def test_snapshot_saved_and_loaded_continues(tmp_path):
     """Poses of some places, thumbnails of some places."""
-    save_map(grown(7).snapshot(), tmp_path / 'map')
+    save_map(grow_map(7).snapshot(), tmp_path / 'map')
     loaded = load_map(tmp_path / 'map')
     assert_holds(loaded, range(7))
     assert loaded.pose(3) is None
@@ -150,7 +162,7 @@ def test_growing_map_equals_plain_list(steps):
     ],
 )
 def test_add_with_error_changes_nothing(count, arguments, error, words):
-    made = grown(count)
+    made = grow_map(count)
     with pytest.raises(error, match=words):
         made.add(*arguments)
     if count:
@@ -170,3 +182,75 @@ def test_growing_map_with_wrong_settings_is_rejected(small_map):
     ):
         with pytest.raises(InputError, match='projection'):
             GrowingMap(settings, projection, 5)
+
+
+# Maps of images or keyframes, and their files: what is saved is loaded
+
+SECOND = 10**9
+GRADIENT = FeatureExtractor('gradient')
+
+
+def traverse(images, seconds=1):
+    """Frames of a traverse, one in so many seconds."""
+    return [Frame(image, (i + 1) * seconds * SECOND, f'{i}') for i, image in enumerate(images)]
+
+
+def test_build_map_with_wrong_poses_fails(route):
+    frames, extractor = traverse(route[:20]), GRADIENT
+    for count in (19, 21):
+        with pytest.raises(InputError, match=f'{count} poses for 20 images'):
+            build_map(frames, extractor, poses_at(range(count)), progress=False)
+    with pytest.raises(InputError, match='shape'):
+        build_map(frames, extractor, poses_at(range(20))[:, :6], progress=False)
+    for bad in ([1, 2, 0, 0, 0, 0, 0], [1, 2, 0, 0, 0, 0, np.nan]):
+        poses = poses_at(range(20))
+        poses[7] = bad
+        with pytest.raises(InputError, match=r"image 7 '7': pose \[1.0, 2.0"):
+            build_map(frames, extractor, poses, progress=False)
+    with pytest.raises(InputError, match='no images'):
+        build_map([], extractor, progress=False)
+    with pytest.raises(SettingsError, match='without poses'):
+        build_map(frames, extractor, progress=False, keyframes=KeyframeSettings(angle=1))
+    nowhere = Trajectory()
+    with pytest.raises(InputError, match=r'none of 20 images became a place.*no odometry'):
+        build_map(
+            frames, extractor, nowhere, progress=False, keyframes=KeyframeSettings(distance=1)
+        )
+    assert build_map(frames, extractor, nowhere, progress=False).poses is None
+
+
+class Watched:
+    """A source that records which threads used and closed it."""
+
+    def __init__(self, frames, fails_at=None):
+        self.frames, self.fails_at = frames, fails_at
+        self.used, self.closed = set(), []
+
+    def __iter__(self):
+        try:
+            for i, frame in enumerate(self.frames):
+                self.used.add(threading.get_ident())
+                if i == self.fails_at:
+                    raise ImageError('image 40 is damaged')
+                yield frame
+        finally:
+            self.closed.append(threading.get_ident())
+
+
+def test_build_map_reads_and_closes_source_on_one_thread(route):
+    """Required by bags; also if the images, or their features, fail."""
+    whole = Watched(traverse(route))
+    assert len(build_map(whole, GRADIENT, progress=False)) == 60
+    damaged = Watched(traverse(route), fails_at=40)
+    with pytest.raises(ImageError, match='40'):
+        build_map(damaged, GRADIENT, progress=False)
+    abandoned = Watched(traverse(route))
+    broken = FeatureExtractor('gradient')
+    broken.extract = lambda images: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        build_map(abandoned, broken, progress=False)
+    for source in (whole, damaged, abandoned):
+        assert len(source.used) == 1
+        assert source.closed == list(source.used)
+        assert threading.get_ident() not in source.used
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith('decoding')]

@@ -15,7 +15,6 @@ import oracle
 import pytest
 from stavpr_ros.alignment import image_distances, SpatialSettings
 from stavpr_ros.alignment.cpu import dot, int8
-from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.prepare.blocks import convert_features
@@ -72,20 +71,20 @@ def test_strip_distances_equal_oracle_bit_for_bit(W, n, d, seed):
     """Whole tiles, lanes and quads, and their remainders."""
     reference, queries = random_strips(W, n, d, seed), random_strips(W, 2, d, seed + 10)
     for x in range(2):
-        found, held = kernel_distances(reference, queries, x)
-        np.testing.assert_array_equal(found, expected_distances(held, queries, x))
+        result, held = kernel_distances(reference, queries, x)
+        np.testing.assert_array_equal(result, expected_distances(held, queries, x))
 
 
 @pytest.mark.parametrize(('n', 'd'), [(1, 5), (9, 30), (300, 1000)])
 def test_vectors_equal_single_strips_bit_for_bit(n, d):
-    """The kernel of one vector an image, and that of strips."""
+    """The kernel for one vector an image, and the kernel for strips."""
     reference, queries = random_strips(1, n, d), random_strips(1, 2, d, seed=10)
     held = convert_features(features_of(reference), rounds=True).strips
     out = np.empty((2, n), np.float32)
     int8.cosine_distances(held.kernel_arguments(), int8.tile(queries), out)
     for x in range(2):
-        found, _ = kernel_distances(reference, queries, x)
-        np.testing.assert_array_equal(out[x], found[0, 0])
+        result, _ = kernel_distances(reference, queries, x)
+        np.testing.assert_array_equal(out[x], result[0, 0])
 
 
 @pytest.mark.parametrize('d', [1, 2, 8, 224, 1000])
@@ -96,22 +95,22 @@ def test_products_of_extreme_strips_neither_saturate_nor_overflow(d):
     kinds = [unit(sign * x) for x in (one, two, even) for sign in (1, -1)]
     strips = np.stack([np.stack(kinds)] * 2)  # (2, 6, d)
     for x in range(len(kinds)):
-        found, held = kernel_distances(strips, strips, x)
-        np.testing.assert_array_equal(found, expected_distances(held, strips, x))
-        np.testing.assert_allclose(found[0, 0, x], 0, atol=1e-6)  # itself
-        np.testing.assert_allclose(found[0, 0, x ^ 1], 2, atol=1e-6)  # its opposite
+        result, held = kernel_distances(strips, strips, x)
+        np.testing.assert_array_equal(result, expected_distances(held, strips, x))
+        np.testing.assert_allclose(result[0, 0, x], 0, atol=1e-6)  # itself
+        np.testing.assert_allclose(result[0, 0, x ^ 1], 2, atol=1e-6)  # its opposite
 
 
 @pytest.mark.parametrize('d', [16, 64, 224, 2000])
 def test_rounding_moves_distances_little(d):
     """A rounded value is off by half a step; strips are as long as 16 bits of a product allow."""
     reference, query = random_strips(1, 400, d), random_strips(1, 2, d, seed=1)
-    found, held = kernel_distances(reference, query, 1)
+    result, held = kernel_distances(reference, query, 1)
     whole = held.codes()[0].astype(np.int64)
     assert np.sqrt((whole**2).sum(axis=1)).max() <= int8.MAX_LENGTH
     assert np.abs(whole).max() <= 127
     exact = 1 - reference[0].astype(np.float64) @ query[0, 1].astype(np.float64)
-    off = found[0, 0] - exact
+    off = result[0, 0] - exact
     # both sides are off by a vector of length sqrt(d / 12) / N in a direction of its own
     N = int8.MAX_LENGTH - np.sqrt(d) / 2
     assert np.sqrt((off**2).mean()) < 1.5 * max(np.sqrt(2 / 12) / N, 0.29 / 63)
@@ -145,13 +144,6 @@ def test_features_rounded_in_blocks_equal_those_rounded_at_once():
     np.testing.assert_array_equal(held.strips.values, at_once.values)
     np.testing.assert_array_equal(held.strips.reciprocals, at_once.reciprocals)
     assert held.strips.values.nbytes < 1.25 * 3 * 600 * 10  # whole quads: 12 for 10 dimensions
-
-
-def test_vertical_alignment_in_int8_is_rejected():
-    with pytest.raises(SettingsError, match="'int8' has no vertical"):
-        make_matcher(
-            features_of(random_strips(7, 4, 8)), SpatialSettings(vertical=True), 'cpu', 'int8'
-        )
 
 
 PROCESSORS = (
@@ -217,7 +209,7 @@ print(int8.INSTRUCTION, hashlib.sha256(out[:3].tobytes()).hexdigest())
 @pytest.mark.long
 @pytest.mark.skipif(os.uname().machine != 'x86_64', reason='features of x86 processors')
 def test_every_instruction_of_this_processor_returns_same_bits():
-    found = {}
+    result = {}
     avx2 = '+sse2,+sse3,+ssse3,+sse4.1,+avx,+avx2,+fma'
     sets = ['', '+sse2', '+sse2,+sse3,+ssse3', avx2]
     flags = Path('/proc/cpuinfo').read_text().split()
@@ -230,6 +222,6 @@ def test_every_instruction_of_this_processor_returns_same_bits():
         command = [sys.executable, '-c', HASHED]
         printed = subprocess.check_output(command, env=os.environ | chosen, text=True)
         name, value = printed.split()
-        found[name] = value
-    assert len(found) == len(sets)
-    assert len(set(found.values())) == 1
+        result[name] = value
+    assert len(result) == len(sets)
+    assert len(set(result.values())) == 1

@@ -1,15 +1,20 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""build_map and evaluate over several inputs: in processes, and on a Ray cluster."""
+"""Commands over several inputs, in processes and on a Ray cluster; progress and help."""
 
+import os
 from pathlib import Path
+import pty
+import re
 import subprocess
 import sys
+import termios
 
 from evaluation_commands import write_images
 from fixtures import route_images
+from processes import environment, TIMEOUT
 import pytest
-from stavpr_ros.commands import build_map, jobs
+from stavpr_ros.commands import build_map, Command, jobs, stavpr
 from stavpr_ros.commands.jobs import Job, job_names, other_arguments, run_jobs
 from stavpr_ros.errors import SettingsError
 
@@ -31,7 +36,7 @@ def ids(folder):
 
 
 @pytest.fixture(scope='module')
-def built(drives, tmp_path_factory):
+def map_folder(drives, tmp_path_factory):
     """Build maps of both, one by one."""
     folder = tmp_path_factory.mktemp('maps')
     for name, drive in zip(NAMES, drives, strict=True):
@@ -41,7 +46,7 @@ def built(drives, tmp_path_factory):
 
 
 @pytest.mark.long
-def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path, capfd):
+def test_build_map_of_several_inputs_equals_maps_of_each(drives, map_folder, tmp_path, capfd):
     options = ['--no-thumbnails', '--processes', '2']
     output = ['--output', str(tmp_path / 'maps')]
     assert build_map.main(['--input', *drives, *output, *options]) == 0
@@ -50,13 +55,13 @@ def test_build_map_of_several_inputs_equals_maps_of_each(drives, built, tmp_path
     assert '--- tuesday: done' in text
     assert '30 of 30 images became places' in text
     assert '%|' not in text
-    assert ids(tmp_path / 'maps') == ids(built)
+    assert ids(tmp_path / 'maps') == ids(map_folder)
 
 
 @pytest.fixture
-def program(tmp_path, monkeypatch):
+def program(tmp_path, environ):
     """Write a module that jobs run; return its file."""
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path), prepend=':')
+    environ['PYTHONPATH'] = f'{tmp_path}:{environ["PYTHONPATH"]}'
 
     def write(text):
         (tmp_path / 'program.py').write_text(f'import os, sys\n{text}\n')
@@ -97,8 +102,8 @@ def test_job_names_and_arguments():
     assert job_names(['a/monday.bag', 'b/tuesday/', 'c.mat:x']) == ['monday', 'tuesday', 'c']
     with pytest.raises(SettingsError, match="'monday'"):
         job_names(['a/monday.bag', 'b/monday'])
-    given = ['--input', 'a', 'b', '--every', '2', '--output', 'c', '--ray', 'auto', '--force']
-    assert other_arguments(given, '--input') == ['--every', '2', '--force']
+    options = ['--input', 'a', 'b', '--every', '2', '--output', 'c', '--ray', 'auto', '--force']
+    assert other_arguments(options, '--input') == ['--every', '2', '--force']
     with pytest.raises(SettingsError, match='--processes 0'):
         run_jobs([], 0, None)
 
@@ -111,9 +116,7 @@ def test_run_here_returns_code_and_output():
 
 
 @pytest.mark.long
-def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(
-    drives, built, tmp_path, capfd, monkeypatch
-):
+def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(drives, map_folder, tmp_path):
     """A head without processors, and two machines of one; the first to work is killed."""
     module = pytest.importorskip('ray', reason='the extra ray is not installed')
     from ray.cluster_utils import Cluster
@@ -143,5 +146,49 @@ def test_ray_with_one_of_two_workers_killed_builds_the_same_maps(
     assert out.count(': done') == 6
     from stavpr_ros.mapping import open_map
 
-    found = [open_map(tmp_path / 'maps' / f'{Path(one).name}.stavpr').map_id for one in inputs]
-    assert found == ids(built) * 3
+    result = [open_map(tmp_path / 'maps' / f'{Path(one).name}.stavpr').map_id for one in inputs]
+    assert result == ids(map_folder) * 3
+
+
+# What commands show: progress on terminals and in log files, and columns of their help
+
+PROGRAM = """
+from stavpr_ros.progress import Progress
+for _ in Progress(range(3), desc='extracting', mininterval=0, delay=0, unit='image'):
+    pass
+with Progress(total=2, mininterval=0, delay=0) as bar:
+    bar.update(2)
+"""
+
+
+def _run(**options):
+    call = [sys.executable, '-c', PROGRAM]
+    return subprocess.run(call, **{'env': environment(), 'timeout': TIMEOUT} | options, check=True)
+
+
+def test_log_file_has_plain_lines():
+    lines = _run(stderr=subprocess.PIPE).stderr.decode().split('\n')
+    assert 'extracting: 3 of 3' in lines
+    assert lines[-2:] == ['2 of 2', '']
+    assert all(re.fullmatch(r'(extracting: )?\d of \d', line) for line in lines[:-1])
+
+
+@pytest.mark.parametrize(('terminal', 'has_bar'), [('xterm', True), ('dumb', False)])
+def test_terminal_that_can_move_a_bar_shows_one(terminal, has_bar):
+    first, second = pty.openpty()
+    termios.tcsetwinsize(second, (24, 80))
+    _run(stderr=second, env=environment() | {'TERM': terminal})
+    assert (b'\rextracting' in os.read(first, 4096)) == has_bar
+    os.close(first)
+    os.close(second)
+
+
+def test_help_has_columns_for_names_of_any_length(monkeypatch, capsys):
+    commands = stavpr.all_commands() | {'a_command_of_another_package': Command('m', 'its text')}
+    monkeypatch.setattr(stavpr, 'all_commands', lambda: commands)
+    assert stavpr.main(['--help']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for name, command in commands.items():
+        (line,) = (line for line in lines if line.split(maxsplit=1)[:1] == [name])
+        assert re.search(rf'^  {name} {{2,}}{re.escape(command.summary)}', line)
+        assert line.index(command.summary) == len('  a_command_of_another_package  ')

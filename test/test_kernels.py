@@ -21,15 +21,15 @@ from stavpr_ros.compilation import cache_folder, kernel, KERNELS
 
 
 @pytest.fixture
-def read_only(tmp_path, monkeypatch):
+def read_only(tmp_path, environ, monkeypatch):
     """Return a folder of kernels that cannot be written; others can be."""
     folder, temporary = tmp_path / 'read_only', tmp_path / 'temporary'
-    for each in (folder, temporary):
-        each.mkdir()
+    for path in (folder, temporary):
+        path.mkdir()
     (folder / 'kernel.nbi').write_text('index')
     is_writable = compilation._is_writable
     monkeypatch.setattr(compilation, '_is_writable', lambda f: f != folder and is_writable(f))
-    monkeypatch.setenv('NUMBA_CACHE_DIR', str(folder))
+    environ['NUMBA_CACHE_DIR'] = str(folder)
     monkeypatch.setattr('tempfile.tempdir', str(temporary))
     return folder
 
@@ -44,9 +44,9 @@ def test_read_only_kernels_are_copied_to_a_temporary_folder(read_only, caplog):
     assert 'they are compiled at each start' in caplog.text
 
 
-def test_package_without_home_keeps_its_kernels_itself(monkeypatch):
-    monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
-    monkeypatch.setenv('HOME', '/proc/nohome')
+def test_package_without_home_keeps_its_kernels_itself(environ):
+    environ.pop('NUMBA_CACHE_DIR', None)
+    environ['HOME'] = '/proc/nohome'
     assert cache_folder() == Path(compilation.__file__).parent / '__pycache__' / 'kernels'
 
 
@@ -119,10 +119,10 @@ def _sum(a, b):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(tmp_path, set_constants):
     """Return a folder in which kernels are kept, an empty one."""
-    monkeypatch.setattr(numba.config, 'CACHE_DIR', str(tmp_path / 'kernels'))
-    monkeypatch.setattr(kernel_cache, 'failures', {})
+    set_constants(numba.config, CACHE_DIR=str(tmp_path / 'kernels'))
+    set_constants(kernel_cache, failures={})
     return tmp_path / 'kernels'
 
 
@@ -148,8 +148,8 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize('damaged', DAMAGE.values(), ids=DAMAGE)
-def test_damaged_kernel_is_compiled_anew_and_replaced(folder, damaged, caplog, monkeypatch):
-    monkeypatch.chdir(folder.parent)
+@pytest.mark.usefixtures('working_folder')
+def test_damaged_kernel_is_compiled_anew_and_replaced(folder, damaged, caplog):
     assert [hits(), hits()] == [0, 1]
     (path,) = folder.iterdir()
     content = path.read_bytes()
@@ -258,8 +258,8 @@ def test_nothing_is_compiled_after_warm(tmp_path, route):
     assert compiled[1] == '[]'
 
 
-def test_warm_fails_where_the_cache_cannot_be_written(monkeypatch, capsys):
+def test_warm_fails_where_the_cache_cannot_be_written(set_constants, capsys):
     failures = {kernel_cache.WRITE_FAILED: '[Errno 28] No space left on device'}
-    monkeypatch.setattr(kernel_cache, 'failures', failures)
+    set_constants(kernel_cache, failures=failures)
     assert warm.main([]) == 1
     assert 'cannot be written: [Errno 28] No space left' in capsys.readouterr().err

@@ -155,14 +155,14 @@ def standing_changes(image):
     """Yield changes of the same scene: fresh noise, other exposure, compressed."""
     rng = np.random.default_rng(1)
 
-    def taken(noise=10.0, gain=1.0, quality=50):
+    def take(noise=10.0, gain=1.0, quality=50):
         seen = np.clip(gain * image + rng.normal(0, noise, image.shape), 0, 255).astype(np.uint8)
         coded = cv2.imencode('.jpg', seen, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
         return small_gray(np.ascontiguousarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)))
 
-    first = taken(noise=3)
-    yield from (image_change(first, taken(noise=noise)) for noise in (3, 6, 10))
-    yield from (image_change(first, taken(gain=gain)) for gain in (0.9, 1.1))
+    first = take(noise=3)
+    yield from (image_change(first, take(noise=noise)) for noise in (3, 6, 10))
+    yield from (image_change(first, take(gain=gain)) for gain in (0.9, 1.1))
 
 
 @pytest.mark.parametrize(

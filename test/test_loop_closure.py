@@ -1,13 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closure: bounded memory, exclusion by seconds, resets, against a plain loop."""
+"""Loop closure: a route that grows and is evicted, means of its places, and a reset."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 import math
 
 import numpy as np
-from places import features_of
+from places import features_of, recognize_all, route_strips
 import pytest
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.lm_dtw import best_match, match_sequence
@@ -23,7 +23,8 @@ from stavpr_ros.method.loop_closer import (
     PathConfirmation,
 )
 from stavpr_ros.method.match import Limits, Match, Path, WindowColumns
-from stavpr_ros.method.model import CLOSE
+from stavpr_ros.method.model import CLOSE, DELAY, MEAN_IMAGES, MEAN_PRIOR, NEAREST
+from stavpr_ros.method.place_means import PlaceMeans
 from stavpr_ros.method.settings import PAPER, ROBUST, RobustOptions
 from stavpr_ros.prepare import route_features
 from stavpr_ros.prepare.centering import z_normalized
@@ -98,8 +99,8 @@ class PlainCloser:
             return None
         window = np.stack(self.rows)
         window[:, :first] = np.inf
-        found = match_sequence(window, self.settings.sequence)
-        return best_match(found, self.settings.nms_radius)
+        result = match_sequence(window, self.settings.sequence)
+        return best_match(result, self.settings.nms_radius)
 
 
 @pytest.mark.parametrize(
@@ -123,20 +124,20 @@ def test_loop_closer_with_limit_equals_plain_loop_with_bans(
             assert answer.path.place < 0
             continue
         answered += 1
-        found = answer.path
-        assert (found.first, found.last, found.place) == (
+        result = answer.path
+        assert (result.first, result.last, result.place) == (
             expected.first,
             expected.last,
             expected.middle,
         )
-        assert found.second_best == expected.second_best_index
+        assert result.second_best == expected.second_best_index
         np.testing.assert_array_equal(
-            [found.distance, found.second_best_distance],
+            [result.distance, result.second_best_distance],
             [expected.distance, expected.second_best_distance],
         )
-        assert answer.path.pairs[:, 1].min() == found.first >= closer.first
-        assert answer.path.pairs[-1].tolist() == [sequence.length - 1, found.last]
-        assert found.last < i + 1 - exclude
+        assert answer.path.pairs[:, 1].min() == result.first >= closer.first
+        assert answer.path.pairs[-1].tolist() == [sequence.length - 1, result.last]
+        assert result.last < i + 1 - exclude
     assert answered > 270
     assert closer.first > 0
 
@@ -161,13 +162,13 @@ def test_late_matches_close_what_was_not_certain_at_first():
         if match.accepted:
             closed.append(i - (length - 1) + middle)
         assert match.accepted or not match.late
-        for found in match.late:
-            assert (found.status, found.is_late) == (Status.MATCH, True)
-            assert found.position == (0 if found.is_oldest else middle)
-            assert abs(int(found.path.pairs[found.position, 1]) - found.place) <= CLOSE
-            late[found.first_image + found.position] = found.place
-            oldest += found.is_oldest
-            closed.append(found.first_image + found.position)
+        for result in match.late:
+            assert (result.status, result.is_late) == (Status.MATCH, True)
+            assert result.position == (0 if result.is_oldest else middle)
+            assert abs(int(result.path.pairs[result.position, 1]) - result.place) <= CLOSE
+            late[result.first_image + result.position] = result.place
+            oldest += result.is_oldest
+            closed.append(result.first_image + result.position)
     assert len(closed) == len(set(closed))
     assert len(late) > oldest >= 5
     assert all(abs(query - lap - place) <= CLOSE for query, place in late.items())
@@ -210,7 +211,7 @@ PLACE = 8
 def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(events, closed):
     """Those before are late; a number moves the place, and ``evict`` evicts the one before."""
     paths, columns = PathConfirmation(SHORT.length), WindowColumns(0, np.zeros((1, 1)))
-    found, images, place, first, at_rest = [], 0, PLACE, 0, False
+    result, images, place, first, at_rest = [], 0, PLACE, 0, False
     for event in events:
         if event == 'reset':
             paths.reset()
@@ -235,10 +236,10 @@ def test_path_is_closed_after_half_a_window_of_certain_matches_or_two_of_any(eve
             waits = not match.accepted and event != NONE
             assert match.reason == 'its path is not confirmed yet' * waits
             assert not waits or not match.with_probability(1.0).accepted
-            assert all(each.is_late for each in match.late)
-            found += [match, *match.late] if match.accepted else []
+            assert all(late.is_late for late in match.late)
+            result += [match, *match.late] if match.accepted else []
             images += 1
-    assert [match.last_image for match in found] == closed
+    assert [match.last_image for match in result] == closed
 
 
 def test_exclude_seconds_leaves_young_places_out(laps):
@@ -363,9 +364,9 @@ def test_loop_closer_of_invalid_settings_is_rejected(laps):
 
 
 @pytest.mark.parametrize('limit', [None, 90])
-def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
+def test_settled_route_in_int8_matches_as_in_float32(laps, set_constants, limit):
     """Rounded once, by the mean and the whitening of the day it settled; an eighth is evicted."""
-    monkeypatch.setattr(route_features, 'SETTLED', 150)
+    set_constants(route_features, SETTLED=150)
     full = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit)
     less = LoopCloser(settings_of(ROBUST), 12, laps.settings, limit=limit, precision='int8')
     matched, settled = 0, min(150, limit or 150)
@@ -385,3 +386,128 @@ def test_settled_route_in_int8_matches_as_in_float32(laps, monkeypatch, limit):
     kept = laps[less.first :]
     np.testing.assert_allclose(less.features().strips, kept.strips, atol=0.05, rtol=0)
     np.testing.assert_allclose(less.features().weights, kept.weights, rtol=1e-5, atol=1e-5)
+
+
+# Means of places over the latest images, and loop closure on a new street in a known light
+
+EXCLUDED = 50
+
+
+def expected_means(rows, places):
+    """Return the means by the definition, (places,), of rows that count, oldest first."""
+    weights = (1 - 1 / MEAN_IMAGES) ** np.arange(len(rows))[::-1]
+    known = [np.append(row, np.full(places - len(row), row[-1])) for row in rows]
+    clipped = np.maximum(np.reshape(known, (len(rows), places)), NEAREST)
+    return weights @ clipped / (weights.sum() + MEAN_PRIOR)
+
+
+def test_means_are_weighted_ones_of_earlier_rows_with_unknown_places_as_the_last():
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(0, 2, 3 + i).astype(np.float32) for i in range(12)]
+    means = PlaceMeans()
+    for i, row in enumerate(rows):
+        counted = rows[: max(0, i - DELAY)]
+        less = means.correct(row, False)
+        np.testing.assert_allclose(less, row - expected_means(counted, len(row)), atol=1e-5)
+
+
+def test_places_that_are_excluded_count_as_mean_0():
+    means = PlaceMeans()
+    for _ in range(10):
+        means.correct(np.array([np.inf, 1.0], np.float32), False)
+    less = means.correct(np.array([2.0, 2.0], np.float32), False)
+    assert less[0] == 2
+    assert less[1] < 2
+    assert means.correct(np.array([np.inf, 1.0], np.float32), False)[0] == np.inf
+
+
+def test_evicted_places_take_their_means_with_them():
+    rng = np.random.default_rng(2)
+    rows = rng.normal(0, 1, (30, 40)).astype(np.float32)
+    whole, evicted = PlaceMeans(), PlaceMeans()
+    for row in rows:
+        whole.correct(row, False)
+        evicted.correct(row, False)
+    evicted.evict(7)
+    for row in rows:
+        kept = evicted.correct(row[7:], False)
+        np.testing.assert_array_equal(kept, whole.correct(row, False)[7:])
+    evicted.evict(33)
+    assert len(evicted.correct(np.empty(0, np.float32), False)) == 0
+
+
+def drive_along(strips, noise=0.3):
+    """Return the matches of a route with images of these strips."""
+    features = features_of(strips, noise)
+    closer = LoopCloser(RecognizerSettings(mode='robust'), EXCLUDED, features.settings)
+    return recognize_all(closer, features)
+
+
+def with_shared_content(seed, amount):
+    """Return strips; from place 200 on, all share content with places 60 to 75."""
+    strips = route_strips(seed, 300)
+    shared = amount * np.random.default_rng(seed + 50).standard_normal((7, 1, strips.shape[2]))
+    strips[:, 60:75] += shared
+    strips[:, 200:260] += shared
+    return strips
+
+
+def probable(matches):
+    return sum(match.probability > RecognizerSettings.min_probability for match in matches)
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_stretch_that_looks_like_an_earlier_one_throughout_is_seldom_probable(set_constants, seed):
+    """No place is passed again, then all are."""
+    strips = with_shared_content(seed, 1.6)
+    assert probable(drive_along(strips)) <= 10
+    twice = drive_along(np.concatenate([strips, strips], axis=1))
+    places = [match.path.place for match in twice if match.accepted]
+    off = np.array(places) - np.arange(len(places))
+    assert len(places) > 265
+    assert np.mean(np.abs(off - np.median(off)) <= 4) > 0.95
+    assert probable(drive_along(strips, noise=1.0)) <= 3
+    set_constants(PlaceMeans, correct=lambda self, z, is_standstill: z)
+    assert probable(drive_along(strips, noise=1.0)) > 8
+
+
+@pytest.mark.parametrize('seed', [0, 3, 4])
+def test_stretch_that_looks_alike_for_less_than_a_window_is_not_closed(seed):
+    matches = drive_along(with_shared_content(seed, 1.8))
+    assert probable(matches) <= 15
+    assert not any(match.accepted or match.late for match in matches)
+
+
+# A loop closer after its reset, as test_golden_streams has the recognizers of maps
+
+N = 120
+ROUTE = route_strips(0, N)
+DRIVE = features_of(np.concatenate([ROUTE[:, :95], route_strips(9, 30), ROUTE[:, 85:]], 1), 0.5, 7)
+DRIVE.strips[:, 70:95] = DRIVE.strips[:, 69:70]  # a stop before the detour
+POSES = np.tile([0.0, 0, 0, 0, 0, 0, 1], (2 * N, 1))
+POSES[:, 0] = 1.1 * np.arange(2 * N)
+
+
+def fields_of(recognizer, features, image):
+    """Return all fields of the match of the next image as text."""
+    match = recognizer.update(features[image : image + 1], (image + 1) * 10**8, POSES[image])
+    return repr([np.asarray(getattr(match, f.name), object).tolist() for f in fields(Match)])
+
+
+def assert_same(one, new, features):
+    pairs = [[fields_of(c, features, image) for c in (one, new)] for image in range(len(features))]
+    assert [first for first, _ in pairs] == [second for _, second in pairs]
+    assert sum('Status.MATCH' in first for first, _ in pairs) > 10
+
+
+@pytest.mark.parametrize('precision', ['float32', 'int8'])
+def test_loop_closer_after_a_reset_answers_as_a_new_one_on_its_route(precision):
+    """The route stays; another one has the same without any window, by a reset at each image."""
+    options = {'limit': 240, 'precision': precision}
+    one, new = (LoopCloser(RecognizerSettings(), 30, DRIVE.settings, **options) for _ in 'ab')
+    for image in range(len(DRIVE)):
+        fields_of(one, DRIVE, image)
+        fields_of(new, DRIVE, image)
+        new.reset()
+    one.reset()
+    assert_same(one, new, features_of(ROUTE, 0.5, 8))

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command map, and merging maps into sessions."""
+"""The command map: merging maps into sessions, and projecting them."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -12,20 +12,27 @@ import cv2
 from map_examples import example_map
 from map_files import parts_of, version2
 import numpy as np
+from places import poses_at
 import pytest
+from stavpr_ros.commands import map as map_command
 from stavpr_ros.commands.map import main
 from stavpr_ros.commands.program import until_unread
-from stavpr_ros.errors import FeatureMismatchError, InputError
+from stavpr_ros.errors import FeatureMismatchError, InputError, SettingsError
+from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.near_duplicates import without_duplicates
+from stavpr_ros.mapping import build_map as map_of
 from stavpr_ros.mapping import (
     GrowingMap,
     load_map,
+    Map,
     merge_maps,
     open_map,
     save_map,
     select_places,
     select_session,
 )
+from stavpr_ros.mapping.reduction import with_principal_components
+from stavpr_ros.sources.frame import Frame
 
 
 @pytest.fixture(scope='module')
@@ -35,13 +42,12 @@ def drive():
 
 
 @pytest.fixture
-def folder(drive, tmp_path, monkeypatch):
+def folder(drive, working_folder):
     """Change into a folder with maps of two drives."""
-    save_map(drive, tmp_path / 'day.stavpr')
+    save_map(drive, 'day.stavpr')
     night = replace(drive, poses=None, thumbnails=(), ids=('',) * len(drive))
-    save_map(night, tmp_path / 'night.stavpr')
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    save_map(night, 'night.stavpr')
+    return working_folder
 
 
 def test_map_info_shows_what_a_map_holds(folder, capsys):
@@ -58,10 +64,7 @@ def test_map_info_shows_what_a_map_holds(folder, capsys):
         'a route of 23 m', 'to 2023-11-14 22:13:44 UTC',
     ):  # fmt: skip
         assert text in shown
-
-
-def test_map_info_shows_stamps_that_are_no_dates_in_seconds(folder, capsys):
-    save_map(example_map(), 'both.stavpr')
+    save_map(both, 'both.stavpr', force=True)  # its stamps are no dates
     assert main(['info', 'both.stavpr']) == 0
     shown = capsys.readouterr().out
     assert 's to 24.0 s\n' in shown
@@ -135,7 +138,7 @@ def test_map_compact_prints_what_it_drops(folder, drive, capsys):
     standing = replace(select_places(drive, stops), poses=None)
     twice = merge_maps([standing, standing], ['day', 'night'])
     same_as = np.arange(len(twice), dtype=np.int32)
-    same_as[len(stops) + 8] = 5  # the stop of one session is that of the other
+    same_as[len(stops) + 8] = 5  # both sessions stop at one place
     save_map(replace(twice, same_as=same_as), 'stops.stavpr')
     assert main(['compact', 'stops.stavpr', 'driven.stavpr', '--drop-duplicates']) == 0
     assert '26 of 74 places dropped' in capsys.readouterr().out
@@ -147,8 +150,7 @@ def test_map_compact_prints_what_it_drops(folder, drive, capsys):
 def test_duplicates_where_the_robot_moved_are_kept(drive):
     stops = np.array([0, *[1] * 9, *range(2, 24)])
     dark = select_places(drive, stops)
-    poses = np.zeros((len(stops), 7))
-    poses[:, 6], poses[:, 0] = 1, np.arange(len(stops))
+    poses = poses_at(range(len(stops)))
     assert len(without_duplicates(replace(dark, poses=poses))) == len(stops)
     poses[2:6, 0] = poses[1, 0] + 0.02
     assert len(without_duplicates(replace(dark, poses=poses))) == len(stops) - 4
@@ -255,3 +257,80 @@ def test_maps_that_do_not_fit_are_not_merged(drive):
         merge_maps([], [])
     with pytest.raises(InputError, match='no place is left'):
         select_session(merge_maps([drive], ['a']), 'a', keep=False)
+
+
+# Projection of a map to its principal components: by hand, in files, when the map grows
+
+D = 6
+pytestmark = pytest.mark.usefixtures('one_thread')
+
+
+def images(count):
+    rng = np.random.default_rng(0)
+    wide = cv2.blur(rng.integers(0, 256, (48, 48 + 8 * count, 3), np.uint8), (5, 5))
+    return [np.ascontiguousarray(wide[:, 8 * i : 8 * i + 48]) for i in range(count)]
+
+
+@pytest.fixture(scope='module')
+def whole():
+    frames = [Frame(image, 0, str(i)) for i, image in enumerate(images(30))]
+    return map_of(frames, FeatureExtractor('gradient'), thumbnails=False, progress=False)
+
+
+@pytest.mark.parametrize('count', [30, 40])
+def test_directions_are_those_of_largest_variance(count):
+    """Of 7 strips each, fewer and more than their 224 dimensions."""
+    frames = [Frame(image, 0, str(i)) for i, image in enumerate(images(count))]
+    whole = map_of(frames, FeatureExtractor('gradient'), thumbnails=False, progress=False)
+    assert (7 * count < whole.dimension) == (count == 30)
+    reduced = with_principal_components(whole, D)
+    x = whole.features.strips.astype(np.float64)
+    centered = (x - x.mean(axis=1, keepdims=True)).reshape(-1, x.shape[2])
+    _, _, directions = np.linalg.svd(centered, full_matrices=False)
+    matrix = reduced.projection.matrix
+    np.testing.assert_allclose(matrix @ matrix.T, directions[:D].T @ directions[:D], atol=1e-4)
+    projected = x @ matrix
+    projected /= np.linalg.norm(projected, axis=2, keepdims=True)
+    np.testing.assert_allclose(reduced.features.strips, projected, atol=1e-5)
+
+
+def test_more_directions_than_a_third_of_the_strips_are_rejected(whole):
+    few = select_places(whole, np.arange(3))
+    assert with_principal_components(few, 7).dimension == 7
+    with pytest.raises(SettingsError, match=r'^8 principal .* 21 strips .* at most 7'):
+        with_principal_components(few, 8)
+
+
+@pytest.mark.parametrize('before', [[], [12]])
+def test_query_of_reduced_map_is_projected_as_its_places(whole, before):
+    """Also where one reduction follows another."""
+    reduced = whole
+    for dimension in (*before, D):
+        reduced = with_principal_components(reduced, dimension)
+    assert reduced.projection.matrix.shape == (whole.dimension, D)
+    query = reduced.extractor().extract(images(30)[7:8])
+    query.require_same_settings(reduced.settings, 'the map')
+    np.testing.assert_allclose(query.strips[:, 0], reduced.features.strips[:, 7], atol=1e-4)
+    growing = GrowingMap.from_map(reduced, 100)
+    growing.add(query)
+    assert len(growing) == 31
+    assert growing.projection.identity == reduced.projection.identity
+
+
+@pytest.mark.parametrize('dimension', [0, -1, 224, 300])
+def test_reduction_to_other_dimension_is_rejected(whole, dimension):
+    with pytest.raises(SettingsError, match=f'^{dimension} principal .* of 224 dimensions'):
+        with_principal_components(whole, dimension)
+
+
+def test_compact_reduces_map_to_principal_components(whole, tmp_path, capsys):
+    saved, compact, smaller = (str(tmp_path / name) for name in ('whole', 'compact', 'smaller'))
+    save_map(whole, saved)
+    assert map_command.main(['compact', saved, compact, '--pca', f'{D}']) == 0
+    result = load_map(compact)
+    assert isinstance(result, Map)
+    assert result.features.strips.shape == (7, 30, D)
+    assert result.projection.name == f'principal components 224 -> {D} of 30 places'
+    assert map_command.main(['compact', compact, smaller, '--pca', '4']) == 0
+    assert load_map(smaller).dimension == 4
+    assert 'strips of 6 dimensions become 4' in capsys.readouterr().out

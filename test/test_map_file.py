@@ -14,8 +14,8 @@ import socket
 
 from conftest import route_images
 from map_examples import example_files, example_map, VERSION2
-from map_files import changed, network, parts_of, version2
-from map_fuzz import hand_made, mutated, use, use_file
+from map_files import alter, network, parts_of, version2
+from map_fuzz import hand_made, mutate, use, use_file
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
@@ -44,7 +44,7 @@ def example() -> Map:
 
 
 @pytest.fixture
-def saved(example, tmp_path) -> Path:
+def map_path(example, tmp_path) -> Path:
     save_map(example, tmp_path / 'route.stavpr')
     return tmp_path / 'route.stavpr'
 
@@ -63,27 +63,27 @@ def assert_same(a: Map, b: Map) -> None:
 
 
 @pytest.mark.parametrize('read', [load_map, open_map])
-def test_saved_map_is_read_as_it_was(example, saved, read):
-    found = read(saved)
-    assert_same(found, example)
-    assert np.array_equal(found.features.strips, example.features.strips)
-    assert found.features.cells == example.features.cells == (4, 2)
-    assert (found.session(11).name, found.session(12).id) == ('morning', 'b')
-    assert found.thumbnails[1:3] == example.thumbnails[1:3]
-    use(found)
+def test_saved_map_is_read_as_it_was(example, map_path, read):
+    result = read(map_path)
+    assert_same(result, example)
+    assert np.array_equal(result.features.strips, example.features.strips)
+    assert result.features.cells == example.features.cells == (4, 2)
+    assert (result.session(11).name, result.session(12).id) == ('morning', 'b')
+    assert result.thumbnails[1:3] == example.thumbnails[1:3]
+    use(result)
 
 
-def test_map_id_is_that_of_the_content(example, saved, tmp_path):
+def test_map_id_is_that_of_the_content(example, map_path, tmp_path):
     map_id = save_map(example, tmp_path / 'again')
     assert re.fullmatch('[0-9a-f]{16}', map_id)
-    assert open_map(saved).map_id == load_map(tmp_path / 'again').map_id == map_id
+    assert open_map(map_path).map_id == load_map(tmp_path / 'again').map_id == map_id
     other = dataclasses.replace(example, ids=('other',) * len(example))
     assert save_map(other, tmp_path / 'other') != map_id
 
 
-def test_error_risks_are_replaced_in_a_file_that_stays_the_same_map(example, saved, tmp_path):
+def test_error_risks_are_replaced_in_a_file_that_stays_the_same_map(example, map_path, tmp_path):
     """The id names the places; risks of today have no recordings."""
-    path, before = tmp_path / 'route', Path(saved).read_bytes()
+    path, before = tmp_path / 'route', Path(map_path).read_bytes()
     path.write_bytes(before)
     map_id = open_map(path).map_id
     for risks in (
@@ -91,29 +91,29 @@ def test_error_risks_are_replaced_in_a_file_that_stays_the_same_map(example, sav
         ErrorRisks('m', 1, (0.6,), (0.0,)),
     ):
         assert save_error_risks(risks, path, True) == map_id
-        found = load_map(path)
-        assert (found.map_id, found.error_risks) == (map_id, risks)
-        assert_same(found, dataclasses.replace(example, error_risks=risks))
-    assert save_map(found, tmp_path / 'again') == map_id
+        result = load_map(path)
+        assert (result.map_id, result.error_risks) == (map_id, risks)
+        assert_same(result, dataclasses.replace(example, error_risks=risks))
+    assert save_map(result, tmp_path / 'again') == map_id
 
     def without_recordings(manifest):
         del manifest['sections']['error_risks']['data']['recordings']
 
-    path.write_bytes(changed(path.read_bytes(), without_recordings))
+    path.write_bytes(alter(path.read_bytes(), without_recordings))
     assert (load_map(path).map_id, load_map(path).error_risks) == (map_id, risks)
     path.write_bytes(before[:-1] + bytes([before[-1] ^ 1]))
     with pytest.raises(MapFileError, match='do not match their hash'):
         save_error_risks(risks, path, True)
 
 
-def test_float16_storage_halves_the_features_and_rounds_them(example, saved, tmp_path):
+def test_float16_storage_halves_the_features_and_rounds_them(example, map_path, tmp_path):
     save_map(example, tmp_path / 'half', 'float16')
     half = open_map(tmp_path / 'half')
     assert half.features.storage == 'float16'
     rounded = example.features.strips.astype(np.float16).astype(np.float32)
     assert np.array_equal(half.features.strips, rounded)
     assert np.array_equal(half.features[[5, 2, 3]].strips, rounded[:, [5, 2, 3]])
-    saved_bytes = saved.stat().st_size - (tmp_path / 'half').stat().st_size
+    saved_bytes = map_path.stat().st_size - (tmp_path / 'half').stat().st_size
     assert abs(saved_bytes - rounded.nbytes // 2) < 64
     use(half)
     save_map(half, tmp_path / 'again')  # keeps the storage
@@ -123,11 +123,11 @@ def test_float16_storage_halves_the_features_and_rounds_them(example, saved, tmp
 
 
 def test_saved_map_is_a_safetensors_file_and_one_made_by_that_library_loads(
-    example, saved, tmp_path
+    example, map_path, tmp_path
 ):
-    tensors = load_file(saved)
+    tensors = load_file(map_path)
     np.testing.assert_array_equal(tensors['strips'], example.features.strips)
-    content = saved.read_bytes()
+    content = map_path.read_bytes()
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], 'little')])
     save_file(tensors, tmp_path / 'theirs', header['__metadata__'])
     assert_same(load_map(tmp_path / 'theirs'), example)
@@ -151,10 +151,10 @@ def test_optional_value_is_a_section_that_older_readers_ignore(
     assert getattr(load_map(half), name) == value
 
 
-def test_reader_written_from_the_documentation_finds_the_same(example, saved):
+def test_reader_written_from_the_documentation_finds_the_same(example, map_path):
     from map_reader import read
 
-    manifest, arrays = read(saved)
+    manifest, arrays = read(map_path)
     np.testing.assert_array_equal(arrays['strips'], example.features.strips)
     np.testing.assert_array_equal(arrays['stamps'], example.stamps)
     assert manifest['settings']['backbone'] == {
@@ -199,14 +199,14 @@ def test_map_without_optional_parts_has_three_parts(example, tmp_path):
     assert (set(loaded.ids), loaded.sessions) == ({''}, ())
 
 
-def test_vectors_of_an_older_map_are_ignored(saved, example, tmp_path, caplog):
+def test_vectors_of_an_older_map_are_ignored(map_path, example, tmp_path, caplog):
     def older(manifest):
         network(vector='global')(manifest)
         manifest['sections']['vectors'] = {'version': 1, 'required': False, 'data': None}
 
     old, new = tmp_path / 'old', tmp_path / 'new'
     vectors = np.zeros((24, 5), np.float32)
-    old.write_bytes(changed(saved.read_bytes(), older, vectors__vectors=vectors))
+    old.write_bytes(alter(map_path.read_bytes(), older, vectors__vectors=vectors))
     save_map(open_map(old), new)
     assert np.array_equal(load_map(old).features.strips, example.features.strips)
     assert load_map(new).settings == load_map(old).settings
@@ -215,16 +215,16 @@ def test_vectors_of_an_older_map_are_ignored(saved, example, tmp_path, caplog):
 
 
 @pytest.mark.parametrize('required', [False, True])
-def test_unknown_section_is_ignored_unless_it_is_required(saved, example, required):
+def test_unknown_section_is_ignored_unless_it_is_required(map_path, example, required):
     sections = {'codes': {'version': 3, 'required': required, 'data': {'bits': 4}}}
     words = np.arange(9, dtype=np.uint8)
-    content = saved.read_bytes()
-    saved.write_bytes(changed(content, lambda m: m.update(sections=sections), codes__words=words))
+    content = map_path.read_bytes()
+    map_path.write_bytes(alter(content, lambda m: m.update(sections=sections), codes__words=words))
     if required:
         with pytest.raises(MapFileError, match='requires section codes, version 3'):
-            load_map(saved)
+            load_map(map_path)
     else:
-        assert_same(load_map(saved), example)
+        assert_same(load_map(map_path), example)
 
 
 def test_what_could_not_be_read_again_is_not_saved(example, tmp_path):
@@ -253,7 +253,7 @@ def test_names_of_images_that_are_no_text_are_replaced(tmp_path):
     assert load_map(tmp_path / 'map').ids == ('a??.png',)
 
 
-def test_load_map_takes_regular_files_only(tmp_path, saved):
+def test_load_map_takes_regular_files_only(tmp_path, map_path):
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'zero').symlink_to('/dev/zero')
     (tmp_path / 'loop').symlink_to(tmp_path / 'loop')
@@ -265,34 +265,34 @@ def test_load_map_takes_regular_files_only(tmp_path, saved):
         ):  # fmt: skip
             with pytest.raises(MapFileError, match=rf'{kind}.*name a map file'):
                 load_map(tmp_path / name)
-    (tmp_path / 'link').symlink_to(saved)
+    (tmp_path / 'link').symlink_to(map_path)
     assert len(load_map(tmp_path / 'link')) == 24
     with pytest.raises(OutputError, match='does not exist'):
-        save_map(load_map(saved), tmp_path / 'missing' / 'map.stavpr')
+        save_map(load_map(map_path), tmp_path / 'missing' / 'map.stavpr')
     with pytest.raises(MapFileError, match='does not exist'):
         load_map(tmp_path / 'missing')
 
 
-def test_sparse_file_is_rejected_before_memory_is_taken(saved):
-    os.truncate(saved, 2**33)
+def test_sparse_file_is_rejected_before_memory_is_taken(map_path):
+    os.truncate(map_path, 2**33)
     with pytest.raises(MapFileError, match='has a hole at byte'):
-        load_map(saved)
+        load_map(map_path)
 
 
 @pytest.mark.parametrize('part', ['strips', 'thumbnails', 'stamps'])
-def test_damage_is_named_by_part_and_offset(example, saved, part):
-    content = bytearray(saved.read_bytes())
-    stored = open_map(saved).features.file.parts[part]
+def test_damage_is_named_by_part_and_offset(example, map_path, part):
+    content = bytearray(map_path.read_bytes())
+    stored = open_map(map_path).features.file.parts[part]
     content[stored.start + stored.size // 2] ^= 1
-    saved.write_bytes(content)
+    map_path.write_bytes(content)
     last = stored.start + stored.size
     expected = rf'bytes {stored.start} to {last}, of part {part}, do not match'
     if part in ('strips', 'thumbnails'):  # left in the file, and verified later
-        opened = open_map(saved)
+        opened = open_map(map_path)
         with pytest.raises(MapFileError, match=expected):
             verify_map(opened)
     with pytest.raises(MapFileError, match=expected):
-        load_map(saved)
+        load_map(map_path)
 
 
 def setting(name, value):
@@ -438,8 +438,8 @@ def header(old, new):
 
 OFFSETS = '"data_offsets":[0,'
 FORMS = [  # a change of the bytes, and what the error names
-    *((version(each), 'has format version') for each in ('3', '1', '2.0', ' 2', '9' * 400)),
-    *((version(each), 'version|no map') for each in (2, None, float('nan'))),
+    *((version(text), 'has format version') for text in ('3', '1', '2.0', ' 2', '9' * 400)),
+    *((version(value), 'version|no map') for value in (2, None, float('nan'))),
     (without_hashes, 'tensor strips has 0 hashes'),
     (lambda content: content + b'\0', r'tensors end at byte \d+, the file at byte \d+'),
     (lambda content: content[:-1], r'tensors end at byte \d+, the file at byte \d+'),
@@ -463,12 +463,12 @@ FORMS = [  # a change of the bytes, and what the error names
 ]
 
 
-def made(number, rows):
-    return [(number, partial(changed, change=one, **parts), text) for parts, one, text in rows]
+def rows_of(number, rows):
+    return [(number, partial(alter, change=one, **parts), text) for parts, one, text in rows]
 
 
 @pytest.mark.parametrize(('number', 'change', 'text'), [
-    *made(0, HAND_MADE), *made(1, STATISTICS), *((0, change, text) for change, text in FORMS)
+    *rows_of(0, HAND_MADE), *rows_of(1, STATISTICS), *((0, change, text) for change, text in FORMS)
 ])  # fmt: skip
 def test_damaged_or_hand_made_file_is_rejected_by_name(originals, tmp_path, number, change, text):
     (tmp_path / 'map').write_bytes(change(originals[number]))
@@ -478,7 +478,7 @@ def test_damaged_or_hand_made_file_is_rejected_by_name(originals, tmp_path, numb
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
-@pytest.mark.parametrize('change', [mutated, hand_made])
+@pytest.mark.parametrize('change', [mutate, hand_made])
 def test_file_of_any_content_is_rejected_or_works(originals, tmp_path, change):
     """Damage changes nothing of a map that loads; reader_fuzz.py tries more of them."""
     rng, path, refused = random.Random(os.environ.get('CI') and 0), tmp_path / 'map', 0
@@ -491,11 +491,11 @@ def test_file_of_any_content_is_rejected_or_works(originals, tmp_path, change):
             refused += 1
         else:
             assert change is hand_made or path.read_bytes() == originals[i % 2]
-    assert 0 < refused < 150 or change is mutated
+    assert 0 < refused < 150 or change is mutate
 
 
-def test_stored_features_are_an_array_like_those_in_memory(example, saved):
-    stored, memory = open_map(saved).features, example.features
+def test_stored_features_are_an_array_like_those_in_memory(example, map_path):
+    stored, memory = open_map(map_path).features, example.features
     assert isinstance(stored, StoredFeatures)
     for places in (slice(3, 9), slice(None, None, 5), slice(4, 4), np.array([7, 8, 2]), [1]):
         assert np.array_equal(stored[places].strips, memory[places].strips)

@@ -9,7 +9,7 @@ from unittest.mock import patch
 from evaluation_commands import write_images
 from fixtures import route_images
 from map_examples import example_map
-from map_files import changed
+from map_files import alter
 import numpy as np
 import pytest
 from stavpr_ros.commands.build_map import main as build_map_main
@@ -27,9 +27,9 @@ SETTINGS = RecognizerSettings(mode='robust')
 
 
 @pytest.fixture(autouse=True)
-def small_maps(monkeypatch):
+def small_maps(set_constants):
     """Keep the statistics of small maps, too."""
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
+    set_constants(prepared_map, MIN_PLACES=1)
 
 
 @pytest.fixture(scope='module')
@@ -57,12 +57,16 @@ def save(place_map, path, storage='float32'):
 
 def answers(place_map, precision):
     recognizer = PlaceRecognizer(place_map, SETTINGS, 'cpu', precision)
-    found = []
+    result = []
     for i in range(40):
         match = recognizer.update(place_map.features[i + 100 : i + 101])
-        found += [recognizer.newest_row().tobytes(), match.probability, match.path.pairs.tobytes()]
-        found.append(match.path)
-    return repr(found), recognizer.start_notes
+        result += [
+            recognizer.newest_row().tobytes(),
+            match.probability,
+            match.path.pairs.tobytes(),
+        ]
+        result.append(match.path)
+    return repr(result), recognizer.start_notes
 
 
 @pytest.mark.parametrize('storage', ['float32', 'float16'])
@@ -74,22 +78,22 @@ def test_answers_with_statistics_are_those_without_bit_for_bit(
     save_map(place_map, tmp_path / 'without', storage)
     assert open_map(tmp_path / 'without').features.statistics is None
     with patch.object(MeanCentering, '_learn', side_effect=AssertionError):
-        found = answers(open_map(path), precision)
-    assert found == answers(open_map(tmp_path / 'without'), precision)
-    assert found[1] == '2 sessions: an image takes up to 2 times the time of one'
+        result = answers(open_map(path), precision)
+    assert result == answers(open_map(tmp_path / 'without'), precision)
+    assert result[1] == '2 sessions: an image takes up to 2 times the time of one'
 
 
 def test_several_threads_learn_the_same_as_one(place_map):
-    found = []
+    result = []
     for threads in (2, 1):  # the fixture ends with all again
         limit_threads(threads)
-        found.append(statistics_of_map(place_map).parts())
-    for name, array in found[0].items():
-        np.testing.assert_array_equal(array, found[1][name])
+        result.append(statistics_of_map(place_map).parts())
+    for name, array in result[0].items():
+        np.testing.assert_array_equal(array, result[1][name])
 
 
-def test_small_map_keeps_none(place_map, monkeypatch):
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 601)
+def test_small_map_keeps_none(place_map, set_constants):
+    set_constants(prepared_map, MIN_PLACES=601)
     assert statistics_of_map(place_map) is None
 
 
@@ -99,7 +103,7 @@ def change_file(path, change=lambda section: None, **parts):
         name if name == 'strips' else f'statistics/{name}': array for name, array in parts.items()
     }
     path.write_bytes(
-        changed(path.read_bytes(), lambda m: change(m['sections']['statistics']), **named)
+        alter(path.read_bytes(), lambda m: change(m['sections']['statistics']), **named)
     )
 
 
@@ -108,12 +112,12 @@ def test_statistics_of_other_features_are_learned_again_and_logged(place_map, tm
     other = place_map.features.strips[:, ::-1]
     change_file(path, strips=other)
     opened = open_map(path)
-    found, note = answers(opened, 'float32')
+    result, note = answers(opened, 'float32')
     assert f'the statistics in {path} are of other features: learned again' in note
     assert 'map compact' in note
     reversed_map = load_map(path)
-    assert found == answers(reversed_map, 'float32')[0]
-    # what is written again has those of these features
+    assert result == answers(reversed_map, 'float32')[0]
+    # a map that is written again has statistics of its own features
     save(opened, tmp_path / 'again')
     assert open_map(tmp_path / 'again').features.statistics is not None
 
@@ -122,9 +126,9 @@ def test_statistics_of_another_method_are_learned_again_and_logged(place_map, tm
     path = save(place_map, tmp_path / 'map')
     change_file(path, lambda section: section['data'].update(method='by\nguess'))
     opened = open_map(path)
-    found, note = answers(opened, 'float32')
+    result, note = answers(opened, 'float32')
     assert r"learned by another version ('by\nguess')" in note
-    assert found == answers(load_map(path), 'float32')[0]
+    assert result == answers(load_map(path), 'float32')[0]
     assert statistics_of_map(opened).method == METHOD
 
 
@@ -158,8 +162,8 @@ def test_commands_write_statistics(place_map, tmp_path, capsys):
         paths = (files[0], output) if action != 'merge' else (output, *files)
         options = ['--different-routes'] if action == 'merge' else []
         assert map_main([action, *map(str, paths), *options]) == 0
-        found = open_map(output).features.statistics
-        assert found.changes.shape[1] == (600 if action != 'merge' else 1200)
+        result = open_map(output).features.statistics
+        assert result.changes.shape[1] == (600 if action != 'merge' else 1200)
         assert not open_map(output).features.has_stale_statistics
     assert map_main(['info', str(tmp_path / 'compact')]) == 0
     assert 'kept for a fast start' in capsys.readouterr().out
@@ -171,16 +175,16 @@ def test_answers_of_codes_are_those_of_features_bit_for_bit(place_map, tmp_path,
     files = [str(tmp_path / name) for name in ('old', 'codes')]
     assert map_main(['compact', *files, '--codes', '--storage', storage]) == 0
     opened = open_map(files[1])
-    found = []
+    result = []
     with patch.object(type(opened.features), '_read', side_effect=AssertionError):
         recognizer = PlaceRecognizer(opened, SETTINGS, 'cpu', 'int8')
     query = place_map.features
     for one in (recognizer, PlaceRecognizer(open_map(files[0]), SETTINGS, 'cpu', 'int8')):
         matches = [one.update(query[i : i + 1]) for i in range(130, 160)]
-        found.append(
+        result.append(
             [one.newest_row().tobytes(), [(m.probability, repr(m.path)) for m in matches]]
         )
-    assert found[0] == found[1]
+    assert result[0] == result[1]
     # other precisions take the features
     assert answers(opened, 'float32') == answers(open_map(files[0]), 'float32')
 
@@ -205,7 +209,7 @@ def test_build_map_writes_statistics(tmp_path):
     images = write_images(tmp_path / 'images', route_images(12))
     output = tmp_path / 'map'
     assert build_map_main(['--input', str(images), '--output', str(output)]) == 0
-    found = open_map(output)
+    result = open_map(output)
     learned = statistics_of_map(load_map(output)).parts()
-    for name, array in found.features.statistics.parts().items():
+    for name, array in result.features.statistics.parts().items():
         np.testing.assert_array_equal(array, learned[name])

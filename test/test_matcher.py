@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The matcher of the CPU: fused kernels equal separate functions."""
+"""The matcher of the CPU: fused kernels equal separate functions; vertical alignment."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numba
 import numpy as np
+import oracle
 from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import (
@@ -20,9 +21,11 @@ from stavpr_ros.alignment import (
     strip_distances,
 )
 from stavpr_ros.errors import InputError, SettingsError
+from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.prepare.centering import z_normalized
-from stavpr_ros.prepare.matcher import CpuMatcher, make_matcher, PRECISIONS
+from stavpr_ros.prepare.matcher import CpuMatcher, cut_cells, make_matcher, PRECISIONS
 from stavpr_ros.prepare.prepared_map import prepare_map
 from stavpr_ros.threads import limit_threads
 
@@ -115,11 +118,6 @@ def test_kernels_of_one_and_two_threads_return_same_bits():
 # ------------------------------------------------ the window
 
 
-def test_make_matcher_of_unknown_precision_is_rejected():
-    with pytest.raises(SettingsError, match="'float16' is unknown: take one of float32, int8"):
-        make_matcher(random_features(7, 4, 8), SpatialSettings(), 'cpu', 'float16')
-
-
 @pytest.mark.parametrize(('places', 'changes', 'precision'), [
     (2_000, {}, 'int8'),
     (1_999, {}, 'float32'),
@@ -130,8 +128,8 @@ def test_precision_auto_is_int8_on_large_maps_in_mode_robust(places, changes, pr
     features = replace(features_of(route_strips(0, places, 32)), cells=(4, 2))
     settings, query = RecognizerSettings(**changes), features[50:51]
     auto, as_set = (
-        PlaceRecognizer(map_of(features), settings, precision=each).distances(query)
-        for each in ('auto', precision)
+        PlaceRecognizer(map_of(features), settings, precision=name).distances(query)
+        for name in ('auto', precision)
     )
     np.testing.assert_array_equal(auto, as_set)
     other = 'int8' if precision == 'float32' and 'spatial' not in changes else 'float32'
@@ -154,3 +152,70 @@ def test_kernels_reject_arrays_of_other_shapes(precision, strategy):
     ]:
         with pytest.raises(InputError, match=words):
             function(*arguments)
+
+
+# Vertical alignment, for cameras at changing heights: cells of strips first, then strips
+
+SETTINGS = FeatureSettings('gradient', GradientSettings(), 5)
+
+
+def features_with_cells(n, H=4, channels=3, columns=2, W=5, seed=0):
+    rng = np.random.default_rng(seed)
+    strips = rng.random((W, n, channels * H * columns))
+    strips[1, 0].reshape(channels, H, columns)[:, 2] = 0  # one cell of one strip is empty
+    strips /= np.linalg.norm(strips, axis=2, keepdims=True)
+    return LocalFeatures(
+        strips.astype(np.float32), np.ones((W, n), np.float32), SETTINGS, (H, columns)
+    )
+
+
+def test_cut_cells_are_those_of_feature_map():
+    features = features_with_cells(3)
+    cells = cut_cells(features.strips, (4, 2))
+    assert cells.shape == (20, 3, 6)
+    for strip in range(5):
+        for image in range(3):
+            cube = features.strips[strip, image].reshape(3, 4, 2)
+            for row in range(4):
+                cell = cube[:, row].reshape(-1)
+                expected = cell / max(np.linalg.norm(cell), 1e-12)
+                np.testing.assert_allclose(cells[strip * 4 + row, image], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('n', 'strategy', 'xi'), [(1, 'adaptive', None), (15, 'vanilla', None), (65, 'adaptive', 2)]
+)
+def test_vertical_distances_equal_oracle(n, strategy, xi):
+    """The inner alignment has its own central cell and no band."""
+    reference, query = features_with_cells(n), features_with_cells(2, seed=1)
+    spatial = SpatialSettings(strategy, 1.0, xi, vertical=True)
+    matcher = CpuMatcher(reference, spatial)
+    result = matcher.distance_matrix(query.strips, query.weights)
+    x = cut_cells(query.strips, (4, 2)).astype(np.float64)
+    y = cut_cells(reference.strips, (4, 2)).astype(np.float64)
+    for image in sorted({0, n // 2, n - 1}):
+        d = np.empty((5, 5))
+        for i in range(5):
+            for j in range(5):
+                cells = 1 - x[4 * i : 4 * i + 4, 1] @ y[4 * j : 4 * j + 4, image].T
+                d[i, j] = oracle.align_images(cells, strategy)
+        expected = oracle.align_images(d, strategy, xi=xi)
+        assert result[1, image] == pytest.approx(expected, abs=2e-6)
+    np.testing.assert_array_equal(
+        matcher.distances(query.strips[:, 1], query.weights[:, 1]), result[1]
+    )
+
+
+def test_vertical_alignment_and_precision_of_other_settings_are_rejected(small_map):
+    spatial = SpatialSettings(vertical=True)
+    with pytest.raises(InputError, match='without projection'):
+        PlaceRecognizer(small_map, RecognizerSettings(spatial=spatial))
+    with pytest.raises(SettingsError, match='vertical'):
+        SpatialSettings('none', vertical=True)
+    for backend, precision, words in (
+        ('cuda', 'float32', 'cuda'),
+        ('cpu', 'int8', "'int8' has no vertical"),
+        ('cpu', 'float16', "'float16' is unknown: take one of float32, int8"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            make_matcher(features_with_cells(3), spatial, backend, precision)

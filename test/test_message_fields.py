@@ -136,7 +136,7 @@ def has_poses(m: LoopClosure, d: Drive) -> bool:
     return nanoseconds(m.query_stamp) in d.odometry
 
 
-def matched(m: PlaceMatch) -> bool:
+def is_match(m: PlaceMatch) -> bool:
     return m.status == Status.MATCH
 
 
@@ -154,40 +154,40 @@ PLACE_MATCH: Checks = {
         'empty = it is in no file (recorded maps)',
         lambda m, d: m.map_id == d.map_id),
     'session': ('session of the map that the place is of; empty = unknown',
-        lambda m, d: m.session == (d.session(m.place_index) if matched(m) else '')),
+        lambda m, d: m.session == (d.session(m.place_index) if is_match(m) else '')),
     'camera': ('camera of that session; empty = unknown',
-        lambda m, d: m.camera == (CAMERAS[d.session(m.place_index)][0] if matched(m) else '')),
+        lambda m, d: m.camera == (CAMERAS[d.session(m.place_index)][0] if is_match(m) else '')),
     'status': ('',
-        lambda m, d: matched(m) <= (m.newest_index >= 0) and (m.status == 7) ==
+        lambda m, d: is_match(m) <= (m.newest_index >= 0) and (m.status == 7) ==
         bool(d.operation == 'mapping' and nanoseconds(m.header.stamp) in d.x)),
     'reason': ('why there is no match; empty for MATCH and MAPPED',
         lambda m, d: bool(m.reason) == (m.status not in (Status.MATCH, Status.MAPPED))),
     'place_index': ('the place of the image at window_middle; mode paper: midpoint of the '
         'matched sequence',
-        lambda m, d: m.place_index == (m.sequence_middle if matched(m) else -1) and (not
-        matched(m) or d.shows(m.window_middle, m.place_index))),
+        lambda m, d: m.place_index == (m.sequence_middle if is_match(m) else -1) and (not
+        is_match(m) or d.shows(m.window_middle, m.place_index))),
     'place_stamp': ('stamp of that place in the map; 0 = unknown',
-        lambda m, d: m.place_stamp == (d.stamp(m.place_index) if matched(m) else Time())),
+        lambda m, d: m.place_stamp == (d.stamp(m.place_index) if is_match(m) else Time())),
     'place_id': ('external identifier of that place; empty = none',
-        lambda m, d: m.place_id == (d.identifier(m.place_index) if matched(m) else '')),
+        lambda m, d: m.place_id == (d.identifier(m.place_index) if is_match(m) else '')),
     'newest_index': ('the place aligned with the newest image',
         lambda m, d: d.shows(m.header.stamp, m.newest_index) if m.status in (Status.MATCH,
         Status.MAPPED) else m.newest_index == -1),
     'newest_stamp': ('',
-        lambda m, d: m.newest_stamp == (d.stamp(m.newest_index) if matched(m) else Time())),
+        lambda m, d: m.newest_stamp == (d.stamp(m.newest_index) if is_match(m) else Time())),
     'newest_id': ('',
-        lambda m, d: m.newest_id == (d.identifier(m.newest_index) if matched(m) else '')),
+        lambda m, d: m.newest_id == (d.identifier(m.newest_index) if is_match(m) else '')),
     'distance': ('mode paper: of the window to that sequence, 0 = identical; mode robust: 1 - '
         'probability',
         lambda m, d: is_close(m.distance, 1 - m.probability) if d.mode == 'robust' else
-        math.isnan(m.distance) == (m.sequence_first < 0) and (not matched(m) or
+        math.isnan(m.distance) == (m.sequence_first < 0) and (not is_match(m) or
         is_close(m.distance, 0, 0.001))),
     'threshold': ('as applied: MATCH means distance < threshold; mode robust: 1 - the '
         'probability that applies: of min_probability or max_error; at least 0.9 of fewer images '
         'than a full window, 1 of a path that is not confirmed yet (operation loop_closure)',
         lambda m, d: (is_close(m.threshold, d.limit(m)) or m.status == Status.INVALID_IMAGE or
         (nanoseconds(m.header.stamp) in d.at_rest and 0.0999 < m.threshold < d.limit(m))) and
-        (not matched(m) or m.distance < m.threshold)),
+        (not is_match(m) or m.distance < m.threshold)),
     'probability': ('that sequence_middle is the right place, 0 to 1; NaN in mode paper and '
         'without a sequence',
         lambda m, d: math.isnan(m.probability) if d.mode == 'paper' or m.sequence_first < 0
@@ -205,10 +205,10 @@ PLACE_MATCH: Checks = {
     'direction': ('1 = the camera moves along the map, -1 = against it (parameter direction: '
         'both), 0 = no sequence',
         lambda m, d: m.direction in ((0,) if not m.path else (1,) if not d.is_back else
-        (-1,) if matched(m) else (1, -1))),
+        (-1,) if is_match(m) else (1, -1))),
     'relative_yaw': ("of the robot in its pose at place_index, rad to the left: yaw of the map's "
         "camera less the own one's; 0 = not stated by the map",
-        lambda m, d: is_close(m.relative_yaw, CAMERAS[d.session(m.place_index)][1] if matched(m)
+        lambda m, d: is_close(m.relative_yaw, CAMERAS[d.session(m.place_index)][1] if is_match(m)
         else 0)),
     'path': ('its warping path, from the oldest image to the newest',
         lambda m, d: not m.path or (sorted({pair.query_index for pair in m.path}) ==
@@ -231,12 +231,12 @@ PLACE_MATCH: Checks = {
         m.second_best_distance > 1 + (d.mode == 'paper')) and (not (d.mode == 'paper' and
         m.second_best_distance < m.distance))),
     'inliers': ('keypoint matches of one geometry; -1 = not checked',
-        lambda m, d: m.inliers >= 30 if d.mode == 'paper' and matched(m) else m.inliers >= -1),
+        lambda m, d: m.inliers >= 30 if d.mode == 'paper' and is_match(m) else m.inliers >= -1),
     'has_relative_pose': ('relative_pose.source is ALIGNED or PNP',
         lambda m, d: m.has_relative_pose == (m.relative_pose.source in (RelativePose.ALIGNED,
         RelativePose.PNP))),
     'relative_pose': ('',
-        lambda m, d: m.relative_pose.source == RelativePose.NONE if not matched(m) or
+        lambda m, d: m.relative_pose.source == RelativePose.NONE if not is_match(m) or
         d.has_camera else m.relative_pose.source in (RelativePose.ALIGNED, RelativePose.NONE)),
 }
 
@@ -244,7 +244,7 @@ ALIGNED_PAIR: Checks = {
     'query_index': ('0-based position in the query window, 0 = its oldest image',
         lambda m, d: 0 <= m.query_index < len(d.window(d.around))),
     'place_index': ('0-based place of the map',
-        lambda m, d: not matched(d.around) or d.shows(d.window(d.around)[m.query_index],
+        lambda m, d: not is_match(d.around) or d.shows(d.window(d.around)[m.query_index],
         m.place_index)),
 }
 
@@ -403,7 +403,7 @@ MAP_INFO: Checks = {
         'in no file (recorded maps)',
         lambda m, d: m.map_id == (d.map_id if m.state == 'loaded' else '')),
     'sessions': ('of the map; empty = unknown',
-        lambda m, d: list(m.sessions) == ([each.id for each in d.places.sessions] if m.state
+        lambda m, d: list(m.sessions) == ([session.id for session in d.places.sessions] if m.state
         == 'loaded' else [])),
     'operation': ('localization, mapping or loop_closure',
         lambda m, d: m.operation == d.operation),
@@ -481,11 +481,11 @@ def running(robot: Robot, drive: Drive, **parameters: Any) -> Iterator[Any]:
         drive.matches = list(
             {nanoseconds(match.header.stamp): match for match in robot.answers[first:]}.values()
         )
-        count = sum(map(matched, drive.matches))
+        count = sum(map(is_match, drive.matches))
         robot.until(lambda: len(candidates) >= count, 'candidates of each match')
         if drive.operation != 'mapping' and drive.x:
             robot.until(
-                lambda: sum(not each.is_late for each in closures) >= count,
+                lambda: sum(not closure.is_late for closure in closures) >= count,
                 'a closure of each match',
             )
         drive.closures, drive.candidates = list(closures), list(candidates)
@@ -604,7 +604,7 @@ def rest(robot: Robot, drive: Drive, x: float) -> None:
     robot.set(keyframe_distance=0.001)
 
 
-def published(drives: Sequence[Drive], kind: str) -> Iterator[tuple[Any, Drive]]:
+def messages_of(drives: Sequence[Drive], kind: str) -> Iterator[tuple[Any, Drive]]:
     """Yield the messages of a kind; the drive holds the message around each."""
     for d in drives:
         by_stamp = {nanoseconds(match.header.stamp): match for match in d.matches}
@@ -623,7 +623,7 @@ def published(drives: Sequence[Drive], kind: str) -> Iterator[tuple[Any, Drive]]
             'LoopClosure': [(c, own(c)) for c in d.closures],
             'AlignedPlaces': [(pair, inside(c)) for c in d.closures for pair in c.pairs],
             'RelativePose': [
-                (m.relative_pose, inside(m)) for m in [*filter(matched, d.matches), *d.closures]
+                (m.relative_pose, inside(m)) for m in [*filter(is_match, d.matches), *d.closures]
             ],
             'MapInfo': [(info, d) for info in d.infos],
         }
@@ -635,7 +635,7 @@ def published(drives: Sequence[Drive], kind: str) -> Iterator[tuple[Any, Drive]]
 )
 def test_field_is_as_documented(drives, kind, name):
     sentence, check = TABLES[kind][name]
-    wrong = [m for m, drive in published(drives, kind) if not check(m, drive)]
+    wrong = [m for m, drive in messages_of(drives, kind) if not check(m, drive)]
     assert not wrong, f'{len(wrong)} messages have another {name}: {sentence!r}: {wrong[0]}'
 
 
@@ -652,15 +652,15 @@ def test_drives_show_what_the_fields_distinguish(drives):
     assert {match.status for drive in drives for match in drive.matches} == set(range(8))
     assert {1 - PROBABILITY, 0.1} == {round(match.threshold, 6) for match in early.matches}
     assert 0.0 in {match.threshold for match in loop.matches}
-    assert any(matched(match) for match in back.matches)
+    assert any(is_match(match) for match in back.matches)
     for drive in (robust, paper):
-        assert {matched(match) for match in drive.matches} == {True, False}
+        assert {is_match(match) for match in drive.matches} == {True, False}
         assert drive.candidates
         assert drive.closures
     sessions = {match.session for match in robust.matches + paper.matches}
     assert sessions == {'', 'day', 'night'}
-    assert any(each.is_late for each in loop.closures)
-    assert len([each for each in loop.closures if each.relative_pose.is_independent]) > 1
+    assert any(closure.is_late for closure in loop.closures)
+    assert len([closure for closure in loop.closures if closure.relative_pose.is_independent]) > 1
     assert {info.state for info in mapping.infos} >= {'growing', 'full'}
-    sources = {m.relative_pose.source for m, _ in published(drives, 'LoopClosure')}
+    sources = {m.relative_pose.source for m, _ in messages_of(drives, 'LoopClosure')}
     assert sources >= {RelativePose.ALIGNED, RelativePose.PNP}

@@ -43,11 +43,11 @@ def result_of(status, reason, pairs=PAIRS, place=32, candidates=(), image=None, 
     return ImageResult(match, candidates=candidates, image=image)
 
 
-def accepted(pairs=PAIRS, place=32, **fields):
+def accept(pairs=PAIRS, place=32, **fields):
     return result_of(Status.MATCH, '', pairs, place, **fields)
 
 
-def rejected(**fields):
+def reject(**fields):
     return result_of(Status.NO_MATCH, 'too far', **fields)
 
 
@@ -82,16 +82,16 @@ def test_stamps_after_2038_wrap_as_in_the_messages_of_others():
 @pytest.mark.parametrize(('own', 'message'), [(Status, PlaceMatch), (Source, RelativePose)])
 def test_names_equal_the_constants_of_the_message(own, message):
     constants = {name: getattr(message, name) for name in own.__members__}
-    assert constants == {each.name: each.value for each in own}
+    assert constants == {member.name: member.value for member in own}
 
 
 def test_loop_closure_message_needs_a_match(places):
-    assert loop_closure_message(Outcome(HEADER, accepted()), accepted().match) is None
-    assert loop_closure_message(Outcome(HEADER, rejected(), places), rejected().match) is None
+    assert loop_closure_message(Outcome(HEADER, accept()), accept().match) is None
+    assert loop_closure_message(Outcome(HEADER, reject(), places), reject().match) is None
 
 
 def test_matched_pose_message_has_the_spread_of_near_places(places):
-    message = matched_pose_message(Outcome(HEADER, accepted(), places, Surroundings('odom')))
+    message = matched_pose_message(Outcome(HEADER, accept(), places, Surroundings('odom')))
     assert (message.header.stamp, message.header.frame_id) == (HEADER.stamp, 'odom')
     assert message.pose.pose == pose_message(np.array([35, 35**2, 0, 0, 0, 0, 1]))
     around = [34, 35, 36, 37]  # 33 has no pose
@@ -101,12 +101,12 @@ def test_matched_pose_message_has_the_spread_of_near_places(places):
     expected[:2, :2] += BESIDE**2 * np.outer(across, across)
     np.testing.assert_allclose(message.pose.covariance.reshape(6, 6), expected)
     for place, near in ((10, [10, 11, 12]), (59, [57, 58, 59])):  # the ends of the route
-        at_end = accepted(np.array([[4, place]], np.int32))
+        at_end = accept(np.array([[4, place]], np.int32))
         message = matched_pose_message(Outcome(HEADER, at_end, places, Surroundings('odom')))
         assert message.pose.covariance[0] == pytest.approx(np.var(near) + BESIDE**2, rel=0.01)
-    nowhere = accepted(np.array([[4, 33]], np.int32))
+    nowhere = accept(np.array([[4, 33]], np.int32))
     assert matched_pose_message(Outcome(HEADER, nowhere, places, Surroundings('odom'))) is None
-    assert matched_pose_message(Outcome(HEADER, rejected(), places, Surroundings('odom'))) is None
+    assert matched_pose_message(Outcome(HEADER, reject(), places, Surroundings('odom'))) is None
 
 
 @pytest.mark.parametrize('newest', range(4, 11))
@@ -120,7 +120,7 @@ def test_neighbors_of_a_place_are_of_its_session(newest):
     merged = map_of(features_of(route_strips(0, n)), thumbnails=thumbnails, **parts)
     own = np.arange(newest // 5 * 5, newest // 5 * 5 + 5)
     path = np.column_stack([np.arange(5), np.maximum(newest + np.arange(-4, 1), own[0])])
-    match = accepted(path.astype(np.int32), newest)
+    match = accept(path.astype(np.int32), newest)
     covariance = matched_pose_message(
         Outcome(HEADER, match, merged, Surroundings('map'))
     ).pose.covariance
@@ -141,7 +141,7 @@ def test_pose_is_as_uncertain_beside_the_path_as_a_lane_is_wide(
     for i in range(5):
         position = [i * spacing * math.cos(angle), i * spacing * math.sin(angle), 0]
         route.add(features, pose=np.array([*position, *orientation]))
-    match = accepted(np.array([[4, 2]], np.int32))
+    match = accept(np.array([[4, 2]], np.int32))
     message = matched_pose_message(Outcome(HEADER, match, route, Surroundings('map')))
     covariance = message.pose.covariance.reshape(6, 6)
     assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -163,7 +163,7 @@ def test_matched_pose_message_rotates_about_the_axes_of_the_map(extractor, featu
     for i, turn in enumerate(degrees):
         orientation = (Rotation.from_euler(axis, turn, degrees=True) * camera).as_quat()
         route.add(features, pose=np.array([0, 0, 0, *orientation * (-1) ** i]))
-    match = accepted(np.array([[4, 2]], np.int32))
+    match = accept(np.array([[4, 2]], np.int32))
     message = matched_pose_message(Outcome(HEADER, match, route, Surroundings('map')))
     expected = np.full(3, 0.01)
     expected['xyz'.index(axis)] = np.var(np.radians(degrees))

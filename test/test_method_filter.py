@@ -26,12 +26,12 @@ NAN, INF = float('nan'), float('inf')
 
 
 @pytest.fixture(params=['arrays', 'cpu', 'cuda'][: 2 + (not why_no_cuda())])
-def make(request, monkeypatch):
+def make(request, set_constants):
     """Return a function that makes a filter: of arrays, and of tensors on each device."""
     if request.param == 'arrays':
         return PlaceFilter
     module = pytest.importorskip('stavpr_ros.method.device', exc_type=ImportError)
-    monkeypatch.setattr(module, 'PLACES_AT_ONCE', 32)
+    set_constants(module, PLACES_AT_ONCE=32)
     return partial(module.DevicePlaceFilter, device=request.param)
 
 
@@ -166,9 +166,9 @@ def test_paths_in_a_wide_map_equal_equations(make, seed):
     for z in drive(rng, width, 15, first=(30, 190, 385)[seed], speed=1.3):
         one.update(z)
         plain.update(z)
-    found, expected = one.beliefs(12), plain.beliefs(12)
-    assert 0 < len(found.columns) < width
-    np.testing.assert_allclose(dense(found, width), expected, rtol=0, atol=5e-3)
+    result, expected = one.beliefs(12), plain.beliefs(12)
+    assert 0 < len(result.columns) < width
+    np.testing.assert_allclose(dense(result, width), expected, rtol=0, atol=5e-3)
 
 
 @pytest.mark.parametrize('speeds', [tuple(0.25 * v for v in range(17)), (0.0, 16.0)])
@@ -177,8 +177,8 @@ def test_many_and_fast_speeds_follow_the_camera(make, speeds):
     for z in drive(np.random.default_rng(2), 2500, 20, 900, speeds[-1], 0):
         one.update(np.where(z == -3, -6, z).astype(np.float32))
     beliefs = one.beliefs(12)
-    found = beliefs.columns[beliefs.probabilities.argmax(axis=1)]
-    np.testing.assert_array_equal(found, places[-12:])
+    result = beliefs.columns[beliefs.probabilities.argmax(axis=1)]
+    np.testing.assert_array_equal(result, places[-12:])
 
 
 def test_power_is_that_of_numpy_up_to_the_steepest():
@@ -277,13 +277,13 @@ def test_states_move_back(make, moment):
         laps = one.by_place().reshape(2, 100)
         np.testing.assert_allclose(laps.sum(axis=0), other.by_place(), rtol=1e-4, atol=1e-6)
         if image + 1 >= moment:
-            found = dense(one.beliefs(min(image + 1, 9)), 200).reshape(-1, 2, 100).sum(axis=1)
+            result = dense(one.beliefs(min(image + 1, 9)), 200).reshape(-1, 2, 100).sum(axis=1)
             expected = dense(other.beliefs(min(image + 1, 9)), 100)
-            np.testing.assert_allclose(found, expected, rtol=0, atol=5e-3)
+            np.testing.assert_allclose(result, expected, rtol=0, atol=5e-3)
 
 
 def test_move_back_is_of_those_columns_alone(make):
-    """Paths behind them go on; those of a block at their border are followed on both sides."""
+    """Paths behind them go on; a block at their border is followed on both sides."""
     one, other = make(2000, 9), make(2000, 9)
     for z in drive(np.random.default_rng(0), 2000, 12, 1500, 0.33):
         one.update(z)
@@ -317,15 +317,15 @@ def test_filter_without_its_oldest_columns_equals_one_of_the_others(moments):
     gap, width = np.array([70]), 150
     one, other = PlaceFilter(width, 9, gaps=gap), PlaceFilter(width, 9, gaps=gap - 60)
     z, removed = drive(np.random.default_rng(0), width, 30, 72), 0
-    z[:, :60] = np.inf  # of columns that go; those of the other filter follow the last ones
+    z[:, :60] = np.inf  # columns that go; in the other filter, they follow the last ones
     for image, row in enumerate(z):
         one.update(np.roll(row, -removed))
         other.update(np.roll(row, -60))
         if image + 1 in moments:
             removed += 60 // len(moments)
             one.evict(60 // len(moments))
-        found, expected = (answers(each, width, min(image + 1, 9)) for each in (one, other))
-        for x, y in zip(found, expected, strict=True):
+        result, expected = (answers(f, width, min(image + 1, 9)) for f in (one, other))
+        for x, y in zip(result, expected, strict=True):
             np.testing.assert_allclose(np.roll(x, removed - 60, axis=-1), y, rtol=0, atol=1e-4)
 
 

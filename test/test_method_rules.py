@@ -57,11 +57,11 @@ def without_half(patch):
     """Let the probability of a camera at rest be of the whole window alone."""
     show, half = FilterWindow._assess, (LENGTH + 1) // 2
 
-    def shown(self, l, position=None):
-        found = show(self, l, position)
-        return found._replace(probability=1.0) if (l, position) == (half, None) else found
+    def show_half(self, l, position=None):
+        result = show(self, l, position)
+        return result._replace(probability=1.0) if (l, position) == (half, None) else result
 
-    patch.setattr(FilterWindow, '_assess', shown)
+    patch.setattr(FilterWindow, '_assess', show_half)
 
 
 def alike(share, first=0, end=PLACES):
@@ -69,8 +69,8 @@ def alike(share, first=0, end=PLACES):
     return (share * KNOWN + (1 - share) * OTHER)[:, first:end]
 
 
-def stretched(period, count, share=0.0):
-    """Return images of which so many of a period are of the map's road, others by a share."""
+def stretch(period, count, share=0.0):
+    """Return images: so many of a period show the map's road, others a share of it."""
     return np.where(IMAGES % period < count, KNOWN, alike(share))[:, 40:120]
 
 
@@ -95,7 +95,7 @@ def drive(strips, noise, **arguments):
     return recognize_all(recognizer(**arguments), features_of(strips, noise, 1))
 
 
-def matched(strips, noise, first=0, **arguments):
+def share(strips, noise, first=0, **arguments):
     """Return the share of images with a match, from the first on."""
     return np.mean([match.accepted for match in drive(strips, noise, **arguments)[first:]])
 
@@ -112,14 +112,14 @@ def places_off(places, noise, whole_path):
 
 def probable_place(query, known=KNOWN, every=1, first=10, reach=2, **settings):
     """Return the mean probability of the place of every such image, from 40 on."""
-    one, found = recognizer(known, **settings), []
+    one, result = recognizer(known, **settings), []
     for i in range(len(query)):
         one.update(query[i : i + 1])
-        found.append(one.place_probabilities()[40 + i - reach : 41 + i + reach].sum())
-    return np.mean(found[first::every])
+        result.append(one.place_probabilities()[40 + i - reach : 41 + i + reach].sum())
+    return np.mean(result[first::every])
 
 
-def inverted():
+def invert():
     """Return the place's probability where every tenth image is the inverse; strip by strip."""
     strips = KNOWN[:, 40:100].copy()
     strips[:, ::10] *= -1
@@ -156,15 +156,15 @@ def resting(noise, known=KNOWN):
 def newest_beyond(noise):
     """Return the share of images beyond the map that the window before is accepted for."""
     matches = drive(np.hstack([KNOWN[:, 40:100], OTHER[:, :30]]), noise)[60:]
-    newest = [each.path_probabilities[-1] for each in matches if each.accepted]
+    newest = [match.path_probabilities[-1] for match in matches if match.accepted]
     return np.count_nonzero(np.array(newest) > matches[0].limits.probability) / len(matches)
 
 
-def varied():
+def vary():
     """Return the share of matches where three directions of all images vary most."""
     rng, directions = np.random.default_rng(1), np.random.default_rng(2).normal(size=(7, 3, 24))
     known, strips = KNOWN + 4 * rng.normal(size=(2, 7, PLACES, 3)) @ directions
-    return matched(strips[:, 40:140], 1.0, LENGTH, known=known, mode=ROBUST)
+    return share(strips[:, 40:140], 1.0, LENGTH, known=known, mode=ROBUST)
 
 
 class Rule(NamedTuple):
@@ -178,26 +178,26 @@ class Rule(NamedTuple):
 
 
 RULES = [
-    Rule('start', model(start=0.0), lambda: matched(KNOWN[:, 40:60], 4.0), 0.72, 0.68),
-    Rule('enter', model(enter=0.0), lambda: matched(np.hstack([OTHER, LATE]), 4, 400), 0.15, 0),
-    Rule('leave', model(leave=1e-12), lambda: matched(
+    Rule('start', model(start=0.0), lambda: share(KNOWN[:, 40:60], 4.0), 0.72, 0.68),
+    Rule('enter', model(enter=0.0), lambda: share(np.hstack([OTHER, LATE]), 4, 400), 0.15, 0),
+    Rule('leave', model(leave=1e-12), lambda: share(
         KNOWN[:, np.r_[20:60, 120:140]], 2.0, 41), 0.98, 0.96),
-    Rule('change', model(change=0.0), lambda: matched(
+    Rule('change', model(change=0.0), lambda: share(
         KNOWN[:, np.r_[20:40, 40:80:3, 80:100, 100:140:3]], 9.0, LENGTH), 0.8, 0.7),
     Rule('spread', model(spread=0.0), lambda: places_off(SWAYING, 5.0, True), 0.1, 0.25),
-    Rule('most', model(most=1e9), inverted, 0.2, 0.05),
-    Rule('high speeds', model(speeds=MODEL.speeds[:-2]), lambda: matched(FAST, 3), 0.5, 0.1),
-    Rule('low speeds', model(speeds=MODEL.speeds[3:]), lambda: matched(
+    Rule('most', model(most=1e9), invert, 0.2, 0.05),
+    Rule('high speeds', model(speeds=MODEL.speeds[:-2]), lambda: share(FAST, 3), 0.5, 0.1),
+    Rule('low speeds', model(speeds=MODEL.speeds[3:]), lambda: share(
         crawling(alike(0.3, 60, 85), 2), 0.05), 0.8, 0.1),
-    Rule('weight', model(weight=0.05), lambda: matched(STAGE, 6.0), 0.88, 0.82),
+    Rule('weight', model(weight=0.05), lambda: share(STAGE, 6.0), 0.88, 0.82),
     Rule('weight, at most', model(weight=1.0),
-         lambda: matched(alike(0.1, 60, 160), 0.2), 0, 0.05),
-    Rule('level', model(level=-5.0), lambda: matched(STAGE, 8.0), 0.5, 0.3),
-    Rule('alpha by change', put(ImageChange, weight=lambda *_: 1.0), lambda: matched(
+         lambda: share(alike(0.1, 60, 160), 0.2), 0, 0.05),
+    Rule('level', model(level=-5.0), lambda: share(STAGE, 8.0), 0.5, 0.3),
+    Rule('alpha by change', put(ImageChange, weight=lambda *_: 1.0), lambda: share(
         crawling(np.where(abs(IMAGES - 105) < 4, alike(0.8), OTHER)[:, 90:120], 5), 0), 0, 0.25),
-    Rule('MAX_CHANGE', put(motion, MAX_CHANGE=1e9), lambda: matched(
+    Rule('MAX_CHANGE', put(motion, MAX_CHANGE=1e9), lambda: share(
         KNOWN[:, :60], 3.0, known=crawling(KNOWN[:, :60], 4)), 0.7, 0.5),
-    Rule('MIN_CHANGE', put(motion, MIN_CHANGE=0.0), lambda: matched(
+    Rule('MIN_CHANGE', put(motion, MIN_CHANGE=0.0), lambda: share(
         np.hstack([KNOWN[:, 20:80], crawling(KNOWN[:, 120:132], 3)]), 0.0, 60), 0.7, 0.6),
     Rule('STANDSTILL', put(motion, STANDSTILL=0.0), lambda: resting(6.0), 1, 0.8),
     Rule('dark stretch', put(motion, DARK_PROBABILITY=2.0), tunnel, 0.55, 0.45),
@@ -205,49 +205,49 @@ RULES = [
     Rule('STRETCH', put(motion, STRETCH=1), lambda: resting(
         3.0, KNOWN[:, np.r_[:76, 75:PLACES]]), 1, 0),
     Rule('distinct', put(ImageChange, distinct=lambda change, at: change._from_before[at] > -1),
-         lambda: matched(STAGE, 8.5, known=KNOWN[:, np.r_[:70, np.full(1500, 70), 70:PLACES]]),
+         lambda: share(STAGE, 8.5, known=KNOWN[:, np.r_[:70, np.full(1500, 70), 70:PLACES]]),
          0.3, 0.15),
     Rule('line', in_kernel(path, 'centered_place', LINE=0), lambda: places_off(
         np.rint(np.arange(20, 140, 1.5)).astype(int), 3.0, False), 0.1, 0.25),
     Rule('ON_LINE', in_kernel(path, 'centered_place', ON_LINE=1e9),
          lambda: places_off(STOP_AND_GO, 3.0, False), 0.15, 1.5),
-    Rule('MAX_STEP', in_kernel(path, 'follow', MAX_STEP=1), lambda: matched(FAST, 3), 0.5, 0.1),
+    Rule('MAX_STEP', in_kernel(path, 'follow', MAX_STEP=1), lambda: share(FAST, 3), 0.5, 0.1),
     Rule('half at rest', without_half, resting_beyond, 0.1, 0.5),
-    Rule('share of the image', put(window, close_sums=lambda *each: np.ones(len(each[-1]))),
+    Rule('share of the image', put(window, close_sums=lambda *x: np.ones(len(x[-1]))),
          lambda: newest_beyond(6.0), 0.2, 0.33),
     Rule('ON_MAP', put(window, ON_MAP=0.0),
-         lambda: matched(KNOWN[:, np.r_[:60, 100:115]], 2.0, 60), 0.85, 0.6),
-    Rule('EARLY', put(localizer, EARLY=0.5), lambda: matched(alike(0.3, 60, 75), 0.2), 0.65, 0.85),
-    Rule('CERTAIN', put(evidence, CERTAIN=9.0), lambda: matched(LOOK_ALIKE, 0.2), 0, 0.005),
-    Rule('BELIEF', put(evidence, BELIEF=0.0), lambda: matched(KNOWN[:, 40:60], 5.0), 0.45, 0.1),
+         lambda: share(KNOWN[:, np.r_[:60, 100:115]], 2.0, 60), 0.85, 0.6),
+    Rule('EARLY', put(localizer, EARLY=0.5), lambda: share(alike(0.3, 60, 75), 0.2), 0.65, 0.85),
+    Rule('CERTAIN', put(evidence, CERTAIN=9.0), lambda: share(LOOK_ALIKE, 0.2), 0, 0.005),
+    Rule('BELIEF', put(evidence, BELIEF=0.0), lambda: share(KNOWN[:, 40:60], 5.0), 0.45, 0.1),
     Rule('UNEVEN_WEIGHT', put(evidence, UNEVEN_WEIGHT=0),
-         lambda: matched(stretched(6, 4), 1), 0, 0.8),
+         lambda: share(stretch(6, 4), 1), 0, 0.8),
     Rule('EVEN', in_kernel(evidence, 'unevenness', EVEN=0.0),
-         lambda: matched(STAGE, 9.0), 0.18, 0.1),
+         lambda: share(STAGE, 9.0), 0.18, 0.1),
     Rule('EVEN_SHARE', in_kernel(evidence, 'unevenness', EVEN_SHARE=0.0),
-         lambda: matched(stretched(9, 6, 0.2), 0.5), 0.8, 0.05),
-    Rule('EXCESS', put(evidence, EXCESS=-0.5), lambda: matched(STAGE, 3.0), 0.93, 0.1),
-    Rule('OFFSET', in_kernel(motion, '_excess', OFFSET=1e-9), lambda: matched(
+         lambda: share(stretch(9, 6, 0.2), 0.5), 0.8, 0.05),
+    Rule('EXCESS', put(evidence, EXCESS=-0.5), lambda: share(STAGE, 3.0), 0.93, 0.1),
+    Rule('OFFSET', in_kernel(motion, '_excess', OFFSET=1e-9), lambda: share(
         DENSE[:, 20:120], 0.1, known=DENSE), 0.38, 0.2),
-    Rule('EXCESS_WEIGHT', put(evidence, EXCESS_WEIGHT=0.0), lambda: matched(
+    Rule('EXCESS_WEIGHT', put(evidence, EXCESS_WEIGHT=0.0), lambda: share(
         0.3 * np.repeat(KNOWN[:, 60:66], 10, axis=1) + 0.7 * OTHER[:, :60], 0.2), 0.25, 0.75),
-    Rule('LEAD', put(evidence, LEAD=0.0), lambda: matched(STAGE, 3.0), 0.9, 0),
-    Rule('APART', put(window, APART=0), lambda: matched(STAGE, 3.0), 0.9, 0),
-    Rule('STRAIGHT', put(window, STRAIGHT=(1.0,)), lambda: matched(KNOWN[:, ::3], 5.0), 0.8, 0.5),
+    Rule('LEAD', put(evidence, LEAD=0.0), lambda: share(STAGE, 3.0), 0.9, 0),
+    Rule('APART', put(window, APART=0), lambda: share(STAGE, 3.0), 0.9, 0),
+    Rule('STRAIGHT', put(window, STRAIGHT=(1.0,)), lambda: share(KNOWN[:, ::3], 5.0), 0.8, 0.5),
     Rule('STRAIGHT, at most', put(window, STRAIGHT=window.STRAIGHT[:-1]),
-         lambda: matched(KNOWN[:, ::5], 3.0), 0.8, 0.1),
-    Rule('CELLS', put(evidence, CELLS=0.0), lambda: matched(
+         lambda: share(KNOWN[:, ::5], 3.0), 0.8, 0.1),
+    Rule('CELLS', put(evidence, CELLS=0.0), lambda: share(
         FINE[:, 20:120], 11.0, LENGTH, known=FINE), 0.6, 0.1),
-    Rule('CREEP', put(evidence, CREEP=0.0), lambda: matched(np.hstack([ALIKE[:, 20:75], (
+    Rule('CREEP', put(evidence, CREEP=0.0), lambda: share(np.hstack([ALIKE[:, 20:75], (
         0.7 * KNOWN[:, 80:81] + 0.3 * OTHER[:, :60])]), 1.0, 65, known=ALIKE), 0.05, 0.15),
-    Rule('RECENT', put(evidence, RECENT=0.0), lambda: matched(LOOK_ALIKE, 0.2), 0.05, 0.15),
-    Rule('LAST', put(evidence, LAST=1000), lambda: matched(
+    Rule('RECENT', put(evidence, RECENT=0.0), lambda: share(LOOK_ALIKE, 0.2), 0.05, 0.15),
+    Rule('LAST', put(evidence, LAST=1000), lambda: share(
         np.hstack([OTHER, KNOWN[:, 20:140]]), 3.0, PLACES), 0.7, 0.3),
     Rule('running mean', put(centering, PRIOR=1e9),
-         lambda: matched(STAGE + 10 * LIGHT, 3.0, LENGTH), 0.95, 0.5),
+         lambda: share(STAGE + 10 * LIGHT, 3.0, LENGTH), 0.95, 0.5),
     Rule('centered means', put(sys.modules[__name__], PLAIN=replace(PLAIN, mean_centering=False)),
-         lambda: matched(STAGE - 3 * LIGHT, 3.0, LENGTH, known=KNOWN + 3 * LIGHT), 0.95, 0),
-    Rule('whitening', put(centering, STRENGTH=0.0), varied, 0.5, 0.1),
+         lambda: share(STAGE - 3 * LIGHT, 3.0, LENGTH, known=KNOWN + 3 * LIGHT), 0.95, 0),
+    Rule('whitening', put(centering, STRENGTH=0.0), vary, 0.5, 0.1),
 ]  # fmt: skip
 
 
@@ -255,7 +255,7 @@ RULES = [
 def test_each_rule_has_a_drive_that_is_worse_without_it(rule, monkeypatch):
     sign = 1 if rule.with_rule > rule.without else -1
     if rule.name != 'CREEP':  # white noise, which shows what the other rules do, is creep as well
-        monkeypatch.setattr(evidence, 'CREEP', 0.0)
+        put(evidence, CREEP=0.0)(monkeypatch)
     assert sign * rule.drive() >= sign * rule.with_rule
     rule.off(monkeypatch)
     assert sign * rule.drive() <= sign * rule.without

@@ -1,23 +1,33 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The node over ROS: images in, matches out; parameters that change meanwhile; its clock."""
+"""The node over ROS: images in, matches out, parameters, its clock, its subscriptions."""
+
+import array
+import threading
 
 from builtin_interfaces.msg import Time
+import cv2
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
-from robot import image_message, LENGTH, SECOND
+from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from robot import image_message, LENGTH, RELIABLE, SECOND
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CompressedImage, Image
 from stavpr_msgs.msg import PlaceCandidates, PlaceMatch
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
+from stavpr_ros.ros import output
 from stavpr_ros.ros.messages import nanoseconds
-from std_msgs.msg import Float32, Int32
+from std_msgs.msg import Float32, Header, Int32
+from std_srvs.srv import Trigger
 
-WARMING_UP, MATCH = PlaceMatch.WARMING_UP, PlaceMatch.MATCH
+WARMING_UP, MATCH, SKIPPED = PlaceMatch.WARMING_UP, PlaceMatch.MATCH, PlaceMatch.SKIPPED
 THRESHOLD = 0.2
 PAPER = {'mode': 'paper', 'threshold': THRESHOLD}
 
@@ -177,3 +187,267 @@ def test_simulated_clock_stands_still_and_jumps_back(robot, start, set_clock, ro
     assert robot.statuses(route[7:12])[::4] == [WARMING_UP, MATCH]
     assert robot.answers[-1].newest_index == 11
     assert robot.counts('input')['jumps_back'] == '0'
+
+
+# Subscriptions of the node: transports, invalid images, odometry, QoS
+
+WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+INVALID = PlaceMatch.INVALID_IMAGE
+RELIABILITY = 'qos_overrides./image.subscription.reliability'
+
+
+@pytest.fixture
+def publish(robot, request):
+    """Make a publisher of images; it is destroyed with the test."""
+
+    def publish(kind, topic, qos=qos_profile_sensor_data):
+        publisher = robot.node.create_publisher(kind, topic, qos)
+        request.addfinalizer(lambda: robot.node.destroy_publisher(publisher))
+        return publisher
+
+    return publish
+
+
+@pytest.fixture
+def stranger(context):
+    """Return a node of another participant: in each, a topic has one type."""
+    node = rclpy.create_node('stranger', context=context)
+    yield node
+    node.destroy_node()
+
+
+def test_keyframes_by_distance_and_angle_use_odometry(robot, start, route):
+    """On a topic with another name; poses are valid for half a second."""
+    off = {'relative_pose': 'none', 'odometry_error': 0.0}
+    start('-r', 'odom:=/odom', '-r', 'image:=/image', keyframe_distance=1.0, **off)
+    match = robot.show(route[0])
+    assert (match.status, 'no odometry' in match.reason) == (SKIPPED, True)
+    assert 'never' in robot.until_diagnosed('input', WARN, 'odometry').message
+    robot.until(lambda: robot.odometry.get_subscription_count() > 0, 'a subscriber of odometry')
+    assert robot.show_at(5.0, route[1]).status == WARMING_UP
+    assert robot.show_at(5.4, route[2]).status == SKIPPED
+    assert robot.show_at(6.1, route[3]).status in (WARMING_UP, MATCH)
+    assert robot.show_at(6.1, route[4], degrees=170).status == SKIPPED
+    robot.set(keyframe_angle=30.0)  # its earlier name
+    robot.until_logged("parameter 'keyframe_angle' is keyframe_angle_deg now")
+    assert robot.show_at(6.1, route[5], degrees=40).status in (WARMING_UP, MATCH)
+    assert 'no odometry' in robot.show(route[7], 3600 * SECOND).reason  # another clock
+
+    def is_compared():
+        robot.odometry.publish(Odometry(header=Header(stamp=Time(sec=1))))
+        return 'without odometry at their stamps' in robot.diagnostics['input'].message
+
+    robot.until(is_compared, 'a remark on the stamps')
+    robot.until_diagnosed('input', WARN, 'has stopped')
+    robot.set(keyframe_distance=0.0, keyframe_angle_deg=0.0)
+    robot.until(lambda: not robot.odometry.get_subscription_count(), 'the end of odometry')
+
+
+def test_a_rule_that_skips_every_image_is_a_warning_and_so_is_the_missing_map(robot, start, route):
+    """By the stamps, in a replay that is faster; once for each such stretch."""
+    start(map_path='', operation='mapping', keyframe_distance=0.5)
+    robot.drive(route[:8])
+    robot.until_logged('every image is skipped: no odometry for this image')
+    assert sum('every image is skipped' in line for line in robot.log) == 1
+    assert robot.transition('deactivate')
+    robot.until_logged('no map written, because none of')
+
+
+def test_wrongly_remapped_odometry_and_a_covered_lens_are_diagnosed(
+    robot, start, publish, stranger, route
+):
+    """The topic with odometry is named, no topic of a pose graph; one of another type too."""
+    publish(Odometry, '/pose_graph/odometry')
+    publish(TransformStamped, '/pose_graph/map_to_odom')
+    start('-r', 'odom:=/wheel', keyframe_distance=1.0)
+    message = 'nothing is published on /wheel, odometry is on /odom: remap odom'
+    robot.until_diagnosed('input', WARN, message)
+    stranger.create_publisher(Image, '/wheel', 1)
+    robot.until_diagnosed('input', WARN, 'sensor_msgs/msg/Image is published on /wheel, odometry')
+    robot.set(keyframe_distance=0.0)
+    robot.show(np.full_like(route[0], 200))
+    robot.until_diagnosed('input', WARN, 'the images show nothing (standard deviation 0.0 of 255)')
+
+
+def test_compressed_images_on_a_remapped_topic_are_recognized(
+    robot, start, publish, stranger, route
+):
+    """The topic is below the one that `image` is remapped to; the diagnostics name it."""
+    start('-r', 'image:=/front/image', wait=False, image_transport='compressed')
+    topic = '/front/image/compressed'
+    assert topic in robot.until_diagnosed('input', WARN, 'no publisher').message
+    raw = stranger.create_publisher(Image, topic, 1)
+    mistyped = 'sensor_msgs/msg/Image is published there: compare image_transport'
+    robot.until_diagnosed('input', ERROR, mistyped)
+    stranger.destroy_publisher(raw)
+    camera = publish(CompressedImage, topic)
+    robot.wait_for_node(camera, CompressedImage)
+
+    def show(data):
+        message = CompressedImage(format='rgb8; jpeg compressed bgr8', data=array.array('B', data))
+        return robot.show(message, publisher=camera)
+
+    match = show(b'not an image at all')
+    assert (match.status, 'rgb8' in match.reason) == (INVALID, True)
+    matches = [show(cv2.imencode('.jpeg', image[:, :, ::-1])[1]) for image in route[40:46]]
+    assert [match.status for match in matches] == 4 * [WARMING_UP] + 2 * [MATCH]
+    assert matches[-1].newest_index == 45
+
+
+def test_incompatible_publishers_are_reported(robot, start, publish, route):
+    """Alone, beside a compatible one, and no longer when they are gone."""
+    start(wait=False, **{RELIABILITY: 'reliable'})
+    unreliable = publish(Image, 'image')
+    robot.node.destroy_publisher(robot.publisher)
+    remedy = f'remove {RELIABILITY}, or make the publisher reliable'
+    offers = f'a publisher of /image offers another reliability: {remedy}'
+    robot.until_diagnosed('input', ERROR, f'1 publisher refused for QoS: {offers}')
+    robot.until_logged(f'images are not received: {offers}')
+    robot.publisher = robot.node.create_publisher(Image, 'image', RELIABLE)
+    robot.wait_for_node()
+
+    def is_reported():
+        robot.show(route[0])
+        warning = '1 publisher refused for QoS, while images of others arrive'
+        return warning in robot.diagnostics['input'].message
+
+    robot.until(is_reported, 'a warning')
+    assert robot.counts('input')['publishers_refused'] == '1'
+    robot.node.destroy_publisher(unreliable)
+    robot.until(lambda: robot.counts('input')['publishers_refused'] == '0', 'no refusal')
+
+
+def test_durability_override_excludes_volatile_publishers(robot, start, publish):
+    durability = 'qos_overrides./image.subscription.durability'
+    start(wait=False, **{durability: 'transient_local'})
+    robot.until_diagnosed('input', ERROR, f'{durability} to volatile, or')
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    robot.wait_for_node(publish(Image, 'image', latched))
+
+
+def test_invalid_qos_override_is_an_error(robot, start):
+    start(wait=False, **{RELIABILITY: 'certain'})
+    robot.until_diagnosed('map', ERROR, 'correct qos_overrides./image.subscription')
+    robot.until_state('unconfigured')
+    robot.until_logged('certain')
+
+
+# One node for the tests below: rates, gaps and jumps of stamps, invalid images, its neighbors
+
+
+def test_max_rate_skips_images_by_their_stamps(robot, running, route):
+    robot.set(max_rate=5.0)  # probes would be skipped, and overtake others
+    before = robot.counts('processing')
+    statuses = robot.statuses(route, SECOND // 30)
+    assert [i for i, status in enumerate(statuses) if status != SKIPPED] == list(range(0, 60, 6))
+    assert 'exceeds max_rate = 5 Hz' in robot.answers[-1].reason
+    dropped = int(robot.counts('processing')['dropped_max_rate'])
+    assert dropped - int(before.get('dropped_max_rate', 0)) == 50
+    robot.show(route[0])
+    assert robot.show(route[1], -SECOND // 30).status == SKIPPED  # was overtaken on its way
+    robot.set(max_rate=0.0)
+    assert SKIPPED not in robot.statuses(route[10:20], SECOND // 30)
+
+
+def test_max_rate_without_stamps_uses_arrival(robot, running, route):
+    robot.set(max_rate=0.001)
+    matches = [robot.ask(image_message(image, 0)) for image in route[:3]]
+    assert [match.status for match in matches] == [WARMING_UP, SKIPPED, SKIPPED]
+    robot.set(max_rate=5.0)
+    late = image_message(route[3])
+    robot.until(lambda: robot.ask(late).status == WARMING_UP, 'an image that is late enough')
+
+
+def test_jump_back_of_stamps_resets_the_window(robot, running, route):
+    before = robot.counts('input')
+    assert robot.statuses(route[:5])[-1] == MATCH
+    assert robot.show(route[5], -SECOND // 20).status == MATCH  # out of order is no jump
+    assert robot.show(route[6], -60 * SECOND).status == WARMING_UP
+    assert robot.statuses(route[7:11])[-1] == MATCH
+    assert robot.answers[-1].newest_index == 10
+    after = robot.counts('input')
+    assert int(after['jumps_back']) == int(before['jumps_back']) + 1
+    assert after['longest_jump_back_s'] == '60.050'
+    line = 'window reset: the stamps of the images jumped back by 60.050 s'
+    assert robot.log.count(line) == 1
+
+
+def test_gaps_are_counted_and_keep_the_window(robot, running, route):
+    robot.set(max_stamp_gap=2.0)
+    robot.drive(route[:5])
+    before = int(robot.counts('input')['gaps'])
+    assert robot.show(route[5], 2 * SECOND).status == MATCH
+    assert robot.show(route[6], 3 * SECOND).status == MATCH
+    assert int(robot.counts('input')['gaps']) == before + 1
+    robot.set(max_stamp_gap=0.5)
+    assert robot.statuses(route[7:9]) == 2 * [MATCH]
+    robot.show(route[9], SECOND // 2)
+    assert int(robot.counts('input')['gaps']) == before + 3
+
+
+def test_invalid_images_are_counted_and_explained_once_a_cause(robot, running, route):
+    invalid = {kind: image_message(route[0]) for kind in ('cut off', 'encoding', 'depth')}
+    invalid['cut off'].height = 10**6
+    invalid['encoding'].encoding = 'teleport8'
+    invalid['depth'].encoding = '32FC1'
+    before = robot.counts('input')
+    for i in range(2):
+        for kind, message in invalid.items():
+            match = robot.show(message)
+            assert (match.status, bool(match.reason)) == (PlaceMatch.INVALID_IMAGE, True), kind
+        matches = robot.drive(route[3 * i : 3 * i + 3])
+    assert [match.status for match in matches] == 3 * [MATCH]  # the window was kept
+    assert matches[-1].newest_index == 5
+    robot.until_diagnosed('input', DiagnosticStatus.WARN, 'cut off 2')
+    after = robot.counts('input')
+    for kind in invalid:
+        key = f'dropped_invalid_{kind.replace(" ", "_")}'
+        assert int(after[key]) == int(before.get(key, 0)) + 2
+        line = f'logged once; /diagnostics counts "invalid: {kind}"'
+        assert sum(line in text for text in robot.log) == 1
+
+
+def test_requests_of_many_clients_wait_and_all_get_a_response(robot, running):
+    """200 at once, while the first one takes long."""
+    end = threading.Event()
+    client = robot.node.create_client(Trigger, '/stavpr/reset', qos_profile=QoSProfile(depth=1000))
+    try:
+        robot.does(Trigger, 'reset')
+        robot.until(client.service_is_ready, 'the service')
+        robot.until(client.call_async(Trigger.Request()).done, 'the first response')
+        running.runtime.worker.call(end.wait)
+        responses = [client.call_async(Trigger.Request()) for _ in range(200)]
+        end.set()
+        robot.until(lambda: all(response.done() for response in responses), 'all responses')
+    finally:
+        end.set()
+        robot.node.destroy_client(client)
+
+
+def test_node_draws_match_images_for_a_subscriber_only(robot, running, route, monkeypatch):
+    calls, draw = [], output.draw_match
+    monkeypatch.setattr(output, 'draw_match', lambda *args: calls.append(args) or draw(*args))
+    robot.drive(route[:4])
+    assert calls == []
+    drawn = robot.listen(Image, '/stavpr/match_image')
+
+    def is_received():
+        robot.show(route[4])
+        return bool(drawn)
+
+    robot.until(is_received, 'an image')
+    match = robot.drive(route[5:10])[-1]
+    robot.until(lambda: drawn[-1].header == match.header, 'the last image')
+    image = np.frombuffer(drawn[-1].data, np.uint8).reshape(drawn[-1].height, -1, 3)
+    np.testing.assert_array_equal(image[14:96, :128], route[9][14:])  # below the label
+
+
+def test_node_logs_an_incompatible_subscriber_and_lost_images_once(robot, running):
+    requested = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    robot.listen(PlaceMatch, '/stavpr/match', requested)
+    robot.until_logged('a subscriber of ~/match receives nothing: it requests another durability')
+    running.statistics.add_drop('lost in transport', 3)
+    line = '3 images lost in transport in the last 10 s: '
+    robot.until_logged(line)
+    robot.counts('input')  # of two more reports
+    assert sum(line in text for text in robot.log) == 1

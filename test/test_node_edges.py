@@ -33,9 +33,9 @@ def info(size=(640, 480), focal=300.0, **fields):
 
 
 def test_mount_of_text_is_a_pose():
-    found = np.array(mount_of(MOUNT))
-    np.testing.assert_allclose(found[:3], (0.1, 0, 1.2))
-    assert abs(found[3:] @ FORWARD[3:]) == pytest.approx(1)
+    result = np.array(mount_of(MOUNT))
+    np.testing.assert_allclose(result[:3], (0.1, 0, 1.2))
+    assert abs(result[3:] @ FORWARD[3:]) == pytest.approx(1)
     assert mount_of('1, 2, 3, 0, 0, 0, 1') == (1, 2, 3, 0, 0, 0, 1)
     assert mount_of(' ') is None
     for text in ('1 2 3', 'a b c d e f', '0 0 0 0 0 0 0', '0 0 nan 0 0 0'):
@@ -181,22 +181,22 @@ def test_oldest_closures_are_dropped_in_order_while_too_many_wait(queue):
     dropped = [RelativePose.DROPPED] * 3
     assert sources[:5] == [RelativePose.PNP, *dropped, RelativePose.PNP]
     assert set(sources[5:]) == {RelativePose.PNP}
-    found = queue.published[1]
+    result = queue.published[1]
     reason = f'PnP: dropped, {MAX_WAITING + 2} newer closures are waiting'
-    assert found.relative_pose.reason == reason
-    assert not found.has_relative_pose
+    assert result.relative_pose.reason == reason
+    assert not result.has_relative_pose
     assert queue.statistics.counts().edges.total == {'pnp': MAX_WAITING + 1, 'dropped': 3}
 
 
 @pytest.mark.parametrize(('seconds', 'source'), [(60.0, Source.PNP), (0.0, Source.DROPPED)])
 def test_flush_publishes_waiting_closures_by_pnp_until_its_time_is_over(
-    queue, monkeypatch, seconds, source
+    queue, set_constants, seconds, source
 ):
-    monkeypatch.setattr(edges, 'FLUSH_TIME', seconds)
+    set_constants(edges, FLUSH_TIME=seconds)
     for number in range(3):
         queue.put(number)
     worker, call = queue.publisher._worker, queue.publisher._worker.call
-    monkeypatch.setattr(worker, 'call', lambda do: (call(do), queue.free.set())[0])
+    worker.call = lambda do: (call(do), queue.free.set())[0]
     queue.publisher.flush()
     sources = [message.relative_pose.source for message in queue.published]
     assert sources == [Source.PNP, source, source]

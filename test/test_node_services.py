@@ -1,25 +1,33 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Services, states and transitions of the node: valid and invalid requests at any time."""
+"""Services, states, maps and parameters of the node: valid and invalid requests at any time."""
 
 from contextlib import contextmanager
 import dataclasses
 from dataclasses import replace
+import math
+from pathlib import Path
+import shutil
 import threading
 import weakref
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from hypothesis import given, HealthCheck, settings, strategies
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
 import pytest
-from rcl_interfaces.srv import GetParameters
-from robot import image_message, LATCHED, LENGTH, SECOND
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.lifecycle import TransitionCallbackReturn
+from robot import image_message, LATCHED, LENGTH, parameters_of, SECOND
 from stavpr_msgs.msg import MapInfo, PlaceMatch
 from stavpr_msgs.srv import LoadMap, Relocalize, SaveMap, SetOperation
+from stavpr_ros.errors import MapFileError, SettingsError
 from stavpr_ros.features.registry import settings_class
-from stavpr_ros.mapping import load_map, Map, save_map
+from stavpr_ros.mapping import load_map, Map, open_map, save_map, verify_map
+from stavpr_ros.parameters import BY_NAME, PARAMETERS, REMOVED
 from stavpr_ros.pipeline import read_map
 from stavpr_ros.ros import map_loading, runtime
 from std_srvs.srv import Trigger
@@ -68,10 +76,10 @@ def test_services_while_a_map_is_loaded_are_served(robot, start, route, tmp_path
         assert robot.transition('cleanup')
 
 
-def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, disk, monkeypatch):
+def test_load_map_that_takes_too_long_fails(robot, start, tmp_path, disk, set_constants):
     start(map_path='')
     disk.clear()
-    monkeypatch.setattr(map_loading, 'LOAD_TIMEOUT', 0.1)
+    set_constants(map_loading, LOAD_TIMEOUT=0.1)
     message = robot.refuses(LoadMap, 'load_map', path=str(tmp_path / 'slow.stavpr'))
     disk.set()
     assert message == f'{tmp_path}/slow.stavpr was not read within 0.1 s: copy it to a faster disk'
@@ -86,13 +94,14 @@ def test_services_and_parameters_name_files_in_the_maps_folder_only(
     secret.write_text('export PATH\n')
     (folder / 'link').symlink_to(secret)
     (folder / 'outside').symlink_to(tmp_path)
+    (folder / 'zero').symlink_to('/dev/zero')
     start(maps_folder=str(folder))
     own = str(folder / 'own.stavpr')
     assert robot.does(SaveMap, 'save_map', path='own.stavpr').message == f'60 places to {own}'
     loaded = robot.does(LoadMap, 'load_map', path='own.stavpr')
     assert (loaded.message, loaded.map.path) == (f'60 places from {own}', own)
     assert robot.does(LoadMap, 'load_map', path=own).success
-    for path in (map_file, str(secret), '../.bashrc', 'link', 'outside/.bashrc', '.'):
+    for path in (map_file, str(secret), '../.bashrc', 'link', 'zero', 'outside/.bashrc', '.'):
         for kind, name, fields in (
             (LoadMap, 'load_map', {}),
             (SaveMap, 'save_map', {'overwrite': True}),
@@ -235,7 +244,7 @@ def test_load_map_of_a_damaged_file_keeps_the_map_and_the_window(
 
 
 def test_relocalize_returns_the_last_match_with_candidates_and_pose(robot, start, route):
-    """As many as requested, or as parameter candidates; the pose is that of ~/pose."""
+    """As many as requested, or as parameter candidates; the pose is published on ~/pose."""
     poses = robot.listen(PoseWithCovarianceStamped, '/stavpr/pose')
     start(candidates=3, **PAPER)
     match = robot.drive(route[30 : 30 + LENGTH])[-1]
@@ -390,9 +399,9 @@ def test_node_after_a_failed_configuration_can_be_configured(
     robot.until_diagnosed('map', DiagnosticStatus.OK, '60 places of')
 
 
-def test_node_without_its_map_frees_it(robot, node, map_file, monkeypatch):
+def test_node_without_its_map_frees_it(robot, node, map_file, set_constants):
     """By cleanup, and by another map, even if its hashes are compared for hours."""
-    monkeypatch.setattr(map_loading, 'REST', 1e9)
+    set_constants(map_loading, REST=1e9)
     configure(robot, map_file)
     places = weakref.ref(node.runtime.pipeline.places)
     assert robot.transition('cleanup')
@@ -401,3 +410,224 @@ def test_node_without_its_map_frees_it(robot, node, map_file, monkeypatch):
     places = weakref.ref(node.runtime.pipeline.places)
     robot.does(LoadMap, 'load_map', path=map_file)
     robot.until(lambda: places() is None, 'the end of the old map')
+
+
+# Files of maps that are overwritten, or damaged, while the node uses them
+
+
+@pytest.fixture
+def other_map(small_map, tmp_path):
+    """Return the file of a shorter map."""
+    places = slice(40)
+    other = small_map.__class__(
+        small_map.features[places], small_map.projection, small_map.stamps[places], ('',) * 40
+    )
+    save_map(other, tmp_path / 'other.stavpr')
+    return tmp_path / 'other.stavpr'
+
+
+@pytest.fixture
+def in_use(map_file, tmp_path):
+    """Return a map file that may be changed."""
+    return Path(shutil.copy(map_file, tmp_path / 'route.stavpr'))
+
+
+def copied_over(other: Path, path: Path) -> None:
+    """Write a file over another, as ``cp`` does: it stays the same file."""
+    inode = path.stat().st_ino
+    path.write_bytes(other.read_bytes())
+    assert path.stat().st_ino == inode
+
+
+def test_map_copied_over_the_one_in_use_is_reported_and_can_be_loaded(
+    robot, start, route, in_use, other_map
+):
+    """Images are matched with the map in memory; nothing takes the file for its own."""
+    start(map_path=str(in_use), geometric_check='orb')
+    robot.drive(route[:6])
+    copied_over(other_map, in_use)
+    matches = robot.drive(route[6:12])
+    assert [match.newest_index for match in matches] == list(range(6, 12))
+    robot.until_diagnosed('map', DiagnosticStatus.WARN, 'has been overwritten since')
+    message = robot.refuses(SetOperation, 'set_operation', operation='mapping')
+    assert 'has been overwritten since' in message
+    assert robot.refuses(SaveMap, 'save_map', path=str(in_use.parent / 'copy')) == message
+    for path, places in ((other_map, 40), (in_use, 40)):
+        assert robot.does(LoadMap, 'load_map', path=str(path)).map.places == places
+    robot.until_diagnosed('map', DiagnosticStatus.OK, '40 places')
+    assert robot.drive(route[:LENGTH])[-1].status == PlaceMatch.MATCH
+
+
+def test_load_map_of_damaged_strips_is_reported_later_or_refused_with_verify(
+    robot, start, route, in_use, tmp_path
+):
+    """A flipped bit in the features: the header, and all that is read at once, are intact."""
+    part = open_map(in_use).features.file.parts['strips']
+    content = bytearray(in_use.read_bytes())
+    content[part.start + 100] ^= 1
+    damaged = tmp_path / 'damaged.stavpr'
+    damaged.write_bytes(content)
+    start(map_path=str(in_use))
+    message = robot.refuses(LoadMap, 'load_map', path=str(damaged), verify=True)
+    assert f'bytes {part.start} to' in message
+    assert 'of part strips, do not match their hash' in message
+    assert robot.until_map(state='loaded').path == str(in_use)
+    robot.does(LoadMap, 'load_map', path=str(in_use), verify=True)
+    robot.does(LoadMap, 'load_map', path=str(damaged))
+    robot.until_diagnosed('map', DiagnosticStatus.WARN, 'the map in use is not reliable')
+    robot.until_logged('the map in use is not reliable')
+    assert robot.drive(route[:LENGTH])[-1].status == PlaceMatch.MATCH
+    robot.does(LoadMap, 'load_map', path=str(in_use))
+    robot.until_diagnosed('map', DiagnosticStatus.OK, '60 places')
+
+
+def test_stored_map_that_is_overwritten_is_never_read_as_its_own(in_use, small_map, tmp_path):
+    """By a map of the same size, whose features are valid: no hash is compared on use."""
+    places = open_map(in_use)
+    copied_over(in_use, in_use)  # the content is the same; that is not known
+    for read in (
+        lambda: places.features[:3],
+        lambda: places.features.strip(0),
+        lambda: places.thumbnails[0],
+        lambda: save_map(places, tmp_path / 'copy.stavpr'),
+        lambda: verify_map(places),
+    ):
+        with pytest.raises(MapFileError, match='has been overwritten since it was opened: load'):
+            read()
+    assert places.thumbnail(0) is None
+
+
+# Parameters of any name, type and value: each is set, or rejected with a reason
+
+NESTED = '[' * 2000
+TEXTS = strategies.text(strategies.characters(exclude_characters='\0', codec='utf-8'), max_size=40)
+VALUES = strategies.builds(
+    ParameterValue,
+    type=strategies.sampled_from([*range(10), 77, 255]),
+    bool_value=strategies.booleans(),
+    integer_value=strategies.integers(-(2**63), 2**63 - 1),
+    double_value=strategies.floats(),
+    string_value=strategies.sampled_from(['', NESTED, '{"a":' * 2000, '{}', '/dev/zero', '..'])
+    | TEXTS,
+    string_array_value=strategies.lists(TEXTS, max_size=3),
+)
+NAMES = strategies.sampled_from([row.name for row in PARAMETERS] + ['', 'use_sim_time', '/', 'é'])
+
+
+def service_of(node, kind):
+    return next(service for service in node.services if service.srv_type is kind)
+
+
+def test_parameters_that_rclpy_cannot_read_get_a_response(robot, start):
+    """Over ROS: an unknown type; those before it are set, those after it are not."""
+    node = start(map_path='')
+    right = Parameter(name='min_probability', value=ParameterValue(type=3, double_value=0.25))
+    strange = Parameter(name='candidates', value=ParameterValue(type=77))
+    later = Parameter(name='candidates', value=ParameterValue(type=2, integer_value=3))
+    parameters = [right, strange, later]
+    results = robot.call(SetParameters, 'set_parameters', parameters=parameters).results
+    assert [result.successful for result in results] == [True, False, False]
+    assert '77 is not a valid' in results[1].reason
+    atomic = 'set_parameters_atomically'
+    result = robot.call(SetParametersAtomically, atomic, parameters=parameters).result
+    assert not result.successful
+    assert '77 is not a valid' in result.reason
+    values = [node.get_parameter(name).value for name in ('min_probability', 'candidates')]
+    assert values == [0.25, 10]
+
+
+# at the start, and of a node that localizes
+WRONG_TYPES = [
+    ('threshold', 'high', 'has the wrong type: expected a number'),
+    ('queue_size', 4.5, 'has the wrong type: expected an integer'),
+    ('publish_tf', 1, 'has the wrong type: expected true or false'),
+    ('robot_id', 2, 'has the wrong type: expected text'),
+]
+NOT_DECLARED = {
+    'sequence_lenght': 'is unknown: did you mean sequence_length?',
+    'beta': 'is unknown: see `ros2 param list`',
+} | {name: f'was removed in 1.0: {remedy}' for name, remedy in REMOVED.items()}
+REJECTED = [
+    *WRONG_TYPES,
+    *((name, 'package.module:name', words) for name, words in NOT_DECLARED.items()),
+    ('map_path', 'other.stavpr', 'call the service ~/load_map'),
+    ('operation', 'mapping', 'call the service ~/set_operation'),
+    ('nms_radius', 7, 'while the node is unconfigured'),
+    ('threshold', 0.8, 'is of mode paper'),
+    ('min_probability', 1.0, 'below 1'),
+    ('save_path', '/missing/route.stavpr', 'save_path'),
+    ('geometric_check', 'eye', 'take one of none'),
+    ('save_path', 'a' * 20_000, 'expected at most 4096, none of them a control'),
+    ('save_path', '\x1b[2J', 'none of them a control'),
+    ('robot_id', 'a\nb', 'none of them a control'),
+]
+
+
+def test_parameters_that_are_rejected_by_name_change_nothing(make_node, map_file):
+    node = make_node(map_path=map_file)
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    before = node.settings
+    for name, value, words in REJECTED:
+        (result,) = node.set_parameters(parameters_of({name: value}))
+        assert (result.successful, words in result.reason) == (False, True), result.reason
+        assert name in result.reason
+        assert len(result.reason) < 1000
+        assert not node.has_parameter(name) or node.get_parameter(name).value != value
+        assert node.settings is before
+    together = parameters_of({'candidates': 3, 'min_probability': 1.0})
+    assert not node.set_parameters_atomically(together).successful
+    assert node.settings.pipeline.candidates == 10
+    for values in ({'map_path': map_file}, {'candidates': 3}):  # the first one is the current one
+        assert node.set_parameters(parameters_of(values))[0].successful
+    assert node.runtime.pipeline.settings.candidates == 3
+
+
+def test_parameters_of_the_start_are_rejected_or_logged_by_name(make_node, capfd):
+    for name, value, words in WRONG_TYPES:
+        with pytest.raises(SettingsError, match=f'{name} = {value!r} {words}'):
+            make_node(**{name: value})
+    node = make_node(**dict.fromkeys(NOT_DECLARED, 'package.module:name'))
+    (result,) = node.set_parameters(parameters_of({'feature_settings': NESTED}))
+    assert 'expected a JSON object' in result.reason
+    assert len(result.reason) < 1000
+    logged = capfd.readouterr().err
+    assert all(f'parameter {name!r} {words}' in logged for name, words in NOT_DECLARED.items())
+
+
+def test_integer_where_a_number_is_expected_is_converted(make_node):
+    """As in `threshold: 1` of a parameter file, and in `ros2 param set NODE threshold 1`."""
+    node = make_node(mode='paper', threshold=1)
+    assert repr(node.settings.pipeline.threshold) == '1.0'
+    assert node.set_parameters(parameters_of({'threshold': 2}))[0].successful
+    assert repr(node.get_parameter('threshold').value) == '2.0'
+
+
+def test_any_parameter_is_set_or_rejected_with_a_reason(make_node):
+    node = make_node(map_path='')
+
+    @settings(max_examples=300, suppress_health_check=list(HealthCheck))
+    @given(strategies.lists(strategies.tuples(NAMES, VALUES), min_size=1, max_size=3))
+    def check(pairs):
+        parameters = [Parameter(name=name, value=value) for name, value in pairs]
+        for kind in (SetParameters, SetParametersAtomically):
+            request, response = kind.Request(parameters=parameters), kind.Response()
+            service_of(node, kind).callback(request, response)
+            results = response.results if kind is SetParameters else [response.result]
+            assert len(results) == (len(pairs) if kind is SetParameters else 1)
+            assert all(result.successful or result.reason for result in results)
+        for name, row in BY_NAME.items():
+            value = node.get_parameter(name).value
+            assert type(value) is type(row.default)
+            assert not (isinstance(value, float) and math.isnan(value))
+
+    check()
+
+
+def test_parameter_by_its_earlier_name_is_set_with_a_warning(make_node, capfd):
+    node = make_node(keyframe_angle=5.0)
+    assert node.get_parameter('keyframe_angle_deg').value == 5
+    assert "parameter 'keyframe_angle' is keyframe_angle_deg now" in capfd.readouterr().err
+    assert node.set_parameters(parameters_of({'keyframe_angle': 7}))[0].successful
+    assert node.settings.pipeline.keyframes.angle == 7
+    assert "parameter 'keyframe_angle' is keyframe_angle_deg now" in capfd.readouterr().err
+    assert not node.has_parameter('keyframe_angle')

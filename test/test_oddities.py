@@ -56,7 +56,7 @@ def test_clocks_that_jump_are_named_in_commands_and_node(
     for stamp in stamps:
         time = Time(sec=stamp // SECOND, nanosec=stamp % SECOND)
         image_input.on_image(Image(header=Header(stamp=time)))
-    assert [text in each for each in image_input.oddities()] == expected
+    assert [text in line for line in image_input.oddities()] == expected
 
 
 def test_stamps_of_another_epoch_than_the_recording_are_named(tmp_path, caplog):

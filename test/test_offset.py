@@ -41,7 +41,7 @@ def panorama(seed=0):
     return image
 
 
-def warped(image, shift=0.0, beside=0.0):
+def warp(image, shift=0.0, beside=0.0):
     """Return the middle of a panorama, shifted to the right; pixels, in all and beside."""
     x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     u = abs(x + 0.5 - WIDTH / 2) / (WIDTH / 2)
@@ -67,7 +67,7 @@ def plain_evidence(query, place):
     for model, (a, b) in enumerate(zip(A, B, strict=True)):
         beside = np.rint((a * centers + b) * abs(centers) * WIDTH / 2 * PARTS) / PARTS
         at = beside[:, None] + np.arange(len(SHIFTS))
-        shown = np.array([plain_mean(*each) for each in zip(means, at, strict=True)])
+        shown = np.array([plain_mean(*block) for block in zip(means, at, strict=True)])
         for k in range(len(SHIFTS)):
             used = shown[~np.isnan(means[:, k]), k]
             if len(used):
@@ -92,7 +92,7 @@ def plain_drifted(earlier):
 
 def test_kernels_equal_plain_sums():
     image = panorama(3)
-    query, place = describe_columns(warped(image, 9, 4)), describe_columns(warped(image))
+    query, place = describe_columns(warp(image, 9, 4)), describe_columns(warp(image))
     evidence, is_enough = module.block_evidence(query, place, OffsetFilter()._beside)
     expected, enough = plain_evidence(query, place)
     np.testing.assert_allclose(evidence, expected, rtol=0, atol=1e-4)
@@ -103,7 +103,7 @@ def test_kernels_equal_plain_sums():
 @pytest.mark.parametrize('shift', [-48.0, -7.5, 0.0, 3.3, 60.0])
 def test_shift_is_positive_where_the_scene_is_further_right(shift):
     image = panorama()
-    result = offset(warped(image, shift), warped(image))
+    result = offset(warp(image, shift), warp(image))
     assert result.is_valid
     assert result.shift * WIDTH == pytest.approx(shift, abs=1.0)
     assert result.deviation * WIDTH < 3
@@ -117,14 +117,14 @@ def test_parallax_below_a_step_is_seen_and_no_shift_counts_as_parallax(beside, s
     results = []
     for seed in range(6):
         image = panorama(seed)
-        results.append(offset(warped(image, shift, beside), warped(image)).parallax * WIDTH)
+        results.append(offset(warp(image, shift, beside), warp(image)).parallax * WIDTH)
     assert np.mean(results) == pytest.approx(beside, abs=0.5)
 
 
 @pytest.mark.parametrize('beside', [-12.0, 12.0])
 def test_near_scene_beside_the_path_is_parallax_not_heading(beside):
     image = panorama(1)
-    result = offset(warped(image, 5.0, beside), warped(image))
+    result = offset(warp(image, 5.0, beside), warp(image))
     assert result.is_valid
     assert result.shift * WIDTH == pytest.approx(5.0, abs=3)
     assert result.parallax * WIDTH == pytest.approx(beside, rel=0.4)
@@ -132,9 +132,9 @@ def test_near_scene_beside_the_path_is_parallax_not_heading(beside):
 
 def test_camera_that_turns_at_once_is_followed():
     image, one = panorama(2), OffsetFilter()
-    place = describe_columns(warped(image))
+    place = describe_columns(warp(image))
     for shift in [0.0] * 8 + [40.0] * 2:
-        result = one.update(describe_columns(warped(image, shift)), place)
+        result = one.update(describe_columns(warp(image, shift)), place)
     assert result.is_valid
     assert result.shift * WIDTH == pytest.approx(40, abs=2)
 
@@ -146,8 +146,8 @@ def test_repeating_structure_is_resolved_by_earlier_images():
     history, single = OffsetFilter(), OffsetFilter()
     for seed in range(3):
         image = panorama(seed)
-        history.update(describe_columns(warped(image, 12)), describe_columns(warped(image)))
-    pair = describe_columns(warped(repeated, 12)), describe_columns(warped(repeated))
+        history.update(describe_columns(warp(image, 12)), describe_columns(warp(image)))
+    pair = describe_columns(warp(repeated, 12)), describe_columns(warp(repeated))
     assert history.update(*pair).shift * WIDTH == pytest.approx(12, abs=3)
     assert not single.update(*pair).is_valid
     history.reset()
@@ -157,7 +157,7 @@ def test_repeating_structure_is_resolved_by_earlier_images():
 def test_covered_camera_has_no_valid_offset_from_its_first_image():
     image, estimator = panorama(2), OffsetFilter()
     rng = np.random.default_rng(0)
-    place = describe_columns(warped(image))
+    place = describe_columns(warp(image))
     for _ in range(5):
         assert estimator.update(place, place).is_valid
     noise = rng.normal(20, 3, (HEIGHT, WIDTH, 3)).clip(0, 255).astype(np.uint8)
@@ -178,7 +178,7 @@ def test_lateral_offset_follows_from_the_expansion_between_places(spacing):
     """With an expansion of 0.06 half widths per meter, 1 m has a parallax of 0.06 f widths."""
     image, damaged = panorama(1), 3
     steps = 0.06 * spacing * (np.arange(8) - 4) * WIDTH / 2
-    places = [describe_columns(forward(image, each)) for each in steps]
+    places = [describe_columns(forward(image, outward)) for outward in steps]
 
     def columns(k):
         if k == damaged:
@@ -194,7 +194,7 @@ def test_lateral_offset_follows_from_the_expansion_between_places(spacing):
 
 
 def test_lateral_offset_is_uncertain_where_places_are_at_rest():
-    place = describe_columns(warped(panorama()))
+    place = describe_columns(warp(panorama()))
     one = Offset(0.0, 0.01, 0.03, 1e6, 0.6, parallax_deviation=0.003)
     lateral, deviation = Expansion(lambda _: place, np.zeros(12)).lateral(one, 4, 0.5)
     assert deviation > lateral
@@ -214,7 +214,7 @@ def test_crops_of_real_images_by_day_and_night(data_folder):
     for place, query in zip(places[:60], queries[:60], strict=True):
         columns = crop(place, 0)
         both = own.update(crop(query, 0), columns), cropped.update(crop(query, 0.08), columns)
-        if all(each.is_valid for each in both):
+        if all(result.is_valid for result in both):
             errors.append((both[1].shift - both[0].shift + 0.08 / 0.73) * 1024)
     assert len(errors) >= 20
     assert np.sqrt(np.mean(np.square(errors))) < 10

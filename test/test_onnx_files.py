@@ -33,7 +33,7 @@ IMAGES = list(np.random.default_rng(1).integers(0, 256, (4, 48, 64, 3), np.uint8
 
 
 @pytest.fixture
-def saved(tmp_path):
+def save_network(tmp_path):
     """Return a function that writes a network: a convolution to 8 x 8 cells ``y``, and more."""
 
     def save(*nodes, shape=('b', 3, 64, 64), dtype=FLOAT, **constants):
@@ -67,11 +67,11 @@ ARGMAX = helper.make_node('ArgMax', ['y'], ['z'], axis=1)
 RESHAPE = helper.make_node('Reshape', ['y', 's'], ['z'])
 
 
-def test_input_of_the_network_by_hand(saved):
+def test_input_of_the_network_by_hand(save_network):
     """Sums over 64 equal pixels; blue first, mean and std by channel; two images."""
     image = np.full((64, 64, 3), (100, 2, 1), np.uint8)
     settings = settings_class('onnx')(
-        model=str(saved(w=np.ones((1, 3, 8, 8), np.float32))),
+        model=str(save_network(w=np.ones((1, 3, 8, 8), np.float32))),
         size=64, layer='y', channels='bgr', scale=1.0, mean=(0, 0, 20), std=(1, 1, 2),
     )  # fmt: skip
     maps = backbone_class('onnx')(settings).feature_maps([image, 2 * image])
@@ -80,9 +80,9 @@ def test_input_of_the_network_by_hand(saved):
     assert (maps[1] == 64 * (2 + 4 + (200 - 20) / 2)).all()
 
 
-def test_features_that_are_not_finite_are_rejected(saved):
+def test_features_that_are_not_finite_are_rejected(save_network):
     """Sums of 192 values are out of range where all are bright; or always."""
-    path = saved(w=np.ones((1, 3, 8, 8), np.float32))
+    path = save_network(w=np.ones((1, 3, 8, 8), np.float32))
     made = extractor(path, mean=(0, 0, 0), std=(1, 1, 1), scale=1e34)
     with pytest.raises(ImageError, match='not finite'):
         made.extract([np.full((16, 16, 3), 255, np.uint8)])
@@ -91,12 +91,12 @@ def test_features_that_are_not_finite_are_rejected(saved):
 
 
 @pytest.mark.parametrize('batch', ['b', 1, 4])
-def test_batch_of_convolutions_may_be_stated(saved, batch):
-    made = extractor(saved(shape=(batch, 3, 64, 64)))
+def test_batch_of_convolutions_may_be_stated(save_network, batch):
+    made = extractor(save_network(shape=(batch, 3, 64, 64)))
     np.testing.assert_allclose(made.extract(IMAGES).strips, single(made), atol=1e-5)
 
 
-def test_registers_of_tokens_are_excluded_or_rejected(saved):
+def test_registers_of_tokens_are_excluded_or_rejected(save_network):
     """Tokens of DINOv3: class, four registers, then the patches row by row."""
     nodes = (
         helper.make_node('Reshape', ['y', 's'], ['flat']),
@@ -104,10 +104,10 @@ def test_registers_of_tokens_are_excluded_or_rejected(saved):
         helper.make_node('Pad', ['patches', 'pads', 'large'], ['tokens']),
     )
     pads, large = np.array((0, 5, 0, 0, 0, 0)), np.float32(1e6)
-    path = saved(*nodes, s=np.array((0, 8, 64)), pads=pads, large=large)
+    path = save_network(*nodes, s=np.array((0, 8, 64)), pads=pads, large=large)
     expected = extractor(path, 'y', strips=4).extract(IMAGES)
-    found = extractor(path, 'tokens', strips=4, prefix_tokens=5).extract(IMAGES)
-    np.testing.assert_array_equal(found.strips, expected.strips)
+    result = extractor(path, 'tokens', strips=4, prefix_tokens=5).extract(IMAGES)
+    np.testing.assert_array_equal(result.strips, expected.strips)
     with pytest.raises(
         SettingsError, match=r'68 without the first 1: .*prefix_tokens = 5 leaves 8'
     ):
@@ -115,7 +115,7 @@ def test_registers_of_tokens_are_excluded_or_rejected(saved):
 
 
 @pytest.mark.parametrize('batch', ['b', 1])
-def test_vector_of_a_whole_image_as_of_megaloc(saved, batch):
+def test_vector_of_a_whole_image_as_of_megaloc(save_network, batch):
     """8448 numbers of float16 weights that are cast, of unit norm, one row an image."""
     weights = np.random.default_rng(2).standard_normal((512, 8448)).astype(np.float16)
     nodes = (
@@ -125,11 +125,11 @@ def test_vector_of_a_whole_image_as_of_megaloc(saved, batch):
         helper.make_node('LpNormalization', ['product'], ['descriptor'], axis=1, p=2),
     )
     shape = np.array((1 if batch == 1 else -1, 512))
-    path = saved(*nodes, shape=(batch, 3, 64, 64), s=shape, half=weights)
+    path = save_network(*nodes, shape=(batch, 3, 64, 64), s=shape, half=weights)
     made = extractor(path, 'descriptor')
     features = made.extract(IMAGES)
     assert (made.settings.strips, features.strips.shape) == (1, (1, 4, 8448))
-    maps = extractor(saved(), 'y', strips=1).extract(IMAGES).strips[0]
+    maps = extractor(save_network(), 'y', strips=1).extract(IMAGES).strips[0]
     product = maps @ weights
     expected = product / np.linalg.norm(product, axis=1, keepdims=True)
     np.testing.assert_allclose(features.strips[0], expected, atol=1e-5)
@@ -144,14 +144,16 @@ def test_vector_of_a_whole_image_as_of_megaloc(saved, batch):
         ({'layer': 'y', 'pooling': 'max'}, "pooling = 'max'"),
     ],
 )
-def test_settings_that_do_not_fit_the_layer_are_rejected_before_any_image(saved, changes, named):
-    path = saved(RESHAPE, s=np.array((-1, 512)))
+def test_settings_that_do_not_fit_the_layer_are_rejected_before_any_image(
+    save_network, changes, named
+):
+    path = save_network(RESHAPE, s=np.array((-1, 512)))
     with pytest.raises((InputError, SettingsError), match=named):
         extractor(path, **{'layer': 'z'} | changes)
 
 
-def test_map_of_vectors_localizes_in_the_pipeline(saved, route, tmp_path):
-    network, path = saved(RESHAPE, s=np.array((-1, 512))), tmp_path / 'vectors.stavpr'
+def test_map_of_vectors_localizes_in_the_pipeline(save_network, route, tmp_path):
+    network, path = save_network(RESHAPE, s=np.array((-1, 512))), tmp_path / 'vectors.stavpr'
     frames = [Frame(image, i + 1, '') for i, image in enumerate(route)]
     save_map(build_map(frames, extractor(network, 'z'), progress=False), path)
     assert load_map(path).features.strips.shape == (1, 60, 512)
@@ -173,18 +175,22 @@ MEAN = helper.make_node('ReduceMean', ['y'], ['m'], axes=[0, 2, 3], keepdims=1)
     ],
     ids=['to any row', 'to one row', 'images influence each other'],
 )
-def test_network_for_one_image_is_run_image_by_image(saved, nodes, batch, shape):
-    made = extractor(saved(*nodes, shape=(batch, 3, 64, 64), s=np.array(shape, np.int64)), 'z')
+def test_network_for_one_image_is_run_image_by_image(save_network, nodes, batch, shape):
+    made = extractor(
+        save_network(*nodes, shape=(batch, 3, 64, 64), s=np.array(shape, np.int64)), 'z'
+    )
     assert np.array_equal(made.extract(IMAGES).strips, single(made))
 
 
-def test_nodes_after_the_layer_are_not_computed(saved):
+def test_nodes_after_the_layer_are_not_computed(save_network):
     """The reshaping fits images of 64 pixels only; a branch needs a tensor from outside it."""
     inner = helper.make_node('Identity', ['y'], ['v'])
     value = helper.make_tensor_value_info('v', FLOAT, None)
     branch = helper.make_graph([inner], 'branch', [], [value])
     either = helper.make_node('If', ['c'], ['w2'], then_branch=branch, else_branch=branch)
-    path = saved(RESHAPE, either, shape=('b', 3, 'h', 'w'), s=np.array((1, 512)), c=np.array(True))
+    path = save_network(
+        RESHAPE, either, shape=('b', 3, 'h', 'w'), s=np.array((1, 512)), c=np.array(True)
+    )
     whole = extractor(path, 'y', 128).extract(IMAGES).strips
     assert np.array_equal(extractor(path, 'w2', 128).extract(IMAGES).strips, whole)
     with pytest.raises(SettingsError, match='Reshape'):
@@ -204,9 +210,9 @@ def test_nodes_after_the_layer_are_not_computed(saved):
         ({'dtype': onnx.TensorProto.UINT8}, {}, "input 'x' is of ONNX type 2, expected 1"),
     ],
 )
-def test_other_inputs_and_settings_are_rejected_by_name(saved, network, changes, named):
+def test_other_inputs_and_settings_are_rejected_by_name(save_network, network, changes, named):
     with pytest.raises((FeatureMismatchError, SettingsError, UnavailableError), match=named):
-        extractor(saved(**network), **changes)
+        extractor(save_network(**network), **changes)
 
 
 @pytest.mark.parametrize(
@@ -218,15 +224,17 @@ def test_other_inputs_and_settings_are_rejected_by_name(saved, network, changes,
         (RESHAPE, '', "no layer '': its layers are z, y"),
     ],
 )
-def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(saved, node, layer, named):
+def test_layers_that_are_not_one_row_an_image_are_rejected_by_name(
+    save_network, node, layer, named
+):
     with pytest.raises(SettingsError, match=named):
-        extractor(saved(node, s=np.array((4, 512))), layer).extract(IMAGES)
+        extractor(save_network(node, s=np.array((4, 512))), layer).extract(IMAGES)
 
 
-def test_weights_in_another_file_are_rejected_with_the_remedy(saved, tmp_path):
+def test_weights_in_another_file_are_rejected_with_the_remedy(save_network, tmp_path):
     with pytest.raises(UnavailableError, match='no usable ONNX model'):
         extractor(Path(__file__))
-    model = onnx.load(saved())
+    model = onnx.load(save_network())
     path = tmp_path / 'b.onnx'
     onnx.save(model, path, save_as_external_data=True, location='b.bin', size_threshold=0)
     with pytest.raises(UnavailableError, match='weights are in other files: save it as one'):
@@ -249,14 +257,14 @@ class Network(nn.Module):
 
 @pytest.mark.filterwarnings('ignore::DeprecationWarning', 'ignore:no signature found')
 @pytest.mark.parametrize('half', [False, True])
-def test_network_of_torch_is_exported_as_documented(tmp_path, monkeypatch, half):
+@pytest.mark.usefixtures('working_folder')
+def test_network_of_torch_is_exported_as_documented(half):
     """Outputs, an inner layer and tokens of a TorchScript file, in float32 and float16."""
     page = Path(__file__).parents[1] / 'docs' / 'features.md'
     code = re.search('```python\n(.*?)```', page.read_text(), re.DOTALL)[1]
     if half:
         code = code.replace('.eval()', '.eval().half()').replace('224)', '224).half()')
     network = Network().eval()
-    monkeypatch.chdir(tmp_path)
     torch.jit.save(torch.jit.trace(network, torch.rand(1, 3, 224, 224)), 'net.pt')
     exec(code)
     plain = {'size': 224, 'mean': (0, 0, 0), 'std': (1, 1, 1)}
@@ -271,9 +279,9 @@ def test_network_of_torch_is_exported_as_documented(tmp_path, monkeypatch, half)
         ('/norm/LayerNormalization_output_0', tokens),
     ):
         settings = settings_class('onnx')(model='net.onnx', layer=layer, **plain)
-        found = backbone_class('onnx')(settings).feature_maps(IMAGES)
+        result = backbone_class('onnx')(settings).feature_maps(IMAGES)
         tolerance = 2e-2 if half else 1e-5
-        np.testing.assert_allclose(found, expected, atol=tolerance, rtol=tolerance)
+        np.testing.assert_allclose(result, expected, atol=tolerance, rtol=tolerance)
 
 
 CUDA, TENSORRT, CPU = (f'{name}ExecutionProvider' for name in ('CUDA', 'Tensorrt', 'CPU'))
@@ -320,18 +328,20 @@ def providers(monkeypatch):
         ('cpu', (TENSORRT, CUDA), CPU),
     ],
 )
-def test_network_runs_on_the_provider_of_its_device(saved, providers, device, offered, chosen):
+def test_network_runs_on_the_provider_of_its_device(
+    save_network, providers, device, offered, chosen
+):
     used = providers(offered, offered)
-    settings = settings_class('onnx')(model=str(saved()), layer='y', size=64)
+    settings = settings_class('onnx')(model=str(save_network()), layer='y', size=64)
     backbone_class('onnx')(settings, device)
     assert used[0] == chosen
 
 
 @pytest.mark.parametrize('offered', [(), (CUDA,)], ids=['not installed', 'not loaded'])
-def test_network_without_provider_of_the_gpu(saved, providers, caplog, offered):
+def test_network_without_provider_of_the_gpu(save_network, providers, caplog, offered):
     """An error if the GPU was requested; auto takes the CPU with a warning."""
     providers(offered, ())
-    settings = settings_class('onnx')(model=str(saved()), layer='y', size=64)
+    settings = settings_class('onnx')(model=str(save_network()), layer='y', size=64)
     with pytest.raises(UnavailableError, match=r"device 'cuda'.*onnxruntime-gpu.*'cpu' or 'auto'"):
         backbone_class('onnx')(settings, 'cuda')
     backbone_class('onnx')(settings, 'auto')
@@ -339,8 +349,8 @@ def test_network_without_provider_of_the_gpu(saved, providers, caplog, offered):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason='no CUDA device')
-def test_network_on_gpu_equals_cpu(saved):
-    settings = settings_class('onnx')(model=str(saved()), layer='y', size=64)
+def test_network_on_gpu_equals_cpu(save_network):
+    settings = settings_class('onnx')(model=str(save_network()), layer='y', size=64)
     on_gpu, on_cpu = (
         backbone_class('onnx')(settings, device).feature_maps(IMAGES) for device in ('auto', 'cpu')
     )

@@ -116,13 +116,13 @@ def test_atomic_output_error_in_the_block_leaves_what_was_there(tmp_path):
     path = tmp_path / 'a.json'
     path.write_text('{}')
 
-    def interrupted():
+    def interrupt():
         with atomic_output(path, JSON, force=True) as file:
             file.write(b'x')
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
+        interrupt()
     assert (path.read_text(), names(tmp_path)) == ('{}', ['a.json'])
 
 

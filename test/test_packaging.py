@@ -61,7 +61,7 @@ def distribution(package: str) -> setuptools.Distribution:
         return distutils.core.run_setup('setup.py', stop_after='init')
 
 
-def imported(folder: Path) -> set[str]:
+def imported_names(folder: Path) -> set[str]:
     """Return the top-level names that the Python files of a folder import, wherever they do."""
     names = set()
     for path in folder.rglob('*.py'):
@@ -77,14 +77,14 @@ def manifest(path: Path) -> ElementTree.Element:
     return ElementTree.parse(path / 'package.xml').getroot()
 
 
-def declared(package: str, *tags: str) -> set[str]:
+def declared_names(package: str, *tags: str) -> set[str]:
     root = manifest(PACKAGES[package])
     return {element.text for tag in tags for element in root.findall(tag)}
 
 
 def imports_of(package: str) -> set[str]:
     """Return what a package imports besides itself."""
-    return imported(PACKAGES[package] / package) - {package}
+    return imported_names(PACKAGES[package] / package) - {package}
 
 
 @each_package
@@ -102,12 +102,12 @@ def test_every_imported_distribution_is_required(package):
 @each_package
 def test_every_imported_ros_package_is_dependency(package):
     folder = PACKAGES[package]
-    run = imports_of(package) | imported(folder / 'launch')
+    run = imports_of(package) | imported_names(folder / 'launch')
     needed = {ROS_PACKAGES.get(name, name) for name in run if ROS.fullmatch(name)}
-    assert needed - declared(package, 'exec_depend', 'depend') == set()
-    tests = {name for name in imported(folder / 'test') if ROS.fullmatch(name)}
+    assert needed - declared_names(package, 'exec_depend', 'depend') == set()
+    tests = {name for name in imported_names(folder / 'test') if ROS.fullmatch(name)}
     tests -= INTERFACES.keys()  # built by the tests
-    assert tests - declared(package, 'exec_depend', 'depend', 'test_depend') == set()
+    assert tests - declared_names(package, 'exec_depend', 'depend', 'test_depend') == set()
 
 
 def test_versions_agree():
@@ -189,9 +189,11 @@ def test_stavpr_without_a_package_names_it(no_plugins, capsys):
 
 
 @pytest.mark.parametrize('module', program.OPTIONAL)
-def test_a_command_without_an_optional_module_names_its_package(monkeypatch, capsys, module):
+def test_a_command_without_an_optional_module_names_its_package(
+    hide_module, monkeypatch, capsys, module
+):
     """The module is missing while the command is imported, or while it runs, or a part of it."""
-    monkeypatch.setitem(sys.modules, module, None)
+    hide_module(module)
     package = program.OPTIONAL[module]
     sentence = f'this needs {package}, which is not installed: pip install {package}'
     assert program.run_program('work', partial(import_module, f'{module}.part')) == 1
@@ -211,13 +213,12 @@ def test_a_command_without_an_optional_module_names_its_package(monkeypatch, cap
     ('matplotlib', 'map info --plot map.png monday.stavpr'),
 ])  # fmt: skip
 def test_a_report_without_its_packages_is_refused_before_any_work(
-    monkeypatch, capsys, tmp_path, small_map, module, words
+    hide_module, monkeypatch, capsys, working_folder, small_map, module, words
 ):
-    monkeypatch.chdir(tmp_path)
     save_map(small_map, 'monday.stavpr')
-    for name in [each for each in sys.modules if re.match(rf'{module}\b|stavpr_lab.map_p', each)]:
+    for name in [n for n in sys.modules if re.match(rf'{module}\b|stavpr_lab.map_p', n)]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, module, None)
+    hide_module(module)
     assert stavpr.main(words.split()) == 1
     assert 'which is not installed: pip install ' in capsys.readouterr().err
 
@@ -290,25 +291,19 @@ def plugged(tmp_path, monkeypatch):
     plugins.load.cache_clear()
 
 
-def test_command_of_another_package_runs(plugged, capsys):
+def test_entry_points_of_another_package_are_used_and_replace_none(plugged, capsys, caplog):
+    """A command, a store and a kind of features; a broken one is named and skipped."""
     assert stavpr.main(['hello', 'a', 'b']) == 2
     stavpr.main(['--help'])
     assert 'greet' in capsys.readouterr().out
-
-
-def test_command_of_this_package_is_not_replaced(plugged):
     assert stavpr.all_commands()['node'].module == 'stavpr_ros.commands.node'
-
-
-def test_broken_plugin_is_named_and_skipped(plugged, caplog):
-    assert 'plugged' in plugins.load(plugins.COMMANDS)
-    assert 'broken' not in plugins.load(plugins.COMMANDS)
+    assert plugins.load(plugins.COMMANDS).keys() & {'plugged', 'broken'} == {'plugged'}
     assert 'plug-in broken of plugged (plugged:MISSING): AttributeError' in caplog.text
-
-
-def test_store_of_another_package_opens_its_scheme(plugged):
     assert is_address('drawer:socks')
     assert store_of('drawer:socks').open_map('drawer:socks') == 'drawer:socks'
+    assert 'plain' in kinds()
+    assert settings_class('plain').__name__ == 'GradientSettings'
+    assert backbone_class('plain').__name__ == 'Gradient'
 
 
 def test_unknown_scheme_lists_known_ones():
@@ -322,12 +317,6 @@ def test_address_without_stavpr_fleet_names_it(no_plugins, address):
     assert is_address(address)
     with pytest.raises(UnavailableError, match=r"the package stavpr_fleet.*install '\.\[fleet\]'"):
         store_of(address)
-
-
-def test_kind_of_features_of_another_package_is_listed_and_loaded(plugged):
-    assert 'plain' in kinds()
-    assert settings_class('plain').__name__ == 'GradientSettings'
-    assert backbone_class('plain').__name__ == 'Gradient'
 
 
 def test_kind_of_a_missing_package_names_it(no_plugins):

@@ -111,13 +111,12 @@ def test_invalid_values_are_rejected_by_name(values, words):
         node_settings(DEFAULTS | values)
 
 
-def test_paths_are_absolute_and_expanded(monkeypatch, tmp_path):
-    monkeypatch.setenv('HOME', '/home/robot')
-    monkeypatch.chdir(tmp_path)
-    given = {'map_path': '~/a.stavpr', 'save_path': 'b.stavpr', 'model_path': '~/net.onnx'}
-    settings = node_settings(DEFAULTS | given)
+def test_paths_are_absolute_and_expanded(environ, working_folder):
+    environ['HOME'] = '/home/robot'
+    options = {'map_path': '~/a.stavpr', 'save_path': 'b.stavpr', 'model_path': '~/net.onnx'}
+    settings = node_settings(DEFAULTS | options)
     assert settings.map_path == '/home/robot/a.stavpr'
-    assert settings.save_path == str(tmp_path / 'b.stavpr')
+    assert settings.save_path == str(working_folder / 'b.stavpr')
     assert settings.pipeline.model_path == '/home/robot/net.onnx'
     assert node_settings(DEFAULTS | {'model_path': 'download'}).pipeline.model_path == 'download'
 

@@ -17,7 +17,7 @@ from pipelines import (
     message,
     MIN_PROBABILITY,
     process,
-    recorded,
+    record,
     SECOND,
     settings_of,
     stamps_of,
@@ -181,7 +181,7 @@ def test_loop_closure_evicts_places_and_indices_stay(route):
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_matched_pair_has_the_distances_of_the_window(operation, route):
     """Bit for bit, of late matches as well."""
-    pipeline = recorded(route, operation)
+    pipeline = record(route, operation)
     matches, rows, earlier = [], [], 0
     for i, image in enumerate(route[:30]):
         (result,) = process(pipeline, [image], first=i, poses=True)
@@ -211,7 +211,7 @@ def test_matched_pair_has_the_distances_of_the_window(operation, route):
 
 def test_matched_pair_of_the_newest_images_alone_is_of_these(route):
     """After a jump, while images from before it are in the window."""
-    pipeline = recorded(route, 'localization', 60, sequence=SequenceSettings(12))
+    pipeline = record(route, 'localization', 60, sequence=SequenceSettings(12))
     pipeline.change(replace(pipeline.settings, min_probability=0.5))
     process(pipeline, route[5:22], first=5, poses=True)
     lengths = []
@@ -319,7 +319,7 @@ def test_change_of_operation_that_fails_changes_nothing(map_file, route):
 def test_loop_closure_takes_the_kind_of_features_of_the_map(map_file, route):
     pipeline = Pipeline(settings_of(), 'loop_closure')
     pipeline.change(loaded=read_map(map_file, pipeline.settings))
-    # the map file is not that of the route
+    # the route has no file
     assert (len(pipeline.places), pipeline.save_state.path) == (0, '')
     assert pipeline.operation.extractor.settings.projection is not None
     pipeline.change(operation='localization')
@@ -336,7 +336,7 @@ CONFIRMED = 11  # images after which its path is confirmed
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_min_probability_and_candidates_change_with_a_full_window(operation, route):
-    pipeline = recorded(route, operation, candidates=3)
+    pipeline = record(route, operation, candidates=3)
     result = process(pipeline, route[:CONFIRMED])[-1]
     assert (result.match.status, len(result.candidates)) == (Status.MATCH, 3)
     assert result.candidates[0].place == result.match.path.place
@@ -374,7 +374,7 @@ def test_keyframe_rules_change_and_the_last_keyframe_stays(map_file, route):
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_geometric_check_in_mode_paper_accepts_and_rejects(operation, route):
-    pipeline = recorded(route, operation, candidates=2, mode='paper', threshold=1.0)
+    pipeline = record(route, operation, candidates=2, mode='paper', threshold=1.0)
     assert {result.match.inliers for result in process(pipeline, route[:CERTAIN])} == {-1}
     check = GeometricSettings(min_inliers=100)
     pipeline.change(replace(pipeline.settings, geometric=check))
@@ -423,22 +423,22 @@ def test_geometric_check_decides_each_late_match(route, monkeypatch):
     check = GeometricSettings(min_inliers=8)
 
     def closing(**changes):
-        pipeline = recorded(route, 'loop_closure', **changes)
-        (result,) = (each for each in process(pipeline, route[:12], first=30) if each.match.late)
+        pipeline = record(route, 'loop_closure', **changes)
+        (result,) = (r for r in process(pipeline, route[:12], first=30) if r.match.late)
         return pipeline.places, result
 
     places, result = closing(geometric=check)
     assert result.match.accepted
-    for each in result.match.late:
-        query = places.thumbnail(each.first_image + each.position)
-        found = PlaceVerifier(check).inliers(query, places, each.place)
-        assert each.inliers == found >= 8
+    for late in result.match.late:
+        query = places.thumbnail(late.first_image + late.position)
+        output = PlaceVerifier(check).inliers(query, places, late.place)
+        assert late.inliers == output >= 8
     rejected = {result.match.place, result.match.late[0].place}
     monkeypatch.setattr(PlaceVerifier, 'inliers', lambda *given: 8 * (given[3] not in rejected))
     _, other = closing(geometric=check)
     assert not other.match.accepted
-    left = [each.place for each in result.match.late if each.place not in rejected]
-    assert [each.place for each in other.match.late] == left != []
+    left = [late.place for late in result.match.late if late.place not in rejected]
+    assert [late.place for late in other.match.late] == left != []
 
 
 def test_geometric_check_without_thumbnails_changes_nothing(small_map, route, tmp_path):
@@ -468,9 +468,9 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
     Each image fails before it is valid: if it counted as a keyframe, it would then be skipped.
     """
     keyframes = KeyframeSettings(change=0.01)
-    pipeline, other = (recorded(route, operation, keyframes=keyframes) for _ in range(2))
+    pipeline, other = (record(route, operation, keyframes=keyframes) for _ in range(2))
     extract = Failing(pipeline.operation.extractor.extract)
-    monkeypatch.setattr(pipeline.operation.extractor, 'extract', extract)
+    pipeline.operation.extractor.extract = extract
     thumbnail = Failing(lambda image: b'')
     monkeypatch.setattr('stavpr_ros.pipeline.operations.encode_thumbnail', thumbnail)
     cut_off = message(route[0])
@@ -489,7 +489,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
         with pytest.raises(InputError, match='quaternion of norm 0'):
             pipeline.operation.process(message(image), i, np.zeros(7))
         good, expected = (
-            process(each, [image], first=50 + i, poses=True)[0] for each in (pipeline, other)
+            process(p, [image], first=50 + i, poses=True)[0] for p in (pipeline, other)
         )
         for name in ('image_index', 'candidates'):
             assert getattr(good, name) == getattr(expected, name)
@@ -502,7 +502,7 @@ def test_process_of_an_invalid_image_changes_nothing(operation, route, monkeypat
 
 @pytest.mark.parametrize('operation', ['localization', 'loop_closure'])
 def test_reset_empties_the_window_and_keeps_the_places(operation, route):
-    pipeline = recorded(route, operation, keyframes=KeyframeSettings(change=0.01))
+    pipeline = record(route, operation, keyframes=KeyframeSettings(change=0.01))
     process(pipeline, route[:LENGTH])
     assert pipeline.operation.window_fill == LENGTH
     places = len(pipeline.places)
@@ -511,8 +511,8 @@ def test_reset_empties_the_window_and_keeps_the_places(operation, route):
     # the first equals the last keyframe
     matches = process(pipeline, route[4 : 4 + LENGTH], first=100)
     waiting = statuses(matches).count(Status.WARMING_UP)
-    found = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
-    assert statuses(matches) == [Status.WARMING_UP] * waiting + [found] * (5 - waiting)
+    result = Status.NO_MATCH if operation == 'loop_closure' else Status.MATCH  # not confirmed yet
+    assert statuses(matches) == [Status.WARMING_UP] * waiting + [result] * (5 - waiting)
     assert waiting == 4 if operation == 'loop_closure' else 1 <= waiting <= 4
     assert matches[-1].match.window_stamps == tuple((101 + i) * SECOND for i in range(LENGTH))
     if operation == 'loop_closure':

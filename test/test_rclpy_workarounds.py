@@ -55,7 +55,7 @@ def spin_until(executor, done):
 
 
 @pytest.fixture
-def submitted(monkeypatch):
+def submitted_tasks(monkeypatch):
     """Collect what executors submit to pools whose threads never begin."""
     tasks = []
 
@@ -68,15 +68,15 @@ def submitted(monkeypatch):
 
 
 def test_multi_threaded_executor_of_upstream_submits_a_waiting_callback_again(
-    node, context, submitted
+    node, context, submitted_tasks
 ):
     executor = MultiThreadedExecutor(2, context=context)
     executor.add_node(node)
     node.create_timer(0.0, lambda: None)
     for _ in range(20):
         executor.spin_once(timeout_sec=0.05)
-    assert len(submitted) > len({id(task) for task in submitted})
-    for task in submitted:
+    assert len(submitted_tasks) > len({id(task) for task in submitted_tasks})
+    for task in submitted_tasks:
         task()
     executor.shutdown()
 
@@ -93,11 +93,11 @@ def prompt(node, context):
 def test_prompt_executor_of_a_waiting_callback_submits_it_once(node, prompt, monkeypatch):
     ran, submissions, submit = [], [], ThreadPoolExecutor.submit
 
-    def counted(pool, function, *arguments):
+    def count(pool, function, *arguments):
         submissions.append(arguments)
         return submit(pool, function, *arguments)
 
-    monkeypatch.setattr(ThreadPoolExecutor, 'submit', counted)
+    monkeypatch.setattr(ThreadPoolExecutor, 'submit', count)
     node.create_timer(0.0, lambda: ran.append(1))
     for _ in range(20):
         prompt.spin_once(timeout_sec=0.05)
@@ -138,11 +138,11 @@ def test_prompt_executor_calls_back_with_events_of_publishers(node, prompt):
     assert changes == [1]
 
 
-def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt, monkeypatch):
-    def destroyed(*_, **__):
+def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt):
+    def raise_destroyed(*_, **__):
         raise rclpy_implementation.InvalidHandle('destroyed')
 
-    monkeypatch.setattr(prompt, 'wait_for_ready_callbacks', destroyed)
+    prompt.wait_for_ready_callbacks = raise_destroyed
     prompt.spin_once(0.1)
 
 
@@ -150,7 +150,7 @@ def test_prompt_executor_meeting_a_destroyed_entity_goes_on(prompt, monkeypatch)
 
 
 @pytest.fixture
-def received(node, context):
+def reception(node, context):
     """Return what `callback` raises errors for, events of matches, and the subscription."""
     messages, matches = queue.Queue(), queue.Queue()
 
@@ -166,8 +166,8 @@ def received(node, context):
     return messages, matches, subscription
 
 
-def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, received, capfd):
-    messages, matches, _ = received
+def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, reception, capfd):
+    messages, matches, _ = reception
     publisher = node.create_publisher(Int32, 'received', 10)
     assert matches.get(timeout=60) == 1
     for number in range(2):
@@ -181,8 +181,8 @@ def test_receiver_without_an_executor_calls_back_with_messages_and_events(node, 
 
 
 @pytest.mark.parametrize('by', ['subscription', 'node', 'context'])
-def test_receiver_of_a_destroyed_subscription_node_or_context_ends(context, received, by, node):
-    messages, _, subscription = received
+def test_receiver_of_a_destroyed_subscription_node_or_context_ends(context, reception, by, node):
+    messages, _, subscription = reception
     publisher = node.create_publisher(Int32, 'received', 10)
     while messages.empty():  # until the thread waits, and is matched
         publisher.publish(Int32(data=1))
@@ -220,8 +220,8 @@ def test_receiver_that_is_destroyed_by_its_callback_or_during_it_ends(node, cont
     assert not receiver.is_alive()
 
 
-def test_executor_does_not_wait_for_a_received_subscription(received, prompt):
-    *_, subscription = received
+def test_executor_does_not_wait_for_a_received_subscription(reception, prompt):
+    *_, subscription = reception
     assert not any(map(prompt.can_execute, (subscription, *subscription.event_handlers)))
 
 
@@ -250,11 +250,11 @@ def lost_response(context, node, monkeypatch):
         service = node.create_service(Trigger, '/lost', handle)
         send = service.send_response
 
-        def counted(response, header):
+        def count(response, header):
             attempts.append(header)
             return send(response, header)
 
-        service.send_response = counted
+        service.send_response = count
         prepare(service)
         qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         client = other.create_client(Trigger, '/lost', qos_profile=qos)
@@ -272,8 +272,8 @@ def test_service_of_upstream_with_an_unmatched_client_drops_the_response(lost_re
     assert len(lost_response()) == 1
 
 
-def test_service_with_an_unmatched_client_repeats_the_response(lost_response, monkeypatch):
-    monkeypatch.setattr(rclpy_workarounds, 'RESPONSE_TIMEOUT', 0.5)
+def test_service_with_an_unmatched_client_repeats_the_response(lost_response, set_constants):
+    set_constants(rclpy_workarounds, RESPONSE_TIMEOUT=0.5)
     assert len(lost_response(repeat_responses)) > 2
 
 
@@ -314,16 +314,16 @@ def test_service_with_another_error_raises_it_at_once():
 
 
 @pytest.fixture
-def managed(context):
+def managed_node(context):
     node = ManagedNode('managed', context=context)
     yield node
     node.destroy_node()
 
 
-def test_services_of_a_managed_node_repeat_responses(managed):
-    names = {service.srv_name.rpartition('/')[2] for service in managed.services}
+def test_services_of_a_managed_node_repeat_responses(managed_node):
+    names = {service.srv_name.rpartition('/')[2] for service in managed_node.services}
     assert {'change_state', 'get_state', 'set_parameters'} <= names
-    for service in managed.services:
+    for service in managed_node.services:
         assert service.send_response.__name__ == 'send_repeatedly', service.srv_name
 
 
@@ -337,11 +337,11 @@ def test_lifecycle_node_of_upstream_raises_at_an_invalid_transition(context):
     node.destroy_node()
 
 
-def test_managed_node_at_an_invalid_transition_stays_in_its_state(managed):
-    assert not managed.advance(managed.trigger_activate)
-    assert managed.state == 'unconfigured'
-    assert managed.advance(managed.trigger_configure)
-    assert managed.state == 'inactive'
+def test_managed_node_at_an_invalid_transition_stays_in_its_state(managed_node):
+    assert not managed_node.advance(managed_node.trigger_activate)
+    assert managed_node.state == 'unconfigured'
+    assert managed_node.advance(managed_node.trigger_configure)
+    assert managed_node.state == 'inactive'
 
 
 def test_managed_node_destroyed_before_a_transition_logs_no_error(context, capfd):
@@ -365,8 +365,8 @@ def test_destroyed_managed_node_has_no_services_of_its_life_cycle(node, context)
             }
 
     wait_for('upstream', 'managed')
-    for each in nodes:
-        each.destroy_node()
+    for lifecycle_node in nodes:
+        lifecycle_node.destroy_node()
     wait_for('upstream')
 
 

@@ -115,14 +115,14 @@ def test_features_not_finite_are_rejected_and_change_nothing(small_map, value, m
     strips = features[:].strips.copy()
     strips[2, 0, 0] = value
     damaged = LocalFeatures(strips, features.weights, features.settings)
-    for each in (one, other):
-        recognize_all(each, features[:3])
+    for localizer in (one, other):
+        recognize_all(localizer, features[:3])
     for call in (one.update, one.distances):
         with pytest.raises(InputError, match='features of the image are not finite'):
             call(damaged[:1])
     for i in range(3, 6):
-        found, expected = (each.update(features[i : i + 1]) for each in (one, other))
-        assert repr(vars(found)) == repr(vars(expected))
+        result, expected = (localizer.update(features[i : i + 1]) for localizer in (one, other))
+        assert repr(vars(result)) == repr(vars(expected))
     with pytest.raises(InputError, match='features of the map are not finite'):
         recognizer(replace(small_map, features=damaged))
 
@@ -183,9 +183,9 @@ def plain(costs, places, count, nms_radius):
     return taken
 
 
-def known(candidates):
+def pairs_of(candidates):
     """Return place and distance of each: NaN, an unknown probability, equals nothing."""
-    return [(each.place, each.distance) for each in candidates]
+    return [(candidate.place, candidate.distance) for candidate in candidates]
 
 
 def nearest_of(costs, places, distance):
@@ -211,9 +211,9 @@ def test_ranked_candidates_equal_plain_loop(case):
     nearest = nearest_of(costs, places, float(costs.min())) if np.isfinite(costs).any() else None
     before = costs.copy()
     layout = ColumnLayout(nms_radius=nms_radius)
-    found = layout.ranked(nearest, WindowSequences(costs, places), count)
+    result = layout.ranked(nearest, WindowSequences(costs, places), count)
     expected = plain(costs.tolist(), places.tolist(), count, nms_radius)
-    assert known(found) == [(int(places[i]), float(costs[i])) for i in expected]
+    assert pairs_of(result) == [(int(places[i]), float(costs[i])) for i in expected]
     np.testing.assert_array_equal(costs, before)
 
 
@@ -293,9 +293,9 @@ def test_whitening_equals_equation_in_numpy():
         gains = 1 / np.sqrt(1 + STRENGTH * shares / np.sum(shares**2))
         assert gains.max() / gains.min() > 1.3
         expected = some[j] @ directions * gains @ directions.T
-        found = whitening(some.astype(np.float32))
-        np.testing.assert_allclose(found[j], expected, atol=1e-5)
-        np.testing.assert_allclose(whitening.inverse(found)[j], some[j], atol=1e-5)
+        result = whitening(some.astype(np.float32))
+        np.testing.assert_allclose(result[j], expected, atol=1e-5)
+        np.testing.assert_allclose(whitening.inverse(result)[j], some[j], atol=1e-5)
 
 
 def test_mean_centering_with_whitening_of_map_and_query_agree():
@@ -333,7 +333,7 @@ def test_z_normalized_equals_plain_loop(around, firsts):
     row = np.random.default_rng(0).normal(3, 2, 60).astype(np.float32)
     row[[3, 40]] = np.inf
     counted = np.arange(60) % 7 > 0
-    found = z_normalized(row, around, counted, np.array(firsts))
+    result = z_normalized(row, around, counted, np.array(firsts))
     for part in np.split(np.arange(60), firsts[1:]):
         own = row[part].astype(float)
         known = own[counted[part] & np.isfinite(own)]
@@ -341,7 +341,7 @@ def test_z_normalized_equals_plain_loop(around, firsts):
         near = np.pad(np.where(np.isfinite(z), np.maximum(z, -1), 0), around, 'edge')
         for i, entry in enumerate(part):
             expected = z[i] - near[i : i + 2 * around + 1].mean() * bool(around)
-            assert found[entry] == pytest.approx(expected, abs=1e-5)
+            assert result[entry] == pytest.approx(expected, abs=1e-5)
     assert len(z_normalized(row[:0])) == 0
 
 

@@ -39,7 +39,7 @@ def corridor(seed=0, noise=0.5):
     rng = np.random.default_rng(seed)
     places = rng.standard_normal((7, N, 32))
     both = places, places + noise * rng.standard_normal(places.shape)
-    return [features_of(each) for each in both]
+    return [features_of(strips) for strips in both]
 
 
 def driven_map(features, positions, **parts):
@@ -60,8 +60,8 @@ def drive(recognizer, features, positions=None):
 def test_agreement_of_another_length_is_the_tail_of_chi_squared():
     """Five images after the middle one drive 8 m, where the path is 5 places of 1 m long."""
     driven = track(count=LENGTH, step=1.6)
-    found = agreement(track(), (40, 45), driven, MIDDLE, 0.1)
-    assert found == pytest.approx(chi2.sf(3**2 / (1 + 0.8**2), 3))
+    result = agreement(track(), (40, 45), driven, MIDDLE, 0.1)
+    assert result == pytest.approx(chi2.sf(3**2 / (1 + 0.8**2), 3))
     assert agreement(track(), (40, 45), track(count=LENGTH), MIDDLE, 0.1) == 1
 
 
@@ -72,8 +72,8 @@ def test_agreement_of_another_shape_is_the_tail_of_chi_squared():
     mine, line = driven @ (1, 1j), np.array([-1, 0, 1])
     mine = (mine - mine.mean()) * np.exp(-1j * np.pi / 4)
     rest = np.abs(line - mine) ** 2 / (0.25 + np.array([0.1, 0, 0.1]) ** 2)
-    found = agreement(track(), (40, 41), driven, 1, 0.1)
-    assert found == pytest.approx(chi2.sf(2 * rest.mean(), 3))
+    result = agreement(track(), (40, 41), driven, 1, 0.1)
+    assert result == pytest.approx(chi2.sf(2 * rest.mean(), 3))
 
 
 @pytest.mark.parametrize('turn', [90, -90])
@@ -92,8 +92,8 @@ def test_agreement_without_poses_is_unknown():
         for row in rows:
             arrays = {'track': track(), 'driven': driven.copy()}
             arrays[hole][row] = unknown
-            found = agreement(arrays['track'], (40, 45), arrays['driven'], MIDDLE, 0.1)
-            assert np.isnan(found), (hole, row)
+            result = agreement(arrays['track'], (40, 45), arrays['driven'], MIDDLE, 0.1)
+            assert np.isnan(result), (hole, row)
     others = driven.copy()
     others[[0, 7]] = unknown  # of other images: the rest is compared
     assert agreement(track(), (40, 45), others, MIDDLE, 0.1) == 1
@@ -147,9 +147,9 @@ def test_absence_of_odometry_or_poses_changes_nothing(positions, driven, changes
     places, query = corridor()
     settings = replace(settings_of(), **changes)
     expected = drive(PlaceRecognizer(driven_map(places, None), settings), query)
-    found = drive(PlaceRecognizer(driven_map(places, positions), settings), query, driven)
-    assert [repr(one.path) for one in found] == [repr(one.path) for one in expected]
-    assert [one.reason for one in found] == [one.reason for one in expected]
+    result = drive(PlaceRecognizer(driven_map(places, positions), settings), query, driven)
+    assert [repr(one.path) for one in result] == [repr(one.path) for one in expected]
+    assert [one.reason for one in result] == [one.reason for one in expected]
 
 
 def test_session_of_a_match_ends_its_track():

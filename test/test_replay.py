@@ -1,12 +1,14 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay as `ros2 bag play`: its parts, and the command with a subscriber or as a process."""
+"""Replay as `ros2 bag play`, its parts and the command; the command record."""
 
 from collections import deque
 from contextlib import closing, contextmanager
 from functools import partial
+import json
 import math
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ from bags import SECOND, TEXT, write_odometry, writing
 from evaluation_commands import write_images
 from nav_msgs.msg import Odometry
 import numpy as np
-from processes import DOMAIN, environment, TIMEOUT
+from processes import DOMAIN, environment, Process, TIMEOUT
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -44,7 +46,7 @@ FIRST = 100 * SECOND
 
 
 def images(count, gap=SECOND):
-    """One image a second from second 100 on, its stamp that of the odometry beside it."""
+    """Return one image a second from second 100 on, stamped as the odometry beside it."""
     pixels = np.zeros((2, 3, 3), np.uint8)
     return [ImageRecord.of_image(pixels + i, FIRST + i * gap) for i in range(count)]
 
@@ -128,15 +130,12 @@ class Received:
     def __init__(self, node, *topics, qos=1000):
         self.messages, self.changed = [], threading.Condition()
         for message_type, topic in topics:
-            node.create_subscription(message_type, topic, self._keep(topic), qos)
+            node.create_subscription(message_type, topic, partial(self.receive, topic), qos)
 
-    def _keep(self, topic):
-        def keep(message):
-            with self.changed:
-                self.messages.append((topic, message))
-                self.changed.notify_all()
-
-        return keep
+    def receive(self, topic, message):
+        with self.changed:
+            self.messages.append((topic, message))
+            self.changed.notify_all()
 
     def wait(self, enough):
         with self.changed:
@@ -298,13 +297,12 @@ def test_replay_command_loops_over_a_part_of_a_bag(context, tmp_path):
     ],
 )
 def test_replay_command_of_a_part_that_is_missing_fails(
-    tmp_path, capsys, monkeypatch, name, options, error
+    tmp_path, capsys, environ, name, options, error
 ):
     write_odometry(tmp_path / 'bag', [FIRST], images=images(1))
     (tmp_path / 'images').mkdir()
     (tmp_path / 'images/0.ppm').write_bytes(b'P6 3 2 255 ' + bytes(18))
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(DOMAIN))
-    monkeypatch.setenv(process.PROFILES_VARIABLE, '')  # what the command sets ends with the test
+    environ[process.PROFILES_VARIABLE] = ''  # what the command sets ends with the test
     assert main([str(tmp_path / name), *options]) == 1
     assert error in capsys.readouterr().err
 
@@ -318,26 +316,22 @@ def every(images):
     return True
 
 
-class Subscriber:
+class Subscriber(Received):
     """Subscribes to images with best effort and publishes a match of each."""
 
     def __init__(self, node, answers=every):
         self.answers = answers  # decides from the images received so far
-        self.images = []
-        self.changed = threading.Condition()
         self.publisher = node.create_publisher(PlaceMatch, '~/match', 10)
-        node.create_subscription(Image, 'image', self.receive, BEST_EFFORT)
+        super().__init__(node, (Image, 'image'), qos=BEST_EFFORT)
 
-    def receive(self, image):
-        with self.changed:
-            self.images.append(image)
-            self.changed.notify_all()
+    def receive(self, topic, image):
+        super().receive(topic, image)
         if self.answers(self.images):
             self.publisher.publish(PlaceMatch(header=image.header))
 
-    def wait_for(self, count):
-        with self.changed:
-            assert self.changed.wait_for(lambda: len(self.images) >= count, TIMEOUT)
+    @property
+    def images(self):
+        return self.of('image')
 
     def data(self):
         return [bytes(image.data) for image in self.images]
@@ -363,10 +357,10 @@ def subscribe(node):
 
 
 @pytest.fixture
-def replay(monkeypatch, capfd):
+def replay(environ, monkeypatch, capfd):
     """Run the command in this process, which keeps its signal handlers."""
     monkeypatch.setattr('signal.signal', lambda *_: None)
-    monkeypatch.setenv(process.PROFILES_VARIABLE, '')  # set by the command: ends with the test
+    environ[process.PROFILES_VARIABLE] = ''  # set by the command: ends with the test
 
     def run(*arguments):
         code = main([str(argument) for argument in arguments])
@@ -423,7 +417,7 @@ def test_replay_of_a_bag_publishes_its_images(
     subscriber = subscribe(answers=answers)
     status, output, errors = replay(path, *arguments.split())
     assert status == code
-    assert all(each in output + errors for each in words), output + errors
+    assert all(text in output + errors for text in words), output + errors
     assert subscriber.data() == [data[i] for i in received]
     if 'rate' in arguments:
         assert float(output.partition(' in ')[2].partition(' s')[0]) >= 0.4
@@ -481,7 +475,7 @@ def test_replay_after_a_signal_ends_at_once(tmp_path, subscribe, sent):
     try:
         lines = iter(process.stderr.readline, '')
         assert any('the next image is due in 60 s' in line for line in lines)
-        subscriber.wait_for(1)
+        subscriber.wait(bool)
         process.send_signal(sent)
         _, errors = process.communicate(timeout=TIMEOUT)
     finally:
@@ -502,12 +496,88 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
     assert stamps == [50, 100, 200]
 
 
-def test_transport_profile_of_the_user_is_kept(monkeypatch):
-    monkeypatch.delenv(process.PROFILES_VARIABLE, raising=False)
+def test_transport_profile_of_the_user_is_kept(environ):
+    environ.pop(process.PROFILES_VARIABLE, None)
     process.prepare_transport()
     profile = ElementTree.parse(os.environ[process.PROFILES_VARIABLE])
     assert int(profile.find('.//{*}segment_size').text) == 32 * 2**20
     assert {kind.text for kind in profile.iterfind('.//{*}type')} == {'SHM', 'UDPv4'}
-    monkeypatch.setenv(process.PROFILES_VARIABLE, 'my_own.xml')
+    environ[process.PROFILES_VARIABLE] = 'my_own.xml'
     process.prepare_transport()
     assert os.environ[process.PROFILES_VARIABLE] == 'my_own.xml'
+
+
+# The command record: earlier recordings stay until there is something to replace them by
+
+OLD = '{"stamp": 1, "frame_id": "old"}\n'
+
+
+@pytest.fixture
+def record(robot, tmp_path, request):
+    """Start the command over an old recording; it is ended with the test."""
+    path = tmp_path / 'old.jsonl'
+    path.write_text(OLD)
+
+    def start(*options):
+        recorder = Process(tmp_path / 'log', 'record', '--output', str(path), *options)
+        request.addfinalizer(recorder.end)
+        return recorder
+
+    return start
+
+
+@pytest.fixture
+def publisher(robot):
+    publisher = robot.node.create_publisher(PlaceMatch, '/stavpr/match', 10)
+    yield publisher
+    robot.node.destroy_publisher(publisher)
+
+
+def recording(robot, process):
+    robot.until(lambda: '\nrecording' in process.output(), 'the recorder')
+
+
+def test_record_over_an_old_recording_is_refused_without_force(record, tmp_path):
+    process = record()
+    assert process.wait() == 1
+    assert 'exists already: choose another name, or replace it by --force' in process.output()
+    assert (tmp_path / 'old.jsonl').read_text() == OLD
+
+
+def test_record_replaces_an_old_recording_at_the_first_message(record, robot, publisher, tmp_path):
+    path = tmp_path / 'old.jsonl'
+    process = record('--force')
+    recording(robot, process)
+    assert path.read_text() == OLD
+    assert process.stop() == 0  # without a message
+    assert path.read_text() == OLD
+
+    process = record('--force')
+    recording(robot, process)
+    for index in range(3):
+        publisher.publish(PlaceMatch(place_index=index))
+    robot.until(lambda: path.read_text().count('\n') == 3, 'three records')
+    process.popen.kill()  # what is written is there
+    process.wait()
+    assert [json.loads(line)['place_index'] for line in path.open()] == [0, 1, 2]
+    assert sorted(os.listdir(tmp_path)) == ['log', 'old.jsonl']
+
+
+def test_record_on_a_full_disk_ends_with_whole_lines(record, robot, publisher, tmp_path):
+    """The limit of the size of a file has the effect of a full disk."""
+    path = tmp_path / 'old.jsonl'
+    process = record('--force')
+    recording(robot, process)
+    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    def has_ended():
+        publisher.publish(PlaceMatch(reason='x' * 200))
+        return process.popen.poll() is not None
+
+    robot.until(has_ended, 'the end')
+    lines = path.read_text().splitlines(keepends=True)
+    assert len(lines) > 3
+    assert all(json.loads(line)['reason'] == 'x' * 200 for line in lines)
+    assert f'it has {len(lines)} matches, all of them whole: free space' in process.output()
+    assert 'untouched' not in process.output()
+    assert process.wait() == 1

@@ -13,7 +13,7 @@ from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
 from stavpr_ros.mapping import build_map, load_map, open_map, save_map
 from stavpr_ros.mapping.versions import current_version
 from stavpr_ros.sources import open_source
-from test_upkeep import built
+from test_upkeep import build
 
 pytestmark = pytest.mark.usefixtures('one_thread')
 ROUTE, OTHER = route_images(150), route_images(60, 5)
@@ -23,7 +23,7 @@ def darker(images):
     """Return images of another drive: another crop, another light, noise."""
     dice = np.random.default_rng(3)
     moved = [cv2.resize(image[6:, 6:] // 2, image.shape[1::-1]) for image in images]
-    return [np.uint8(np.clip(each + dice.normal(0, 9, each.shape), 0, 255)) for each in moved]
+    return [np.uint8(np.clip(image + dice.normal(0, 9, image.shape), 0, 255)) for image in moved]
 
 
 def coarse(image):
@@ -67,7 +67,7 @@ def test_the_map_itself_is_no_drive(path, tmp_path, capsys):
 
 
 def row(images, day=0, name='monday'):
-    return rows_of(built(images, day), name)[0]
+    return rows_of(build(images, day), name)[0]
 
 
 def test_drives_of_other_times_or_more_images_are_other_drives(data_folder):

@@ -1,12 +1,16 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded map is saved at the end, and no file of another map is overwritten."""
+"""A recorded map is saved at the end, and no other file is overwritten; the folder of maps."""
+
+from pathlib import Path
 
 from pipelines import localizing, Log, process, save, settings_of
 import pytest
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.mapping import load_map, open_map, save_map
 from stavpr_ros.output_file import FileVersion
 from stavpr_ros.pipeline import Pipeline, read_map
+from stavpr_ros.pipeline.maps_folder import inside, maps_folder
 from stavpr_ros.pipeline.saving import save_recorded_map, write_map
 from stavpr_ros.prepare import prepared_map
 
@@ -33,8 +37,8 @@ def test_save_recorded_map_writes_unsaved_places_once(mapping, route, tmp_path):
     assert at_the_end(mapping, path)[-1] == ('info', f'9 places written to {path}')  # its own file
 
 
-def test_saved_map_of_a_long_recording_has_statistics(mapping, tmp_path, monkeypatch):
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 7)
+def test_saved_map_of_a_long_recording_has_statistics(mapping, tmp_path, set_constants):
+    set_constants(prepared_map, MIN_PLACES=7)
     at_the_end(mapping, tmp_path / 'route.stavpr')
     assert open_map(tmp_path / 'route.stavpr').features.statistics is not None
 
@@ -133,3 +137,39 @@ def test_mark_saved_in_any_order_counts_the_places_of_each_snapshot(mapping, rou
     for snapshot in reversed(snapshots):
         snapshot.mark_saved(path)
     assert mapping.unsaved == 1
+
+
+# The folder of maps: where it is, and which names lead into it
+
+
+@pytest.mark.parametrize(
+    ('parameter', 'data', 'folder'),
+    [
+        ('', '/data', '/data/stavpr/maps'),
+        ('', '', '/home/robot/.local/share/stavpr/maps'),
+        ('', 'relative', '/home/robot/.local/share/stavpr/maps'),
+        ('/maps', '/data', '/maps'),
+    ],
+)
+def test_maps_folder_follows_parameter_then_xdg_then_home(parameter, data, folder, environ):
+    environ |= {'XDG_DATA_HOME': data, 'HOME': '/home/robot'}
+    assert maps_folder(parameter) == Path(folder)
+
+
+@pytest.mark.parametrize(
+    'name',
+    ['..', '.', '', '/etc/passwd', '../a', 'town/../../a', 'out', 'out/a', 'loop', '~/a'],
+)
+def test_inside_of_names_that_lead_outside_fails(name, tmp_path):
+    folder = tmp_path / 'maps'
+    folder.mkdir()
+    (folder / 'out').symlink_to('..')
+    (folder / 'loop').symlink_to('/dev/zero')
+    with pytest.raises(SettingsError, match='no file in the maps folder'):
+        inside(folder, name)
+
+
+@pytest.mark.parametrize('name', ['a\0b', 'a\nb', '\x1b[2Ja', 'a' * 20_000])
+def test_inside_of_names_that_harm_a_log_fails(name, tmp_path):
+    with pytest.raises(SettingsError, match='at most 4096, none of them a control character'):
+        inside(tmp_path, name)

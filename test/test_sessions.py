@@ -60,10 +60,10 @@ def recognize(place_map, query, mode='robust'):
 
 def test_map_of_one_session_has_no_gaps(town):
     one = merge_maps(town[:1], ['a'])
-    assert {layout_of(each, 20).columns for each in (town[0], one)} == {None}
+    assert {layout_of(place_map, 20).columns for place_map in (town[0], one)} == {None}
     query = features_of(route(0), 1.0, 9)[10:50]
-    for found, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
-        assert repr(found) == repr(expected)
+    for result, expected in zip(recognize(one, query), recognize(town[0], query), strict=True):
+        assert repr(result) == repr(expected)
     here = recognizer(town[0])
     here.update(query[:1])
     assert here.place_probabilities().shape == (PLACES,)
@@ -220,7 +220,7 @@ def test_map_with_impossible_relations_is_rejected(town, same_as, message):
 
 
 def test_calibration_stays_with_its_route_only(town):
-    """It is that of drives on these places: others, or a session without the rest, have none."""
+    """Drives on these places made it: others, or a session without the rest, have none."""
     risks = ErrorRisks('robust', 1, (0.5,), (0.0,))
     one = replace(town[0], error_risks=risks)
     assert merge_maps([one, one], ['a', 'b']).error_risks is None
@@ -262,7 +262,7 @@ def floors(small_map, tmp_path_factory):
 
 def test_matches_on_a_folder_of_maps_name_the_map(floors, route):
     pipeline = localizing(str(floors))
-    assert [each.id for each in pipeline.places.sessions] == ['floor-0', 'floor-1']
+    assert [session.id for session in pipeline.places.sessions] == ['floor-0', 'floor-1']
     for images, name in ((route[10:25], 'floor-0'), (UPSTAIRS[5:20], 'floor-1')):
         results = process(pipeline, images)  # from floor to floor without a reset: an elevator
         result = results[-1]
@@ -296,7 +296,7 @@ def test_folder_of_maps_with_different_features_names_both(tmp_path, small_map):
         read_map(str(tmp_path), settings_of())
 
 
-def extending(map_file, target, **changes):
+def extend(map_file, target, **changes):
     def open_journal(base, template):
         return JournalWriter.create(target, base, template, print)
 
@@ -306,22 +306,22 @@ def extending(map_file, target, **changes):
 
 
 @pytest.fixture
-def recorded(map_file, route, tmp_path):
+def recording(map_file, route, tmp_path):
     """Record a session that begins in the middle of the map; return pipeline, results, target."""
     target = tmp_path / 'route.stavpr'
-    pipeline = extending(map_file, target, **SURE_SETTINGS)
+    pipeline = extend(map_file, target, **SURE_SETTINGS)
     results = process(pipeline, [*route[20:40], *UPSTAIRS[:20]], first=100, poses=True)
     yield pipeline, results, target
     pipeline.close_journals(delete_route=True)
 
 
-def test_session_on_a_map_is_recorded_and_matched(recorded, map_file, route):
-    pipeline, results, _ = recorded
+def test_session_on_a_map_is_recorded_and_matched(recording, map_file, route):
+    pipeline, results, _ = recording
     images = [*route[20:40], *UPSTAIRS[:20]]
     localized = process(localizing(map_file, **SURE_SETTINGS), images, first=100)
     n = len(pipeline.operation.reference)
-    assert [each.image_index for each in results] == list(range(n, n + 40))
-    assert {each.match.status for each in results} == {Status.MATCH, Status.MAPPED}
+    assert [result.image_index for result in results] == list(range(n, n + 40))
+    assert {result.match.status for result in results} == {Status.MATCH, Status.MAPPED}
     for result, other in zip(results, localized, strict=True):
         assert result.match.accepted == other.match.accepted
         assert (result.match.place, result.match.newest) == (other.match.place, other.match.newest)
@@ -332,19 +332,19 @@ def test_session_on_a_map_is_recorded_and_matched(recorded, map_file, route):
     assert (pair.source, pair.place) == (pipeline.operation.reference, results[15].match.place)
 
 
-def test_session_on_a_map_is_related_to_its_places(recorded, map_file, tmp_path):
-    pipeline, results, _ = recorded
+def test_session_on_a_map_is_related_to_its_places(recording, map_file, tmp_path):
+    pipeline, results, _ = recording
     save(pipeline, tmp_path / 'both.stavpr')
     both = load_map(tmp_path / 'both.stavpr')
     n = len(pipeline.operation.reference)
-    assert [each.id for each in both.sessions] == ['route', 'recorded-1']
+    assert [session.id for session in both.sessions] == ['route', 'recorded-1']
     assert both.session_index.tolist() == [0] * n + [1] * 40
     assert both.same_as[:n].tolist() == list(range(n))
     merged = with_same_places(replace(both, same_as=None))
     certain = [
-        each
-        for each in results
-        if each.match.probability > SURE and len(each.match.path.pairs) == LENGTH
+        result
+        for result in results
+        if result.match.probability > SURE and len(result.match.path.pairs) == LENGTH
     ]
     assert certain
     for result in certain:
@@ -356,29 +356,29 @@ def test_session_on_a_map_is_related_to_its_places(recorded, map_file, tmp_path)
 
 
 @pytest.mark.parametrize('was_saved', [False, True])
-def test_killed_session_on_a_map_becomes_or_stays_a_session_of_the_map(recorded, was_saved):
-    pipeline, _, target = recorded
+def test_killed_session_on_a_map_becomes_or_stays_a_session_of_the_map(recording, was_saved):
+    pipeline, _, target = recording
     if was_saved:
         save(pipeline, target)
         process(pipeline, UPSTAIRS[20:23], first=140)
     count = 43 if was_saved else 40
     pipeline.close_journals(delete_route=False)
     both = load_map(recover(journals(target)[0], relate=with_last_related).path)
-    assert [each.id for each in both.sessions] == ['route', 'recorded-1']
+    assert [session.id for session in both.sessions] == ['route', 'recorded-1']
     assert both.session_index.tolist() == [0] * (len(both) - count) + [1] * count
     assert (both.same_as[-count : 15 - count] < len(both) - count).all()
 
 
 def test_session_on_a_map_is_recorded_without_a_threshold_of_mode_paper(map_file, tmp_path, route):
-    pipeline = extending(map_file, tmp_path / 'a.stavpr', mode='paper', threshold=None)
-    assert {each.match.status for each in process(pipeline, route[:LENGTH])} == {Status.MAPPED}
+    pipeline = extend(map_file, tmp_path / 'a.stavpr', mode='paper', threshold=None)
+    assert {result.match.status for result in process(pipeline, route[:LENGTH])} == {Status.MAPPED}
     pipeline.close_journals(delete_route=True)
 
 
 def test_full_map_records_no_further_place(map_file, tmp_path, route):
-    pipeline = extending(map_file, tmp_path / 'a.stavpr', max_places=62)
+    pipeline = extend(map_file, tmp_path / 'a.stavpr', max_places=62)
     results = process(pipeline, route[:4], first=100)
-    assert [each.match.status for each in results[2:]] == [Status.NOT_READY] * 2
+    assert [result.match.status for result in results[2:]] == [Status.NOT_READY] * 2
     assert pipeline.operation.map_state == 'full'
     assert pipeline.operation.process(message(route[4]), SECOND).match.status is Status.NOT_READY
     pipeline.close_journals(delete_route=True)

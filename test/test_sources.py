@@ -1,12 +1,15 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags, folders and videos: a table of files and their frames, and one of errors."""
+"""Bags, folders and videos: a table of files and their frames, one of errors, and their order."""
 
 from dataclasses import dataclass, field
+import hashlib
 import os
 from pathlib import Path
+import random
 import re
 import shutil
+import sqlite3
 
 from bags import (
     Bag,
@@ -27,13 +30,15 @@ from PIL import Image
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
-from stavpr_ros.errors import ImageError, InputError, SettingsError, SourceError
+from stavpr_ros.errors import ImageError, InputError, OutputError, SettingsError, SourceError
 from stavpr_ros.sources import open_source
 from stavpr_ros.sources.bag import BagSource, RAW
+from stavpr_ros.sources.bag_messages import read_messages
 from stavpr_ros.sources.bag_writer import write_bag
 from stavpr_ros.sources.encodings import decode_message
 from stavpr_ros.sources.folder import FolderSource
 from stavpr_ros.sources.frame import ImageRecord
+from stavpr_ros.sources.order import in_order, natural_key
 from videos import colored_images, copy_video, HEIGHT, RATE, WIDTH, write_video
 
 
@@ -61,8 +66,8 @@ class Drive:
 def frames_of(images, topic='/raw', stamped=True):
     """Return the frames that records of a bag become."""
     return [
-        (f'{topic}#{i}', each.stamp_ns if stamped else each.time_ns, pixels(each))
-        for i, each in enumerate(images)
+        (f'{topic}#{i}', record.stamp_ns if stamped else record.time_ns, pixels(record))
+        for i, record in enumerate(images)
     ]
 
 
@@ -244,7 +249,7 @@ def folder_with_pages(path, kind, name):
     others = ['2.png', '3.jpg', '4.tiff', '5.webp']
     for other in others:
         cv2.imwrite(str(path / other), gray(0))
-    frames = [(each, 0, gray(0)) for each in (name, *others)]
+    frames = [(file, 0, gray(0)) for file in (name, *others)]
     return Drive(path, frames, left_out={'pages': 2})
 
 
@@ -350,7 +355,7 @@ DRIVES: list[tuple] = [  # a function that writes files, and its arguments
     (mcap_without_its_index,),
     *((split_bag, suffix, *row) for suffix in ('db3', 'mcap') for row in SPLIT),
     *((compressed_bag, mode, has) for mode in ('FILE', 'MESSAGE', 'STORAGE') for has in (0, 1)),
-    *((folder, name, each) for name in ('drive', 'drive.bag', 'drive.mp4') for each in FOLDERS),
+    *((folder, name, kind) for name in ('drive', 'drive.bag', 'drive.mp4') for kind in FOLDERS),
     *((folder_with_pages, *one.split()) for one in PAGES),
     (folder_of_names_that_are_no_utf8,),
     *((folder_with_a_bad_file, content) for content in BAD_FILES),
@@ -367,7 +372,7 @@ DRIVES: list[tuple] = [  # a function that writes files, and its arguments
 
 def name_of(case):
     """Return the name of a row of a table."""
-    return ' '.join(getattr(each, '__name__', str(each))[:40] for each in case[:3])
+    return ' '.join(getattr(part, '__name__', str(part))[:40] for part in case[:3])
 
 
 @pytest.mark.parametrize('case', DRIVES, ids=name_of)
@@ -378,7 +383,7 @@ def test_files_become_frames(tmp_path, caplog, case):
     source = open_source(drive.path, on_error=errors.append, **drive.options)
     for _ in range(2):
         frames = list(source)
-        assert [frame.identifier for frame in frames] == [each[0] for each in drive.frames]
+        assert [frame.identifier for frame in frames] == [frame[0] for frame in drive.frames]
         stamps = [stamp for _, stamp, _ in drive.frames]
         off = np.subtract([frame.stamp for frame in frames], stamps)
         assert np.abs(off).max() <= (2e6 if drive.lossy else 0)
@@ -391,7 +396,7 @@ def test_files_become_frames(tmp_path, caplog, case):
     if drive.counted:
         assert len(source) == len(drive.frames) + len(drive.errors)
     assert getattr(source, 'left_out', {}) == drive.left_out
-    notes = [each.getMessage() for each in caplog.records if each.name.startswith('stavpr')]
+    notes = [record.getMessage() for record in caplog.records if record.name.startswith('stavpr')]
     assert (len(notes), bool(notes)) == (len({*notes}), bool(drive.note))
     assert re.search(drive.note, '\n'.join(notes))
     if isinstance(source, BagSource):
@@ -447,7 +452,7 @@ def cut_off(path, kind, share):
     return file
 
 
-def replaced(path, kind, old, new):
+def replace_bytes(path, kind, old, new):
     file = file_of_kind(path, kind)
     file.write_bytes(file.read_bytes().replace(old, new, 1 if kind == 'mcap' else -1))
     return file
@@ -516,7 +521,7 @@ REFUSED: list[tuple] = [  # pattern of the error, a function that writes files, 
     (r'no images.*/text .std_msgs/msg/String, 0 messages', bag_of_texts),
     (r'2 image topics, choose one .* /raw .*, /rear ', bags_of_two_topics),
     *((SECOND_FILE, bag_with_another_file, storage) for storage in ('sqlite3', 'mcap')),
-    ("is an MCAP of profile 'ros1': expected ros2", replaced, 'mcap', b'ros2', b'ros1'),
+    ("is an MCAP of profile 'ros1': expected ros2", replace_bytes, 'mcap', b'ros2', b'ros1'),
     *((r'\.(db3|bag)', cut_off, kind, s) for kind in ('sqlite3', 'ros1') for s in (0, 0.3, 0.99)),
     *((r'\.mcap', cut_off, 'mcap', share) for share in (0, 0.3)),
     ('has no images', cut_off, 'mcap', 0.01),
@@ -533,7 +538,7 @@ REFUSED: list[tuple] = [  # pattern of the error, a function that writes files, 
     (LISTED.format(30), videos_of_two_drives, None, RATE, CREATED),
     ('has videos and images: expected one kind', video_beside, '1.jpg', b'an image'),
     (r'2\.mp4 is damaged', video_beside, '2.mp4', b'damaged'),
-    ('frames of more than 64000000 pixels', replaced, 'avi', SIZE, HUGE),
+    ('frames of more than 64000000 pixels', replace_bytes, 'avi', SIZE, HUGE),
     *((NO_VIDEO, playlist, content) for content in (b'', b'no video' * 99)),
     (NOT_DECODED, playlist, b'ffconcat version 1.0\nfile other.mp4\n'),
     (NOT_DECODED, playlist, b'#EXTM3U\nother.mp4\n'),
@@ -616,3 +621,173 @@ def test_folder_without_permission_fails(tmp_path, monkeypatch, method):
         patch.setattr(Path, method, refuse)
         with pytest.raises(SourceError, match='Permission denied; check its name and permissions'):
             open_source(folder)
+
+
+# Bags that are written, recorded by others or damaged
+
+
+def test_parts_of_a_split_ros1_bag_are_read_by_time(tmp_path):
+    parts_of_a_ros1_bag(tmp_path)
+    times = [record.time_ns for record in records(9)]
+    assert [record.time_ns for record in open_source(tmp_path).records(0.4, 0.3)] == times[4:7]
+    assert [record.time_ns for record in read_messages(tmp_path, ['/text'])] == times
+
+
+def test_bag_is_written_by_one_writer_and_over_what_a_killed_one_left(tmp_path):
+    path = tmp_path / 'drive'
+
+    def others():
+        with pytest.raises(OutputError, match='is being written'):
+            write_bag(path, '/image', records())
+        yield from records()
+        assert not path.exists()
+
+    stale = tmp_path / '.stavpr-0123456789ab'
+    (stale / 'drive').mkdir(parents=True)  # a killed writer left it
+    (stale / 'drive' / 'drive.db3').write_bytes(b'old')
+    assert write_bag(path, '/image', others()) == 5
+    assert [file.name for file in tmp_path.iterdir()] == ['drive']
+    assert sorted(file.name for file in path.iterdir()) == ['drive.db3', 'metadata.yaml']
+
+
+@pytest.mark.parametrize('storage', ['sqlite3', 'mcap'])
+def test_records_of_a_bag_are_those_that_were_written(tmp_path, storage):
+    assert write_bag(tmp_path / 'bag', '/camera/image', records(), storage) == 5
+    source = open_source(tmp_path / 'bag')
+    assert source.topic == '/camera/image'
+    for original, read in zip(records(), source.records(), strict=True):
+        assert vars(read) | {'data': 0} == vars(original) | {'data': 0}
+        np.testing.assert_array_equal(read.data, original.data)
+
+
+def listing(folder):
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.iterdir()}
+
+
+def test_bag_with_write_ahead_log_is_read_and_unchanged(tmp_path):
+    write_bag(tmp_path / 'made', '/image', records())
+    folder = tmp_path / 'odd #name%41?'
+    folder.mkdir()
+    file = folder / 'made#%.db3'
+    shutil.copy(tmp_path / 'made' / 'made.db3', file)
+    database = sqlite3.connect(file)
+    database.execute('PRAGMA journal_mode=WAL')
+    database.execute('PRAGMA wal_autocheckpoint=0')
+    database.execute(
+        'INSERT INTO messages SELECT 99, topic_id, timestamp + 1000000000, data FROM messages '
+        'WHERE id=1'
+    )
+    database.commit()
+    before = listing(folder)
+    assert f'{file.name}-wal' in before
+    assert len(list(open_source(file))) == 6
+    assert listing(folder) == before
+    database.close()
+
+
+def test_write_bag_never_overwrites_nor_leaves_parts(tmp_path):
+    def broken():
+        yield from records(2)
+        raise ImageError('the third one')
+
+    with pytest.raises(ImageError, match='the third one'):
+        write_bag(tmp_path / 'bag', '/image', broken())
+    assert not list(tmp_path.iterdir())
+    write_bag(tmp_path / 'bag', '/image', records())
+    with pytest.raises(OutputError, match='exists already'):
+        write_bag(tmp_path / 'bag', '/image', records())
+    with pytest.raises(SettingsError, match="'zip' is unknown: take one of sqlite3, mcap"):
+        write_bag(tmp_path / 'other', '/image', records(), 'zip')
+
+
+def test_bag_of_2019_is_read(data_folder):
+    path = data_folder / 'bags' / 'klintan_rosbag2js_sample.db3'
+    before = sorted(path.parent.iterdir())
+    for topic in ('/image', '/image/compressed'):
+        (record,), (frame,) = open_source(path, topic).records(), open_source(path, topic)
+        assert frame.image.shape == (480, 640, 3)
+        assert (record.stamp_ns, frame.stamp) == (0, record.time_ns)
+    assert sorted(path.parent.iterdir()) == before
+
+
+def test_bag_of_ros1_is_read(data_folder):
+    path = data_folder / 'bags' / 'kapture_t265_trimmed_locoffice.bag'
+    for camera in (1, 2):
+        topic = f'/camera/fisheye{camera}/image_raw'
+        frames = list(open_source(path, topic))
+        assert [frame.image.shape for frame in frames] == [(800, 848, 3)] * 3
+        assert [round(gap / 1e6) for gap in np.diff([frame.stamp for frame in frames])] == [33, 33]
+        assert all(np.ptp(frame.image) > 100 for frame in frames)
+
+
+# The order of image files: kinds of numbers in names, counters that begin again, EXIF
+
+
+def counter(first, span, count=24, width=0, zero=0):
+    return [f'{(first + i - zero) % (span - zero) + zero:0{width}d}' for i in range(count)]
+
+
+SURE = {
+    'decimal': ['1.05', '1.5', '1.75'],
+    'two counters': ['1.1', '1.2', '1.9', '1.10', '1.11', '2.1'],
+    'nanoseconds behind a dot': ['1700000000.5000000', '1700000000.55000000', '1700000001.0'],
+    'longer than a float': ['1700000000.63555584', '1700000000.113555584'],
+    'negative': ['x-10', 'x-2', 'x-1.5', 'x0', 'x3', 'x12'],
+    'dash': ['IMG-1', 'IMG-2', 'IMG-10'],
+    'dates': ['2030.1.5', '2030.1.10', '2030.2.1'],
+    'copies': ['IMG_9', 'IMG_9 (2)', 'IMG_10'],
+}
+GUESSED = {
+    'decimal': ['1.25', '1.5'],
+    'gopro': [f'G001{i}' for i in counter(9989, 10000, width=4, zero=1)],
+    'steps': counter(9900, 10000, 240, width=4)[::10],
+    '16 bits': counter(65530, 2**16),
+}
+
+
+def test_natural_key_sorts_numbers():
+    names = ['10.jpg', 'a2b10.png', '2.jpg', '1.jpg', 'a2b9.png', 'A1.png', '01.jpg', 'a.png']
+    expected = ['01.jpg', '1.jpg', '2.jpg', '10.jpg', 'a.png', 'A1.png', 'a2b9.png', 'a2b10.png']
+    assert sorted(names, key=natural_key) == expected
+
+
+@pytest.mark.parametrize('mark', [' (1)', '(0)', '-1', '_2', ' copy'])
+def test_natural_key_sorts_numbered_copies_behind_their_name(mark):
+    expected = ['IMG_9.jpg', f'IMG_9{mark}.jpg', 'IMG_10.jpg', f'IMG_10{mark}.JPG']
+    assert sorted({*expected}, key=natural_key) == expected
+
+
+@pytest.mark.parametrize(
+    ('names', 'guesses'), [*((n, 0) for n in SURE.values()), *((n, 1) for n in GUESSED.values())]
+)
+@pytest.mark.parametrize('folder', [False, True])
+def test_names_are_in_the_order_of_their_kind_of_number(tmp_path, names, guesses, folder, caplog):
+    form = '{}/1.jpg' if folder else '{}.jpg'
+    expected = [tmp_path / form.format(name) for name in names]
+    assert in_order(random.Random(0).sample(expected, len(expected)), tmp_path) == expected
+    assert len(caplog.records) == guesses
+
+
+@pytest.mark.parametrize(('names', 'step', 'note'), [
+    ([f'DSC_{i}.JPG' for i in counter(9989, 10000, width=4, zero=1)], 7, None),
+    ([f'{100 + i // 11}MEDIA/{n}.jpg' for i, n in enumerate(counter(9989, 10000))], 7, None),
+    ([f'{(999, 100)[i // 12]}MEDIA/DJI_{i:04d}.jpg' for i in range(24)], 7, 'contradict'),
+    ([f'{i * 7919 % 997:03d} x.jpg' for i in range(24)], 0.25, 'contradict'),
+    ([f'{("phone", "camera")[i % 2]}_{i}.jpg' for i in range(24)], 7, 'contradict'),
+    ([f'{i:04d}.jpg' for i in range(24)], 7, 'go back at 0010.jpg: the names count'),
+])  # fmt: skip
+def test_times_in_exif_decide_unless_a_clock_was_set(tmp_path, names, step, note, caplog):
+    """Also within a second, where the file has its fractions."""
+    expected = [tmp_path / name for name in names]
+    seconds = 600 + step * np.arange(24)
+    seconds[10:] -= 600 if note and 'go back' in note else 0
+    for file, second in zip(expected, seconds, strict=True):
+        exif = Image.Exif()
+        tags = exif.get_ifd(0x8769)
+        tags[0x9003] = f'2030:05:06 10:{int(second) // 60:02d}:{int(second) % 60:02d}'
+        tags[0x9291] = f'{second % 1:.3f}'[2:]
+        file.parent.mkdir(exist_ok=True)
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(file, exif=exif)
+    assert in_order(sorted(expected), tmp_path) == expected
+    assert len(caplog.records) == bool(note)
+    assert (note or '') in caplog.text

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Large images are reduced while they are decoded; results stay those of whole images."""
+"""Large images are reduced while they are decoded; results are as with whole images."""
 
 from functools import partial
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from pipelines import settings_of
 import pytest
-from raw_images import compressed, encoded, padded, raw
+from raw_images import encode, file_message, pad_rows, raw
 from stavpr_ros.commands import build_map as command
 from stavpr_ros.errors import ImageError
 from stavpr_ros.features import FeatureExtractor
@@ -53,7 +53,7 @@ def block_means(image, divisor):
 def message_of(image, encoding='rgb8', padding=0):
     """Return the message of an image with padded rows."""
     rows = np.ascontiguousarray(ENCODERS[encoding](image))
-    step, data = padded(rows.reshape(len(rows), -1).view(np.uint8), padding)
+    step, data = pad_rows(rows.reshape(len(rows), -1).view(np.uint8), padding)
     return raw(encoding, *image.shape[:2], step, data)
 
 
@@ -81,8 +81,8 @@ def test_reduction_keeps_needed_size_and_whole_pixels(size, least, divisor):
 @pytest.mark.parametrize(('make', 'tolerance'), [
     *((partial(message_of, encoding=name, padding=7 * (name != 'rgb8')), 1) for name in ENCODERS),
     (partial(message_of, encoding='nv12'), 1),
-    (lambda image: compressed(encoded('.png', image)), 1),
-    (lambda image: compressed(encoded('.jpg', image)), 4),
+    (lambda image: file_message(encode('.png', image)), 1),
+    (lambda image: file_message(encode('.jpg', image)), 4),
 ])  # fmt: skip
 def test_decode_of_large_image_averages_blocks(image, make, tolerance):
     """To within what is rounded twice, and what a JPEG rounds."""
@@ -94,13 +94,13 @@ def test_decode_of_large_image_averages_blocks(image, make, tolerance):
 
 def test_decode_of_small_image_is_unchanged(image):
     small = image[:768, :1024]
-    for message in (message_of(small), compressed(encoded('.jpg', small))):
+    for message in (message_of(small), file_message(encode('.jpg', small))):
         np.testing.assert_array_equal(decode_message(message, MIN_SIZE), decode_message(message))
     assert not np.shares_memory(decode_message(message_of(small), MIN_SIZE), small)
 
 
 def test_decode_of_large_image_cut_off_is_rejected(image):
-    for message, missing in ((message_of(image), 1), (compressed(encoded('.jpg', image)), 30)):
+    for message, missing in ((message_of(image), 1), (file_message(encode('.jpg', image)), 30)):
         message.data = message.data[:-missing]
         with pytest.raises(ImageError, match='cut off'):
             decode_message(message, MIN_SIZE)
@@ -124,11 +124,11 @@ def test_map_of_large_files_has_the_features_that_a_node_computes(image, tmp_pat
     """Of the library and of the command."""
     path, folder, extractor = tmp_path / 'map', tmp_path / 'images', FeatureExtractor('gradient')
     folder.mkdir()
-    (folder / 'large.jpg').write_bytes(encoded('.jpg', image))
+    (folder / 'large.jpg').write_bytes(encode('.jpg', image))
     options = ['--input', str(folder), '--output', str(path), '--features', 'gradient']
     assert command.main(options) == 0
     least = extractor.needed_size(THUMBNAIL_WIDTH)
-    reduced = decode_message(compressed(encoded('.jpg', image)), least)
+    reduced = decode_message(file_message(encode('.jpg', image)), least)
     assert reduced.shape == (270, 480, 3)
     expected = extractor.extract([reduced]).strips
     for places in (build_map(open_source(folder), extractor, progress=False), load_map(path)):

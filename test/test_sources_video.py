@@ -42,14 +42,14 @@ def test_rate_chooses_frames(tmp_path, fps, count):
     assert (len(output.images), len(output.times)) == (count, FRAMES)
 
 
-def coded(path, name, codec, **options):
+def encode(path, name, codec, **options):
     return write_video(path / name, colored_images(30), codec, options=options), *even(
         colored_images(30)
     )
 
 
-def interlaced(path, codec):
-    """One of two fields, of which the other is as after a fast motion."""
+def interlace(path, codec):
+    """Write a video of two fields; the second one looks as after a fast motion."""
     images = np.full((6, HEIGHT, WIDTH, 3), 40, np.uint8)
     images[:, 1::2] = 200
     options = {'flags': '+ildct+ilme', 'x264-params': 'tff=1', 'qmin': '1', 'qmax': '1'}
@@ -63,7 +63,7 @@ QUARTERS[:, : HEIGHT // 2, WIDTH // 2 :] = 0, 255, 0
 QUARTERS[:, HEIGHT // 2 :, WIDTH // 2 :] = 0, 0, 255
 
 
-def turned(path, *matrix):
+def turn(path, *matrix):
     """Write a display matrix into a file; return images that are turned or mirrored by it."""
     file = write_video(path / 'phone.mp4', QUARTERS)
     content, at = file.read_bytes(), file.read_bytes().index(b'tkhd') + 44
@@ -75,7 +75,7 @@ def turned(path, *matrix):
     return file, *even(images[:, ::vertical, ::horizontal])
 
 
-def copied(path, name, later, first=0, **options):
+def copy(path, name, later, first=0, **options):
     """Copy a file; frames that an edit list hides are not shown, and times begin at 0."""
     whole = write_video(path / 'whole.mp4', codec='libx264', options={'g': '60'})
     return copy_video(whole, path / name, later, **options), *even(colored_images()[first:])
@@ -90,7 +90,7 @@ def variable_rate(path):
 def time_that_falls(path):
     """Write one that is continued by the rate."""
     file = write_video(path / 'phone.mkv', colored_images(3), 'mjpeg', pixels='yuvj420p')
-    # SimpleBlock, track 1: the time of the third becomes that of the first
+    # SimpleBlock, track 1: the third gets the time of the first
     content = file.read_bytes()
     third = content.index(b'\x81\x00\x43')
     file.write_bytes(content[:third] + b'\x81\x00\x00' + content[third + 3 :])
@@ -129,22 +129,22 @@ def with_sound(path, name, codec, voice, *sounds):
 
 SOUNDS = [[(0, 8)], [(5, 9)], [(0, 1), (3, 6)]]
 VIDEOS = [  # a function that writes a file, and its arguments
-    (coded, 'dash.TS', 'libx264'),
-    (coded, 'camcorder.MTS', 'libx264'),
-    (coded, 'h265.mp4', 'libx265', {'x265-params': 'log-level=none'}),
-    (coded, 'b_frames.avi', 'libx264', {'bf': '2'}),
-    (coded, 'xvid.avi', 'mpeg4', {'bf': '2'}),
-    (coded, 'disc.mpg', 'mpeg2video', {'bf': '2'}),
-    (coded, 'old.wmv', 'wmv2'),
-    (coded, 'web.flv', 'flv'),
-    (coded, 'vp9.webm', 'libvpx-vp9', {'deadline': 'realtime'}),
-    (coded, 'bare.h264', 'libx264'),
-    (interlaced, 'mpeg2video'),
-    (interlaced, 'libx264'),
-    *((turned, *matrix) for matrix in ((0, 1, -1, 0), (0, -1, 1, 0), (-1, 0, 0, -1))),
-    *((turned, *matrix) for matrix in ((-1, 0, 0, 1), (0, 1, 1, 0))),
-    (copied, 'cut.mp4', -1, 30, {'avoid_negative_ts': 'disabled'}),
-    (copied, 'later.mkv', 7.5),
+    (encode, 'dash.TS', 'libx264'),
+    (encode, 'camcorder.MTS', 'libx264'),
+    (encode, 'h265.mp4', 'libx265', {'x265-params': 'log-level=none'}),
+    (encode, 'b_frames.avi', 'libx264', {'bf': '2'}),
+    (encode, 'xvid.avi', 'mpeg4', {'bf': '2'}),
+    (encode, 'disc.mpg', 'mpeg2video', {'bf': '2'}),
+    (encode, 'old.wmv', 'wmv2'),
+    (encode, 'web.flv', 'flv'),
+    (encode, 'vp9.webm', 'libvpx-vp9', {'deadline': 'realtime'}),
+    (encode, 'bare.h264', 'libx264'),
+    (interlace, 'mpeg2video'),
+    (interlace, 'libx264'),
+    *((turn, *matrix) for matrix in ((0, 1, -1, 0), (0, -1, 1, 0), (-1, 0, 0, -1))),
+    *((turn, *matrix) for matrix in ((-1, 0, 0, 1), (0, 1, 1, 0))),
+    (copy, 'cut.mp4', -1, 30, {'avoid_negative_ts': 'disabled'}),
+    (copy, 'later.mkv', 7.5),
     (variable_rate,),
     (time_that_falls,),
     (clock_that_starts_again,),
@@ -191,10 +191,12 @@ def test_video_that_ends_early_is_reported_once(tmp_path):
         ('raise ImportError', 600, 'needs PyAV, which is not installed: pip install av'),
     ],
 )
-def test_decoder_that_fails_is_an_error(tmp_path, monkeypatch, program, timeout, reason):
+def test_decoder_that_fails_is_an_error(
+    tmp_path, environ, set_constants, program, timeout, reason
+):
     (tmp_path / 'av.py').write_text(program)
-    monkeypatch.setenv('PYTHONPATH', str(tmp_path), prepend=':')
-    monkeypatch.setattr(video, 'TIMEOUT', timeout)
+    environ['PYTHONPATH'] = f'{tmp_path}:{environ["PYTHONPATH"]}'
+    set_constants(video, TIMEOUT=timeout)
     began = time.monotonic()
     with pytest.raises(SourceError, match=reason):
         open_source(write_video(tmp_path / 'phone.mp4', colored_images(1)))

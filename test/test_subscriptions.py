@@ -23,8 +23,8 @@ class Setup:
     """A subscription and its publishers; ``received`` holds the numbers of the images."""
 
     def __init__(self, context, **overrides):
-        given = [Parameter(name, value=value) for name, value in overrides.items()]
-        self.node = ManagedNode('subscriber', context=context, parameter_overrides=given)
+        options = [Parameter(name, value=value) for name, value in overrides.items()]
+        self.node = ManagedNode('subscriber', context=context, parameter_overrides=options)
         self.cameras = rclpy.create_node('cameras', context=context)
         self.executor = SingleThreadedExecutor(context=context)
         self.executor.add_node(self.node)
@@ -78,16 +78,13 @@ class Setup:
 
 
 @pytest.fixture
-def setup(context):
-    made = []
-
+def setup(context, request):
     def setup(**overrides):
-        made.append(Setup(context, **overrides))
-        return made[-1]
+        made = Setup(context, **overrides)
+        request.addfinalizer(made.close)
+        return made
 
-    yield setup
-    for each in made:
-        each.close()
+    return setup
 
 
 def test_subscription_follows_publishers_that_come_and_go(setup):

@@ -13,6 +13,7 @@ import sys
 from evaluation_commands import write_images
 from fixtures import route_images
 import numpy as np
+from places import poses_at
 import pytest
 from stavpr_ros.commands.map import main
 from stavpr_ros.errors import InputError, OutputError, StavprError
@@ -37,7 +38,7 @@ pytestmark = pytest.mark.usefixtures('one_thread')
 ROUTE, OTHER, BYPASS = (route_images(count, seed) for count, seed in ((200, 0), (120, 5), (70, 9)))
 
 
-def built(images, day=0, poses=None, thumbnails=False):
+def build(images, day=0, poses=None, thumbnails=False):
     """Return the map of a drive, with noise of its own."""
     dice = np.random.default_rng(day)
     frames = [
@@ -53,26 +54,23 @@ def built(images, day=0, poses=None, thumbnails=False):
 
 @pytest.fixture(scope='module')
 def first():
-    poses = np.zeros((len(ROUTE), 7))
-    poses[:, 0], poses[:, 6] = np.arange(len(ROUTE)), 1
-    return built(ROUTE, poses=poses)
+    return build(ROUTE, poses=poses_at(range(len(ROUTE))))
 
 
 @pytest.fixture(scope='module')
 def rebuilt():
     """Return a drive on which 60 places look otherwise."""
-    return built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 1)
+    return build([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 1)
 
 
 @pytest.fixture(scope='module')
 def around():
     """Return a drive that leaves the map at place 80, and comes back at 90."""
-    poses = np.zeros((240, 7))
-    poses[:, 1], poses[:, 6] = np.arange(240), 1  # of another frame
-    return built([*ROUTE[:80], *BYPASS, *ROUTE[90:180]], 2, poses)
+    poses = poses_at(range(240))[:, [1, 0, *range(2, 7)]]  # of another frame
+    return build([*ROUTE[:80], *BYPASS, *ROUTE[90:180]], 2, poses)
 
 
-def updated(place_map, drive, version=None, name='drive'):
+def update(place_map, drive, version=None, name='drive'):
     version = version or Version('', base_places=len(place_map))
     return update_map(place_map, drive, name, version)
 
@@ -86,11 +84,11 @@ def recall(place_map, drive):
 @pytest.fixture(scope='module')
 def two(first):
     """Return the map with another drive."""
-    return updated(first, built(ROUTE, 9))[0]
+    return update(first, build(ROUTE, 9))[0]
 
 
 def test_drive_over_the_route_becomes_a_session(first, rebuilt):
-    place_map, version = updated(first, rebuilt)
+    place_map, version = update(first, rebuilt)
     assert version.changes == ('certain of 70% of 200 images', 'added the drive, 200 images')
     assert [session.id for session in place_map.sessions] == ['first', 'drive']
     assert np.bincount(place_map.session_index).tolist() == [200, 200]
@@ -104,25 +102,25 @@ def test_drive_over_the_route_becomes_a_session(first, rebuilt):
     assert ids[200:][shown].tolist() == [str(place) for place in related]
     assert set(ids[200:][~shown]) == {f'drive/{i}' for i in np.flatnonzero(~shown)}
     np.testing.assert_array_equal(place_map.poses[200:][shown], first.poses[related])
-    again = built([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 3)
+    again = build([*ROUTE[:80], *OTHER[:60], *ROUTE[140:]], 3)
     assert recall(place_map, again) > recall(first, again) + 0.1
 
 
 def test_detour_has_poses_by_odometry_from_where_it_left_the_map(first, around):
-    place_map, _ = updated(first, around)
+    place_map, _ = update(first, around)
     own = 200 + np.flatnonzero(place_map.same_as[200:] >= 200)
     assert 60 <= len(own) <= 75
     poses = place_map.poses[own]
     np.testing.assert_allclose(poses[:, 0], poses[0, 0], atol=1e-6)
     np.testing.assert_allclose(np.diff(poses[:, 1]), 1, atol=1e-6)
-    assert recall(place_map, built([*ROUTE[60:80], *BYPASS, *ROUTE[90:120]], 4)) > 0.8
+    assert recall(place_map, build([*ROUTE[60:80], *BYPASS, *ROUTE[90:120]], 4)) > 0.8
 
 
 def test_map_before_its_first_update_and_latest_three_drives_stay(first, rebuilt, around):
     place_map, version = first, None
-    drives = rebuilt, around, *(built(ROUTE, day) for day in (3, 4, 5))
+    drives = rebuilt, around, *(build(ROUTE, day) for day in (3, 4, 5))
     for day, drive in enumerate(drives, 1):
-        place_map, version = updated(place_map, drive, version, f'day {day}')
+        place_map, version = update(place_map, drive, version, f'day {day}')
         assert len(place_map.sessions) == min(1 + day, 4)
     assert [session.id for session in place_map.sessions] == ['first', 'day 3', 'day 4', 'day 5']
     assert version.changes[2] == 'removed the 240 places of day 2: 3 drives are kept'
@@ -133,36 +131,36 @@ def test_map_before_its_first_update_and_latest_three_drives_stay(first, rebuilt
 
 def test_no_session_of_a_merged_map_goes(first):
     """Nor the floors of a building, where each drive is on one of them."""
-    other = built(OTHER)
+    other = build(OTHER)
     place_map, version = merge_maps([first, other, first], 'abc'), None
     place_map = replace(place_map, same_as=np.r_[0:320, 0:200].astype(np.int32))
     for day in range(1, 5):
-        drive = built(OTHER if day == 2 else ROUTE, day)
-        place_map, version = updated(place_map, drive, version, f'day {day}')
-    assert [each.id for each in place_map.sessions] == ['a', 'b', 'c', 'day 2', 'day 3', 'day 4']
+        drive = build(OTHER if day == 2 else ROUTE, day)
+        place_map, version = update(place_map, drive, version, f'day {day}')
+    assert [s.id for s in place_map.sessions] == ['a', 'b', 'c', 'day 2', 'day 3', 'day 4']
 
 
 def test_drive_over_less_than_half_of_the_route_changes_nothing(first, two):
     for place_map in (first, two):
         with pytest.raises(InputError, match=r'the drive passes 4.% of a session of the map'):
-            updated(place_map, built(ROUTE[100:190], 2))
-    assert len(updated(first, built(ROUTE[80:], 2))[0]) == 320
+            update(place_map, build(ROUTE[100:190], 2))
+    assert len(update(first, build(ROUTE[80:], 2))[0]) == 320
 
 
 def test_images_at_rest_and_beyond_two_laps_are_not_added(first):
-    stops = built([*ROUTE[:100], *[ROUTE[100]] * 50, *ROUTE[100:]], 1)
-    assert len(updated(first, stops)[0]) == pytest.approx(400, abs=2)
-    closed = with_seam(built([*ROUTE, *ROUTE[:45]]))
+    stops = build([*ROUTE[:100], *[ROUTE[100]] * 50, *ROUTE[100:]], 1)
+    assert len(update(first, stops)[0]) == pytest.approx(400, abs=2)
+    closed = with_seam(build([*ROUTE, *ROUTE[:45]]))
     assert closed.seam == 44
-    laps = built([*ROUTE[60:], *ROUTE, *ROUTE, *ROUTE[:40]], 1)
-    place_map, version = updated(closed, laps)
+    laps = build([*ROUTE[60:], *ROUTE, *ROUTE, *ROUTE[:40]], 1)
+    place_map, version = update(closed, laps)
     assert version.changes == ('certain of 100% of 580 images', 'added the drive, 490 images')
     related = np.arange(90, 580) + 60
     np.testing.assert_allclose((place_map.same_as[245:] - related + 3) % 200, 3, atol=2)
     with pytest.raises(InputError, match=r'passes 3.% of a session'):
-        updated(closed, built([*ROUTE[160:], *ROUTE[:50]], 1))  # over the seam
-    away = built([*ROUTE, *route_images(400, 7)], 1)
-    place_map, _ = updated(first, away)
+        update(closed, build([*ROUTE[160:], *ROUTE[:50]], 1))  # over the seam
+    away = build([*ROUTE, *route_images(400, 7)], 1)
+    place_map, _ = update(first, away)
     assert place_map.same_as[200:400].tolist() == pytest.approx(range(200), abs=2)
     assert len(place_map) == 600
 
@@ -188,17 +186,17 @@ def test_drive_that_may_be_wrong_changes_nothing(first, two, images, reason):
     twice = replace(first, same_as=np.r_[0:51, 50, 52:200].astype(np.int32))  # is not closed
     for place_map in (first, twice, two):
         with pytest.raises(InputError, match=reason):
-            updated(place_map, built(images, 1))
+            update(place_map, build(images, 1))
 
 
 def test_drive_whose_thumbnails_fit_other_places_changes_nothing():
-    drive, place_map = built(ROUTE, 1, thumbnails=True), built(ROUTE, thumbnails=True)
-    assert updated(place_map, drive)[0].thumbnails == place_map.thumbnails + drive.thumbnails
+    drive, place_map = build(ROUTE, 1, thumbnails=True), build(ROUTE, thumbnails=True)
+    assert update(place_map, drive)[0].thumbnails == place_map.thumbnails + drive.thumbnails
     shifted = drive.thumbnails[100:] + drive.thumbnails[:100]
-    mirrored = built([np.ascontiguousarray(image[:, ::-1]) for image in ROUTE], 1, thumbnails=True)
+    mirrored = build([np.ascontiguousarray(image[:, ::-1]) for image in ROUTE], 1, thumbnails=True)
     for wrong in (shifted, mirrored.thumbnails):
         with pytest.raises(InputError, match='thumbnails'):
-            updated(place_map, replace(drive, thumbnails=wrong))
+            update(place_map, replace(drive, thumbnails=wrong))
 
 
 def test_places_that_are_the_same_stay_so_without_the_first_of_them(first):
@@ -226,7 +224,7 @@ def drives(rebuilt, around, tmp_path):
     return [str(file) for file in files]
 
 
-def changed(path, place_map, version=None):
+def save_next(path, place_map, version=None):
     """Save another map as the next version of a file."""
     before = current_version(path)
     return save_version(path, FileVersion.of(path), place_map, before, version or before, None)
@@ -239,7 +237,7 @@ def test_damaged_version_is_kept_anew_from_the_map(first, path, length):
     history.mkdir()
     old = history / f'{before.map_id}.stavpr'
     old.write_bytes(path.read_bytes()[:length])
-    changed(path, select_places(first, np.arange(20)))
+    save_next(path, select_places(first, np.arange(20)))
     assert (len(load_map(path)), len(load_map(old))) == (20, len(first))
 
 
@@ -277,7 +275,7 @@ def test_update_log_and_rollback(path, drives, capsys):
 
 def test_map_with_more_drives_keeps_three_after_the_next_update(path, first):
     """Earlier versions kept five, and have the use of each place in their records."""
-    drives = [built(ROUTE, day) for day in range(1, 6)]
+    drives = [build(ROUTE, day) for day in range(1, 6)]
     merged = merge_maps([first, *drives], ['first', *'12345'])
     same_as = np.tile(np.arange(200, dtype=np.int32), 6)
     save_map(replace(merged, same_as=same_as), path, force=True)
@@ -288,15 +286,15 @@ def test_map_with_more_drives_keeps_three_after_the_next_update(path, first):
     (folder / f'{record["map_id"]}.json').write_text(json.dumps(record))
     assert current_version(path).base_places == 200
     assert main(['log', str(path)]) == 0
-    opened, drive = FileVersion.of(path), built(OTHER[:40] + ROUTE[40:], 6)
+    opened, drive = FileVersion.of(path), build(OTHER[:40] + ROUTE[40:], 6)
     version = update_file(path, opened, load_map(path), drive, '6')
     assert (version.number, version.base_places) == (6, 200)
-    assert [each.id for each in load_map(path).sessions] == ['first', '4', '5', '6']
+    assert [session.id for session in load_map(path).sessions] == ['first', '4', '5', '6']
     assert roll_back(path).number == 5
 
 
 def test_poisoned_drive_leaves_the_file_as_it_is(path, tmp_path, capsys):
-    save_map(built(OTHER, 1), tmp_path / 'other.stavpr')
+    save_map(build(OTHER, 1), tmp_path / 'other.stavpr')
     before = path.read_bytes()
     assert main(['update', str(path), str(tmp_path / 'other.stavpr')]) == 1
     assert 'stays as it is' in capsys.readouterr().err
@@ -338,7 +336,7 @@ def test_killed_update_loses_nothing(path, drives):
 
 def test_map_that_another_program_has_replaced_stays(path, first, rebuilt):
     opened, before = FileVersion.of(path), current_version(path)
-    place_map, version = updated(first, rebuilt, before)
+    place_map, version = update(first, rebuilt, before)
     save_map(replace(first, stamps=first.stamps + 1), path, force=True)
     other = path.read_bytes()
     with pytest.raises(StavprError):
@@ -346,14 +344,14 @@ def test_map_that_another_program_has_replaced_stays(path, first, rebuilt):
     assert path.read_bytes() == other
 
 
-def test_old_versions_are_deleted(path, first, monkeypatch):
-    monkeypatch.setattr(versions, 'MAX_VERSIONS', 2)
+def test_old_versions_are_deleted(path, first, set_constants):
+    set_constants(versions, MAX_VERSIONS=2)
     for day in range(1, 4):
         later = replace(first, stamps=first.stamps + day)
-        changed(path, later, Version('', changes=(f'{day}',)))
+        save_next(path, later, Version('', changes=(f'{day}',)))
     files = sorted(Path(f'{path}.history').glob('*.stavpr'))
     assert len(files) == 2
-    assert [each.changes for each in versions.versions(path)][:3] == [('3',), ('2',), ('1',)]
+    assert [version.changes for version in versions.versions(path)][:3] == [('3',), ('2',), ('1',)]
     with pytest.raises(InputError, match='is no version'):
         roll_back(path, versions.versions(path)[2].map_id)
 
@@ -362,7 +360,7 @@ def test_versions_of_a_branch_that_was_left_are_deleted(path, first):
     folder, ids = Path(f'{path}.history'), []
     for day in (1, 2, 3):
         later = replace(first, stamps=first.stamps + day)
-        ids.append(changed(path, later, Version('')).map_id)
+        ids.append(save_next(path, later, Version('')).map_id)
         (folder / 'notes.txt').touch()
         if day == 2:
             assert roll_back(path).map_id == ids[0]

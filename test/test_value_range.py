@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Images of 16 bits of which few are used, as of thermal cameras: one range for a map."""
+"""Images that use few of 16 bits, as thermal cameras make: one range for a map."""
 
 from dataclasses import replace
 
@@ -33,8 +33,8 @@ def drives():
     views = np.stack([wall[:, 8 * i : 8 * i + 80] for i in range(IMAGES)])
     noise = rng.normal(0, 2, views.shape)
     return [
-        np.clip(LOW + 5.5 * each, 0, 65535).astype(np.uint16)
-        for each in (views, 0.8 * views + 20 + noise)
+        np.clip(LOW + 5.5 * shades, 0, 65535).astype(np.uint16)
+        for shades in (views, 0.8 * views + 20 + noise)
     ]
 
 
@@ -86,8 +86,8 @@ def test_thermal_images_match_by_the_range_of_the_map(thermal_map, folders, capl
     loaded = load_map(path)
     assert loaded.settings == thermal_map.settings
     query = extract_features(open_source(folders[1]), loaded.extractor(), progress=False)
-    found = matches(loaded, query)
-    assert len(found) > IMAGES / 2
+    result = matches(loaded, query)
+    assert len(result) > IMAGES / 2
     again = build_map(open_source(folders[0]), FeatureExtractor('gradient'), progress=False)
     assert again.settings == thermal_map.settings
     assert caplog.text.count(f'images of 16 bits: their values {low} to {high}') == 1
@@ -141,7 +141,7 @@ def test_pipeline_finds_the_range_before_its_first_place(drives, thermal_map, op
         pipeline.operation.process(raw(image), (i + 1) * 10**9)
         for i, image in enumerate(drives[0])
     ]
-    assert {each.match.status for each in results[:20]} == {Status.NOT_READY}
+    assert {result.match.status for result in results[:20]} == {Status.NOT_READY}
     assert results[4].match.reason == 'images of 16 bits, 5 of 20 for their range'
     places = pipeline.places
     assert (len(places), places.settings) == (IMAGES - 20, thermal_map.settings)

@@ -24,7 +24,7 @@ def texture(seed, size=(480, 640)):
     return np.ascontiguousarray(np.clip(image * 85, 0, 255).astype(np.uint8))
 
 
-def moved(image, matrix):
+def move(image, matrix):
     return cv2.warpPerspective(
         image, np.float64(matrix), image.shape[1::-1], borderMode=cv2.BORDER_REFLECT
     )
@@ -39,7 +39,7 @@ VIEWS = {
 
 
 class Thumbnails:
-    """Places of which thumbnails are known, and how often each was read."""
+    """Thumbnails of places, and a list of the places that were read."""
 
     def __init__(self, images):
         self.images, self.read = images, []
@@ -65,7 +65,7 @@ class Pairs:
 def test_inliers_of_flat_scene_from_other_viewpoint_are_many(method, view):
     check = Pairs(GeometricSettings(method))
     one = texture(0)
-    assert check.inliers(one, moved(one, VIEWS[view])) > 100
+    assert check.inliers(one, move(one, VIEWS[view])) > 100
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -85,14 +85,14 @@ def test_inliers_of_two_depths_count_both(method):
     """Parallax, which no homography explains."""
     check = Pairs(GeometricSettings(method))
     near, far = texture(1), texture(2)
-    one, other = far.copy(), moved(far, [[1, 0, 10], [0, 1, 0], [0, 0, 1]])
-    one[240:], other[240:] = near[240:], moved(near, [[1, 0, 50], [0, 1, 0], [0, 0, 1]])[240:]
+    one, other = far.copy(), move(far, [[1, 0, 10], [0, 1, 0], [0, 0, 1]])
+    one[240:], other[240:] = near[240:], move(near, [[1, 0, 50], [0, 1, 0], [0, 0, 1]])[240:]
     shuffled = other.copy()
     shuffled[240:] = texture(3)[240:]
     assert check.inliers(one, other) > 1.5 * check.inliers(one, shuffled)
 
 
-def test_inliers_without_common_geometry_are_few(monkeypatch):
+def test_inliers_without_common_geometry_are_few(set_constants):
     """The same small patches, each elsewhere: they match, but not as one scene."""
     rng = np.random.default_rng(0)
     one, other = texture(4), texture(5)
@@ -101,8 +101,7 @@ def test_inliers_without_common_geometry_are_few(monkeypatch):
     for cell, place, patch in zip(cells, rng.permutation(len(cells)), patches, strict=False):
         for image, (y, x) in ((one, cell), (other, cells[place])):
             image[y + 10 : y + 70, x + 10 : x + 70] = patch
-    monkeypatch.setattr(verification, 'FEATURES', 2000)
-    monkeypatch.setattr(verification, 'WIDTH', 640)
+    set_constants(verification, FEATURES=2000, WIDTH=640)
     assert Pairs().inliers(one, one) > 800
     assert Pairs().inliers(one, other) < 150
 
@@ -118,7 +117,7 @@ def test_inliers_of_one_patch_repeated_in_query_are_few():
 
 def test_inliers_after_query_memory_is_reused_are_of_new_query():
     check, buffer = Pairs(), texture(0)
-    place = moved(texture(7), VIEWS['shifted'])
+    place = move(texture(7), VIEWS['shifted'])
     before = check.inliers(buffer, place)
     buffer[:] = texture(7)
     assert check.inliers(buffer, place) > 100 > before
@@ -166,7 +165,7 @@ def test_inliers_separate_real_places(data_folder, name, recall):
 def test_place_verifier_keeps_keypoints_of_places_until_map_changes():
     check = GeometricSettings()
     verifier, one, other = PlaceVerifier(check), texture(0), texture(100)
-    places = Thumbnails({3: moved(one, VIEWS['shifted']), 4: other})
+    places = Thumbnails({3: move(one, VIEWS['shifted']), 4: other})
     counts = [verifier.inliers(one, places, place) for place in (3, 4, 3)]
     assert counts[0] == Pairs(check).inliers(one, places.images[3]) > 100
     assert counts == [counts[0], Pairs(check).inliers(one, other), counts[0]]

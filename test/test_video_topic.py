@@ -6,7 +6,6 @@ Video topics: packets by encoders of PyAV, in substitutes for the messages of ot
 The substitutes are built from the published definitions, in a bag or in this process.
 """
 
-import sys
 from types import SimpleNamespace
 
 from bags import SECOND, writing
@@ -42,7 +41,7 @@ def codec(request):
 
 
 @pytest.fixture(scope='module')
-def encoded(codec):
+def video(codec):
     return packets(IMAGES, codec, GOP)
 
 
@@ -61,17 +60,17 @@ def message_of(packet, kind, codec, i, **changes):
     return SimpleNamespace(**fields | changes)
 
 
-def decoded(stream, messages):
+def decode(stream, messages):
     """Return the image of each message, or the kind of its error."""
-    found = []
+    result = []
     for message in messages:
         image = stream.read(message)
         assert image.header.stamp.sec
         try:
-            found.append(decode_message(image))
+            result.append(decode_message(image))
         except ImageError as error:
-            found.append(error.kind)
-    return found
+            result.append(error.kind)
+    return result
 
 
 def check(found, missing=()):
@@ -84,74 +83,74 @@ def check(found, missing=()):
 
 
 @pytest.mark.parametrize('kind', [FFMPEG, FOXGLOVE])
-def test_each_packet_is_an_image_from_the_first_key_frame_on(encoded, codec, kind):
-    messages = [message_of(each, kind, codec, i) for i, each in enumerate(encoded)]
-    check(decoded(VideoStream(), messages))
-    late = decoded(VideoStream(), messages[3:])
+def test_each_packet_is_an_image_from_the_first_key_frame_on(video, codec, kind):
+    messages = [message_of(packet, kind, codec, i) for i, packet in enumerate(video)]
+    check(decode(VideoStream(), messages))
+    late = decode(VideoStream(), messages[3:])
     check([*IMAGES[:3], *late], dict.fromkeys(range(3, GOP), NO_KEY_FRAME))
 
 
-def test_lost_packets_are_counted_and_their_key_frame_is_awaited(encoded, codec):
-    messages = [message_of(each, FFMPEG, codec, i) for i, each in enumerate(encoded)]
+def test_lost_packets_are_counted_and_their_key_frame_is_awaited(video, codec):
+    messages = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(video)]
     stream = VideoStream()
-    found = decoded(stream, messages[:6] + messages[8:])
-    check([*found[:6], *IMAGES[6:8], *found[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
+    result = decode(stream, messages[:6] + messages[8:])
+    check([*result[:6], *IMAGES[6:8], *result[6:]], {8: NO_KEY_FRAME, 9: NO_KEY_FRAME})
     assert stream.lost == 2
-    decoded(stream, messages)  # the publisher has started again
+    decode(stream, messages)  # the publisher has started again
     assert stream.lost == 2
     for i, message in enumerate(messages):
         message.pts = 33_333 * i  # microseconds
-    check(decoded(other := VideoStream(), messages))
+    check(decode(other := VideoStream(), messages))
     assert other.lost == 0
 
 
-def test_bad_packets_are_errors_of_their_images_only(encoded, codec, monkeypatch):
+def test_bad_packets_are_errors_of_their_images_only(video, codec, set_constants):
     stream, random = VideoStream(), np.random.default_rng(0)
     for kind in (FFMPEG, FOXGLOVE):
-        for i, packet in enumerate(encoded * 4):
+        for i, packet in enumerate(video * 4):
             message = message_of(packet, kind, codec, i)
             message.data = message.data.copy()
             where = random.integers(0, message.data.size, 1 + i % 7)
             message.data[where] = random.integers(0, 256, where.size)
             message.data = message.data[: random.integers(0, message.data.size + 1)]
-            decoded(stream, [message])
-    good = [message_of(each, FFMPEG, codec, i) for i, each in enumerate(encoded)]
-    check(decoded(stream, good))
-    bad = message_of(encoded[0], FFMPEG, codec, 0, width=100_000, height=100_000)
-    assert decoded(stream, [bad]) == ['too large']
-    bad = message_of(encoded[0], FFMPEG, codec, 0, encoding='av1')
-    assert decoded(stream, [bad]) == ['encoding']
-    monkeypatch.setattr(files, 'MAX_PIXELS', WIDTH * HEIGHT - 1)  # what the parameters claim
+            decode(stream, [message])
+    good = [message_of(packet, FFMPEG, codec, i) for i, packet in enumerate(video)]
+    check(decode(stream, good))
+    bad = message_of(video[0], FFMPEG, codec, 0, width=100_000, height=100_000)
+    assert decode(stream, [bad]) == ['too large']
+    bad = message_of(video[0], FFMPEG, codec, 0, encoding='av1')
+    assert decode(stream, [bad]) == ['encoding']
+    set_constants(files, MAX_PIXELS=WIDTH * HEIGHT - 1)  # what the parameters claim
     for message in good[:2]:
         message.width = message.height = 1
-    assert decoded(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]
+    assert decode(VideoStream(), good[:2]) == ['damaged', NO_KEY_FRAME]
 
 
 def test_image_that_ffmpeg_conceals_is_damaged(route):
     messages = [
-        message_of(each, FOXGLOVE, 'libx264', i)
-        for i, each in enumerate(packets(route[:6], 'libx264', 5))
+        message_of(packet, FOXGLOVE, 'libx264', i)
+        for i, packet in enumerate(packets(route[:6], 'libx264', 5))
     ]
     messages[2].data = messages[2].data[: messages[2].data.size // 2]
-    found = [each if isinstance(each, str) else '' for each in decoded(VideoStream(), messages)]
-    assert found == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
+    result = [image if isinstance(image, str) else '' for image in decode(VideoStream(), messages)]
+    assert result == ['', '', 'damaged', NO_KEY_FRAME, NO_KEY_FRAME, '']
 
 
 def test_b_frames_are_refused_with_the_remedy():
-    found = packets(IMAGES, b_frames=2)
-    message = message_of(found[0], FOXGLOVE, 'libx264', 0)
+    result = packets(IMAGES, b_frames=2)
+    message = message_of(result[0], FOXGLOVE, 'libx264', 0)
     with pytest.raises(ImageError, match='max_b_frames: 0'):
         VideoStream().read(message).decode()
 
 
 @pytest.mark.parametrize('kind', [FFMPEG, FOXGLOVE, 'ros1', 'newer'])
-def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded, kind):
+def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, video, kind):
     is_ros1, name = kind == 'ros1', FOXGLOVE if kind in (FOXGLOVE, 'newer') else FFMPEG
     text = ROS1_FFMPEG if is_ros1 else DEFINITIONS[name] + (NEWER if kind == 'newer' else '')
     path = tmp_path / ('drive.bag' if is_ros1 else 'drive')
     with writing(path, is_ros1) as bag:
         bag.define(name, text)
-        for i, packet in enumerate(encoded):
+        for i, packet in enumerate(video):
             if i == 7:
                 continue
             data, header = np.frombuffer(bytes(packet), np.uint8), bag.header((i + 1) * SECOND)
@@ -167,7 +166,7 @@ def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded
     assert (source.message_type, len(source)) == (name, COUNT - 1)
     frames = list(source)
     if name == FFMPEG:  # the other one does not report that a packet is missing
-        assert [each.kind for each in errors] == 2 * [NO_KEY_FRAME]
+        assert [error.kind for error in errors] == 2 * [NO_KEY_FRAME]
         left = [*range(7), *range(10, COUNT)]
         assert [frame.stamp for frame in frames] == [(i + 1) * SECOND for i in left]
         for i, frame in zip(left, frames, strict=True):
@@ -177,10 +176,10 @@ def test_bag_with_a_video_topic_is_a_sequence_of_images(tmp_path, codec, encoded
 
 
 @pytest.mark.parametrize('ros1', [False, True])
-def test_video_in_compressed_images_of_a_bag_is_decoded(tmp_path, codec, encoded, ros1):
+def test_video_in_compressed_images_of_a_bag_is_decoded(tmp_path, codec, video, ros1):
     path = tmp_path / 'drive.bag'
     with writing(path, ros1) as bag:
-        for i, packet in enumerate(encoded):
+        for i, packet in enumerate(video):
             data = np.frombuffer(bytes(packet), np.uint8)
             fields = bag.header((i + 1) * SECOND), f'bgr8; {CODECS[codec][1].upper()}', data
             bag.write('/camera/compressed', COMPRESSED, (i + 1) * SECOND, *fields)
@@ -190,15 +189,13 @@ def test_video_in_compressed_images_of_a_bag_is_decoded(tmp_path, codec, encoded
 
 @pytest.mark.parametrize('image_input', ['compressed'], indirect=True)
 @pytest.mark.parametrize('has_pyav', [True, False])
-def test_node_decodes_video_in_compressed_images(
-    image_input, monkeypatch, encoded, codec, has_pyav
-):
+def test_node_decodes_video_in_compressed_images(image_input, hide_module, video, codec, has_pyav):
     if not has_pyav:
-        monkeypatch.setitem(sys.modules, 'av.video.reformatter', None)
-    for i, packet in enumerate(encoded):
+        hide_module('av.video.reformatter')
+    for i, packet in enumerate(video):
         header, data = Header(stamp=Time(sec=i + 1)), bytes(packet)
         image_input.on_image(CompressedImage(header=header, format=CODECS[codec][1], data=data))
-    assert [each.header.stamp.sec for each in image_input.passed] == list(range(1, COUNT + 1))
+    assert [image.header.stamp.sec for image in image_input.passed] == list(range(1, COUNT + 1))
     if has_pyav:
         check(list(map(decode_message, image_input.passed)))
     else:
@@ -219,32 +216,32 @@ def test_bag_of_another_transport_has_a_remedy_and_damaged_messages_are_errors(t
             bag.write_bytes('/video', FOXGLOVE, SECOND, content)
     errors = []
     assert list(BagSource(tmp_path / 'damaged', on_error=errors.append)) == []
-    assert [each.kind for each in errors] == 3 * ['damaged']
+    assert [error.kind for error in errors] == 3 * ['damaged']
 
 
 @pytest.fixture
-def installed(monkeypatch):
-    """Make a class of messages known to the node, as that of packets."""
+def transport(monkeypatch):
+    """Let the node have a class of messages for packets."""
     monkeypatch.setattr(ros_input, 'message_class', lambda name: CompressedImage)
 
 
 @pytest.mark.parametrize('image_input', ['ffmpeg'], indirect=True)
 def test_node_subscribes_below_the_topic_of_images_and_counts_lost_packets(
-    installed, image_input, encoded, codec
+    transport, image_input, video, codec
 ):
     images, queue = image_input, image_input.passed
     assert images.topic == '/image/ffmpeg'
     images.max_rate = 1.0
     for i in (0, 1, 2, 3, 5, 6):
-        message = message_of(encoded[i], FFMPEG, codec, i)
+        message = message_of(video[i], FFMPEG, codec, i)
         if i == 2:  # faster than max_rate: decoded, since the next ones depend on it
             message.header.stamp = Time(sec=2, nanosec=1)
         images.on_image(message)
-    assert [each.header.stamp.sec for each in queue] == [1, 2, 4, 6, 7]
+    assert [image.header.stamp.sec for image in queue] == [1, 2, 4, 6, 7]
     check([*IMAGES[:3], decode_message(queue[2]), IMAGES[4], *map(decode_message, queue[3:])])
     assert len(images.rejected) == 1
     images._on_lost(3)  # by the middleware, the one above among them
     assert images.statistics.counts().dropped.total['lost in transport'] == 3
-    images.on_image(message_of(encoded[7], FFMPEG, codec, 7))
+    images.on_image(message_of(video[7], FFMPEG, codec, 7))
     with pytest.raises(ImageError, match='before a key frame'):
         decode_message(queue[-1])

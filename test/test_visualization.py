@@ -20,7 +20,7 @@ from fixtures import route_images
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 import numpy as np
-from pipelines import at, LENGTH, localizing, message, process, recorded, SECOND
+from pipelines import at, LENGTH, localizing, message, process, record, SECOND
 from processes import environment, TIMEOUT
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -95,16 +95,15 @@ def header(i=0):
 
 
 @pytest.fixture
-def localized(map_file, route):
+def localization(map_file, route):
     """Return a pipeline whose window is matched, and the match of the last image."""
     pipeline = localizing(map_file)
     return pipeline, process(pipeline, route[: LENGTH + 4])[-1]
 
 
-def test_visualization_without_subscribers_publishes_and_draws_nothing(localized, monkeypatch):
-    pipeline, match = localized
-    recognizer = pipeline.operation.recognizer
-    monkeypatch.setattr(recognizer, 'newest_row', lambda: pytest.fail('not requested'))
+def test_visualization_without_subscribers_publishes_and_draws_nothing(localization):
+    pipeline, match = localization
+    pipeline.operation.recognizer.newest_row = lambda: pytest.fail('not requested')
     views, publishers = views_of()
     show(views, header(), match, pipeline.operation, 'map')
     views.publish_route(pipeline.places, 'map')
@@ -113,8 +112,8 @@ def test_visualization_without_subscribers_publishes_and_draws_nothing(localized
     assert not views.needs_candidates
 
 
-def test_visualization_of_a_match_publishes_routes_and_markers(localized):
-    pipeline, result = localized
+def test_visualization_of_a_match_publishes_routes_and_markers(localization):
+    pipeline, result = localization
     match = result.match
     assert match.accepted
     views, publishers = views_of('map_path', 'matched_path', 'markers')
@@ -137,8 +136,8 @@ def test_visualization_of_a_match_publishes_routes_and_markers(localized):
     assert len({marker.id for marker in shown}) == len(shown)
 
 
-def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
-    pipeline, _ = localized
+def test_visualization_of_an_image_without_a_match_shows_no_place(localization):
+    pipeline, _ = localization
     views, publishers = views_of(*TOPICS)
     show(views, header(), ImageResult(Match(Status.DROPPED, 'because')), pipeline.operation, 'map')
     assert [m.action for m in publishers.messages('markers')[0].markers] == [Marker.DELETEALL]
@@ -147,7 +146,7 @@ def test_visualization_of_an_image_without_a_match_shows_no_place(localized):
 
 
 def test_visualization_of_loop_closures_connects_query_and_place(route):
-    pipeline = recorded(route, 'loop_closure')
+    pipeline = record(route, 'loop_closure')
     views, publishers = views_of('markers', 'map_path')
     matches = process(pipeline, route[:30], first=30, poses=True)
     for i, match in enumerate(matches):
@@ -184,7 +183,7 @@ def test_visualization_on_a_map_connects_odometry_and_place(map_file, route):
 
 
 def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
-    pipeline = recorded(route, count=30)
+    pipeline = record(route, count=30)
     views, publishers = views_of('map_path')
     for i in range(30, 60):
         (match,) = process(pipeline, route[i : i + 1], i, True)
@@ -195,8 +194,8 @@ def test_visualization_of_a_growing_route_is_published_when_it_has_grown(route):
     assert 5 < len(sizes) < 20
 
 
-def test_visualization_of_distances_is_the_newest_row(localized):
-    pipeline, match = localized
+def test_visualization_of_distances_is_the_newest_row(localization):
+    pipeline, match = localization
     views, publishers = views_of('distances', 'window_image', 'match_image/compressed')
     show(views, header(), match, pipeline.operation, 'map')
     (row,) = publishers.messages('distances')
@@ -271,12 +270,12 @@ def test_node_publishes_for_viewers_and_navigation(robot, start, route):
     topics = set(re.findall(r'"(/stavpr/[a-z_/]+)', json.dumps(foxglove)))
     assert len(topics) >= 7
 
-    def published():
+    def topic_types():
         return dict(robot.node.get_publisher_names_and_types_by_node('stavpr', '/'))
 
-    robot.until(lambda: topics <= published().keys(), f'publishers of {sorted(topics)}')
+    robot.until(lambda: topics <= topic_types().keys(), f'publishers of {sorted(topics)}')
     for topic, kind in named:
-        assert published()[topic] == [kind]
+        assert topic_types()[topic] == [kind]
 
     def panels(part):
         return {part} if isinstance(part, str) else panels(part['first']) | panels(part['second'])
@@ -297,24 +296,24 @@ def test_node_publishes_for_viewers_and_navigation(robot, start, route):
 ABOUT = Surroundings('map', odometry_frame='odom')
 
 
-def posed(x, y, degrees):
+def pose_of(x, y, degrees):
     return np.array([x, y, 0, *Rotation.from_euler('z', degrees, degrees=True).as_quat()])
 
 
 def test_map_to_odometry_takes_the_pose_of_odometry_to_that_of_the_map():
-    place, odometry = posed(5, 2, 90), posed(1, 0, 0)
-    np.testing.assert_allclose(map_to_odometry(place, odometry), posed(5, 1, 90), atol=1e-12)
+    place, odometry = pose_of(5, 2, 90), pose_of(1, 0, 0)
+    np.testing.assert_allclose(map_to_odometry(place, odometry), pose_of(5, 1, 90), atol=1e-12)
     # the odometry's frame in the map, then the robot in that: the robot in the map
     rng = np.random.default_rng(0)
     place, odometry = (
         np.concatenate([rng.normal(size=3), Rotation.random(rng=rng).as_quat()]) for _ in range(2)
     )
-    found = matrices(map_to_odometry(place, odometry)) @ matrices(odometry)
-    np.testing.assert_allclose(found, matrices(place), atol=1e-12)
+    result = matrices(map_to_odometry(place, odometry)) @ matrices(odometry)
+    np.testing.assert_allclose(result, matrices(place), atol=1e-12)
 
 
 def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
-    poses = np.tile(posed(0, 0, 30), (len(small_map), 1))
+    poses = np.tile(pose_of(0, 0, 30), (len(small_map), 1))
     poses[:, 0] = np.arange(len(poses))
     places = replace(small_map, poses=poses)
     path = match_module.Path(np.column_stack([np.arange(4), np.arange(10, 6, -1)]), 9)
@@ -322,17 +321,17 @@ def test_pose_is_turned_by_the_mountings_of_the_cameras(small_map):
     message = matched_pose_message(Outcome(header(0), result, places, Surroundings('map')))
     o = message.pose.pose.orientation
     assert message.pose.pose.position.x == 7
-    assert abs(np.array([o.x, o.y, o.z, o.w]) @ posed(0, 0, 210)[3:]) == pytest.approx(1)
+    assert abs(np.array([o.x, o.y, o.z, o.w]) @ pose_of(0, 0, 210)[3:]) == pytest.approx(1)
     assert message.pose.covariance[35] == 0.01
 
 
 def test_planar_keeps_yaw_and_has_the_covariance_of_x_y_and_yaw_only():
     tilted = Rotation.from_euler('ZYX', [40, 20, 10], degrees=True).as_quat()
-    given = PoseWithCovarianceStamped()
-    given.pose.pose = pose_message(np.array([1, 2, 3, *tilted]))
-    given.pose.covariance[::7] = [0.01, 4.0, 0.3, 0.3, 0.3, 0.01]
-    given.pose.covariance[1] = given.pose.covariance[6] = 0.2
-    flat = planar(given).pose
+    message = PoseWithCovarianceStamped()
+    message.pose.pose = pose_message(np.array([1, 2, 3, *tilted]))
+    message.pose.covariance[::7] = [0.01, 4.0, 0.3, 0.3, 0.3, 0.01]
+    message.pose.covariance[1] = message.pose.covariance[6] = 0.2
+    flat = planar(message).pose
     position, o = flat.pose.position, flat.pose.orientation
     assert (position.x, position.y, position.z) == (1, 2, 0)
     assert math.degrees(2 * math.atan2(o.z, o.w)) == pytest.approx(40)
@@ -458,9 +457,9 @@ def test_navigation_on_a_growing_route_publishes_nothing(publishing, route):
         ({'operation': 'mapping', 'features': 'auto', 'model_path': '/no'}, 'model_path'),
     ],
 )
-def test_configuration_that_fails_leaves_no_thread(make_node, monkeypatch, parameters, problem):
+def test_configuration_that_fails_leaves_no_thread(make_node, hide_module, parameters, problem):
     """One without tf2_msgs fails at the publishers, the others at the map and the model."""
-    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    hide_module('tf2_msgs.msg')
     node, before = make_node(**parameters), set(threading.enumerate())
     assert node.trigger_configure() == TransitionCallbackReturn.ERROR
     assert problem in node.problem
@@ -479,7 +478,7 @@ def test_example_of_bridges_publishes_a_pose_at_the_start_and_on_each_request(ro
     start()
     ids = (robot.until_map(state='loaded').map_id, '0123456789abcdef')
     programs = [
-        subprocess.Popen([*command, '-p', f'map_id:="{each}"'], env=environment()) for each in ids
+        subprocess.Popen([*command, '-p', f'map_id:="{i}"'], env=environment()) for i in ids
     ]
     try:
         robot.until(lambda: requests.get_subscription_count() == len(ids), 'both programs')

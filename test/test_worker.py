@@ -15,17 +15,15 @@ TIMEOUT = 30
 
 
 @pytest.fixture
-def make():
+def make(request):
     """Make a worker; it is stopped with the test."""
-    made = []
 
     def make(process=lambda item: None, capacity=1, ending=None):
-        made.append(Worker(process, capacity, ending or threading.Event()))
-        return made[-1]
+        worker = Worker(process, capacity, ending or threading.Event())
+        request.addfinalizer(worker.stop)
+        return worker
 
-    yield make
-    for worker in made:
-        worker.stop()
+    return make
 
 
 class Busy:

@@ -26,7 +26,7 @@ PRINT = 'from stavpr_ros.alignment.cpu import int8; print(int8.INSTRUCTION)'
 # Few: each one compiles kernels, minutes under emulation.
 INT8_TESTS = ('test/test_int8.py', '-k', 'strip_distances_equal or extreme')
 TESTS = (
-    'test/test_int8.py', 'test/test_matcher.py', 'test/test_lm_dtw.py', 'test/test_spatial.py',
+    'test/test_int8.py', 'test/test_matcher.py', 'test/test_alignment.py',
     '-k', 'strip_distances_equal or extreme or fused or paths_equal or image_distances_equal',
 )  # fmt: skip
 # QEMU's name of a processor, the instruction for int8 that it has, tests

@@ -71,8 +71,8 @@ class _Handler(BaseHTTPRequestHandler):
             points.upsert(name, models.PointsList.model_validate(body).points)
             return {'operation_id': 0, 'status': 'completed'}
         if action == ('POST', 'points'):
-            found = points.retrieve(name, body['ids'], with_payload=True)
-            return [json.loads(one.model_dump_json()) for one in found]
+            result = points.retrieve(name, body['ids'], with_payload=True)
+            return [json.loads(one.model_dump_json()) for one in result]
         if action == ('POST', 'points', 'query', 'batch'):
             requests = models.QueryRequestBatch.model_validate(body).searches
             answers = points.query_batch_points(name, requests)

@@ -153,17 +153,17 @@ def test_votes_follow_the_speed():
 def test_recognizer_in_neighborhoods_matches_as_exact_one(store, city, query, tmp_path):
     exact = drive(PlaceRecognizer(city, SETTINGS), query)
     recognizer = FleetRecognizer(city_in(city, store, tmp_path, None), SETTINGS, timeout=60)
-    found = drive(recognizer, query)
-    early = [m.probability > EARLY for m in found[:19] if m.accepted]
+    result = drive(recognizer, query)
+    early = [m.probability > EARLY for m in result[:19] if m.accepted]
     assert all(early)
     accepted = [i for i, match in enumerate(exact) if match.accepted]
     assert len(accepted) > 30
     for i in accepted[5:]:
-        assert found[i].accepted
-        assert abs(found[i].path.place - exact[i].path.place) <= 1
-        assert abs(found[i].probability - exact[i].probability) < 0.01
-        np.testing.assert_allclose(found[i].path.pairs[:, 1], exact[i].path.pairs[:, 1], atol=2)
-    newest, row = found[-1].path.place, recognizer.newest_row()
+        assert result[i].accepted
+        assert abs(result[i].path.place - exact[i].path.place) <= 1
+        assert abs(result[i].probability - exact[i].probability) < 0.01
+        np.testing.assert_allclose(result[i].path.pairs[:, 1], exact[i].path.pairs[:, 1], atol=2)
+    newest, row = result[-1].path.place, recognizer.newest_row()
     np.testing.assert_array_equal(recognizer.window_columns(np.arange(CITY))[-1], row)
     assert row.shape == (CITY,)
     assert np.isfinite(row).sum() < CITY
@@ -182,7 +182,7 @@ def test_probabilities_are_those_of_the_same_map_on_a_robot(kind):
     query.strips[:, 60:70] = walk(10, seed=9).strips
     one = FleetRecognizer(CityMap.of(MemoryStore(place_map)), SETTINGS, timeout=60)
     pairs = zip(drive(one, query), drive(PlaceRecognizer(place_map, SETTINGS), query), strict=True)
-    probabilities = [(found.probability, expected.probability) for found, expected in pairs]
+    probabilities = [(result.probability, expected.probability) for result, expected in pairs]
     np.testing.assert_allclose(*np.transpose(probabilities), atol=1e-3)
 
 
@@ -192,8 +192,8 @@ def test_recognizer_after_a_reset_answers_as_a_new_one(city, query):
     one, new = (FleetRecognizer(CityMap.of(store), SETTINGS, timeout=60) for store in stores)
     drive(one, query)
     one.reset()
-    for found, expected in zip(drive(one, query), drive(new, query), strict=True):
-        values = [vars(match) | {'path': vars(match.path)} for match in (found, expected)]
+    for result, expected in zip(drive(one, query), drive(new, query), strict=True):
+        values = [vars(match) | {'path': vars(match.path)} for match in (result, expected)]
         np.testing.assert_equal(*values)
     stores[0].cut = True
     one.reset()
@@ -278,8 +278,8 @@ def test_open_of_missing_or_interrupted_upload_names_remedy(tmp_path, server):
         open_city_map('qdrant://host:1')
 
 
-def test_open_over_http_sends_no_key(monkeypatch):
-    monkeypatch.setenv('QDRANT_API_KEY', 'secret')
+def test_open_over_http_sends_no_key(environ):
+    environ['QDRANT_API_KEY'] = 'secret'
     with pytest.raises(SettingsError, match='would be sent without encryption'):
         open_city_map('qdrant://robots.example:6333/city')
 
@@ -353,11 +353,11 @@ def test_node_whose_server_is_cut_off_goes_on_and_reports_it(robot, start, route
     assert last.status == PlaceMatch.MATCH
     assert abs(last.newest_index - 44) <= 1
 
-    def reported():
+    def is_reported():
         status = robot.diagnostics['map']
         return status.level == DiagnosticStatus.WARN and 'Qdrant server' in status.message
 
-    robot.until(reported, 'the finding on the map')
+    robot.until(is_reported, 'the finding on the map')
 
 
 def test_load_map_service_rejects_addresses(robot, start, server):

@@ -21,7 +21,7 @@ import time
 from bags import write_odometry
 import cv2
 from map_examples import example_files
-from map_fuzz import hand_made, mutated, use_file
+from map_fuzz import hand_made, mutate, use_file
 import numpy as np
 from stavpr_lab.evaluation.ground_truth import GroundTruth
 from stavpr_ros.errors import StavprError
@@ -131,7 +131,7 @@ def onnx_model(path: Path) -> None:
 def attack(reader: str, files: int, seed: int) -> None:
     """Read many damaged files; the first that fails is kept in the working directory."""
     rng, read = random.Random(seed), READERS[reader]
-    change = hand_made if reader == 'hand-made map' else mutated
+    change = hand_made if reader == 'hand-made map' else mutate
     with tempfile.TemporaryDirectory() as temporary:
         made, tried = Path(temporary, 'made'), Path(temporary, 'tried')
         made.mkdir()

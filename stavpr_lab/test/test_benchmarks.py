@@ -27,11 +27,11 @@ PEAKS = Peaks(1e9, 1e10)
 
 
 @pytest.mark.slow
-def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch):
+def test_command_measures_every_stage_of_both_modes(tmp_path, monkeypatch, set_constants):
     monkeypatch.setattr(peaks, 'measure_peaks', lambda *_: PEAKS)
-    monkeypatch.setattr(matching, 'CITY', 200)
-    given = '--sizes 50 300 --dimensions 224 --seconds 0.001 --no-memory --commit abc'
-    assert matching.main([*given.split(), '--output', str(tmp_path)]) == 0
+    set_constants(matching, CITY=200)
+    options = '--sizes 50 300 --dimensions 224 --seconds 0.001 --no-memory --commit abc'
+    assert matching.main([*options.split(), '--output', str(tmp_path)]) == 0
     (path,) = tmp_path.glob('matching-*.json')
     document = json.loads(path.read_text())
     rows = document['rows']
@@ -55,18 +55,18 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     accepted, *others = (np.array(values, bool) for values in columns)
     others.append(np.zeros(5, bool))  # no early ones
     outcome = off_map.Outcome(accepted, np.array([0.9, 0.8, 0.6, 0.2, np.nan]), *others)
-    found = off_map.Outcome.pool([outcome, outcome]).numbers()
-    assert (found['images'], found['matched'], found['wrong']) == (10, 6, 2)
-    assert (found['precision'], found['recall']) == (4 / 6, 4 / 8)
-    assert (found['unseen'], found['unseen_matched']) == (2, 2)
-    assert (found['sure'], found['unseen_sure']) == (0, 0)  # 0.6
+    result = off_map.Outcome.pool([outcome, outcome]).numbers()
+    assert (result['images'], result['matched'], result['wrong']) == (10, 6, 2)
+    assert (result['precision'], result['recall']) == (4 / 6, 4 / 8)
+    assert (result['unseen'], result['unseen_matched']) == (2, 2)
+    assert (result['sure'], result['unseen_sure']) == (0, 0)  # 0.6
     sure = replace(outcome, probabilities=np.array([1, 0.9, 0.95, 0.2, np.nan])).numbers()
     assert (sure['sure'], sure['unseen_sure']) == (1, 1)
-    assert found['rates']['0.05'] == (3 / 4, 3 / 4)  # 0.2 is above the table's limit
+    assert result['rates']['0.05'] == (3 / 4, 3 / 4)  # 0.2 is above the table's limit
     lower = replace(outcome, probabilities=np.array([0.99, 0.8, 0.6, 0.4, np.nan])).numbers()
     assert lower['rates'] == {'0.05': (3 / 4, 3 / 4), '0.01': (2 / 3, 2 / 4)}
-    assert found['recall_at_100_precision'] == 0.5  # above 0.6
-    assert found['f1'] == 3 / 4  # three of four right, one wrong
+    assert result['recall_at_100_precision'] == 0.5  # above 0.6
+    assert result['f1'] == 3 / 4  # three of four right, one wrong
     bins = outcome.calibration()['bins']
     assert [(row['images'], row['right']) for row in bins] == [(1, 1), (1, 0), (1, 1), (1, 1)]
 
@@ -80,9 +80,9 @@ def test_public_graph_one_closure_at_a_time_ends_like_all_at_once():
     edges = [(i, i + 1, turn, np.eye(6) * 10) for i in range(40)]
     edges += [(i, i + 4, np.eye(4), np.eye(6) * 1e4) for i in range(30)]
     expected = graph_files.ours(edges)
-    found, accepted, times = graph_files.one_at_a_time(edges)
+    result, accepted, times = graph_files.one_at_a_time(edges)
     assert accepted.tolist() == expected[1].tolist() == [True] * 30
-    np.testing.assert_allclose(found, expected[0], atol=1e-3)
+    np.testing.assert_allclose(result, expected[0], atol=1e-3)
     assert len(times) == 30
 
 

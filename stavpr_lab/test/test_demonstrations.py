@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Demonstrations: the synthetic street, its days, blind stretches, false closures, processes."""
+"""Demonstrations: the synthetic street, its days, blind stretches, teach and repeat, processes."""
 
 from dataclasses import replace
 import fcntl
@@ -25,13 +25,25 @@ from stavpr_lab.demonstration.false_places import FalsePlaces, NEAR, RUN
 from stavpr_lab.demonstration.graph_client import fetch_graph
 from stavpr_lab.demonstration.live import run_live
 from stavpr_lab.demonstration.recordings import Recording
+from stavpr_lab.demonstration.repeat import (
+    animate,
+    CONDITIONS,
+    repeat,
+    STEP,
+    teach,
+    View,
+)
+from stavpr_lab.demonstration.repeat import (
+    plot as plot_repeat,
+)
 from stavpr_lab.demonstration.street.days import Days
 from stavpr_lab.demonstration.street.laps import drive_laps, RingWorld
-from stavpr_lab.demonstration.street.rendering import center_line_ahead
+from stavpr_lab.demonstration.street.rendering import center_line_ahead, FOCAL
 from stavpr_lab.demonstration.street.street import CELL
 from stavpr_lab.demonstration.street.traverses import (
     GOOD_LIGHT,
     nearest_places,
+    RAINY_DUSK,
     second_traverse,
     Traverse,
     World,
@@ -39,6 +51,8 @@ from stavpr_lab.demonstration.street.traverses import (
 from stavpr_msgs.msg import AlignedPlaces, LoopClosure
 from stavpr_nav.follower import NO_EVIDENCE
 from stavpr_ros.errors import StavprError
+from stavpr_ros.relative_pose.expansion import Expansion
+from stavpr_ros.relative_pose.offset import describe_columns, OffsetFilter
 from stavpr_ros.ros.messages import time_message
 
 SIZE = (96, 72)
@@ -103,10 +117,10 @@ def test_center_line_ahead_of_closed_street_agrees_with_poses(image):
     across, _, turned = traverse.camera(number)
     yaw += turned  # the camera is turned in the street
     forward, right = np.array([np.cos(yaw), np.sin(yaw)]), np.array([np.sin(yaw), -np.cos(yaw)])
-    found = [x, y] + ahead[:, :1] * forward + (ahead[:, 1:2] - across) * right
+    result = [x, y] + ahead[:, :1] * forward + (ahead[:, 1:2] - across) * right
     line = RingWorld(5).center_line
     cells = (int(along / CELL) + 1 + np.arange(80)) % (len(line) - 1)
-    assert np.abs(found - line[cells, :2]).max() < 1e-3  # the ends meet to 0.2 mm
+    assert np.abs(result - line[cells, :2]).max() < 1e-3  # the ends meet to 0.2 mm
 
 
 DAYS = Days(
@@ -226,12 +240,11 @@ def test_run_live_returns_why_the_node_cannot_start(tmp_path, route):
     assert 'copy the file that the map was built with there' in (tmp_path / 'node.log').read_text()
 
 
-def test_domain_is_free_and_its_settings_are_its_own(monkeypatch):
+def test_domain_is_free_and_its_settings_are_its_own(environ, monkeypatch):
     kept = {'ROS_DISTRO': 'jazzy', 'ROS_LOG_DIR': '/log'}
     foreign = {'ROS_DOMAIN_ID': '7', 'ROS_STATIC_PEERS': 'robot', 'RMW_IMPLEMENTATION': 'rmw_none'}
     foreign |= {'FASTRTPS_DEFAULT_PROFILES_FILE': '/none', 'RCUTILS_CONSOLE_OUTPUT_FORMAT': ''}
-    for name, value in (kept | foreign).items():
-        monkeypatch.setenv(name, value)
+    environ |= kept | foreign
     monkeypatch.setattr(live.random, 'sample', lambda *_: [41, 41, 42])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
         participant.bind(('', 7410 + 250 * 41))  # as one that uses domain 41
@@ -248,3 +261,114 @@ def test_second_demonstration_in_a_folder_is_refused(tmp_path, capsys):
         fcntl.flock(first, fcntl.LOCK_EX)
         assert demo.main(['--output', str(tmp_path)]) == 2
     assert f'another demo writes to {tmp_path}: give another --output' in capsys.readouterr().err
+
+
+# Teach and repeat in the simulator: a short lap, a covered camera, another route
+
+COVERED = 20.0  # seconds
+
+
+@pytest.fixture(scope='module')
+def lesson():
+    return teach(RingWorld(7), 0.0, 60.0)
+
+
+def cover(image, time):
+    """Cover the camera after some seconds; noise is left."""
+    dark = np.random.default_rng(round(time * 10)).normal(15, 3, image.shape)
+    return image if time < COVERED else dark.clip(0, 255).astype(np.uint8)
+
+
+def test_robot_returns_to_its_path_at_dusk_and_stops_when_covered(lesson, tmp_path):
+    images = []
+
+    def change(image, time):
+        images.append(image)
+        return cover(image, time)
+
+    drive = repeat(lesson, CONDITIONS['dusk'], COVERED + 3, begin=10, change=change)
+    assert drive.errors[0] == pytest.approx((1.0, math.radians(10)), abs=0.05)
+    driven = np.cumsum(drive.speeds) * STEP
+    assert driven[-1] > 25
+    assert drive.within(0.5) >= 0.95
+    assert drive.within(1.0, after=15.0) == 1.0
+    assert drive.presses == 0
+    covered = drive.times >= COVERED
+    assert drive.speeds[covered][0] > 1
+    assert drive.speeds[covered & (drive.times > COVERED + 1)].max() < 0.05
+    assert drive.reasons[-1] == 'not localized on the route'
+    plot_repeat(lesson, {'dusk': drive}, tmp_path / 'repeat.png')
+    assert (tmp_path / 'repeat.png').stat().st_size > 10_000
+    animate(lesson, drive, images[:15], tmp_path / 'repeat.webp')
+    assert (tmp_path / 'repeat.webp').stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(('seed', 'seconds', 'meters'), [(11, 4, 8), (13, 1, 1.2)])
+def test_robot_stops_where_the_camera_shows_another_route(lesson, seed, seconds, meters):
+    """Street 11 has the same cars as the taught one, at the same places."""
+    world = RingWorld(seed)
+    other, line, shown = View(world, CONDITIONS['day']), world.center_line[:-1], []
+
+    def change(image, time):
+        if time < 12:
+            return image
+        shown.append(other.image(line[round(0.5 / CELL) * len(shown)], len(shown)))
+        return shown[-1]
+
+    drive = repeat(lesson, CONDITIONS['day'], 12.5 + seconds, begin=10, change=change)
+    assert drive.speeds[drive.times < 12][-1] > 2
+    assert drive.speeds[drive.times >= 12 + seconds].max() < 0.05
+    assert drive.speeds[drive.times >= 12].sum() * STEP < meters
+
+
+def test_robot_on_another_route_does_not_move(lesson):
+    drive = repeat(lesson, CONDITIONS['day'], 4.0, begin=10, world=RingWorld(11))
+    assert drive.speeds.max() == 0
+
+
+def test_view_at_a_pose_of_the_street(lesson):
+    view, line = View(lesson.world, CONDITIONS['day']), lesson.world.center_line
+    for along in (0.3, 123.4, 599.6):
+        cell = int(along / CELL)
+        x, y, heading = line[cell]
+        ahead, right = along - cell * CELL, 1.3
+        pose = np.array([
+            x + ahead * math.cos(heading) + right * math.sin(heading),
+            y + ahead * math.sin(heading) - right * math.cos(heading),
+            heading,
+        ])  # fmt: skip
+        assert view.on_street(pose) == pytest.approx((along, right), abs=1e-6)
+
+
+def test_heading_on_the_other_lane_at_dusk_in_rain():
+    """The end of the street is not infinitely far: it is shifted as well, by about 1.5 degrees."""
+    along, world = np.arange(100, 140, 2.0), World(21)
+    lesson, other = (
+        Traverse(world, along, np.zeros(len(along), bool), light)
+        for light in (GOOD_LIGHT, RAINY_DUSK)
+    )
+    estimator, errors = OffsetFilter(), []
+    for k in range(len(along)):
+        columns = [describe_columns(traverse[k].image) for traverse in (other, lesson)]
+        offset = estimator.update(*columns)
+        truth = lesson.camera(k)[2] - other.camera(k)[2]
+        errors.append((offset.heading(FOCAL) - truth, math.atan(offset.shift / FOCAL) - truth))
+    rms = np.degrees(np.sqrt(np.mean(np.square(errors), axis=0)))
+    assert rms[0] < 1.2
+    assert rms[0] < 0.8 * rms[1]
+
+
+def test_lateral_offset_in_meters_at_dusk(lesson):
+    columns = [describe_columns(lesson.place_map.thumbnail(k)) for k in range(70)]
+    expansion = Expansion(columns.__getitem__, lesson.run.distances[:70])
+    view = View(lesson.world, CONDITIONS['dusk'])
+    for left in (1.0, -1.0):
+        estimator, results = OffsetFilter(), []
+        for k in range(30, 60, 2):
+            x, y, heading = lesson.poses[k]
+            pose = x - left * math.sin(heading), y + left * math.cos(heading), heading
+            offset = estimator.update(describe_columns(view.image(np.array(pose), k)), columns[k])
+            results.append(expansion.lateral(offset, k, FOCAL))
+        lateral, deviation = np.median(results, axis=0)
+        assert lateral == pytest.approx(left, abs=0.4)
+        assert 0.1 < deviation < 1.0

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Descriptors that other programs computed: files, maps and evaluations of them."""
 
-import sys
-
 from checkpoints import Hostile
 import numpy as np
 import pytest
@@ -56,7 +54,7 @@ def test_read_descriptors_of_each_kind_of_file(tmp_path, vectors, kind):
 
 @pytest.mark.parametrize('kind', ['npy', 'npz:b', 'mat'])
 def test_read_descriptors_of_strips_keeps_their_order(tmp_path, kind):
-    """Strip j of image i is row [i, j]; weights are norms over that of the image."""
+    """Strip j of image i is row [i, j]; weights are norms over the norm of the image."""
     array = np.random.default_rng(1).standard_normal((6, 3, 5)).astype(np.float32)
     features = read_descriptors(save(tmp_path, kind, array))
     assert features.strips.shape == (3, 6, 5)
@@ -112,12 +110,11 @@ BOTH = {'a': SOUND, 'b': SOUND}
         ('cell.mat', CELLS, 'arrays of numbers are none'),
     ],
 )
-def test_read_descriptors_of_other_files_is_rejected(tmp_path, monkeypatch, name, content, words):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / name.partition(':')[0], content)
+def test_read_descriptors_of_other_files_is_rejected(working_folder, name, content, words):
+    write(working_folder / name.partition(':')[0], content)
     with pytest.raises(SourceError, match=words):
-        read_descriptors(f'{tmp_path}/{name}')
-    assert not (tmp_path / 'trap').exists()
+        read_descriptors(f'{working_folder}/{name}')
+    assert not (working_folder / 'trap').exists()
 
 
 @pytest.mark.parametrize(
@@ -145,10 +142,9 @@ def test_read_tables_of_many_programs(tmp_path, text):
 @pytest.mark.parametrize(
     'array', ['<f2', '>f4', 'f8', 'i1', 'u8', 'fortran', 'huge', 'tiny', 'huge32', 'tiny32']
 )
-def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, monkeypatch):
+def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, set_constants):
     """Squares of float32 overflow from 1e19 on: rows are scaled before."""
-    monkeypatch.setattr(descriptors, 'AT_ONCE', 16)
-    monkeypatch.setattr(descriptors, 'MAPPED', 0)
+    set_constants(descriptors, AT_ONCE=16, MAPPED=0)
     whole = np.round(vectors * 8)  # -128 fits into i1
     whole -= whole.min() + (128 if array == 'i1' else 0)
     scale = {'huge': 1e200, 'tiny': 1e-200, 'huge32': 1e30, 'tiny32': 1e-30}.get(array, 1)
@@ -160,9 +156,9 @@ def test_read_descriptors_of_any_type_and_size(tmp_path, vectors, array, monkeyp
     np.testing.assert_allclose(features.strips[0], unit(whole.astype('f8')), atol=1e-6)
 
 
-def test_read_descriptors_of_bits_has_hamming_distances(tmp_path, monkeypatch):
+def test_read_descriptors_of_bits_has_hamming_distances(tmp_path, set_constants):
     """Of vectors and of strips; other arrays are rejected."""
-    monkeypatch.setattr(descriptors, 'AT_ONCE', 4)
+    set_constants(descriptors, AT_ONCE=4)
     bits = np.random.default_rng(2).integers(0, 2, (6, 3, 16))
     for name, array, own in (
         ('vectors', np.packbits(bits.reshape(6, 48), axis=1), bits.reshape(6, 1, 48)),
@@ -189,7 +185,7 @@ def test_read_descriptors_takes_the_only_array_that_can_be_meant(tmp_path, vecto
         np.testing.assert_allclose(features.strips[0], unit(vectors), atol=1e-6)
 
 
-def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, monkeypatch):
+def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, hide_module):
     """HDF5 behind 512 bytes; columns of MATLAB are rows of the file."""
     h5py = pytest.importorskip('h5py', reason='the extra hdf5 is not installed')
     path = tmp_path / 'a.mat'
@@ -210,7 +206,7 @@ def test_read_descriptors_of_matlab_7_3(tmp_path, vectors, monkeypatch):
     np.testing.assert_allclose(features.strips[2, 4], unit(strips[4, 2]), atol=1e-6)
     with pytest.raises(SourceError, match=r'which array\? .* are strips, x: give'):
         read_descriptors(str(path))
-    monkeypatch.setitem(sys.modules, 'h5py', None)
+    hide_module('h5py')
     with pytest.raises(SourceError, match=r'version 7.3 .* -v7, or pip install h5py'):
         read_descriptors(str(path))
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The documentation: examples and tutorials run, names exist, numbers are those of the results."""
+"""The documentation: examples and tutorials run, names exist, numbers equal the results."""
 
 import contextlib
 import json
@@ -43,12 +43,12 @@ def workspace(tmp_path_factory) -> Path:
 
 def code_blocks(page: Path, language: str = '') -> list[str]:
     blocks = re.findall(r'^```(\w*)\n(.*?)^```$', page.read_text(), re.M | re.S)
-    return [code for found, code in blocks if found == language]
+    return [code for result, code in blocks if result == language]
 
 
 def documented_commands() -> list[list[str]]:
     """Every command of the pages but the node."""
-    found, names = [], {*stavpr.COMMANDS, *stavpr.PACKAGES}
+    result, names = [], {*stavpr.COMMANDS, *stavpr.PACKAGES}
     for page in PAGES:
         for block in code_blocks(page):
             for line in block.replace('\\\n', ' ').splitlines():
@@ -57,8 +57,8 @@ def documented_commands() -> list[list[str]]:
                 if words[:2] == ['ros2', 'run'] and words[2][:7] == 'stavpr_':
                     words = words[3:]
                 if words and words[0] in names - {'node'}:
-                    found.append(words)
-    return found
+                    result.append(words)
+    return result
 
 
 @pytest.fixture
@@ -67,12 +67,12 @@ def run(workspace, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     monkeypatch.setattr('stavpr_ros.signals.signal.signal', lambda *_: None)
 
-    def printed(work, *arguments):
+    def capture(work, *arguments):
         with contextlib.suppress(SystemExit):  # of --help
             work(*arguments)
         return capsys.readouterr().out
 
-    return printed
+    return capture
 
 
 def test_readme_python_example_runs(run):
@@ -103,7 +103,9 @@ def test_build_map_and_evaluate_examples_run(run, workspace):
     ]
     documented = documented_commands()
     for words in map(str.split, examples):
-        assert any(words[: len(given)] == given for given in documented), f'undocumented: {words}'
+        assert any(words[: len(command)] == command for command in documented), (
+            f'undocumented: {words}'
+        )
         run(stavpr.main, words)
     assert json.loads((workspace / 'result.json').read_text())['settings']['mode'] == 'robust'
     assert json.loads((workspace / 'unknown.json').read_text())['unknown_images'] == 40
@@ -124,9 +126,9 @@ def test_documented_options_exist(run):
 
 def test_documented_parameters_exist():
     text = '\n'.join(page.read_text() for page in PAGES)
-    given = set(re.findall(r'(?:-p (?=\w+:=)|param set /stavpr )(\w+)', text))
-    assert given
-    assert given <= NAMES
+    names = set(re.findall(r'(?:-p (?=\w+:=)|param set /stavpr )(\w+)', text))
+    assert names
+    assert names <= NAMES
     table = (ROOT / 'README.md').read_text().partition('| parameter |')[2].partition('\n\n')[0]
     assert set(re.findall(r'^\| `(\w+)`', table, re.M)) <= NAMES
 
@@ -173,8 +175,8 @@ def test_accuracy_in_readme_is_that_of_its_run():
         names = [drive.replace('/', f'/g/{mode}/') for drive in drives]
         same, *others, train, corridor = (measured[name]['sequence']['f1'] for name in names)
         (line,) = re.findall(rf'^\| `{mode}` (\| *\d*\.\d.*)$', readme, re.M)
-        found = [float(number) for number in re.findall(r'\d*\.\d+', line)[:4]]
-        assert found == pytest.approx([same, min(others), train, corridor], abs=0.00051), mode
+        result = [float(number) for number in re.findall(r'\d*\.\d+', line)[:4]]
+        assert result == pytest.approx([same, min(others), train, corridor], abs=0.00051), mode
 
 
 def test_speed_in_readme_is_that_of_its_run():

@@ -1,8 +1,10 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command evaluate, on synthetic traverses and on real ones, and the page of its report."""
+"""The command evaluate on traverses and descriptors: numbers, exports, the page of its report."""
 
 import csv
+from glob import glob
+import json
 import os
 import re
 import shutil
@@ -14,12 +16,14 @@ from fixtures import route_images
 import numpy as np
 import pytest
 from scores import best_f1
-from stavpr_lab.commands import evaluate
+from stavpr_lab.commands import build_descriptor_map, evaluate
 from stavpr_lab.evaluation.evaluate import recognize_all
 from stavpr_lab.evaluation.metrics import image_matches
+from stavpr_lab.features.descriptors import read_descriptors
 from stavpr_ros.alignment import SequenceSettings, SpatialSettings
+from stavpr_ros.errors import UnavailableError
 from stavpr_ros.features import FeatureExtractor
-from stavpr_ros.mapping import build_map, save_map
+from stavpr_ros.mapping import build_map, load_map, merge_maps, save_map
 from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 
@@ -87,16 +91,16 @@ def test_evaluate_compares_odometry_with_the_map_poses(folders, numbers, tmp_pat
 
 
 def test_evaluate_of_two_folders_writes_numbers_and_settings(folders, numbers):
-    found = numbers(*pair(folders), '--mode', 'paper', '--tolerance', 1)
-    assert all(found[kind]['average_precision'] > 0.9 for kind in KINDS)
-    assert found['sequence']['queries'] == PLACES
-    assert found['sequence_without_ends']['queries'] == PLACES - 19
+    result = numbers(*pair(folders), '--mode', 'paper', '--tolerance', 1)
+    assert all(result[kind]['average_precision'] > 0.9 for kind in KINDS)
+    assert result['sequence']['queries'] == PLACES
+    assert result['sequence_without_ends']['queries'] == PLACES - 19
     expected = {'mode': 'paper', 'tolerance': 1, 'strategy': 'adaptive', 'exclude_places': None}
-    assert expected.items() <= found['settings'].items()
-    assert 'gradient' in found['settings']['features']
-    assert found['times']['total_s'] > 0
-    assert found['calibration'] is None  # mode paper declares no probabilities
-    assert not {'false_alarm_rate', 'default_threshold'} & found.keys()
+    assert expected.items() <= result['settings'].items()
+    assert 'gradient' in result['settings']['features']
+    assert result['times']['total_s'] > 0
+    assert result['calibration'] is None  # mode paper declares no probabilities
+    assert not {'false_alarm_rate', 'default_threshold'} & result.keys()
 
 
 @pytest.mark.parametrize(
@@ -107,7 +111,7 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     """Every image through the recognizer, windows assigned to their middles, best F1."""
     options = [*options, '--mode', 'paper', '--warp', '2x', '--tolerance', 2]
     options += ['--sequence-length', 8, '--beta', 1.5]
-    found = numbers(*pair(folders), '--query', folders / 'shifted', *options)
+    result = numbers(*pair(folders), '--query', folders / 'shifted', *options)
     extractor = FeatureExtractor('gradient')
     place_map = build_map(open_source(folders / 'map'), extractor, progress=False)
     query = build_map(open_source(folders / 'shifted'), extractor, progress=False).features[::2]
@@ -117,15 +121,15 @@ def test_evaluate_numbers_are_those_of_the_recognizer(folders, numbers, options,
     matches, true = image_matches(recognize_all(recognizer, query), 8), np.arange(0, PLACES, 2)
     correct = np.abs(matches.places - true) <= 2
     best = best_f1(matches.distances, correct)
-    assert found['sequence']['f1'] == best.f1
-    assert found['sequence']['threshold'] == pytest.approx(best.threshold, abs=1e-6)
-    assert found['sequence']['recall_at_1'] == np.mean(correct)
+    assert result['sequence']['f1'] == best.f1
+    assert result['sequence']['threshold'] == pytest.approx(best.threshold, abs=1e-6)
+    assert result['sequence']['recall_at_1'] == np.mean(correct)
     distances = recognizer.distances(query)
     single = best_f1(distances.min(axis=1), np.abs(distances.argmin(axis=1) - true) <= 2)
-    assert found['single']['f1'] == single.f1
+    assert result['single']['f1'] == single.f1
     ends = slice(3, PLACES // 2 - 4)
     inner = best_f1(matches.distances[ends], correct[ends])
-    assert found['sequence_without_ends']['f1'] == inner.f1
+    assert result['sequence_without_ends']['f1'] == inner.f1
 
 
 def test_evaluate_with_unknown_images_counts_false_alarms(folders, numbers):
@@ -148,8 +152,8 @@ def test_evaluate_with_crop_equals_images_cropped_before(folders, numbers, tmp_p
         return write_images(tmp_path / name, [image[:, columns] for image in images])
 
     first, second = crop('map', slice(128 - 38)), crop('query', slice(13, None))
-    found = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
-    assert found == numbers(*pair(folders), '--map', first, '--query', second)['sequence']
+    result = numbers(*pair(folders), '--crop-map', 0.3, '--crop-query', 0.1)['sequence']
+    assert result == numbers(*pair(folders), '--map', first, '--query', second)['sequence']
 
 
 def test_evaluate_with_saved_maps_equals_folders(folders, tmp_path, numbers, run):
@@ -176,8 +180,8 @@ def test_evaluate_with_a_dataset_finds_map_query_and_tolerance(tmp_path, numbers
     images = route_images(24)
     for name in ('summer', 'winter'):
         write_images(tmp_path / 'nordland' / name, images)
-    found = numbers('--dataset', f'nordland={tmp_path}')
-    assert (found['settings']['tolerance'], found['sequence']['f1']) == (3, 1)
+    result = numbers('--dataset', f'nordland={tmp_path}')
+    assert (result['settings']['tolerance'], result['sequence']['f1']) == (3, 1)
     source, saved = open_source(tmp_path / 'nordland' / 'winter'), tmp_path / 'unknown.stavpr'
     save_map(build_map(source, FeatureExtractor('gradient', projection=32), progress=False), saved)
     options = ['--dataset', f'nordland={tmp_path}', '--features', 'gradient']
@@ -192,9 +196,9 @@ def test_evaluate_with_a_ground_truth_file_has_tolerance_zero(folders, numbers, 
     options = [*pair(folders), '--truth', pairs]
     exact = numbers(*options)['single']
     assert (exact['recall_at_1'], exact['queries_with_match']) == (0, PLACES - 2)
-    found = numbers(*options, '--tolerance', 2)
-    assert found['single']['recall_at_1'] == 1
-    decision = found['decision']  # the last two images are named by no pair: nothing is wrong
+    result = numbers(*options, '--tolerance', 2)
+    assert result['single']['recall_at_1'] == 1
+    decision = result['decision']  # the last two images are named by no pair: nothing is wrong
     assert (decision['images_with_truth'], decision['wrongly_matched']) == (PLACES - 2, 0)
     assert decision['matched_with_truth'] < decision['matched'] <= decision['images'] == PLACES
 
@@ -225,10 +229,10 @@ def test_evaluate_with_loop_closure_matches_the_second_lap(tmp_path, numbers):
     cv2.imwrite(str(tmp_path / 'truth.png'), truth)
     options = ['--query', query, '--truth', tmp_path / 'truth.png', '--loop-closure']
     options += ['--mode', 'paper']
-    found = numbers(*options, '--tolerance', 1, '--exclude-places', 25)
-    assert found['sequence']['queries_with_match'] == 40
-    assert found['single']['recall_at_1'] == 1
-    assert found['sequence']['f1'] > 0.7
+    result = numbers(*options, '--tolerance', 1, '--exclude-places', 25)
+    assert result['sequence']['queries_with_match'] == 40
+    assert result['single']['recall_at_1'] == 1
+    assert result['sequence']['f1'] > 0.7
     # map and ground truth end at the same image
     assert numbers(*options, '--exclude-places', 40)['single']['recall_at_1'] > 0.8
     beyond = numbers(*options, '--exclude-places', 41)['single']
@@ -255,20 +259,20 @@ def report(run, tmp_path):
 def test_evaluate_with_places_removed_counts_unseen_images(folders, report, tmp_path, mode):
     """Without places 20 .. 39, images 25 .. 34 are more than five places from the map."""
     options = ['--mode', mode, '--remove-from-map', '20:40', '--remove-from-map', '50:53']
-    found, rows, text = report(*pair(folders), *options, '--tolerance', 0)
-    assert (found['places'], found['images']) == (PLACES - 23, PLACES)
-    assert found['sequence']['queries_with_match'] == PLACES - 23
+    result, rows, text = report(*pair(folders), *options, '--tolerance', 0)
+    assert (result['places'], result['images']) == (PLACES - 23, PLACES)
+    assert result['sequence']['queries_with_match'] == PLACES - 23
     assert [int(row['true_place']) for row in rows[:60:10]] == [0, 10, -1, -1, 20, -1]
     accepted = [int(row['accepted']) for row in rows]
     matched = sum(accepted[25:35])
-    assert found['unseen'] == [
+    assert result['unseen'] == [
         {'first': 20, 'last': 40, 'images': 10, 'matched': matched},
         {'first': 50, 'last': 53, 'images': 0, 'matched': 0},
     ]
     assert f'20 .. 39: {matched} of 10 unseen images matched' in text
     right = [int(row['sequence_right']) for row in rows]
     wrong = sum(a and not r for a, r in zip(accepted, right, strict=True))
-    decision, threshold = found['decision'], found['sequence']['threshold']
+    decision, threshold = result['decision'], result['sequence']['threshold']
     assert (decision['matched'], decision['wrongly_matched']) == (sum(accepted), wrong)
     assert decision['rule'] == ('default' if mode == 'robust' else 'best F1')
     rate, (low, high) = decision['error_rate'], decision['error_rate_interval']
@@ -287,26 +291,26 @@ def test_evaluate_with_places_removed_counts_unseen_images(folders, report, tmp_
 def test_evaluate_combines_drive_options(folders, report):
     """Reversed at double speed with a stop: the removed places are unseen, the others found."""
     options = ['--speed', 2, '--stop', '30:12', '--reverse', '--remove-from-map', '20:40']
-    found, rows, _ = report(*pair(folders), *options, '--mode', 'paper', '--tolerance', 0)
+    result, rows, _ = report(*pair(folders), *options, '--mode', 'paper', '--tolerance', 0)
     images = [*range(0, 30, 2), *[30] * 13, *range(32, PLACES, 2)][::-1]
     assert [int(row['recorded_image']) for row in rows] == images
     assert rows[0]['identifier'] == '058.png'
     number = {place: i for i, place in enumerate([*range(20), *range(40, PLACES)])}
     assert [int(row['true_place']) for row in rows] == [number.get(i, -1) for i in images]
-    assert [stretch['images'] for stretch in found['unseen']] == [13 + len((26, 28, 32, 34))]
-    assert found['single']['recall_at_1'] == 1
-    assert found['settings']['remove_from_map'] == [[20, 40]]
+    assert [stretch['images'] for stretch in result['unseen']] == [13 + len((26, 28, 32, 34))]
+    assert result['single']['recall_at_1'] == 1
+    assert result['settings']['remove_from_map'] == [[20, 40]]
 
 
 def test_evaluate_shows_the_calibration_of_declared_probabilities(folders, report, tmp_path):
-    found, rows, text = report(*pair(folders))
-    calibration = found['calibration']
+    result, rows, text = report(*pair(folders))
+    calibration = result['calibration']
     declared = sum(row['probability'] != 'nan' for row in rows)
-    early = found['decision']['early_matched']
+    early = result['decision']['early_matched']
     assert calibration['images'] == declared + early > declared
     assert f'{early} early matches, 0 of them wrongly' in text
     # a node has the first match with the early ones, and none for the end of the last window
-    online, matched = (found['decision'][name] for name in ('online_matched', 'matched'))
+    online, matched = (result['decision'][name] for name in ('online_matched', 'matched'))
     assert early < online < matched == len(rows)
     assert f'(online: {online}, when each image comes)' in text
     error = calibration['expected_calibration_error']
@@ -343,7 +347,7 @@ def test_report_holds_numbers_matches_plots_and_page(folders, run, tmp_path):
     left, top, width, height = data['box']
     assert 0 < left < left + width < 1
     assert 0 < top < top + height < 1
-    shown = next(pair for pair in data['pairs'] if pair['right'])
+    shown = next(row for row in data['pairs'] if row['right'])
     assert shown['recorded'] == [shown['image'], shown['place']]
     assert data['places'][str(shown['place'])].startswith('data:image/jpeg')
     results = read_json((folder / 'results.json').read_text())
@@ -414,15 +418,15 @@ def test_evaluate_without_truth_reports_matches_of_unequal_traverses(folders, ru
     assert code == 0, errors
     assert output.splitlines()[0] == 'elsewhere on the map map, no ground truth'
     assert 'matched, default: ' in output
-    found = read_json((tmp_path / 'report' / 'results.json').read_text())
+    result = read_json((tmp_path / 'report' / 'results.json').read_text())
     counts = {'matched', 'early_matched', 'online_matched'}
-    assert found['decision'].keys() == {'rule', 'images', *counts}
-    assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & found.keys()
+    assert result['decision'].keys() == {'rule', 'images', *counts}
+    assert not {*KINDS, 'calibration', 'unseen', 'recommended_threshold'} & result.keys()
     with (tmp_path / 'report' / 'answers.csv').open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 40
     assert {rows[0][name] for name in ('true_place', 'sequence_right', 'in_map')} == {''}
-    assert sum(int(row['accepted']) for row in rows) == found['decision']['matched']
+    assert sum(int(row['accepted']) for row in rows) == result['decision']['matched']
     page = (tmp_path / 'report' / 'report.html').read_text()
     assert 'no ground truth</h1>' in page
     assert not re.search('the ground truth</h2>|All numbers|Yellow is', page)
@@ -437,13 +441,13 @@ def test_evaluate_of_loop_closures_in_the_hallway_gives_the_measured_recall(data
     folder = data_folder / 'rtabmap_hallway_loop'
     options = ['--loop-closure', '--exclude-places', 20, '--sequence-length', 10]
     options += ['--query', folder / 'samples', '--truth', folder / 'samples_GT.bmp']
-    found = numbers(*options)
-    assert found['sequence']['recall_at_1'] > 0.8
-    assert found['default_threshold']['threshold'] == 0.5  # 1 - min_probability
-    assert found['decision']['precision'] == found['default_threshold']['precision'] == 1
+    result = numbers(*options)
+    assert result['sequence']['recall_at_1'] > 0.8
+    assert result['default_threshold']['threshold'] == 0.5  # 1 - min_probability
+    assert result['decision']['precision'] == result['default_threshold']['precision'] == 1
     late = numbers(*options, '--late-closures')
     assert late['decision']['precision'] == 1
-    assert late['decision']['recall'] > found['decision']['recall']
+    assert late['decision']['recall'] > result['decision']['recall']
 
 
 def test_reports_and_numbers_are_replaced_only_by_force(run, folders, tmp_path):
@@ -486,3 +490,201 @@ def test_report_fits_a_phone_and_marks_pairs_by_clicks(tmp_path):
         print(f'screenshot: {shot}')
     text = subprocess.check_output([*browser, '--dump-dom', page.as_uri()], text=True, timeout=100)
     assert '<title>0 16 of 24 pairs are marked</title>' in text  # 0 pixels are cut off
+
+
+# Inputs and exports of evaluate: descriptors, several queries, options of maps, other formats
+
+
+@pytest.fixture(scope='module')
+def vectors():
+    """Return a curve of 40 vectors, not of unit norm; the sixth is zero."""
+    curve = np.cumsum(np.random.default_rng(0).standard_normal((40, 24)), axis=0)
+    curve[5] = 0
+    return curve.astype(np.float32)
+
+
+@pytest.fixture
+def arrays(tmp_path, vectors):
+    """Write descriptors of a map and a query, with noise; return the options."""
+    np.save(tmp_path / 'map.npy', vectors)
+    noise = np.random.default_rng(3).normal(0, 0.5, vectors.shape)
+    np.savez(tmp_path / 'query.npz', query=vectors + noise)
+    paths = ['--map', tmp_path / 'map.npy', '--query', f'{tmp_path}/query.npz:query']
+    return [*paths, '--sequence-length', 5, '--truth', 'identity']
+
+
+def test_evaluate_of_descriptors_and_of_exported_ones_are_equal(run, arrays, tmp_path):
+    first, second, exported = (tmp_path / name for name in ('1.json', '2.json', 'arrays'))
+    assert run(*arrays, '--json', first, '--export', exported)[0] == 0
+    again = ['--map', exported / 'map.npy', '--query', exported / 'query.npy', *arrays[4:]]
+    assert run(*again, '--json', second)[0] == 0
+    numbers = [json.loads(path.read_text()) for path in (first, second)]
+    assert numbers[0]['sequence']['f1'] == pytest.approx(numbers[1]['sequence']['f1'])
+    assert numbers[0]['single']['recall_at_1'] > 0.9
+    run.fails(1, 'exists already', *arrays, '--json', tmp_path / '3.json', '--export', exported)
+
+
+def test_evaluate_names_a_result_that_cannot_be_wrong(run, arrays, tmp_path):
+    twice = [*arrays[:3], arrays[1], *arrays[4:]]
+    texts = 'accepts 100% of the 40 places', 'map and query are the same images'
+    for options, shown in (([*arrays, '--tolerance', 40], 0), (twice, 1), (arrays, None)):
+        code, _, errors = run(*options, '--json', tmp_path / 'a.json', '--force')
+        assert (code, [text in errors for text in texts]) == (0, [shown == 0, shown == 1])
+
+
+def test_evaluate_names_the_time_of_several_sessions(run, small_map, route, tmp_path):
+    save_map(merge_maps([small_map, small_map], 'ab'), tmp_path / 'both.stavpr')
+    both = ['--map', tmp_path / 'both.stavpr', '--query', write_images(tmp_path / 'query', route)]
+    code, shown, _ = run(*both, '--json', tmp_path / 'a.json')
+    assert (code, '2 sessions: an image takes up to 2 times the time of one' in shown) == (0, True)
+
+
+def test_evaluate_exports_strips_of_images(run, route, tmp_path):
+    folder = write_images(tmp_path / 'images', route[:24])
+    both = ['--map', folder, '--query', folder, '--sequence-length', 5]
+    both += ['--features', 'gradient']
+    assert run(*both, '--json', tmp_path / 'a.json', '--export', tmp_path)[0] == 0
+    array = np.load(tmp_path / 'map.npy')
+    features = FeatureExtractor('gradient').extract(route[:24])
+    assert array.shape == (24, 7, 224)
+    again = read_descriptors(str(tmp_path / 'map.npy'))
+    np.testing.assert_allclose(again.strips, features.strips, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(again.weights, features.weights, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('options', 'word'),
+    [
+        (['--strips', 7], '--strips'),
+        (['--projection', 8], '--projection'),
+        (['--features', 'onnx'], '--features'),
+        (['--gradient-cell', 32], '--gradient-cell'),
+        (['--crop-map', 0.2], 'saved map or an array'),
+    ],
+)
+def test_evaluate_of_descriptors_rejects_options_of_images(run, arrays, options, word):
+    run.fails(2, word, *arrays, *options)
+
+
+def test_map_of_descriptors_takes_descriptors_only(run, arrays, route, tmp_path, runner):
+    build = runner(build_descriptor_map)
+    saved = tmp_path / 'route.stavpr'
+    source = ['--descriptors-source', 'netvlad']
+    poses = tmp_path / 'poses.csv'
+    poses.write_text(''.join(f'{i},0,0\n' for i in range(40)))
+    code, output, _ = build('--input', arrays[1], '--output', saved, *source, '--poses', poses)
+    assert (code, '1 strips of 24 dimensions' in output) == (0, True)
+    place_map = load_map(saved)
+    assert place_map.pose(39)[0] == 39
+    with pytest.raises(UnavailableError, match='not from images'):
+        place_map.extractor()
+    query = ['--query', *arrays[3:], '--json', tmp_path / 'a.json', '--force']
+    assert run('--map', saved, *query)[0] == 0
+    run.fails(1, 'megaloc', '--map', saved, *query, '--descriptors-source', 'megaloc')
+    images = write_images(tmp_path / 'images', route[:24])
+    run.fails(1, 'not from images', '--map', saved, '--query', images)
+
+
+def test_map_of_bits_takes_bits_without_the_option(run, arrays, vectors, tmp_path, runner):
+    """The map has the setting; a query of numbers is rejected."""
+    path, saved = tmp_path / 'bits.npy', tmp_path / 'bits.stavpr'
+    np.save(path, np.packbits(vectors > 0, axis=1))
+    build = runner(build_descriptor_map)
+    build.fails(1, 'with --descriptors-bits true', '--input', path, '--output', saved)
+    code, output, _ = build('--input', path, '--output', saved, '--descriptors-bits', 'true')
+    assert (code, '1 strips of 24 dimensions' in output) == (0, True)
+    options = ['--map', saved, *arrays[4:], '--json', tmp_path / 'a.json', '--force', '--query']
+    assert run(*options, path)[0] == 0
+    run.fails(1, 'expected uint8 for bits', *options, arrays[3])
+
+
+@pytest.mark.long
+def test_evaluate_of_several_queries_equals_each(run, arrays, vectors, tmp_path):
+    np.save(tmp_path / 'other.npy', vectors[::-1])
+    options, query = ['--map', arrays[1], *arrays[4:]], arrays[3]
+    several = ['--query', query, tmp_path / 'other.npy', '--output', tmp_path / 'out']
+    assert run(*options, *several, '--processes', 2)[0] == 0
+    assert run(*options, '--query', query, '--json', tmp_path / 'a.json')[0] == 0
+    both = (tmp_path / 'a.json', *(tmp_path / 'out').glob('query*.json'))
+    one, other = (json.loads(file.read_text()) for file in both)
+    for name in ('sequence', 'single', 'decision', 'calibration', 'map_id'):
+        assert one[name] == other[name]
+    assert (tmp_path / 'out' / 'other' / 'report.html').is_file()
+
+
+N = 24
+
+
+@pytest.fixture
+def export(runner, tmp_path, route):
+    """Run evaluate on the same images as map and query with an export; return the outcome."""
+    for name in ('map', 'query'):
+        write_images(tmp_path / name, route[:N])
+    command = runner(evaluate)
+    folders = ['--map', tmp_path / 'map', '--query', tmp_path / 'query', '--sequence-length', 5]
+
+    def export(name, *options):
+        form = ['--export', tmp_path / 'out', '--export-format', name]
+        return command(*folders, *form, '--json', tmp_path / 'numbers.json', *options)
+
+    return export
+
+
+def test_export_vpr_methods_evaluation_has_positions_in_the_names(export, tmp_path):
+    options = ['--truth', 'identity', '--tolerance', 2, '--features', 'gradient']
+    assert export('vpr_methods_evaluation', *options)[0] == 0
+    out, positions, rows = tmp_path / 'out', [], []
+    for side in ('database', 'queries'):
+        paths = (out / f'{side}_images_paths.txt').read_text().splitlines()
+        assert sorted(paths) == sorted(os.path.basename(p) for p in glob(f'{out}/{side}/*'))
+        assert all((out / side / path).is_file() for path in paths)
+        positions.append(np.array([path.split('@')[1:3] for path in paths]).astype(float))
+        rows.append(np.load(out / f'{side}_descriptors.npy'))
+    assert rows[0].dtype == np.float32
+    assert rows[0].shape == (N, 7 * 224)
+    np.testing.assert_allclose(np.linalg.norm(rows[0], axis=1), 1, rtol=1e-5)
+    assert (rows[1] @ rows[0].T).argmax(axis=1).tolist() == list(range(N))
+    distances = np.linalg.norm(positions[1][:, None] - positions[0], axis=2)
+    index = np.arange(N)
+    np.testing.assert_array_equal(distances <= 25, abs(index[:, None] - index) <= 2)
+
+
+def test_export_vpr_methods_evaluation_takes_positions_from_poses(export, tmp_path):
+    poses = tmp_path / 'poses.csv'
+    poses.write_text(''.join(f'{i},{-i},7\n' for i in range(N)))
+    options = ['--truth', 'poses', '--query-poses', poses, '--map-poses', poses, '--reverse']
+    assert export('vpr_methods_evaluation', *options)[0] == 0
+    paths = (tmp_path / 'out/queries_images_paths.txt').read_text().splitlines()
+    assert [path.split('@')[1:3] for path in paths] == [
+        [f'{i:.2f}', f'{-i:.2f}'] for i in reversed(range(N))
+    ]
+    shown = os.readlink(tmp_path / 'out/queries' / paths[0])
+    assert shown == str(max((tmp_path / 'query').iterdir()))
+
+
+def test_export_vpr_tutorial_gives_its_metrics_our_numbers(export, tmp_path):
+    assert export('vpr_tutorial', '--truth', 'identity', '--tolerance', 1)[0] == 0
+    S, truth = np.load(tmp_path / 'out/S.npy'), np.load(tmp_path / 'out/GT.npz')
+    assert S.shape == truth['GThard'].shape == truth['GTsoft'].shape == (N, N)
+    recall = truth['GTsoft'][S.argmax(axis=0), np.arange(N)].mean()
+    single = read_json((tmp_path / 'numbers.json').read_text())['single']
+    assert recall == pytest.approx(single['recall_at_1'])
+
+
+def test_export_hloc_names_images_below_one_folder(export, tmp_path):
+    assert export('hloc')[0] == 0
+    pairs = [line.split() for line in (tmp_path / 'out/pairs.txt').read_text().splitlines()]
+    assert all((tmp_path / name).is_file() for arrays in pairs for name in arrays)
+    best = {}
+    for query, place in pairs:
+        best.setdefault(query, place)
+    assert [place.removeprefix('map/') for place in best.values()] == [
+        query.removeprefix('query/') for query in best
+    ]
+    (tmp_path / 'a place').symlink_to(tmp_path / 'map')
+    code, _, errors = export('hloc', '--map', tmp_path / 'a place', '--force')
+    assert (code, 'has a space' in errors) == (1, True)
+    np.save(tmp_path / 'v.npy', np.eye(N))
+    arrays = ['--map', tmp_path / 'v.npy', '--query', tmp_path / 'v.npy', '--force']
+    code, _, errors = export('hloc', *arrays)
+    assert (code, 'give --map and --query as folders' in errors) == (1, True)

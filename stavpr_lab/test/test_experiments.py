@@ -100,9 +100,7 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     """Queries that are shifted to the side have different numbers in every configuration."""
     images = route_images(40)
     shifted = {'map': images, 'query': [np.roll(image, 60, axis=1) for image in images]}
-    sources = [
-        FolderSource(write_images(tmp_path / name, drive)) for name, drive in shifted.items()
-    ]
+    sources = [FolderSource(write_images(tmp_path / name, v)) for name, v in shifted.items()]
     truth = GroundTruth.identity(40, 40, 1)
     experiment = DatasetExperiment(Dataset(*sources, truth, 1), 'gradient', None)
     extractor = FeatureExtractor('gradient')
@@ -111,7 +109,7 @@ def test_every_configuration_reaches_the_recognizer(tmp_path):
     plain = evaluate_on_map(place_map, query.features, truth, settings)
     columns = {column.name: column for preset in PRESETS.values() for column in preset}
     metrics = {name: experiment.evaluate(column) for name, column in columns.items()}
-    numbers = {name: found.to_json() for name, found in metrics.items() if found is not None}
+    numbers = {name: result.to_json() for name, result in metrics.items() if result is not None}
     assert numbers['sta_vpr'] == plain.sequence.to_json()
     assert numbers['spatial'] == plain.single.to_json()
     different = ('no_alignment', 'temporal', 'sta_vpr_fast', 'grp', 'ra', 'vanilla', 'robust')

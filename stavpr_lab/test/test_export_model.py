@@ -179,12 +179,12 @@ def test_export_of_each_signature_equals_the_original(
     assert ('batches' in output) == batches
     assert 'GNU GENERAL PUBLIC LICENSE, Version 3' in output
     assert hashlib.sha256(path.read_bytes()).hexdigest() in output
-    network, found = original(repository, name, **arguments), features(path, 'global')
+    network, result = original(repository, name, **arguments), features(path, 'global')
     with torch.no_grad():
         singles = [network(image[None]) for image in batch_of(images())]
     which = {'transformer': 'token', 'salad': 0}.get(name)
     expected = torch.cat([one if which is None else one[which] for one in singles])
-    np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-4)
+    np.testing.assert_allclose(result, expected, atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -200,13 +200,13 @@ def test_export_of_maps_equals_the_inner_module(run, repository, tmp_path, name,
     path = tmp_path / 'net.onnx'
     code, _, errors = run(*entry(repository, name, ALLOW, '--output', path, *options))
     assert (code, errors) == (0, '')
-    found, network = features(path, 'map'), original(repository, name)
+    result, network = features(path, 'map'), original(repository, name)
     with torch.no_grad():
         if name == 'salad':
             expected, _ = network.backbone(batch_of(images()))
         else:
             expected = network(batch_of(images()))['patches'].mT.reshape(3, 8, 4, 4)
-    np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-4)
+    np.testing.assert_allclose(result, expected, atol=1e-5, rtol=1e-4)
     outputs = {value.name for value in onnx.load(path).graph.output}
     assert outputs == ({'map'} if '' in options else {'global', 'map'})
 
@@ -240,8 +240,8 @@ TOKENS = ['--vector', 'token', '--map-module']
 )
 def test_export_names_what_is_wrong(run, repository, tmp_path, name, options, code, words):
     path = tmp_path / 'net.onnx'
-    found, _, errors = run(*entry(repository, name, ALLOW, '--output', path, *options))
-    assert found == code
+    result, _, errors = run(*entry(repository, name, ALLOW, '--output', path, *options))
+    assert result == code
     assert re.search(words, errors), errors
     assert not path.exists()
 

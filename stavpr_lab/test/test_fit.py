@@ -17,14 +17,14 @@ from stavpr_ros.method.model import MODEL
 
 
 @pytest.fixture
-def restored():
+def restore_numbers():
     before = {name: fit_windows.value_of(name) for name in ('CLOSE', 'start')}
     yield before
     for name, value in before.items():
         fit_windows.set_value(name, value)
 
 
-def test_numbers_are_set_in_all_modules_and_in_kernels(restored):
+def test_numbers_are_set_in_all_modules_and_in_kernels(restore_numbers):
     arguments = np.arange(9), np.full((1, 9), 0.1), np.array([4])
     assert path.close_sums(*arguments)[0] == pytest.approx(0.5)
     fit_windows.set_value('CLOSE', 4)

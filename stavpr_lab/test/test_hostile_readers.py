@@ -14,7 +14,7 @@ from processes import executable
 import pytest
 
 ROOM = 64 * 2**20  # bytes
-# of a small process: that of its parent counts for a child before it runs the command
+# of a small process: a child counts its parent's memory before it runs the command
 PEAK = """
 import resource, subprocess, sys
 code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)

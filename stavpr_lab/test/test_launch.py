@@ -84,13 +84,13 @@ def test_launch_file_without_a_package_that_it_needs_starts_nothing(load, name, 
 
 @pytest.mark.parametrize('name', NAMES)
 def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
-    """All are given at once; names and types are those of the tables of the nodes."""
+    """All are given at once; names and types are in the tables of the nodes."""
     launch, types = load(name), {}
     for node in launch.start():
         renamed = OTHER_NAMES if node.executable == 'pose_graph' else {}
-        table = {renamed.get(n, n): row for n, row in TABLES.get(node.executable, {}).items()}
+        table = {renamed.get(n, n): d for n, d in TABLES.get(node.executable, {}).items()}
         types = {**table, **types, 'use_sim_time': False}
-    given = {n: TEXTS[type(types[n])][0] for n in launch.arguments if n in types}
+    options = {n: TEXTS[type(types[n])][0] for n in launch.arguments if n in types}
     own = {'replay': REPLAY, 'multi_camera': {'cameras'}}.get(name, set())
     expected = {*types, *RENAMED, *REMOVED, *COMMON, *own} - set(FIXED[name]) - NO_ARGUMENTS
     assert set(launch.arguments) == expected
@@ -98,7 +98,7 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
         assert len(argument.description) > 10
         assert hasattr(argument, 'default_value') or argument.first in REQUIRED
     reached = set()
-    for node in launch.start(**given):
+    for node in launch.start(**options):
         if node.executable == 'replay':  # which publishes /clock instead
             continue
         file, values = node.parameters
@@ -106,7 +106,7 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
         renamed = OTHER_NAMES if node.executable == 'pose_graph' else {}
         for parameter, default in {**TABLES[node.executable], 'use_sim_time': False}.items():
             argument = renamed.get(parameter, parameter)
-            if argument in given:
+            if argument in options:
                 reached.add(argument)
                 value, kind = values[parameter], type(default)
                 text = repr(TEXTS[type(types[argument])][1])
@@ -116,7 +116,7 @@ def test_every_argument_reaches_every_node_that_has_the_parameter(load, name):
             'image/compressed': '${image}/compressed',
         }
         assert words(node.namespace) == '${namespace}' + '/front' * (name == 'multi_camera')
-    assert reached == set(given) - set(RENAMED)
+    assert reached == set(options) - set(RENAMED)
 
 
 def test_removed_parameters_reach_the_node_which_names_them(load):
@@ -232,7 +232,7 @@ def test_launch_of_replay_passes_its_options(load, given, expected):
 def test_documented_launch_arguments_exist(load):
     pages = [ROOT / 'README.md', *(ROOT / 'docs').rglob('*.md')]
     text = ' '.join(page.read_text() for page in pages).replace('\\\n', ' ')
-    found = re.findall(r'^ros2 launch stavpr_(?:ros|nav) (\w+)\.launch\.py(.*)', text, re.M)
-    assert {name for name, _ in found} >= {'stavpr', 'replay', 'multi_camera', 'teach', 'repeat'}
-    for name, given in found:
-        assert set(re.findall(r'(\w+):=', given)) <= set(load(name).arguments), (name, given)
+    result = re.findall(r'^ros2 launch stavpr_(?:ros|nav) (\w+)\.launch\.py(.*)', text, re.M)
+    assert {name for name, _ in result} >= {'stavpr', 'replay', 'multi_camera', 'teach', 'repeat'}
+    for name, options in result:
+        assert set(re.findall(r'(\w+):=', options)) <= set(load(name).arguments), (name, options)

@@ -125,8 +125,8 @@ def test_evaluate_ranking_recall_at_k_counts_any_of_the_first_k():
     places[1, :7] = 1, 2, 4, 5, 6, 7, 3
     places[2, :1] = 8
     places[3, :1] = 3  # not in the map: not counted
-    found = evaluate_ranking(ranking(places, np.arange(4)), truth).recall_at
-    assert found == {1: 0, 5: 1 / 3, 10: 2 / 3, 20: 2 / 3}
+    result = evaluate_ranking(ranking(places, np.arange(4)), truth).recall_at
+    assert result == {1: 0, 5: 1 / 3, 10: 2 / 3, 20: 2 / 3}
 
 
 def test_evaluate_ranking_of_a_slice_counts_only_these_queries():
@@ -169,13 +169,13 @@ def test_calibrate_six_images_by_hand():
     probabilities = np.array([1.0, 0.95, 0.94, 0.3, NAN, 0.55])
     correct = np.array([True, True, False, True, True, False])
     has_match = np.array([True, True, True, True, True, False])
-    found = calibrate(probabilities, correct, has_match)
-    assert found.images.tolist() == [0, 0, 0, 1, 0, 1, 0, 0, 0, 3]
-    assert found.declared[[3, 5, 9]] == pytest.approx([0.3, 0.55, 2.89 / 3])
-    assert found.right[[3, 5, 9]] == pytest.approx([1, 0, 2 / 3])
-    assert np.isnan(found.right[0])
-    assert found.expected_error == pytest.approx((2.89 - 2 + 0.7 + 0.55) / 5)
-    numbers = found.to_json()
+    result = calibrate(probabilities, correct, has_match)
+    assert result.images.tolist() == [0, 0, 0, 1, 0, 1, 0, 0, 0, 3]
+    assert result.declared[[3, 5, 9]] == pytest.approx([0.3, 0.55, 2.89 / 3])
+    assert result.right[[3, 5, 9]] == pytest.approx([1, 0, 2 / 3])
+    assert np.isnan(result.right[0])
+    assert result.expected_error == pytest.approx((2.89 - 2 + 0.7 + 0.55) / 5)
+    numbers = result.to_json()
     assert numbers['images'] == 5
     assert numbers['bins'][3] == {
         'from': 0.3, 'to': 0.4, 'images': 1, 'declared': 0.3, 'right': 1.0
@@ -191,8 +191,8 @@ def test_calibrate_six_images_by_hand():
 
 
 def test_calibrate_of_a_level_that_nothing_reaches_has_no_precision():
-    found = calibrate(np.array([0.4, 0.2]), np.array([True, False]), np.ones(2, bool))
-    level = found.to_json()['levels'][0]
+    result = calibrate(np.array([0.4, 0.2]), np.array([True, False]), np.ones(2, bool))
+    level = result.to_json()['levels'][0]
     assert level == {'probability': 0.5, 'matched': 0, 'precision': None, 'recall': 0.0}
 
 

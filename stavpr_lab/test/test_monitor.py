@@ -65,7 +65,7 @@ def test_history_keeps_a_match_just_after_a_dropped_image():
 
 
 @pytest.fixture
-def served(history):
+def browser(history):
     """Return a function that sends a request, with the commands that the server has run."""
     commands = []
 
@@ -99,21 +99,21 @@ def test_monitor_on_a_port_that_is_none_is_a_wrong_usage(port, capsys):
     assert 'expected a port, 0 to 65535' in capsys.readouterr().err
 
 
-def test_server_serves_the_page_the_events_and_the_image(served, history):
-    status, page = served('GET', '/')
+def test_server_serves_the_page_the_events_and_the_image(browser, history):
+    status, page = browser('GET', '/')
     assert status == 200
     assert b'<canvas id="matrix"' in page
     # nothing from the network
     assert not re.findall(rb'(?:src|href)="(?!data:)|https?://|@import|url\(', page)
-    assert served('GET', '/image.jpg')[0] == 404
+    assert browser('GET', '/image.jpg')[0] == 404
     history.set('state', 'active')
     history.show(b'jpeg')
-    status, line = served('GET', '/events')
+    status, line = browser('GET', '/events')
     events = json.loads(line.removeprefix(b'data: '))
     assert events.pop('now') == pytest.approx(time.monotonic(), abs=TIMEOUT)
     assert (status, events) == (200, {'state': 'active', 'image': 2, 'samples': []})
-    assert served('GET', '/image.jpg?2') == (200, b'jpeg')
-    assert served('GET', '/../setup.py')[0] == 404
+    assert browser('GET', '/image.jpg?2') == (200, b'jpeg')
+    assert browser('GET', '/../setup.py')[0] == 404
 
 
 EVENTS = """<script>
@@ -159,14 +159,14 @@ def test_page_shows_a_result_of_long_ago_as_such(history, tmp_path, old, route):
     assert bool(is_green[:350].sum() > 50) is (old == 0)
 
 
-def test_server_runs_commands_and_returns_their_errors(served):
+def test_server_runs_commands_and_returns_their_errors(browser):
     sent = {'Content_Type': 'application/json'}
     body = json.dumps({'name': 'operation', 'value': 'mapping'})
-    status, answer = served('POST', '/command', body, **sent)
+    status, answer = browser('POST', '/command', body, **sent)
     assert (status, json.loads(answer)) == (200, {'success': True, 'message': 'operation mapping'})
-    status, answer = served('POST', '/command', '{"name": "stop"}', **sent)
+    status, answer = browser('POST', '/command', '{"name": "stop"}', **sent)
     assert json.loads(answer) == {'success': False, 'message': 'not now'}
-    assert served.commands == [('operation', 'mapping'), ('stop', '')]
+    assert browser.commands == [('operation', 'mapping'), ('stop', '')]
 
 
 @pytest.mark.parametrize(
@@ -185,19 +185,19 @@ def test_server_runs_commands_and_returns_their_errors(served):
         ('{}', {'Content_Length': 'x'}, 400),
     ],
 )
-def test_server_refuses_commands_of_other_sites_and_garbage(served, body, changes, status):
+def test_server_refuses_commands_of_other_sites_and_garbage(browser, body, changes, status):
     headers = {'Content_Type': 'application/json'} | changes
-    assert served('POST', '/command', body, **headers)[0] == status
-    assert served.commands == []
+    assert browser('POST', '/command', body, **headers)[0] == status
+    assert browser.commands == []
 
 
 @pytest.mark.parametrize('host', ['localhost:8080', '127.0.0.1', '[::1]:80', '192.168.1.7:8080'])
-def test_server_accepts_addresses_of_this_machine(served, host):
-    assert served('GET', '/', Host=host)[0] == 200
+def test_server_accepts_addresses_of_this_machine(browser, host):
+    assert browser('GET', '/', Host=host)[0] == 200
 
 
-def test_server_on_a_port_in_use_is_rejected(served, history):
-    port = served.server.server_port
+def test_server_on_a_port_in_use_is_rejected(browser, history):
+    port = browser.server.server_port
     with pytest.raises(UnavailableError, match=f'127.0.0.1:{port} cannot be used: .*--port'):
         MonitorServer('127.0.0.1', port, history, None)
 
@@ -209,7 +209,7 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
     start()
     monitor = Monitor(robot.node, '/stavpr', history)
 
-    def shown():
+    def view():
         return history.since(0, TIMEOUT)[1]
 
     def command(name, value=''):
@@ -220,17 +220,17 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
         return results[0]
 
     with history.viewer():
-        robot.until(lambda: shown().get('state') == 'active', 'the state')
-        robot.until(lambda: 'route' in shown(), 'the route')
+        robot.until(lambda: view().get('state') == 'active', 'the state')
+        robot.until(lambda: 'route' in view(), 'the route')
         robot.drive(route[: LENGTH + 3])
         shown_images = cycle(route)
 
         def complete():
             robot.show(next(shown_images))
-            return history.image and 'pose' in shown() and shown()['samples'][-1]['row']
+            return history.image and 'pose' in view() and view()['samples'][-1]['row']
 
         robot.until(complete, 'an image, a pose and distances')
-    parts = shown()
+    parts = view()
     assert parts['map']['places'] == len(parts['route']) == 60
     match = next(sample for sample in parts['samples'] if sample['status'] == 'match')
     assert match['probability'] > 0.05
@@ -239,10 +239,10 @@ def test_monitor_shows_and_controls_the_node(robot, start, route, history):
     robot.until(lambda: monitor._images is None, 'no subscription without a page')
     assert command('reset') == 'the window is empty'
     assert command('stop') == 'deactivate: done'
-    robot.until(lambda: shown()['state'] == 'inactive', 'the state')
+    robot.until(lambda: view()['state'] == 'inactive', 'the state')
     assert command('start') == 'activate: done'
     assert command('operation', 'mapping') == 'operation mapping'
-    robot.until(lambda: shown()['map']['operation'] == 'mapping', 'the operation')
+    robot.until(lambda: view()['map']['operation'] == 'mapping', 'the operation')
     with pytest.raises(StavprError, match='expected start, stop, reset or operation'):
         monitor.command('explode', '')
 
@@ -272,10 +272,10 @@ def test_monitor_executable_serves_the_page_until_a_signal(tmp_path):
     try:
         address = re.compile(r'monitor of /stavpr: open http://127.0.0.1:(\d+)/')
         end = threading.Event()
-        while not (found := address.search(process.output())):
+        while not (result := address.search(process.output())):
             assert process.popen.poll() is None
             end.wait(0.05)
-        connection = HTTPConnection('127.0.0.1', int(found[1]), timeout=TIMEOUT)
+        connection = HTTPConnection('127.0.0.1', int(result[1]), timeout=TIMEOUT)
         connection.request('GET', '/events')
         assert b'not found' in connection.getresponse().readline()
         assert process.stop(signal.SIGINT) == 0  # with a page open

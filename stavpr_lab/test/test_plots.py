@@ -122,8 +122,8 @@ def test_animation_has_every_fifth_image_beside_its_place(tmp_path, small_map, r
     save_map(small_map, tmp_path / 'map.stavpr')
     write_images(tmp_path / 'second_traverse', route[:12])
     missed = {'status': 'NO_MATCH', 'newest_index': -1, 'probability': 0.25}
-    found = {'status': 'MATCH', 'newest_index': 10, 'probability': 0.75}
-    lines = [json.dumps(missed)] * 10 + [json.dumps(found)] * 2
+    result = {'status': 'MATCH', 'newest_index': 10, 'probability': 0.75}
+    lines = [json.dumps(missed)] * 10 + [json.dumps(result)] * 2
     (tmp_path / 'matches.jsonl').write_text('\n'.join(lines))
     write_animation(tmp_path, tmp_path / 'demo.webp')
     with Image.open(tmp_path / 'demo.webp') as animation:

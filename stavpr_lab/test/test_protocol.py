@@ -36,12 +36,12 @@ def test_recalls_equal_metrics_of_random_rankings():
     places = rng.integers(-1, 9, 100)
     scores = rng.integers(0, 40, 100) / 40 - 0.2 * truth.accepts(places)  # with ties
     ranking = Ranking(places[:, None], scores)
-    (found,) = evaluate_matches('plain', [(5, ranking)], {1: truth})
+    (result,) = evaluate_matches('plain', [(5, ranking)], {1: truth})
     expected = evaluate_ranking(ranking, truth)
     full = expected.recall_at_full_precision
-    assert found.f1 == expected.best.f1
-    assert found.recall_at_1[0] == expected.recall_at[1]
-    assert found.recall_at_100_precision[0] == full
+    assert result.f1 == expected.best.f1
+    assert result.recall_at_1[0] == expected.recall_at[1]
+    assert result.recall_at_100_precision[0] == full
     assert 0 < full < expected.recall_at[1] < 1
 
 
@@ -63,13 +63,13 @@ def test_error_rate_and_recall_by_hand():
 
 @pytest.mark.parametrize('run_length', [1, 40])
 def test_interval_has_the_width_of_independent_runs(run_length):
-    """4000 images, half of them wrong in runs: the deviation is that of the number of runs."""
+    """4000 images, half of them wrong in runs: the deviation follows from the number of runs."""
     runs = 4000 // run_length
     right = np.repeat(np.random.default_rng(5).permutation(np.arange(runs) % 2), run_length)
     ranking = Ranking(np.where(right, np.arange(4000), -1)[:, None], np.where(right, 0.1, np.inf))
     truths = {0: GroundTruth.identity(4000, 4000)}
-    (found,) = evaluate_matches('plain', [(1, ranking)], truths)
-    value, low, high = found.recall_at_1
+    (result,) = evaluate_matches('plain', [(1, ranking)], truths)
+    value, low, high = result.recall_at_1
     assert value == 0.5
     expected = 2 * 1.96 * 0.5 / np.sqrt(runs)
     assert 0.6 * expected < high - low < 1.5 * expected
@@ -79,13 +79,13 @@ def test_plain_sequences_are_the_smallest_sums_of_diagonals():
     """Sequences that are longer than the query are left out."""
     D = np.random.default_rng(1).random((12, 15))
     assert [length for length, _ in match_sequences(D, 'seqslam')] == [4, 5, 10]
-    for length, found in match_sequences(D, 'plain', (1, 4, 5, 20)):
+    for length, result in match_sequences(D, 'plain', (1, 4, 5, 20)):
         middle = (length - 1) // 2
         for first in range(12 - length + 1):
             starts = range(15 - length + 1)
             sums = [sum(D[first + t, s + t] for t in range(length)) for s in starts]
-            assert found.best[first + middle] == int(np.argmin(sums)) + middle
-            assert found.scores[first + middle] == pytest.approx(min(sums) / length)
+            assert result.best[first + middle] == int(np.argmin(sums)) + middle
+            assert result.scores[first + middle] == pytest.approx(min(sums) / length)
 
 
 def test_vectors_of_images_are_weighted_strips_without_the_mean():
@@ -108,15 +108,15 @@ def test_evaluate_prints_the_protocol_of_arrays(command, tmp_path):
         rows = read_json(path.read_text())['protocol']
         lengths = [*LENGTHS, *LENGTHS, *LENGTHS[1:], *LENGTHS * 2]
         assert [row['length'] for row in rows] == list(np.repeat(lengths, 4))
-        found = {(row['method'], row['length'], row['tolerance']): row for row in rows}
-        single = [found['plain', 1, t]['recall_at_1'] for t in (0, 1, 2, 10)]
+        result = {(row['method'], row['length'], row['tolerance']): row for row in rows}
+        single = [result['plain', 1, t]['recall_at_1'] for t in (0, 1, 2, 10)]
         known = [40, 42, 44, 60] if removed else [60] * 4  # queries with a place in the map
         right = np.multiply([value for value, *_ in single], known)
         np.testing.assert_allclose(right, np.round(right))
         if not removed:
             assert 0.5 < single[0][1] < single[0][0] < 1
             assert '\ncentered         5  1.000  1.000 (1.000-1.000)  1.000 (1.000-1.000)' in text
-            assert found['robust', 10, 0]['f1'] > 0.9
+            assert result['robust', 10, 0]['f1'] > 0.9
 
 
 @pytest.mark.parametrize('options', [(), ('--tolerance', 2), ('--output', 'report')])

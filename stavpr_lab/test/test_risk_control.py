@@ -26,7 +26,7 @@ from stavpr_ros.sources import open_source
 PLACES, NAN = 60, float('nan')
 
 
-def driven(truth, places, probabilities, **changes):
+def drive_of(truth, places, probabilities, **changes):
     """Return a drive, its matches, and their images; matches beyond are early ones, of image 0."""
     drive, none = DriveChanges(**changes).apply(truth), ImageMatches.none(len(places))
     matches = replace(none, places=np.array(places), probabilities=np.array(probabilities))
@@ -41,20 +41,20 @@ def risk_at(risks, probability):
 def test_risks_of_two_blocks_by_hand():
     """Above .9 the only match of the first block at double speed is wrong: 1, and so below."""
     truth = GroundTruth.identity(5, 5)
-    recorded = driven(truth, [0, 4, 2, 3, -1], [0.9, 0.5, 0.3, NAN, NAN])
+    recorded = drive_of(truth, [0, 4, 2, 3, -1], [0.9, 0.5, 0.3, NAN, NAN])
     risks = measure_risks([recorded], 2, 'x')
     assert (risks.units, risks.method) == (2, 'x')
     assert [risk_at(risks, p) for p in (0.15, 0.4, 0.6, 0.95)] == [0.5, 0.5, 0, 0]
-    double = driven(truth, [3, 2, 4], [0.99, 0.95, 0.99], speed=2)
+    double = drive_of(truth, [3, 2, 4], [0.99, 0.95, 0.99], speed=2)
     risks = measure_risks([recorded, double], 2, 'x')
     assert [risk_at(risks, p) for p in (0.15, 0.95, 0.995)] == [1, 1, 0]
-    early = driven(truth, [0, 4, 2, 3, -1, 2], [0.9, 0.5, 0.3, NAN, NAN, 0.96])
+    early = drive_of(truth, [0, 4, 2, 3, -1, 2], [0.9, 0.5, 0.3, NAN, NAN, 0.96])
     assert risk_at(measure_risks([early], 2, 'x'), 0.95) == 1
 
 
 def test_risk_of_a_block_off_the_map_is_the_share_of_matched_images():
     truth = GroundTruth.from_pairs([0, 1], [0, 1], 4, 4)
-    risks = measure_risks([driven(truth, [0, 1, 3, -1], [0.9, 0.9, 0.6, NAN])], 2, 'x')
+    risks = measure_risks([drive_of(truth, [0, 1, 3, -1], [0.9, 0.9, 0.6, NAN])], 2, 'x')
     assert [risk_at(risks, p) for p in (0.5, 0.7)] == [0.5, 0]
 
 
@@ -64,9 +64,9 @@ def test_images_beside_a_removed_stretch_do_not_count():
     places = np.r_[:10, np.full(5, 9), np.full(15, -1), 10:20]
     for image, place, risk in ((20, -1, 0), (20, 3, 1 / 61)):
         places[image] = place
-        recorded = driven(truth, np.arange(40), np.full(40, 0.9))
+        recorded = drive_of(truth, np.arange(40), np.full(40, 0.9))
         matched = np.where(places < 0, NAN, 0.9)
-        detour = driven(truth, places, matched, removed=((10, 30),))
+        detour = drive_of(truth, places, matched, removed=((10, 30),))
         assert measure_risks([recorded, detour], 40, 'x').risks[0] == pytest.approx(risk, abs=1e-6)
 
 
@@ -91,20 +91,20 @@ def wrong_blocks(declared):
     """Return the risks of blocks of one image each, which is matched wrongly."""
     count = len(declared)
     truth = GroundTruth.identity(count + 1, count + 1).select(np.arange(count))
-    return measure_risks([driven(truth, np.full(count, count), declared)], 1, 'x')
+    return measure_risks([drive_of(truth, np.full(count, count), declared)], 1, 'x')
 
 
 @pytest.mark.parametrize(('blocks', 'rate'), [(10, 0.1), (30, 0.2)])
 def test_error_rate_of_a_new_block_is_kept_in_the_mean(blocks, rate):
     """The mean of as many blocks alone would choose a probability that does not keep it."""
-    rng, found = np.random.default_rng(0), []
+    rng, result = np.random.default_rng(0), []
     for _ in range(1500):
         declared = 1 / (1 + np.exp(-rng.uniform(-1.5, 6.5, blocks + 1)))
         risks, new = wrong_blocks(declared[:-1]), declared[-1]
         by_mean = PROBABILITIES[np.argmax(np.array(risks.risks) / blocks <= rate)]
-        found.append((new > least_probability(rate, risks), new > by_mean))
-    kept, by_mean = np.mean(found, axis=0)
-    error = 3 * np.sqrt(rate * (1 - rate) / len(found))
+        result.append((new > least_probability(rate, risks), new > by_mean))
+    kept, by_mean = np.mean(result, axis=0)
+    error = 3 * np.sqrt(rate * (1 - rate) / len(result))
     assert rate / 2 < kept <= rate + error / 3
     assert by_mean > rate + error
 
@@ -127,12 +127,12 @@ def traverses(tmp_path_factory):
 
 
 @pytest.fixture
-def command(traverses, tmp_path, monkeypatch, runner):
+def command(traverses, tmp_path, set_constants, runner):
     """Return the path of a copy of the map, and a function that evaluates the query on it."""
     path, run = tmp_path / 'route.stavpr', runner(evaluate)
     path.write_bytes((traverses / 'route.stavpr').read_bytes())
     pair = ['--map', path, '--query', traverses / 'query', '--truth', 'identity']
-    monkeypatch.setattr(prepared_map, 'MIN_PLACES', 1)
+    set_constants(prepared_map, MIN_PLACES=1)
     return path, lambda *options: run(*pair, '--sequence-length', 5, *options)
 
 
@@ -156,8 +156,8 @@ def test_calibration_in_a_map_is_that_of_max_error(command, traverses, tmp_path)
     ):
         code, output, errors = run(*options, '--json', tmp_path / 'out.json', '--force')
         assert (code, 'not kept by the calibration' in output) == (0, is_noted), errors
-        found = read_json((tmp_path / 'out.json').read_text())['default_threshold']
-        assert found['threshold'] == pytest.approx(1 - probability)
+        result = read_json((tmp_path / 'out.json').read_text())['default_threshold']
+        assert result['threshold'] == pytest.approx(1 - probability)
     assert least_probability(0.2, risks) != pytest.approx(least_probability(0.2))
     content = path.read_bytes()
     code, output, errors = run('--calibrate', 'add')  # the same recording counts once
@@ -191,11 +191,11 @@ def test_calibration_that_fails_leaves_the_map_as_it_is(command, monkeypatch, tr
     path.chmod(0o644)
     other = replace(load_map(path), threshold=0.5)
 
-    def replaced(*arguments):
+    def replace_map(*arguments):
         save_map(other, path, force=True)
         return measure_risks(*arguments)
 
-    monkeypatch.setattr(evaluate_calibrate, 'measure_risks', replaced)
+    monkeypatch.setattr(evaluate_calibrate, 'measure_risks', replace_map)
     code, _, errors = run('--calibrate')
     assert (code, 'was replaced meanwhile' in errors) == (2, True), errors
     assert (open_map(path).threshold, open_map(path).error_risks) == (0.5, None)

@@ -4,7 +4,7 @@
 
 from bags import SECOND, write_odometry
 import numpy as np
-from policy import allowed
+from policy import names_of
 from processes import Process
 import pytest
 from stavpr_msgs.msg import PlaceMatch
@@ -19,19 +19,11 @@ BY_OPTIONS_OR_DATA = {'/camera_info', '/clock', '/odom', '/tf', '/tf_static'}  #
 @pytest.mark.parametrize(
     ('node', 'command', 'last'),
     [
-        (
-            'stavpr_record',
-            ('record', '--output', 'FOLDER/x.jsonl'),
-            ('publish', '/stavpr_record/recording'),
-        ),
-        ('stavpr_replay', ('replay', 'FOLDER/bag'), ('reply', '/stavpr_replay/pause')),
-        ('stavpr_monitor', ('monitor', '--port', '0'), ('request', '/stavpr/reset')),
-        ('pose_graph', ('pose_graph',), ('subscribe', '/stavpr/loop_closure')),
-        (
-            'robot_localization_bridge',
-            ('bridge', 'robot_localization'),
-            ('publish', '/diagnostics'),
-        ),
+        ('stavpr_record', 'record --output FOLDER/x', 'publish /stavpr_record/recording'),
+        ('stavpr_replay', 'replay FOLDER/bag', 'reply /stavpr_replay/pause'),
+        ('stavpr_monitor', 'monitor --port 0', 'request /stavpr/reset'),
+        ('pose_graph', 'pose_graph', 'subscribe /stavpr/loop_closure'),
+        ('robot_localization_bridge', 'bridge robot_localization', 'publish /diagnostics'),
     ],
 )
 def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last):
@@ -39,12 +31,12 @@ def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last)
     image = np.zeros((8, 8, 3), np.uint8)
     images = [ImageRecord.of_image(image, stamp) for stamp in stamps]
     write_odometry(tmp_path / 'bag', stamps, images=images)
-    arguments = [word.replace('FOLDER', str(tmp_path)) for word in command]
+    arguments, (right_of_last, name) = command.replace('FOLDER', str(tmp_path)), last.split()
     # the recorder waits for one, and for the parameters of its node, of another name here
     robot.node.create_publisher(PlaceMatch, '/stavpr/match', 1)
-    process = Process(tmp_path / 'log', *arguments)
+    process = Process(tmp_path / 'log', *arguments.split())
 
-    def used(right: str) -> set[str]:
+    def names_in_use(right: str) -> set[str]:
         if (node, '/') not in robot.node.get_node_names_and_namespaces():
             return set()
         names = getattr(robot.node, f'get_{KINDS[right]}_names_and_types_by_node')(node, '/')
@@ -53,14 +45,14 @@ def test_policy_allows_what_a_program_uses(robot, tmp_path, node, command, last)
     try:
         robot.until(
             lambda: (
-                last[1] in used(last[0])
-                and allowed(node)['publish'] - used('publish') <= BY_OPTIONS_OR_DATA
+                name in names_in_use(right_of_last)
+                and names_of(node)['publish'] - names_in_use('publish') <= BY_OPTIONS_OR_DATA
             ),
-            f'{last[1]} and all publishers of {node}',
+            f'{last} and all publishers of {node}',
         )
         for right in KINDS:
-            names = allowed(node).get(right, set())
-            names_here = {name.replace('/robot/', '/stavpr/') for name in used(right)}
+            names = names_of(node).get(right, set())
+            names_here = {name.replace('/robot/', '/stavpr/') for name in names_in_use(right)}
             assert names_here <= names, right
     finally:
         process.end()

@@ -34,7 +34,7 @@ class Tiny(PublishedNetwork):
         return network[:2]
 
 
-def saved(content: object) -> bytes:
+def dump(content: object) -> bytes:
     stream = io.BytesIO()
     torch.save(content, stream)
     return stream.getvalue()
@@ -44,7 +44,7 @@ def saved(content: object) -> bytes:
 def content():
     """Return a file of weights for Tiny in the current format of torch."""
     torch.manual_seed(0)
-    return saved(Tiny.whole_network().state_dict())
+    return dump(Tiny.whole_network().state_dict())
 
 
 @pytest.fixture
@@ -75,13 +75,13 @@ class Server:
 
 
 @pytest.fixture
-def server(content, monkeypatch):
-    monkeypatch.setenv('no_proxy', '*')
+def server(content, environ):
+    environ['no_proxy'] = '*'
     server = Server()
     server.body = content
     thread = threading.Thread(target=server.http.serve_forever, kwargs={'poll_interval': 0.01})
     thread.start()
-    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address), raising=False)
+    Tiny.published = PublishedFile(server.address)
     yield server
     server.http.shutdown()
     thread.join()
@@ -126,10 +126,10 @@ def test_download_that_fails_leaves_no_file(server, cache, content, changes, mes
     assert list(cache.iterdir()) == []
 
 
-def test_published_hash_is_checked_in_full(server, cache, content, monkeypatch):
+def test_published_hash_is_checked_in_full(server, cache, content):
     digest = hashlib.sha256(content).hexdigest()
     other = digest[:16] + '0' * 48
-    monkeypatch.setattr(Tiny, 'published', PublishedFile(server.address, sha256=other))
+    Tiny.published = PublishedFile(server.address, sha256=other)
     fetch(server, cache, content)
     with pytest.raises(UnavailableError, match='it is damaged or another file; delete it'):
         Tiny(PublishedSettings())
@@ -214,9 +214,9 @@ ENTRIES = {'epoch': 3, 'state_dict': {'module.a.weight': WEIGHT}, 'best': torch.
 @pytest.mark.parametrize(
     'content',
     [
-        saved({'a.weight': WEIGHT}),
-        saved({'a.weight': nn.Parameter(WEIGHT)}),
-        saved(ENTRIES),
+        dump({'a.weight': WEIGHT}),
+        dump({'a.weight': nn.Parameter(WEIGHT)}),
+        dump(ENTRIES),
         OldPickle().file(ENTRIES | {'best': None}),
     ],
     ids=['plain', 'parameters', 'with entries', 'Python 2'],
@@ -231,7 +231,7 @@ def test_read_checkpoint_of_every_format(tmp_path, content):
 def test_read_checkpoint_executes_nothing(tmp_path):
     mark = tmp_path / 'executed'
     old = OldPickle().file({'state_dict': Call(Global('posix', 'mkdir'), (str(mark),))})
-    for hostile in (saved({'a.weight': Hostile(str(mark))}), pickle.dumps(Hostile(str(mark)))):
+    for hostile in (dump({'a.weight': Hostile(str(mark))}), pickle.dumps(Hostile(str(mark)))):
         with pytest.raises(
             UnavailableError, match=r'net\.pth cannot be read as a file of weights'
         ):

@@ -11,7 +11,7 @@ from domain import DOMAIN
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from policy import allowed
+from policy import names_of
 from processes import Process, TIMEOUT
 import pytest
 import rclpy
@@ -144,21 +144,17 @@ def rover(request, context, route, map_file):
 
 
 @pytest.fixture
-def repeat(context, rover, map_file):
+def repeat(context, rover, map_file, request):
     """Make a node that is spun with the rover; it ends with the test."""
-    made = []
 
     def make(**parameters):
         values = {'map_path': map_file} | FAST | parameters
         node = RepeatNode(context=context, **overrides(**values))
-        made.append(node)
+        request.addfinalizer(lambda: node.is_ending or node.destroy_node())
         rover.executor.add_node(node)
         return node
 
-    yield make
-    for node in made:
-        if not node.is_ending:
-            node.destroy_node()
+    return make
 
 
 def test_goal_is_reached_with_feedback_and_velocities_stop(rover, repeat):
@@ -263,20 +259,6 @@ def test_node_that_is_suspended_goes_on_from_rest(rover, map_file, tmp_path):
     finally:
         process.popen.send_signal(signal.SIGCONT)
         process.end()
-
-
-def test_slow_camera_is_driven_with_stop_and_go_and_half_the_rate_without(rover, repeat):
-    repeat(give_up_after=0.0)
-    rover.begin()
-    rover.every = 2
-    rover.until(lambda: rover.place > 7)
-    assert rover.drives()
-    rover.every = 10
-    rover.until(rover.rests)
-    place, ticks = rover.place, rover.ticks
-    rover.until(lambda: rover.place > place + 1)
-    images = (rover.ticks - ticks) / rover.every
-    assert (rover.place - place) / images < 0.5  # meters between two images
 
 
 def test_paused_clock_stops_the_robot_and_steps_do_not_move_its_place(rover, repeat):
@@ -408,7 +390,7 @@ def test_security_policy_allows_what_the_nodes_use(context, repeat, tmp_path, na
         right: {topic for topic, _ in names if '/_action/' not in topic}
         for right, names in (('publish', published), ('subscribe', subscribed), ('reply', replied))
     }
-    rights = allowed(name)
+    rights = names_of(name)
     assert rights.pop('execute', {'/repeat'}) == {'/repeat'}
     optional = {'/clock', '/image/compressed', '/cmd_vel', '/odom'}
     assert {r: n - optional for r, n in rights.items()} == {

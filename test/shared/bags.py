@@ -99,10 +99,10 @@ def pixels(record):
 
 def write_images(bag, images):
     """Write records on /raw, with a text beside each."""
-    for each in images:
-        header = bag.header(each.stamp_ns, each.frame_id)
-        bag.write('/raw', RAW, each.time_ns, header, 6, 8, 'rgb8', 0, 24, each.data)
-        bag.write('/text', TEXT, each.time_ns, 'hello')
+    for image in images:
+        header = bag.header(image.stamp_ns, image.frame_id)
+        bag.write('/raw', RAW, image.time_ns, header, 6, 8, 'rgb8', 0, 24, image.data)
+        bag.write('/text', TEXT, image.time_ns, 'hello')
 
 
 def write_mixed(path, ros1=False, bad=()):

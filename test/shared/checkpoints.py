@@ -130,7 +130,7 @@ class Hostile:
 
 
 def places365_file(parameters: dict[str, torch.Tensor]) -> bytes:
-    """Return a checkpoint as that of Places365: old names, ``module.``, other entries beside."""
+    """Return a checkpoint as Places365 publishes it: old names, ``module.``, other entries."""
     old = OrderedDict()
     for name, value in parameters.items():
         older = name

@@ -3,13 +3,15 @@
 """Fixtures: the folder of real data, synthetic images and maps."""
 
 from collections import OrderedDict
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from functools import cache
 import os
 from pathlib import Path
 import re
 import resource
+import sys
 from types import SimpleNamespace
+from unittest.mock import patch
 
 from domain import DOMAIN
 from hypothesis import settings
@@ -99,14 +101,14 @@ def route() -> list[np.ndarray]:
 @pytest.fixture(scope='session')
 def small_map(route):
     """Return a map of the synthetic route, with all optional parts of a map."""
+    from places import poses_at
     from stavpr_ros.features import FeatureExtractor
     from stavpr_ros.mapping import build_map
     from stavpr_ros.sources.frame import Frame
 
     frames = [Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route)]
-    poses = np.zeros((len(route), 7))
-    poses[:, 0], poses[:, 6] = np.arange(len(route)), 1
-    return build_map(frames, FeatureExtractor('gradient', projection=64), poses, progress=False)
+    extractor = FeatureExtractor('gradient', projection=64)
+    return build_map(frames, extractor, poses_at(range(len(route))), progress=False)
 
 
 @pytest.fixture(scope='module')
@@ -128,10 +130,41 @@ def device(request):
 
 
 @pytest.fixture
-def model_folders(tmp_path, monkeypatch):
+def environ():
+    """Return the environment of this process, which is as before after the test."""
+    with patch.dict(os.environ):
+        yield os.environ
+
+
+@pytest.fixture
+def working_folder(tmp_path):
+    """Change into the folder of the test, and return it."""
+    with chdir(tmp_path):
+        yield tmp_path
+
+
+@pytest.fixture
+def hide_module(monkeypatch):
+    """Return a function that lets a module be not installed."""
+    return lambda name: monkeypatch.setitem(sys.modules, name, None)
+
+
+@pytest.fixture
+def set_constants(monkeypatch):
+    """Return a function that gives constants of a module other values for the test."""
+
+    def set_constants(module, **values):
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
+
+    return set_constants
+
+
+@pytest.fixture
+def model_folders(tmp_path, environ):
     """Set the folders of models and of downloads, and return both."""
-    monkeypatch.setenv('STAVPR_MODELS', str(tmp_path / 'models'))
-    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    environ['STAVPR_MODELS'] = str(tmp_path / 'models')
+    environ['XDG_CACHE_HOME'] = str(tmp_path / 'cache')
     return tmp_path / 'models', tmp_path / 'cache' / 'stavpr_ros'
 
 
@@ -160,8 +193,8 @@ def runner(monkeypatch, capsys):
             return code, *capsys.readouterr()
 
         def fails(code, words, *arguments):
-            found, _, errors = run(*arguments)
-            assert (found, words in errors) == (code, True), errors
+            status, _, errors = run(*arguments)
+            assert (status, words in errors) == (code, True), errors
 
         run.fails = fails  # expects an exit code, and words in the errors
         return run
@@ -212,21 +245,18 @@ def image_input(context, request):
 
 
 @pytest.fixture
-def make_node(context):
+def make_node(context, request):
     """Make a node that is not configured; it is destroyed with the test."""
     from robot import PARAMETERS, parameters_of
     from stavpr_ros.ros.node import PlaceRecognitionNode
 
-    made = []
-
     def make(**parameters):
         overrides = parameters_of(PARAMETERS | {'autostart': False} | parameters)
-        made.append(PlaceRecognitionNode(context=context, parameter_overrides=overrides))
-        return made[-1]
+        node = PlaceRecognitionNode(context=context, parameter_overrides=overrides)
+        request.addfinalizer(node.destroy_node)
+        return node
 
-    yield make
-    for node in made:
-        node.destroy_node()
+    return make
 
 
 @pytest.fixture(scope='session')
@@ -258,23 +288,20 @@ def map_file(small_map, tmp_path_factory) -> str:
 
 
 @pytest.fixture
-def start(robot, map_file, tmp_path_factory):
+def start(robot, map_file, tmp_path_factory, request):
     """Start a node in this process that localizes on the map; it ends with the test."""
     from robot import NodeThread
-
-    started = []
 
     def start(*arguments, wait=True, **parameters):
         robot.forget()
         files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
-        started.append(NodeThread(robot.context, arguments, files | parameters))
+        thread = NodeThread(robot.context, arguments, files | parameters)
+        request.addfinalizer(thread.end)
         if wait:
             robot.wait_for_node()
-        return started[-1].node
+        return thread.node
 
     yield start
-    for each in started:
-        each.end()
     robot.wait_for_nobody()
 
 
@@ -283,6 +310,7 @@ def node_of_file(robot, map_file, tmp_path_factory):
     """Start the node that the tests of a file share; see ``running``."""
     from robot import NodeThread
 
+    robot.forget()
     files = {'map_path': map_file, 'maps_folder': str(tmp_path_factory.getbasetemp())}
     thread = NodeThread(robot.context, [], files)
     robot.wait_for_node()

@@ -19,6 +19,7 @@ import re
 from typing import Any
 
 import numpy as np
+from places import poses_at
 from stavpr_ros.alignment import SequenceSettings
 from stavpr_ros.features import FeatureExtractor, FeatureSettings, LocalFeatures
 from stavpr_ros.mapping import build_map, descriptor_map, Map, merge_maps
@@ -56,13 +57,6 @@ def views(
         image = image + rng.integers(-noise, noise + 1, image.shape)
         images.append(np.clip(image, 0, 255).astype(np.uint8))
     return images
-
-
-def poses_at(positions: Any) -> np.ndarray:
-    """Return poses x = position, (m, 7)."""
-    poses = np.zeros((len(positions), 7))
-    poses[:, 0], poses[:, 6] = positions, 1
-    return poses
 
 
 def map_of(images: list[np.ndarray], poses: np.ndarray | None = None) -> Map:
@@ -228,8 +222,8 @@ def plain(value: Any) -> Any:
         return value.name
     if is_dataclass(value):
         skipped = {'image', 'stages'}  # pixels that were given, and times
-        rows = [(each.name, getattr(value, each.name)) for each in fields(value)]
-        return {name: plain(each) for name, each in rows if name not in skipped}
+        rows = [(row.name, getattr(value, row.name)) for row in fields(value)]
+        return {name: plain(part) for name, part in rows if name not in skipped}
     if isinstance(value, np.ndarray):
         return [str(value.dtype), value.tolist()]
     if isinstance(value, np.generic):
@@ -239,7 +233,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, tuple) and hasattr(value, '_fields'):
         return {name: plain(getattr(value, name)) for name in value._fields}
     if hasattr(value, '__iter__') and not isinstance(value, str | dict):
-        return [plain(each) for each in value]
+        return [plain(part) for part in value]
     return value
 
 
@@ -272,7 +266,7 @@ def row_of(result: ImageResult) -> list[Any]:
         result.image_index,
         match.inliers >= 20,
         None if math.isnan(value) else round(value, 5),
-        [[each.place, round(each.probability, 5)] for each in match.late],
+        [[late.place, round(late.probability, 5)] for late in match.late],
     ]
 
 

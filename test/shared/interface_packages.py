@@ -49,7 +49,7 @@ def build_interfaces(folder: Path) -> Path:
         shutil.copytree(interfaces, package)
         text = CMAKE.format(name=name, dependencies=' '.join(DEPENDENCIES))
         (package / 'CMakeLists.txt').write_text(text)
-        depends = ''.join(f'<depend>{each}</depend>' for each in DEPENDENCIES)
+        depends = ''.join(f'<depend>{name}</depend>' for name in DEPENDENCIES)
         (package / 'package.xml').write_text(PACKAGE.format(name=name, dependencies=depends))
     command = [sys.executable, '-m', 'colcon', '--log-base', 'log', 'build']
     command += ['--cmake-args', '-DBUILD_TESTING=OFF', f'-DPython3_EXECUTABLE={sys.executable}']

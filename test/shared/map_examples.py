@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 from fixtures import route_images
 import numpy as np
+from places import poses_at
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.features.gradient import GradientSettings
 from stavpr_ros.mapping import build_map, Map, save_map, Session
@@ -20,15 +21,14 @@ PLACES = 24
 
 
 def example_map(projection: int | None = None) -> Map:
-    """Return a map of 24 places in two sessions, 32 dimensions or those of a projection."""
+    """Return a map of 24 places in two sessions, of 32 dimensions or projected."""
     extractor = FeatureExtractor(
         'gradient', GradientSettings(32, cell=8, orientations=4, logarithm=False), 2, projection
     )
     frames = [
         Frame(image, (i + 1) * 10**9, f'place {i}') for i, image in enumerate(route_images(PLACES))
     ]
-    poses = np.zeros((PLACES, 7))
-    poses[:, 0], poses[:, 6] = np.arange(PLACES), 1
+    poses = poses_at(range(PLACES))
     place_map = build_map(frames, extractor, poses, progress=False, thumbnail_width=32)
     poses[3] = np.nan
     return dataclasses.replace(

@@ -29,7 +29,7 @@ def hashes(content: bytes) -> list[str]:
 
 
 def version2(manifest: dict, tensors: dict, metadata: dict | None = None) -> bytes:
-    """Put a file together; metadata replaces that of the header."""
+    """Put a file together; ``metadata`` replaces entries of its header."""
     listed = {
         name: {'dtype': dtype, 'shape': shape, 'sha256': hashes(content)}
         for name, (dtype, shape, content) in tensors.items()
@@ -72,7 +72,7 @@ def array_of(part: tuple[str, list[int], bytes]) -> np.ndarray:
     return np.frombuffer(part[2], dtype).reshape(part[1]).copy()
 
 
-def changed(content: bytes, change: Callable | None = None, **parts: np.ndarray | None) -> bytes:
+def alter(content: bytes, change: Callable | None = None, **parts: np.ndarray | None) -> bytes:
     """
     Return a file with another manifest, and other parts.
 

@@ -61,7 +61,7 @@ def use_file(path: Path, thorough: bool = True) -> None:
         use(load_map(path))
 
 
-def mutated(content: bytes, rng: random.Random) -> bytes:
+def mutate(content: bytes, rng: random.Random) -> bytes:
     """Return a file with damage: bytes removed, replaced, copied, or a number of any size."""
     data = bytearray(content)
     for _ in range(rng.choice((1, 1, 2, 5))):

@@ -10,7 +10,7 @@ DENSENET161 = (6, 12, 36, 24)
 
 
 def vgg16_shapes(classes: int = 1000) -> dict[str, tuple[int, ...]]:
-    """Return those of configuration D: 3 x 3 convolutions with bias, a pooling per stage."""
+    """Return the shapes of configuration D: 3 x 3 convolutions with bias, a pooling per stage."""
     shapes, index, before = {}, 0, 3
     for stage in VGG16:
         for width in stage:

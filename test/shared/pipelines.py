@@ -53,7 +53,7 @@ def process(pipeline, images, first=0, poses=False):
     ]
 
 
-def recorded(route, operation='mapping', count=30, **changes):
+def record(route, operation='mapping', count=30, **changes):
     """Return a pipeline on a saved map of the route; in loop_closure, on the route itself."""
     pipeline = Pipeline(settings_of(**changes), 'mapping')
     process(pipeline, route[:count], poses=True)

@@ -23,6 +23,13 @@ def features_of(strips, noise=0.0, seed=0):
     )
 
 
+def poses_at(xs):
+    """Return poses at these x, (m, 7)."""
+    poses = np.zeros((len(xs), 7))
+    poses[:, 0], poses[:, 6] = xs, 1
+    return poses
+
+
 def map_of(features, poses=None, **parts):
     """Return a map of features."""
     n = len(features)

@@ -8,12 +8,12 @@ from xml.etree import ElementTree
 POLICY = Path(__file__).parents[2] / 'config' / 'sros2_policy.xml'
 
 
-def allowed(node: str) -> dict[str, set[str]]:
+def names_of(node: str) -> dict[str, set[str]]:
     """Return the names in the profile of a node, by right: publish, subscribe, reply ..."""
     (profile,) = ElementTree.parse(POLICY).findall(f'.//profile[@node="{node}"]')
     names: dict[str, set[str]] = {}
     for group in profile:
         (right,) = group.attrib
-        found = {each.text.replace('~', f'/{node}') for each in group if each.text}
-        names[right] = names.get(right, set()) | found
+        texts = {rule.text.replace('~', f'/{node}') for rule in group if rule.text}
+        names[right] = names.get(right, set()) | texts
     return names

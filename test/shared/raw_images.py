@@ -45,12 +45,12 @@ def raw(encoding, height, width, step, data, big=False):
     return SimpleNamespace(**fields, step=step, data=data)
 
 
-def compressed(data, transport=''):
+def file_message(data, transport=''):
     """Return a message with the bytes of a file."""
     return SimpleNamespace(format=transport, data=data)
 
 
-def encoded(suffix, rgb, *options):
+def encode(suffix, rgb, *options):
     """Return the file of an image, RGB or gray, by OpenCV."""
     image = rgb if rgb.ndim == 2 else rgb[..., ::-1].copy()
     return cv2.imencode(suffix, image, options)[1].tobytes()
@@ -60,7 +60,7 @@ def is_deep(encoding):
     return encoding.endswith('16') or encoding.startswith('16')
 
 
-def padded(rows, padding):
+def pad_rows(rows, padding):
     """Rows of bytes as a message's (step, bytes), with junk after every row."""
     rows = np.hstack([rows, np.full((len(rows), padding), 99, np.uint8)])
     return rows.shape[1], rows.tobytes()
@@ -74,7 +74,7 @@ def noise(encoding, height, width, big=False, padding=0):
     dtype = np.dtype(np.uint16 if deep else np.uint8).newbyteorder('>' if big else '<')
     values = np.random.default_rng(1).integers(0, 2**16, (height, width, channels)).astype(dtype)
     expected = (values >> 8 if deep else values)[..., CHANNELS[encoding]].astype(np.uint8)
-    return *padded(values.reshape(height, -1).view(np.uint8), padding), expected
+    return *pad_rows(values.reshape(height, -1).view(np.uint8), padding), expected
 
 
 def mosaic(encoding, scene, big=False):
@@ -99,11 +99,11 @@ def packed_yuv(encoding, yuv, padding=0):
         quads = np.zeros((height, width // 2, 4), np.uint8)
         quads[..., y0], quads[..., y1] = yuv[:, ::2, 0], yuv[:, 1::2, 0]
         quads[..., u], quads[..., v] = yuv[:, ::2, 1], yuv[:, ::2, 2]
-        return padded(quads.reshape(height, -1), padding)
+        return pad_rows(quads.reshape(height, -1), padding)
     u, v = PLANES[encoding]
     shared = yuv if encoding == 'nv24' else yuv[::2, ::2]
     chroma = np.zeros((*shared.shape[:2], 2), np.uint8)
     chroma[..., u], chroma[..., v] = shared[..., 1], shared[..., 2]
-    step, luma_bytes = padded(yuv[..., 0], padding)
+    step, luma_bytes = pad_rows(yuv[..., 0], padding)
     wide = 2 * padding if encoding == 'nv24' else padding
-    return step, luma_bytes + padded(chroma.reshape(len(chroma), -1), wide)[1]
+    return step, luma_bytes + pad_rows(chroma.reshape(len(chroma), -1), wide)[1]

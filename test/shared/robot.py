@@ -196,11 +196,11 @@ class Robot:
     def until_map(self, **fields: object) -> MapInfo:
         """Wait until the last ``~/map_info`` has these fields, and return it."""
 
-        def published() -> bool:
+        def is_published() -> bool:
             last = self.infos[-1] if self.infos else None
             return last is not None and all(getattr(last, name) == fields[name] for name in fields)
 
-        self.until(published, f'map_info with {fields}')
+        self.until(is_published, f'map_info with {fields}')
         return self.infos[-1]
 
     def counts(self, part: str) -> dict[str, str]:
@@ -208,7 +208,7 @@ class Robot:
         called = time.time_ns()
         self._array_times.clear()
         # the first may have been made before this was called
-        self.until(lambda: sum(each > called for each in self._array_times) >= 2, 'diagnostics')
+        self.until(lambda: sum(t > called for t in self._array_times) >= 2, 'diagnostics')
         status = next(s for s in self.arrays[-1].status if s.name.endswith(part))
         return {pair.key: pair.value for pair in status.values}
 
@@ -243,7 +243,7 @@ class Robot:
         A matched publisher does not imply a matched subscriber on the other side, and a
         best-effort one loses earlier images: so empty images are sent until one has a match.
 
-        :param publisher: another one than that of the robot, of messages of a kind.
+        :param publisher: of messages of a kind, in place of the publisher of the robot.
         """
         publisher = publisher or self.publisher
         self.until(lambda: publisher.get_subscription_count() > 0, 'the node')
@@ -313,13 +313,13 @@ class Robot:
         Wait until the node has discovered the endpoints made so far.
 
         It has when it responds to a client that was made after them. A request of that client may
-        be lost, so it is repeated: the service may be that of a previous node.
+        be lost, so it is repeated: a previous node may have the service.
         """
         probe = self.node.create_client(GetState, '/stavpr/get_state')
         responses: list[Any] = []
         attempts = 0
 
-        def responded() -> bool:
+        def has_responded() -> bool:
             nonlocal attempts
             if attempts % RESEND == 0 and probe.service_is_ready():
                 responses.append(probe.call_async(GetState.Request()))
@@ -327,7 +327,7 @@ class Robot:
             return any(response.done() for response in responses)
 
         try:
-            self.until(responded, 'a response of the node')
+            self.until(has_responded, 'a response of the node')
         finally:
             self.node.destroy_client(probe)
 
@@ -354,10 +354,10 @@ class Robot:
     def until_diagnosed(self, part: str, level: bytes, words: str = '') -> DiagnosticStatus:
         """Wait for a level and words of a part: input, map, recognition, processing."""
 
-        def reported() -> bool:
+        def is_reported() -> bool:
             status = self.diagnostics.get(part)
             return status is not None and status.level == level and words in status.message
 
         self.diagnostics.pop(part, None)
-        self.until(reported, f'diagnostics of {part} at level {level!r} with {words!r}')
+        self.until(is_reported, f'diagnostics of {part} at level {level!r} with {words!r}')
         return self.diagnostics[part]

@@ -1,11 +1,13 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The set-up behind the Makefile: what it installs and builds; it needs no network."""
+"""The set-up behind the Makefile, and the stored list of the public API."""
 
+import difflib
 from pathlib import Path
 import re
 import sys
 
+from public_api import COMMAND, FILE, public_api
 import pytest
 import setup_venv
 
@@ -35,7 +37,7 @@ class Recorder:
 
 
 @pytest.fixture
-def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
+def recorder(tmp_path: Path, monkeypatch, set_constants) -> Recorder:
     """Record in a checkout in which nothing is installed and every requirement is ``fake``."""
     for name in ('requirements/locked', 'stavpr_msgs', 'stavpr_ros'):
         (tmp_path / name).mkdir(parents=True)
@@ -43,7 +45,7 @@ def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorder:
         (tmp_path / 'requirements' / f'{name}.txt').write_text('fake==1\n')
     (tmp_path / 'requirements' / 'constraints.txt').touch()
     recorder = Recorder(tmp_path)
-    monkeypatch.setattr(setup_venv, 'ROOT', tmp_path)
+    set_constants(setup_venv, ROOT=tmp_path)
     monkeypatch.setattr(setup_venv, 'machine_problems', list)
     monkeypatch.setattr(setup_venv, 'run_logged', recorder)
     return recorder
@@ -56,3 +58,12 @@ def test_extras_are_added_and_kept(recorder):
     installed = re.findall(r'locked/(\w+)\.txt', recorder.commands['pip'])
     assert installed == ['base', 'onnx', 'dev']
     assert recorder.run('build', '--with', 'dev', 'onnx') == recorder.run('build') == []
+
+
+# The public API equals the stored list: a change of a promised name is visible in review
+
+
+def test_public_api_is_that_of_the_stored_list():
+    stored = FILE.read_text(encoding='utf-8').splitlines()
+    changes = [*difflib.unified_diff(stored, public_api().splitlines(), n=0, lineterm='')]
+    assert not changes, '\n'.join([f'write the changed list by {COMMAND}:', *changes])

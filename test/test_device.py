@@ -1,18 +1,24 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Both alignments and the matcher in torch operations, against the oracle."""
+"""Alignments, matcher and recognizer in torch operations, against the oracle and the CPU."""
 
 import numpy as np
 import oracle
+from places import features_of, map_of, route_strips
 import pytest
 from stavpr_ros.alignment import best_match, SequenceDistances, SequenceSettings, SpatialSettings
 from stavpr_ros.alignment.cpu.int8 import Int8Strips, round_queries
 from stavpr_ros.alignment.device import lm_dtw, spatial_alignment
 from stavpr_ros.errors import InputError, SettingsError
 from stavpr_ros.features import FeatureSettings, LocalFeatures
+from stavpr_ros.mapping import Session
+from stavpr_ros.method import PlaceRecognizer, RecognizerSettings, Status
 from stavpr_ros.method.columns import ColumnLayout
-from stavpr_ros.method.device import DeviceLmDtwWindow
+from stavpr_ros.method.device import DeviceLmDtwWindow, z_normalized_on_device
 from stavpr_ros.method.lm_dtw_window import LmDtwWindow
+from stavpr_ros.method.settings import RobustOptions
+from stavpr_ros.prepare import device_matcher
+from stavpr_ros.prepare.centering import z_normalized
 from stavpr_ros.prepare.matcher import make_matcher
 import torch
 
@@ -43,15 +49,15 @@ def random_distances(seed, shape, levels=None):
 def test_image_distances_equal_oracle(device, strategy, strips, xi, n, sigma, levels):
     d = random_distances(strips, (strips, strips, n), levels)
     settings = SpatialSettings(strategy, sigma, xi)
-    found = spatial_alignment(strips, settings, device)(torch.from_numpy(d).to(device))
+    result = spatial_alignment(strips, settings, device)(torch.from_numpy(d).to(device))
     expected = oracle.image_distances(d, strategy, sigma, xi, np.float32)
-    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result.cpu().numpy(), expected, rtol=0, atol=1e-6)
 
 
 def test_published_figure(device):
     d = torch.from_numpy(oracle.GOLDEN[:, :, None].astype(np.float32)).to(device)
-    found = spatial_alignment(7, SpatialSettings(), device)(d).item()
-    assert found == pytest.approx(0.28724851, abs=1e-6)
+    result = spatial_alignment(7, SpatialSettings(), device)(d).item()
+    assert result == pytest.approx(0.28724851, abs=1e-6)
 
 
 @pytest.mark.parametrize('radius', [0, 3])
@@ -78,15 +84,15 @@ def test_window_equals_oracle_bit_for_bit(device, l, n, beta, levels, banned, ra
         twin.push(row, row, t)
         if t + 1 < l:
             continue
-        (found, sequences), (expected, _) = window.match(), twin.match()
+        (result, sequences), (expected, _) = window.match(), twin.match()
         q, m = oracle.match_sequence(rows[t + 1 - l : t + 1], beta, np.float32)
         answer = oracle.best_match(q, m, radius)
-        np.testing.assert_equal(vars(found), vars(expected))
+        np.testing.assert_equal(vars(result), vars(expected))
         if answer is None:
-            assert found.place < 0
+            assert result.place < 0
             continue
-        assert (found.first, found.last) == (answer.start, answer.last)
-        assert found.distance == answer.distance
+        assert (result.first, result.last) == (answer.start, answer.last)
+        assert result.distance == answer.distance
         costs, middles = sequences()[:2]
         np.testing.assert_array_equal(costs, q)
         m = np.where(np.isfinite(q), m, 0)
@@ -107,7 +113,7 @@ def test_starts_of_default_window_equal_oracle(device):
 
 
 def features(n, seed=0, strips=W, zero=()):
-    """Features of n images, unit norm; those of ``zero`` (strip, image) are all zeros."""
+    """Return unit-norm features of n images, with all zeros at ``zero`` (strip, image)."""
     rng = np.random.default_rng(seed)
     x = rng.random((strips, n, D), np.float32) - np.float32(0.2)
     x /= np.linalg.norm(x, axis=2, keepdims=True)
@@ -148,8 +154,8 @@ def expected_row(reference, query, i, settings, precision):
         ('none', None),
     ],
 )
-def test_distances_of_every_strategy_equal_oracle(device, monkeypatch, strategy, xi, precision):
-    monkeypatch.setattr('stavpr_ros.prepare.device_matcher.WIDENED', 3 * W * D)
+def test_distances_of_every_strategy_equal_oracle(device, set_constants, strategy, xi, precision):
+    set_constants(device_matcher, WIDENED=3 * W * D)
     reference, query = features(7, zero=[(1, 2)]), features(4, seed=1, zero=[(0, 0)])
     settings = SpatialSettings(strategy, 0.7, xi)
     matcher = make_matcher(reference, settings, device, precision)
@@ -194,3 +200,84 @@ def test_invalid_settings_are_rejected(device):
         make_matcher(features(3, strips=3), SpatialSettings('sliding_window'), device, 'float32')
     with pytest.raises(SettingsError, match='no vertical alignment'):
         make_matcher(features(3), SpatialSettings(vertical=True), device, 'float32')
+
+
+# The recognizer on devices of torch against the one on the CPU
+
+pytestmark = pytest.mark.usefixtures('one_thread')
+
+
+def test_z_normalized_equals_that_of_cpu(device):
+    row = np.random.default_rng(0).uniform(0.2, 1, 150).astype(np.float32)
+    row[[7, 149]] = np.inf
+    flat, banned = np.full(5, 0.5, np.float32), np.full(3, np.inf, np.float32)
+    for values in (row, row[:5], flat, banned):
+        for counted in (np.ones(len(values), bool), np.arange(len(values)) % 3 > 0):
+            arguments = (torch.from_numpy(array).to(device) for array in (values, counted))
+            result = z_normalized_on_device(*arguments).cpu()
+            np.testing.assert_allclose(result, z_normalized(values, counted=counted), atol=1e-5)
+
+
+def drive_map(sessions):
+    """Return a map of 120 places, of one session or of two, and the features of a drive."""
+    strips = route_strips(0, 60)
+    strips[:, 30:34] = strips[:, 30:31]  # the map's camera stood
+    places, parts = features_of(strips), {}
+    if sessions:
+        places = features_of(np.concatenate([strips, strips], axis=1), 0.4, 1)
+        same_as = np.arange(120, dtype=np.int32)
+        same_as[60:] -= 60
+        index = np.repeat(np.arange(2, dtype=np.int32), 60)
+        parts = {
+            'sessions': (Session('a'), Session('b')), 'session_index': index, 'same_as': same_as
+        }  # fmt: skip
+    driven = [*range(8, 20), *[20] * 9, *range(20, 60), *[59] * 3]  # it stands at 20, and leaves
+    query = features_of(strips[:, driven], 0.3, 2)
+    query.strips[:, 13:21] = query.strips[:, 12:13]
+    query.strips[:, -3:] = features_of(route_strips(9, 3)).strips
+    return map_of(places, **parts), query
+
+
+@pytest.mark.parametrize('sessions', [False, True], ids=['session', 'sessions'])
+@pytest.mark.parametrize(
+    ('mode', 'precision'), [('robust', 'float32'), ('robust', 'int8'), ('paper', 'float32')]
+)
+def test_recognizer_equals_that_of_cpu(device, mode, precision, sessions):
+    place_map, query = drive_map(sessions)
+    settings = RecognizerSettings(
+        0.8 if mode == 'paper' else None, sequence=SequenceSettings(8), nms_radius=5, mode=mode
+    )
+    cpu, one = (
+        PlaceRecognizer(place_map, settings, backend, precision) for backend in ('cpu', device)
+    )
+    statuses = set()
+    for i in range(len(query)):
+        result, expected = (
+            recognizer.update(query[i : i + 1], i + 1) for recognizer in (one, cpu)
+        )
+        assert result.status == expected.status
+        assert result.window_stamps == expected.window_stamps
+        assert result.window_changes == expected.window_changes
+        statuses.add(expected.status)
+        np.testing.assert_allclose(one.newest_row(), cpu.newest_row(), atol=2e-5)
+        if expected.path.place < 0:
+            continue
+        assert result.distance == pytest.approx(expected.distance, abs=1e-5)
+        if mode == 'robust':
+            assert result.probability == pytest.approx(expected.probability, abs=1e-5)
+        if not expected.accepted:
+            continue
+        assert result.path.place == expected.path.place
+        np.testing.assert_array_equal(result.path.pairs, expected.path.pairs)
+        places = [[c.place for c in recognizer.ranked(2)] for recognizer in (one, cpu)]
+        assert places[0] == places[1]
+    assert {Status.WARMING_UP, Status.MATCH} <= statuses
+    one.reset()
+    assert one.update(query[:1]).status == Status.WARMING_UP
+
+
+def test_settings_that_need_the_cpu_are_rejected(device):
+    place_map, _ = drive_map(False)
+    options = RobustOptions(place_filter=False)
+    with pytest.raises(SettingsError, match='mode paper only'):
+        PlaceRecognizer(place_map, RecognizerSettings(mode=options), device)
