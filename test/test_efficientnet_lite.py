@@ -6,6 +6,7 @@ from collections import OrderedDict
 import hashlib
 from importlib.util import find_spec
 import io
+import resource
 import subprocess
 import sys
 
@@ -132,9 +133,14 @@ def test_weights_are_read_as_torch_reads_them(checkpoint):
         np.testing.assert_array_equal(weights[name], value.numpy())
 
 
+def most_memory():
+    """Return the most resident memory of this process until now, kB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
 def test_damaged_weights_are_an_error_or_other_numbers(checkpoint):
     content, _ = checkpoint
-    random, errors = np.random.default_rng(0), 0
+    random, errors, before = np.random.default_rng(0), 0, most_memory()
     for _ in range(300):
         data = bytearray(content)
         for at in random.integers(0, len(data) if random.random() < 0.3 else 3000, 3):
@@ -144,6 +150,7 @@ def test_damaged_weights_are_an_error_or_other_numbers(checkpoint):
         except UnavailableError:
             errors += 1
     assert errors > 100
+    assert most_memory() - before < 500_000
 
 
 @pytest.mark.parametrize('call', ["cos\nsystem\n(S'touch touched'\ntR.", 'cbuiltins\neval\n.'])

@@ -133,7 +133,9 @@ class _Tensor:
         return np.asarray(numbers[index])
 
 
-class _Unpickler(pickle.Unpickler):
+class _Unpickler(pickle._Unpickler):
+    """In Python: the compiled one allocates as much memory as a damaged file states."""
+
     def find_class(self, module: str, name: str) -> Any:
         """Return what replaces a name; there are no others."""
         if (module, name) == ('collections', 'OrderedDict'):
