@@ -234,7 +234,8 @@ def main(arguments: list[str] | None = None) -> int:
     for key, values in measure(data_folder(), options.quick):
         results[key] = values
         print(key, json.dumps(values.get('sequence', values).get('f1', values)), flush=True)
-    path = options.output / f'accuracy{"-quick" if options.quick else ""}-{about["commit"]}.json'
+    name = f'accuracy-quick-{about["commit"]}' if options.quick else 'accuracy'
+    path = options.output / f'{name}.json'
     write_json(path, about | {'results': results})
     write_lines(path.with_suffix('.md'), markdown(about, results))
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its .md')
