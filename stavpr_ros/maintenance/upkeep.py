@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from stavpr_ros.errors import InputError
 from stavpr_ros.maintenance.same_drive import earlier_drive, rows_of
-from stavpr_ros.maintenance.same_places import recognize_places, SamePlaces
+from stavpr_ros.maintenance.same_places import fill_gaps, recognize_places, SamePlaces
 from stavpr_ros.mapping import Map, merge_maps, select_places
 from stavpr_ros.mapping.transforms import inverse, matrices, to_poses
 from stavpr_ros.mapping.versions import current_version, MAX_VERSIONS, save_version, Version
@@ -224,7 +224,7 @@ def _with_drive(
     :param places: places of the map that they show, (m,), whose identifiers and poses they get;
         -1 = none.
     """
-    n, is_hit = len(place_map), places >= 0
+    n, same = len(place_map), fill_gaps(places)
     # identifiers that stay when places come and go: their numbers where there is none
     ids = tuple(identifier or str(i) for i, identifier in enumerate(place_map.ids))
     identifiers = tuple(
@@ -243,7 +243,8 @@ def _with_drive(
         session = replace(session, thumbnails=())
     both = merge_maps([replace(place_map, ids=ids), session], ['first', name])
     roots = np.arange(n) if place_map.same_as is None else place_map.same_as
-    same_as = np.concatenate([roots, np.where(is_hit, roots[places], n + np.arange(len(images)))])
+    alone = n + np.arange(len(images))
+    same_as = np.concatenate([roots, np.where(same >= 0, roots[same], alone)])
     return replace(both, threshold=place_map.threshold, same_as=same_as.astype(np.int32))
 
 
