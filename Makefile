@@ -26,7 +26,7 @@ RUN = $(SETUP) run
 OPTIONS = --torch-index '$(TORCH_INDEX)' --with
 LEARNED = $(filter learned hybrid efficientnet_lite1,$(FEATURES))
 TESTS := test stavpr_fleet/test stavpr_slam/test stavpr_nav/test stavpr_lab/test
-PYTEST = pytest -n 2 --dist loadfile $(TESTS)
+PYTEST = pytest -n 2 --dist loadfile --durations=10 $(TESTS)
 SOURCES := $(subst $() $(),:,$(CURDIR) $(addprefix $(CURDIR)/stavpr_,fleet slam nav lab))
 TEST = ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(RUN)
 # Package and least percentage of its lines and branches that the tests reach.
