@@ -46,7 +46,7 @@ def test_drive_is_answered_as_before(drive):
 def test_drive_after_a_reset_is_answered_as_by_a_new_pipeline(drive):
     drive, _, results = drive
     if drive.places is None:
-        pytest.skip('the route stays: test_reset has it')
+        pytest.skip('the route stays: test_loop_closure has it')
     pipeline = drive.pipeline()
     drive.images.reverse()
     drive.process(pipeline, BEFORE)
