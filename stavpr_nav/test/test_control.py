@@ -126,6 +126,14 @@ def test_first_image_that_is_not_of_the_route_stops_the_robot(change):
     assert run.drive(2)[-1].speed == pytest.approx(0.8)  # it goes on
 
 
+def test_place_that_does_not_change_stops_the_robot():
+    run = Run()
+    run.drive(2)
+    commands = run.drive(6, place=3)
+    assert commands[-1].reason == NO_EVIDENCE
+    assert sum(command.speed for command in commands) * STEP < 0.4 + 3 * 0.8 * 0.2
+
+
 @pytest.mark.parametrize('similarity', [0.6, 0.2])
 def test_start_without_match_needs_images_like_the_expected_places(similarity):
     run, offset = Run(), Offset(0.0, 0.01, 0.0, 1e6, similarity)
