@@ -164,18 +164,18 @@ class ColumnLayout:
         """Return positions: those at most ``nms_radius`` apart are neighbors in one session."""
         return np.asarray(places) if self.columns is None else self.columns[self._same_as[places]]
 
-    def around(self, column: int, radius: int) -> np.ndarray:
+    def around(self, column: int, radius: int, beside: bool = False) -> np.ndarray:
         """
-        Return the columns near a column, as first ones and ends, (m, 2).
+        Return the columns of positions near a column's, as first ones and ends, (m, 2).
 
-        These are the columns whose positions are within the radius, and those within it beside
-        a column of the same position: another session has fewer places, or more.
+        :param beside: with the columns within the radius beside each column of the same position:
+            another session has fewer places, or more.
         """
         if self.columns is None:
             return np.array([[column - radius, column + radius + 1]])
         apart = self._apart(self._positions, self._positions[column])
         is_near = apart <= radius
-        for same in np.flatnonzero(apart <= CLOSE).tolist():
+        for same in np.flatnonzero(apart <= CLOSE).tolist() if beside else ():
             is_near[max(same - radius, 0) : same + radius + 1] = True
         near = np.flatnonzero(is_near)
         ends = np.flatnonzero(np.diff(near) > 1)

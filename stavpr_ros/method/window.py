@@ -346,8 +346,8 @@ class FilterWindow(QueryWindow):
         """Return quantities with those that compare the path with straight ones elsewhere."""
         l, at = len(path), int(path[position])
         steps = np.rint(np.outer(STRAIGHT, np.arange(l) - position)).astype(np.int64)
-        near, straight = self.layout.around(at, APART), self.filter.best_straight
-        here = self.layout.around(at, CLOSE)  # in all sessions
+        near, here = (self.layout.around(at, radius, True) for radius in (APART, CLOSE))
+        straight = self.filter.best_straight
         score = max(straight(steps, slice(*span), near[:0])[0] for span in here.tolist())
         if self._is_route:  # the camera may have passed there several times
             return quantities._replace(lead=max(score, 0.0), images=ROUTE_IMAGES)
