@@ -20,7 +20,7 @@ CEILINGS = {
     'lines of stavpr_nav': 1_622,
     'lines of stavpr_lab': 12_143,
     'lines of the method (prepare, method)': 5_668,
-    'lines of all tests': 32_720,
+    'lines of all tests': 32_728,
     'lines of benchmarks and tools': 8_811,
     'lines of docs and README': 3_993,
     'parameters of the node': 51,
