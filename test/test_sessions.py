@@ -146,11 +146,15 @@ def test_path_is_compared_in_all_sessions_of_its_places():
 def test_short_gaps_of_related_places_are_filled_by_their_neighbors():
     none, places = np.full(30, -1), np.arange(30)
     matched = np.concatenate([places[:3], none[:4], [10, 11], none[:25], [40], none[:2], [90]])
-    filled = fill_gaps(matched)
+    one = np.zeros(100, int)
+    filled = fill_gaps(matched, one)
     np.testing.assert_array_equal(filled[:9], [0, 1, 2, 4, 5, 7, 8, 10, 11])
     np.testing.assert_array_equal(filled[9:], matched[9:])  # a long gap, and one of a jump
     backward = np.array([5, -1, 4])
-    np.testing.assert_array_equal(fill_gaps(backward), backward)
+    np.testing.assert_array_equal(fill_gaps(backward, one), backward)
+    border = np.array([8, -1, 11])  # from the end of a session to the start of the next
+    np.testing.assert_array_equal(fill_gaps(border, one), [8, 10, 11])
+    np.testing.assert_array_equal(fill_gaps(border, np.arange(100) // 10), border)
 
 
 def test_second_best_is_the_most_probable_place_elsewhere_however_faint(town):

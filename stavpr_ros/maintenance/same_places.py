@@ -81,24 +81,27 @@ def with_same_places(place_map: Map, first: int = 1) -> Map:
         if not len(earlier):
             continue
         reference = select_places(replace(place_map, same_as=same_as.astype(np.int32)), earlier)
-        matched = fill_gaps(recognize_places(reference, place_map, places))
+        matched = fill_gaps(recognize_places(reference, place_map, places), index[earlier])
         is_matched = matched >= 0
         same_as[places[is_matched]] = same_as[earlier[matched[is_matched]]]
     return replace(place_map, same_as=same_as.astype(np.int32))
 
 
-def fill_gaps(matched: np.ndarray) -> np.ndarray:
+def fill_gaps(matched: np.ndarray, sessions: np.ndarray) -> np.ndarray:
     """
     Return the matched places of images in order, those of short gaps by their neighbors.
 
-    Within a window, a camera at a possible speed has not been elsewhere.
+    Within a window, a camera at a possible speed along one session has not been elsewhere.
 
-    :param matched: of each image, -1 = none, (n,).
+    :param matched: place of each image, -1 = none, (n,).
+    :param sessions: session of each place, (m,).
     """
-    filled, images = matched.copy(), np.flatnonzero(matched >= 0)
+    filled, length = matched.copy(), SequenceSettings().length
+    images = np.flatnonzero(matched >= 0)
     for first, last in pairwise(images.tolist()):
         start, end, gap = int(matched[first]), int(matched[last]), last - first
-        if gap <= SequenceSettings().length and 0 <= end - start <= max(MODEL.speeds) * gap:
+        is_short = gap <= length and sessions[start] == sessions[end]
+        if is_short and 0 <= end - start <= max(MODEL.speeds) * gap:
             filled[first : last + 1] = np.rint(np.linspace(start, end, gap + 1))
     return filled
 

@@ -64,6 +64,7 @@ def update_map(place_map: Map, drive: Map, name: str, version: Version) -> tuple
     # by the places before the first update: errors would add up from drive to drive
     places = recognize_places(select_places(place_map, np.arange(base)), drive, images)
     places = np.where(places >= 0, places, on_map.of_windows[images])
+    places = fill_gaps(places, on_map.sessions)
     updated = _with_drive(place_map, drive, name, images, places)
     assert updated.session_index is not None
     begins = np.searchsorted(updated.session_index, np.arange(len(updated.sessions)))
@@ -224,7 +225,7 @@ def _with_drive(
     :param places: places of the map that they show, (m,), whose identifiers and poses they get;
         -1 = none.
     """
-    n, same = len(place_map), fill_gaps(places)
+    n, is_hit = len(place_map), places >= 0
     # identifiers that stay when places come and go: their numbers where there is none
     ids = tuple(identifier or str(i) for i, identifier in enumerate(place_map.ids))
     identifiers = tuple(
@@ -244,7 +245,7 @@ def _with_drive(
     both = merge_maps([replace(place_map, ids=ids), session], ['first', name])
     roots = np.arange(n) if place_map.same_as is None else place_map.same_as
     alone = n + np.arange(len(images))
-    same_as = np.concatenate([roots, np.where(same >= 0, roots[same], alone)])
+    same_as = np.concatenate([roots, np.where(is_hit, roots[places], alone)])
     return replace(both, threshold=place_map.threshold, same_as=same_as.astype(np.int32))
 
 
