@@ -2,21 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """A kind of features of another package: a plain dataclass and a class with feature_maps."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, make_dataclass
 
 import cv2
 import numpy as np
 import pytest
 from stavpr_ros.commands import build_map
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.features import registry
 from stavpr_ros.mapping import load_map, Map
+from stavpr_ros.mapping.map_schema import identity_fields
 
 
 @dataclass(frozen=True)
 class PlainSettings:
     """Settings without a help, and none of those that other kinds have."""
 
-    side: int = 28
+    side: 'int' = 28
+    weights: tuple[float, ...] = field(default_factory=lambda: (0.5, 2.0))
 
 
 class Plain:
@@ -48,6 +51,15 @@ def test_kind_of_a_plain_dataclass_makes_a_map_and_has_options(tmp_path, capsys)
     words = ['--input', str(images), '--output', str(path), '--features', 'plain']
     assert build_map.main([*words, '--plain-side', '14']) == 0
     assert load_map(path).settings.backbone == PlainSettings(14)
+    assert registry.settings_from_json('plain', '{"side": 14}') == PlainSettings(14)
     with pytest.raises(SystemExit):
         build_map.main(['--help-features'])
-    assert '--plain-side' in capsys.readouterr().out
+    assert '--plain-weights' in capsys.readouterr().out
+
+
+def test_setting_of_a_type_that_map_files_lack_is_named(monkeypatch):
+    row = 'names', dict, field(default_factory=dict)
+    settings = make_dataclass('Settings', [row], frozen=True)
+    monkeypatch.setitem(registry.KINDS, 'plain', registry.Kind(settings, f'{__name__}:Plain'))
+    with pytest.raises(SettingsError, match='setting names of features plain'):
+        identity_fields('plain')

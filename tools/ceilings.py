@@ -14,13 +14,13 @@ import sys
 
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = {
-    'lines of stavpr_ros': 30_697,
+    'lines of stavpr_ros': 30_721,
     'lines of stavpr_fleet': 1_196,
     'lines of stavpr_slam': 4_378,
     'lines of stavpr_nav': 1_622,
     'lines of stavpr_lab': 12_143,
     'lines of the method (prepare, method)': 5_668,
-    'lines of all tests': 32_728,
+    'lines of all tests': 32_744,
     'lines of benchmarks and tools': 8_811,
     'lines of docs and README': 3_993,
     'parameters of the node': 51,

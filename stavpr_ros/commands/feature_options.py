@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 from stavpr_ros.commands.program import say
 from stavpr_ros.devices import DEVICES
 from stavpr_ros.errors import SettingsError
-from stavpr_ros.features.registry import AUTO, kinds, settings_class
+from stavpr_ros.features.registry import AUTO, default_of, kinds, settings_class
 from stavpr_ros.parameters import default
 
 if TYPE_CHECKING:
@@ -50,8 +50,9 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     for kind in kinds():
         group_of_kind = hidden_parser.add_argument_group(f'features {kind}')
         for row in dataclasses.fields(settings_class(kind)):
-            required = row.default is dataclasses.MISSING
-            example = '' if required else row.default
+            example = default_of(row)
+            required = example is dataclasses.MISSING
+            example = '' if required else example
             default_text = 'required' if required else str(example).strip('()') or 'none'
             text = f'{row.metadata.get("help", "")} ({default_text})'.replace('%', '%%')
             for group, words in ((parser, argparse.SUPPRESS), (group_of_kind, text)):
@@ -122,7 +123,7 @@ def _backbone_settings(arguments: argparse.Namespace) -> Any:
     missing = [
         _option(kind, row.name)
         for row in dataclasses.fields(settings_class(kind))
-        if row.default is dataclasses.MISSING and row.name not in values
+        if default_of(row) is dataclasses.MISSING and row.name not in values
     ]
     if missing:
         raise SettingsError(f'--features {kind} needs {" and ".join(missing)}')

@@ -44,6 +44,12 @@ def setting(
     return dataclasses.field(default=default, metadata={'help': help}, compare=identity)
 
 
+def default_of(field: Any) -> Any:
+    """Return the default of a field of settings, ``dataclasses.MISSING`` = it is required."""
+    has_factory = field.default_factory is not dataclasses.MISSING
+    return field.default_factory() if has_factory else field.default
+
+
 @dataclass(frozen=True)
 class GradientSettings:
     """Settings of the oriented-gradient features."""
@@ -271,6 +277,12 @@ def settings_class(kind: str) -> Any:
     return _kind(kind).settings
 
 
+def make_settings(kind: str, values: dict[str, Any]) -> Any:
+    """Make a kind's settings from values of a JSON document, whose arrays become tuples."""
+    values = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    return settings_class(kind)(**values)
+
+
 def evidence_of(kind: str, strips: int, dimension: int) -> tuple[float, Cells | None]:
     """
     Return the constant of the evidence and the cells of a kind of features.
@@ -329,7 +341,7 @@ def settings_from_json(kind: str, text: str, model: str = '') -> Any:
     cls = settings_class(kind)
     fields = dataclasses.fields(cls)
     names = [field.name for field in fields]
-    required_names = [field.name for field in fields if field.default is dataclasses.MISSING]
+    required_names = [field.name for field in fields if default_of(field) is dataclasses.MISSING]
     try:
         values = json.loads(text)
         if not isinstance(values, dict):
@@ -338,7 +350,7 @@ def settings_from_json(kind: str, text: str, model: str = '') -> Any:
             values['model'] = model
         if missing := [name for name in required_names if name not in values]:
             raise TypeError(f'{" and ".join(missing)} missing')
-        return cls(**values)
+        return make_settings(kind, values)
     except (ValueError, TypeError, RecursionError) as error:
         raise SettingsError(
             f'settings {text[:200]!r} of features {kind} are invalid ({error}): expected a JSON '

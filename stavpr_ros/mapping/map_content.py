@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from stavpr_ros.errors import InputError, printable
 from stavpr_ros.features import FeatureSettings, Projection
-from stavpr_ros.features.registry import settings_class
+from stavpr_ros.features.registry import make_settings, settings_class
 from stavpr_ros.mapping.camera import Camera
 from stavpr_ros.mapping.jpeg import jpeg_pixels, MAX_THUMBNAIL_PIXELS
 from stavpr_ros.mapping.map_container import MapFile, Part
@@ -176,7 +176,7 @@ def _settings(content: dict[str, Any]) -> FeatureSettings:
     if 'sha256' in rows and not values['sha256']:
         raise ValueError(f'settings of features {kind} lack the sha256 of the model')
     paths = {row.name for row in fields(settings_class(kind))} & {'model'}
-    backbone = settings_class(kind)(**values, **dict.fromkeys(paths, ''))
+    backbone = make_settings(kind, values | dict.fromkeys(paths, ''))
     return FeatureSettings(**{**content, 'backbone': backbone})
 
 

@@ -10,8 +10,9 @@ from collections.abc import Callable
 from dataclasses import fields
 import math
 import re
-from typing import Any
+from typing import Any, get_type_hints
 
+from stavpr_ros.errors import SettingsError
 from stavpr_ros.features.registry import settings_class
 
 SHA256 = re.compile('[0-9a-f]{64}')
@@ -181,6 +182,12 @@ def identity_fields(kind: str) -> dict[str, Check]:
 
     The location of a model is not among them, nor what is without effect on the features.
     """
-    return {
-        row.name: _SETTING_TYPES[row.type] for row in fields(settings_class(kind)) if row.compare
-    }
+    cls, checks = settings_class(kind), dict[str, Check]()
+    for name in (row.name for row in fields(cls) if row.compare):
+        if (annotation := get_type_hints(cls)[name]) not in _SETTING_TYPES:
+            raise SettingsError(
+                f'setting {name} of features {kind} is a {annotation}: expected bool, int, float, '
+                'str or tuple[float, ...], which map files have'
+            )
+        checks[name] = _SETTING_TYPES[annotation]
+    return checks
