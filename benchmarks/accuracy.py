@@ -223,7 +223,7 @@ def markdown(about: dict[str, Any], results: Results) -> list[str]:
         lines.append([*row, *texts, f'{best["recall_at_100_precision"]:.4f}', '-'])
     head = ('data set', 'features', 'mode', 'speed', 'best F1', 'P at default', 'R at default')
     head += ('R at 100 % P', 'unknown matched')
-    return [*heading('Accuracy', about), *table(head, lines)]
+    return [*heading('Accuracy', 'make accuracy', about), *table(head, lines)]
 
 
 def main(arguments: list[str] | None = None) -> int:

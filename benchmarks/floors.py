@@ -6,7 +6,7 @@ Which floor: a folder of maps of look-alike floors, as parameter ``map_path`` ta
 The odd images of each floor of the data set tower are its map, the even ones the query, floor
 after floor without a reset, as by an elevator; beside each floor with the map of it alone.
 ``python benchmarks/floors.py``, on STAVPR_DATA, in ten seconds; prints the table of
-docs/robust_mode.md.
+benchmarks/results/unseen.md.
 """
 
 from pathlib import Path

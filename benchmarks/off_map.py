@@ -28,14 +28,7 @@ from off_map_page import (
     Results,
     summary_section,
 )
-from results import (
-    environment,
-    options_parser,
-    RESULTS,
-    write_json,
-    write_lines,
-    write_section,
-)
+from results import environment, options_parser, write_json, write_lines
 from stavpr_lab.evaluation.calibration import calibrate
 from stavpr_lab.evaluation.drive import DriveChanges
 from stavpr_lab.evaluation.evaluate import recognize_all
@@ -460,10 +453,7 @@ def main(arguments: list[str] | None = None) -> int:
     step = 'each' if steps == 1 else f'every {steps}th'
     about |= {'stretches': STRETCHES.format(step=step, long=LONG_STRETCHES // steps)}
     write_json(path, about | {'results': results})
-    if options.quick or options.output != RESULTS:
-        write_lines(path.with_suffix('.md'), markdown(about, results))
-    else:
-        write_section(RESULTS / 'robust_mode.md', 'make off-map', markdown(about, results)[2:])
+    write_lines(path.with_suffix('.md'), markdown(about, results))
     print(*summary_section(results), sep='\n')
     print(f'took {time.perf_counter() - began:.0f} s\nwrote {path} and its page')
     return 0

@@ -1,6 +1,6 @@
 # Copyright 2026 The stavpr_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The section of benchmarks/results/robust_mode.md by the rows that off_map.py measures."""
+"""The page benchmarks/results/off_map.md, from the rows that off_map.py measures."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -20,8 +20,8 @@ Results = dict[str, dict[str, Any]]
 TEXT = """\
 `make off-map` measures mode robust with its defaults on all data sets of the
 [accuracy table](../README.md#accuracy), on drives that differ from the recordings.
-[Robust mode](../../docs/robust_mode.md) explains the method and its limits; every drive and all
-bins of the calibration are in [off_map.json](off_map.json).
+Questions that these tables answer: [by night](night.md), [never seen](unseen.md), [how
+sure](sure.md). All numbers, and the bins of the calibration, are in [off_map.json](off_map.json).
 
 * **Detours:** the map lacks a stretch that the query drives; {stretches}.
   Unseen images are more than 5 places from each place of the map.
@@ -37,6 +37,7 @@ bins of the calibration are in [off_map.json](off_map.json).
 * **Calibration:** declared probability beside the share of right matches; the expected error is
   the mean difference of both over ten bins.
 """
+DRIVES = 'Precision / recall of each drive at `max_error` 0.01 (the default, .5) and 0.05:'
 
 
 def percent(part: float, whole: float) -> str:
@@ -201,12 +202,26 @@ def summary_section(results: Results) -> list[str]:
     return table(['', *head], lines)
 
 
+def drives_section(results: Results) -> list[str]:
+    """Return precision and recall of each drive, of each kind of features at each rate."""
+    cells: dict[str, dict[tuple[str, str], str]] = {}
+    for section, suffix in (('drives', ''), ('sparse', '/every third place')):
+        for feature, name, row in _rows(results, section):
+            for rate, (precision, recall) in row['rates'].items():
+                text = f'{precision:.3f} / {recall:.3f}'
+                cells.setdefault(name + suffix, {})[feature, rate] = text
+    columns = sorted({column for row in cells.values() for column in row})
+    head = [f'{KINDS[feature]}, {rate}' for feature, rate in columns]
+    rows = [[name, *(row.get(key, '-') for key in columns)] for name, row in cells.items()]
+    return table(['drive', *head], rows)
+
+
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the page."""
     return [
-        *heading('Off the map, at night, at other speeds', about),
+        *heading('Off the map, at night, at other speeds', 'make off-map', about),
         TEXT.format(stretches=about['stretches']),
-        *filter(None, [about.get('note', '')]),
-        '',
         *summary_section(results),
+        *('## Drives', '', DRIVES, ''),
+        *drives_section(results),
     ]

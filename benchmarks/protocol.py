@@ -51,7 +51,7 @@ STILL = 2.0  # mean change of the gray levels since the image before, below whic
 SHORT_LENGTHS = (5, 20)  # images of sequences of SqueezeNet on Nordland, 0.1 s an image and length
 PATCHES = 'p'
 LABELS = FEATURES | {PATCHES: 'patches of SeqSLAM'}
-# of results/evaluation.md: data set, tolerance, images
+# first table: data set, tolerance, images
 EXCERPT = (
     ('nordland_clean', 1, 5),
     ('nordland', 1, 5),
@@ -127,7 +127,7 @@ def measure(folder: Path, quick: bool) -> Iterator[tuple[str, list[Row]]]:
 
 
 def excerpt(results: Results) -> list[str]:
-    """Return the table of results/evaluation.md: recall@1, recall at 100 % precision."""
+    """Return the first table: recall@1, recall at 100 % precision."""
     lines: dict[tuple[str, str], list[str]] = {}
     for column, (name, *case) in enumerate(EXCERPT):
         for feature, label in LABELS.items():
@@ -142,8 +142,8 @@ def excerpt(results: Results) -> list[str]:
 
 def markdown(about: dict[str, Any], results: Results) -> list[str]:
     """Return the lines of the page: a table of each data set with each kind of features."""
-    lines = heading('Recalls by tolerance and sequence length', about)
-    lines += ['`make protocol` writes this page. Recall@1 and recall at 100 % precision:', '']
+    lines = heading('Recalls by tolerance and sequence length', 'make protocol', about)
+    lines += ['Recall@1 and recall at 100 % precision:', '']
     lines += excerpt(results)
     lines += ['Cells: best F1 / recall@1 / recall at 100 % precision, with 95 % intervals.', '']
     head = ['method', 'images', *(f'+-{t}' for t in TOLERANCES)]

@@ -81,7 +81,7 @@ def report(about: dict[str, Any], run: Run, memory: Sequence[Memory]) -> list[st
     environment.filters |= {'seconds': seconds_text, 'number': number_text}
     template = environment.from_string(TEMPLATE.read_text(encoding='utf-8'))
     page = template.render(
-        heading=heading(f'Matching on {about["machine"]["cpu"]}', about),
+        heading=heading(f'Matching on {about["machine"]["cpu"]}', 'make bench', about),
         run=run,
         stages=ROBUST_STAGES,
         frames=[row for row in rows if (row.stage, row.mode) == ('frame', 'robust')],

@@ -123,8 +123,8 @@ def environment(named_commit: str = '') -> dict[str, Any]:
     }
 
 
-def heading(title: str, about: dict[str, Any]) -> list[str]:
-    """Return the lines that open a report."""
+def heading(title: str, command: str, about: dict[str, Any]) -> list[str]:
+    """Return the lines that open a page, with the command that writes it."""
     sets = ' '.join(about['machine']['instruction_sets'])
     machine = {
         name.replace('_', ' '): value
@@ -138,10 +138,10 @@ def heading(title: str, about: dict[str, Any]) -> list[str]:
     return [
         f'# {title}',
         '',
+        f'Written by `{command}`; benchmarks/README.md describes the method.',
         f'Commit {about["commit"]}, {about["date"]}.',
         *textwrap.wrap(f'Machine: {machine}.', 120),
         *textwrap.wrap(f'Versions: {versions}.', 120),
-        'Method: benchmarks/README.md.',
         '',
     ]
 
@@ -171,14 +171,6 @@ def write_json(path: Path, document: Any) -> None:
 def write_lines(path: Path, lines: Sequence[str]) -> None:
     """Write a text that ends with one line break."""
     path.write_text('\n'.join(lines).rstrip() + '\n', encoding='utf-8')
-
-
-def write_section(page: Path, command: str, lines: Sequence[str]) -> None:
-    """Replace what a command has written on a page, up to the mark of its end."""
-    begin, end = f'<!-- written by {command} -->', '<!-- end -->'
-    before, rest = page.read_text(encoding='utf-8').split(begin)
-    text, behind = '\n'.join(lines).strip(), rest.split(end, 1)[1]
-    page.write_text(f'{before}{begin}\n\n{text}\n\n{end}{behind}', encoding='utf-8')
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

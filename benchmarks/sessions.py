@@ -3,7 +3,7 @@
 """
 Real sessions that update a map, beside the first session alone and all sessions kept.
 
-``make days``; the rows are the end of benchmarks/results/days.md.
+``make days``; the rows are benchmarks/results/sessions.md.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +14,7 @@ import time
 
 from data import data_folder
 import numpy as np
-from results import RESULTS, table
+from results import RESULTS, table, write_lines
 from stavpr_ros.errors import InputError
 from stavpr_ros.features import FeatureExtractor
 from stavpr_ros.maintenance.same_places import with_last_related
@@ -25,15 +25,16 @@ from stavpr_ros.method import PlaceRecognizer, RecognizerSettings
 from stavpr_ros.sources import open_source
 from stavpr_ros.threads import limit_threads
 
-HEADING = '## Real sessions'
-TEXT = """
-`python3 benchmarks/sessions.py`: the first session is the map, the next ones update it, and the
-last one is matched on it; sums of the orders. Nordland and the track have two sessions: the even
-images of the second update the map, the odd ones are matched. The office is driven in two laps on
-two days, each lap is a session. Truth of the office and of the track: the best path of a whole
-session. Poisoned drives (images of another route, mirrored ones, but for the closed laps of the
-office the second half before the first): those that change a map, of all. Milliseconds of an image
-on one thread, mean of the orders' medians.
+TEXT = """\
+# Real sessions
+
+Written by `python benchmarks/sessions.py` (`make days`). The first session is the map, the next
+ones update it, and the last one is matched on it; sums of the orders. Nordland and the track have
+two sessions: the even images of the second update the map, the odd ones are matched. The office is
+driven in two laps on two days, each lap is a session. Truth of the office and of the track: the
+best path of a whole session. Poisoned drives (images of another route, mirrored ones, but for the
+closed laps of the office the second half before the first): those that change a map, of all.
+Milliseconds of an image on one thread, mean of the orders' medians.
 """
 MAPS = 'first session', 'all sessions', 'updated map', 'updated map in int8'
 PRECISIONS = 'float32', 'float32', 'float32', 'int8'  # of MAPS
@@ -211,13 +212,10 @@ def main() -> None:
     others = [route.orders[0][0].drive for route in [*listed[2:], *listed[:2]]]
     maps = ', '.join(MAPS)
     columns = ['route', 'images', f'recall: {maps}', 'wrong', 'places', 'ms', 'poisoned']
-    target, rows = RESULTS / 'days.md', []
+    rows = []
     for route, other in zip(listed, others, strict=True):
         rows.append(drive_route(route, other))
-        lines = [HEADING, TEXT, *table(columns, rows)]
-        days, _, after = target.read_text().partition(HEADING)
-        _, heading, after = after.partition('\n## ')
-        target.write_text('\n'.join([days + lines[0], *lines[1:]]) + f'\n{heading}{after}')
+        write_lines(RESULTS / 'sessions.md', [TEXT, *table(columns, rows)])
 
 
 if __name__ == '__main__':

@@ -27,7 +27,7 @@ def markdown(about: dict[str, Any], rows: list[dict[str, Any]]) -> list[str]:
     seeds = sorted({row['seed'] for row in rows})
     drives = f'Seeds {", ".join(map(str, seeds))}; {len(rows)} draws of the odometry in all.'
     return [
-        *heading('Loop closures and the pose graph, measured', about),
+        *heading('Loop closures and the pose graph, measured', 'python benchmarks/slam.py', about),
         *TEXT.splitlines(),
         drives,
         '',

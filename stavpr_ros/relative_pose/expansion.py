@@ -26,7 +26,7 @@ from stavpr_ros.relative_pose.offset import (
     WIDTH,
 )  # fmt: skip
 
-# Chosen on street 7; what half and double do on streets 21 and 33: benchmarks/results/repeat.md.
+# Chosen on street 7; half and double on 21 and 33: benchmarks/results/repeat_constants.md
 RATES = np.geomspace(0.004, 1.0, 48)  # expansions, half widths per meter
 STEPS = (1, 2, 4, 8)  # places between two compared images
 MAX_DISTANCE = 1.2  # meters between them; the next place counts in any case

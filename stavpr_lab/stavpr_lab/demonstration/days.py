@@ -141,21 +141,20 @@ def plot(results: list[Day], path: Path) -> None:
 
 
 def main() -> None:
-    """Run the days, and write table and plot with each of them; other parts of the file stay."""
+    """Run the days, and write table and plot with each of them."""
     count, target = int(sys.argv[1]), Path(sys.argv[2])
     page, results = target.with_suffix('.md'), []
-    _, heading, others = page.read_text().partition('\n## ') if page.exists() else ('', '', '')
     text = f"""# Days
 
-`python3 -m stavpr_lab.demonstration.days {' '.join(sys.argv[1:])}`; the images of a day are
-matched before the map learns from them.
+Written by `python3 -m stavpr_lab.demonstration.days {' '.join(sys.argv[1:])}` (`make
+days`). The images of a day are matched before the map learns from them.
 
 ![recall and places]({target.name}.png)
 """
     days = Days(int(sys.argv[3])) if sys.argv[3:] else Days()
     for day in run(days, count):
         results.append(day)
-        page.write_text(f'{text}\n{table(results)}\n{heading}{others}')
+        page.write_text(f'{text}\n{table(results)}\n')
         plot(results, target.with_suffix('.png'))
 
 
