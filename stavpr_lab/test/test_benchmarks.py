@@ -17,9 +17,11 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[2] / 'benchmarks'
 sys.path.insert(0, str(BENCHMARKS))
 
+import accuracy
 from lower_bounds import Peaks
 import matching
 import off_map
+import off_map_page
 import peaks
 import report
 
@@ -69,6 +71,15 @@ def test_outcome_counts_right_wrong_and_unseen_matches():
     assert result['f1'] == 3 / 4  # three of four right, one wrong
     bins = outcome.calibration()['bins']
     assert [(row['images'], row['right']) for row in bins] == [(1, 1), (1, 0), (1, 1), (1, 1)]
+
+
+@pytest.mark.parametrize('page', [accuracy, off_map_page])
+def test_pages_of_results_are_written_from_their_rows(page):
+    path = BENCHMARKS / 'results' / f'{page.__name__.removesuffix("_page")}.json'
+    document = json.loads(path.read_text())
+    lines = page.markdown(document, document['results'])
+    assert lines[2].startswith('Written by `make ')
+    assert '\n'.join(lines).rstrip() + '\n' == path.with_suffix('.md').read_text()
 
 
 def test_public_graph_one_closure_at_a_time_ends_like_all_at_once():
