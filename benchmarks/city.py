@@ -50,7 +50,7 @@ TEXT = """\
 # A city
 
 Written by `python benchmarks/city.py`. Precision and recall at the default threshold; processor
-time of an image without extraction (int8, median), and what elapsed beside other programs (load).
+and elapsed time of an image without extraction (int8, median), beside other programs (load).
 64 dimensions: `map compact --pca 64`. Processors and commits: [city.json](city.json).
 """
 
