@@ -212,7 +212,6 @@ def _text(value: Any) -> str:
     return ' '.join(f'{number:g}' for number in (value if isinstance(value, tuple) else (value,)))
 
 
-TITLE = 'The evidence of mode robust: fit, error rates, half and double'
 FIT = """
 Recall where so many images off the map are matched, the mean of their four kinds. Left out: each
 set by the weights whose mean recall is the largest on drives without its group (at .7 % and .2 %,
@@ -278,7 +277,7 @@ def main(arguments: list[str] | None = None) -> int:
                 decide.append(Windows.of(feature, few, rows.pop(('', None))))
                 others |= {(*k, feature): Windows.of(feature, few, v) for k, v in rows.items()}
     values = values_now(options.features)
-    lines = heading(TITLE, 'make fit', about)
+    lines = heading('The evidence of mode robust', 'make fit', about)
     lines += fit_section(every, values) + constants_section(every, values)
     lines += errors_section(every, values, not options.quick)
     lines += numbers_section(decide, values, others) if options.numbers else []
