@@ -7,13 +7,13 @@ import json
 import os
 from pathlib import Path
 import re
-import runpy
 import shlex
 import subprocess
 import textwrap
 
 from evaluation_commands import write_images
 from fixtures import route_images
+from language import remarks
 from processes import environment
 import pytest
 from stavpr_ros.commands import stavpr
@@ -198,9 +198,6 @@ def test_speed_in_readme_is_that_of_its_run():
         assert float(line.split('|')[3]) == pytest.approx(1 / reading, rel=0.02)
 
 
-LANGUAGE = runpy.run_path(str(ROOT / 'tools/language.py'))
-
-
 @pytest.mark.parametrize(
     'text',
     [
@@ -215,7 +212,7 @@ LANGUAGE = runpy.run_path(str(ROOT / 'tools/language.py'))
     ],
 )
 def test_language_check_names_line_and_remedy(text):
-    ((line, words, remedy),) = LANGUAGE['remarks'](f'A line.\n\n{text}\n')
+    ((line, words, remedy),) = remarks(f'A line.\n\n{text}\n')
     assert line == 3
     assert words in ' '.join(text.split())
     assert remedy
@@ -231,7 +228,7 @@ def test_language_check_names_line_and_remedy(text):
     ],
 )
 def test_language_check_accepts_plain_prose(text):
-    assert not list(LANGUAGE['remarks'](text))
+    assert not list(remarks(text))
 
 
 FOLDER = Path(__file__).resolve().parents[2] / 'docs/tutorials'
