@@ -21,8 +21,10 @@ PLAIN = {  # by pattern: what to write in its place
     r'(?= (?:is|are|was|were|of|in|by|from)\b|[.,;:)])': 'a participle needs its noun',
     r'\b(?:what|all that) there (?:is|are|was)\b': 'name it',
     r'\bare no such\b': 'name them',
-    r'\b(?:tells?|told|hears?|heard)\b': 'write "shows", "distinguishes", "receives"',
-    r'\b(?:[01]|one|an?(?: \w+)?|features|number|means?) less (?!than)': 'write "minus"',
+    r'\b(?:tells?|told) apart|\b(?:nodes?|robots?|maps?|filters?) (?:tells?|told|hears?)\b': (
+        'write "distinguishes", "shows", "receives"'
+    ),
+    r'\b(?:[01]|features|means?) less (?!than)': 'write "minus"',
     r'\bthe ways? of an?\b': 'write "path", "route", "steps"',
     r'\b(?:map|file|route|session|window|journal|store)s? (?:holds?|held)\b': 'write "contains"',
     r'\bstanding (?:camera|robot)\b|\bcamera stands\b': 'write "at rest"',
