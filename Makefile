@@ -117,7 +117,8 @@ coverage: development ## run the tests, and require the lines and branches that 
 crash-test: development ## kill, stop and disturb a recording node for HOURS=; nothing may be lost
 	@$(RUN) bash -c 'PYTHONPATH="test/shared:$$PYTHONPATH" python test/crash_run.py $(HOURS)'
 
-lint: development ceilings ## check style and types with ruff and mypy, and sizes
+lint: development ceilings ## check style and types with ruff and mypy, sizes, and the language of docs
+	@$(PYTHON) -E tools/language.py
 	@$(RUN) ruff check .
 	@$(RUN) mypy
 

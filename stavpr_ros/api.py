@@ -21,7 +21,7 @@ OPTIONS = tuple(field.name for field in fields(RecognizerSettings))
 
 class Localizer:
     """
-    Recognizes the places of a map, image by image: features and :class:`PlaceRecognizer` in one.
+    Recognizer of the places of a map, with features and :class:`PlaceRecognizer` in one.
 
     :param route: the map.
     :param settings: of recognition; None = the defaults.

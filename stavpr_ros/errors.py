@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Mapping
 
 CAUSES = {
-    'encoding': 'images of an encoding that is not read',
-    'depth': 'images of depth or measurements',
-    'size': 'images of a size that their encoding cannot have',
+    'encoding': 'images with an unknown encoding',
+    'depth': 'images with depth or measurements',
+    'size': 'images with a size that their encoding cannot have',
     'step': 'images whose rows are too short',
     'cut off': 'images that are cut off',
     'damaged': 'images that are damaged',
@@ -17,7 +17,7 @@ CAUSES = {
     'features': 'images whose features are not finite',
     'image': 'images that cannot be decoded',
     'elsewhere': 'files whose content is not here or not complete',
-    'format': 'images of a format that is not read (convert them to JPEG)',
+    'format': 'images in a format that is not read (convert them to JPEG)',
     'pages': 'pages, frames or views behind the first one of a file (to read them, split it)',
     'video': 'videos among images (to read one, name it)',
     'bag': 'files of bags among images (to read one, name it)',
@@ -32,8 +32,8 @@ CAUSES = {
 def left_out(*counts: Mapping[str, int]) -> str:
     """Return what was left out and why, by the causes of several readers; '' = nothing."""
     total = sum(map(Counter, counts), Counter())
-    parts = (f'{n} {CAUSES.get(cause, f"images ({cause})")}' for cause, n in total.items())
-    return f'left out: {", ".join(parts)}' if total else ''
+    parts = (f'{CAUSES.get(cause, f"images ({cause})")}: {n}' for cause, n in total.items())
+    return f'left out: {"; ".join(parts)}' if total else ''
 
 
 def printable(text: str) -> str:

@@ -230,8 +230,10 @@ def test_node_states_at_the_end_what_it_left_out(make, route, capfd):
     node.runtime.intake.images.on_image(Image(encoding='rgb8'))
     record(node, route[:1])
     assert not end(node)
-    expected = '1 images of a size that their encoding cannot have, 1 messages of odometry without'
-    assert f'left out: {expected} a valid pose\n' in capfd.readouterr().err
+    expected = (
+        'images with a size that their encoding cannot have: 1; messages of odometry without'
+    )
+    assert f'left out: {expected} a valid pose: 1\n' in capfd.readouterr().err
 
 
 def test_node_without_save_path_continues_its_recording_at_the_next_start(make, route, tmp_path):
@@ -369,5 +371,5 @@ def test_node_on_a_full_disk_ends_with_an_error_and_names_the_journal(
     assert process.stop() == 1
     output = process.output()
     assert 'the map is not saved: ' in output
-    assert f'places that are in no map stay in {path}.journal' in output
+    assert f'unsaved places stay in {path}.journal' in output
     assert 10 <= recover(journals(path)[0]).places <= 15

@@ -324,9 +324,13 @@ def wrong_headers():
                 ('nv24', 2, 4, 23, 'expected 24'),
             )
         ),
-        ({'encoding': 'bayer_rggb9'}, 'encoding', 'is not supported: expected one of rgb8'),
+        (
+            {'encoding': 'bayer_rggb9'},
+            'encoding',
+            'is unknown: expected a color or gray image, such as rgb8',
+        ),
         *(
-            ({'encoding': f'{kind}C{n}'}, 'depth', f"'{kind}C{n}' is depth or measurements")
+            ({'encoding': f'{kind}C{n}'}, 'depth', f"'{kind}C{n}' has depth or measurements")
             for kind in ('8S', '16S', '32S', '32F', '64F')
             for n in (1, 4)
         ),
@@ -386,7 +390,7 @@ def wrong_files():
         '32FC1',
         ' 16SC1 ; png',
     ):
-        text = f'{re.escape(repr(transport))} is depth or measurements, not an image'
+        text = f'{re.escape(repr(transport))} has depth or measurements: expected a color or gray'
         yield f'{transport!r}', file_message(png, transport), 'depth', text
     gray = np.tile(np.linspace(0, 1, 160, dtype=np.float32), (120, 1))
     counts = np.round(gray * 65535).astype(np.int32)

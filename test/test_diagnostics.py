@@ -134,7 +134,7 @@ CASES = {
         (OK, 'without thumbnails, so that geometric_check checks no', {'geometric_check': 'orb'}),
         (WARN, 'defect; the map in use has 1000 places', {'problem': 'defect'}),
         (ERROR, 'defect', NO_MAP | {'problem': 'defect'}),
-        (WARN, 'no map: set map_path or call ~/load_map', NO_MAP),
+        (WARN, 'no map is loaded: set map_path, or call ~/load_map', NO_MAP),
         (OK, 'loading route.map', LOADING),
         (OK, 'growing: 1 place of at most 20000', {'map_state': 'growing', 'places': 1}),
         (WARN, 'full: mapping stopped at 20000 places (max_places); save it', FULL_MAP),

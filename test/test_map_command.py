@@ -53,6 +53,7 @@ def folder(drive, working_folder):
 def test_map_info_shows_what_a_map_holds(folder, capsys):
     both, date = example_map(), 1_700_000_000 * 10**9
     sessions = replace(both.sessions[0], start=date), *both.sessions[1:]
+    both = replace(both, threshold=0.25)
     stamps = np.where(both.stamps, both.stamps + date, 0)
     save_map(replace(both, sessions=sessions, stamps=stamps), 'both.stavpr')
     assert main(['info', 'both.stavpr']) == 0
@@ -64,6 +65,7 @@ def test_map_info_shows_what_a_map_holds(folder, capsys):
         'a route of 23 m', 'to 2023-11-14 22:13:44 UTC',
     ):  # fmt: skip
         assert text in shown
+    assert not {'threshold', 'paper'} & set(shown.replace(',', '').split())
     save_map(both, 'both.stavpr', force=True)  # its stamps are no dates
     assert main(['info', 'both.stavpr']) == 0
     shown = capsys.readouterr().out

@@ -443,7 +443,7 @@ FORMS = [  # a change of the bytes, and what the error names
     (without_hashes, 'tensor strips has 0 hashes'),
     (lambda content: content + b'\0', r'tensors end at byte \d+, the file at byte \d+'),
     (lambda content: content[:-1], r'tensors end at byte \d+, the file at byte \d+'),
-    (other(b'PK\3\4' + bytes(26)), 'is no map of this program .*: build one'),
+    (other(b'PK\3\4' + bytes(26)), 'is no map, .*: build one'),
     (other(b''), 'no map'),
     (other(b'hello'), 'no map'),
     (other(b'\x02' + bytes(7) + b'{}'), 'no map'),
@@ -459,7 +459,10 @@ FORMS = [  # a change of the bytes, and what the error names
     (header('"strips":{', '"x":{},"strips":{'), "'x' is in the header, but"),
     (header('"strips":{', '"strips":1,"strips":{'), 'twice'),
     (header('"__metadata__"', '}"__metadata__"'), 'no map'),
-    (lambda content: (2**62).to_bytes(8, 'little') + content[8:], f'header would have {2**62} of'),
+    (
+        lambda content: (2**62).to_bytes(8, 'little') + content[8:],
+        f'a header of {2**62} bytes and has',
+    ),
 ]
 
 

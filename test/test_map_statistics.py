@@ -166,7 +166,7 @@ def test_commands_write_statistics(place_map, tmp_path, capsys):
         assert result.changes.shape[1] == (600 if action != 'merge' else 1200)
         assert not open_map(output).features.has_stale_statistics
     assert map_main(['info', str(tmp_path / 'compact')]) == 0
-    assert 'kept for a fast start' in capsys.readouterr().out
+    assert 'stored for a fast start' in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('storage', ['float32', 'float16'])

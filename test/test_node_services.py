@@ -553,7 +553,7 @@ REJECTED = [
     ('map_path', 'other.stavpr', 'call the service ~/load_map'),
     ('operation', 'mapping', 'call the service ~/set_operation'),
     ('nms_radius', 7, 'while the node is unconfigured'),
-    ('threshold', 0.8, 'is of mode paper'),
+    ('threshold', 0.8, 'applies to mode paper'),
     ('min_probability', 1.0, 'below 1'),
     ('save_path', '/missing/route.stavpr', 'save_path'),
     ('geometric_check', 'eye', 'take one of none'),

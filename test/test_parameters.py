@@ -4,6 +4,7 @@
 
 from dataclasses import fields
 from pathlib import Path
+import re
 
 from parameter_files import configuration_yaml, documentation_markdown
 import pytest
@@ -35,7 +36,9 @@ def test_files_are_generated_from_table():
 def test_rows_are_consistent():
     assert len(BY_NAME) == len(PARAMETERS)
     for row in PARAMETERS:
-        assert row.sentence.endswith('.'), row.name
+        assert re.match(
+            r'((localization|loop_closure|Mode paper): )?\w+s .*\.$', row.sentence, re.I
+        ), f'{row.name}: expected a sentence that begins with what the parameter does'
         assert not row.bounds or row.bounds[0] <= row.default <= row.bounds[1], row.name
         assert not row.choices or row.default in row.choices, row.name
 
@@ -93,7 +96,7 @@ def test_node_settings_of_values_contain_them(values, attribute, expected):
         ({'mode': 'paper', 'threshold': 0.0}, 'threshold = 0.0 must be above 0'),
         (
             {'threshold': 0.8},
-            'threshold = 0.8 is of mode paper: .* min_probability = 0.5; set that',
+            'threshold = 0.8 applies to mode paper: .* min_probability = 0.5; set min_prob',
         ),
         ({'camera_transform': 'x'}, "camera_transform = 'x': expected x y z roll pitch yaw"),
         ({'min_probability': 0.0}, 'min_probability = 0.0 must be above 0 and below 1'),

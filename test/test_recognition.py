@@ -144,7 +144,7 @@ def test_arguments_of_wrong_types_or_values_are_rejected_with_the_expected_one(s
         (lambda: RecognizerSettings('0.5'), SettingsError, "'0.5' is str: expected a number"),
         (lambda: RecognizerSettings(nms_radius='2'), SettingsError, "nms_radius = '2' is str"),
         (lambda: RecognizerSettings(nms_radius=-1), SettingsError, 'nms_radius'),
-        (lambda: RecognizerSettings(0.5), SettingsError, 'is of mode paper'),
+        (lambda: RecognizerSettings(0.5), SettingsError, 'applies to mode paper'),
         (lambda: RecognizerSettings(0.0, mode='paper'), SettingsError, 'threshold'),
         (lambda: RecognizerSettings(-1.0, mode='paper'), SettingsError, 'threshold'),
         (lambda: RecognizerSettings(np.nan, mode='paper'), SettingsError, 'threshold'),

@@ -491,7 +491,7 @@ def test_replay_of_a_folder_with_a_damaged_image_skips_it(tmp_path, subscribe, r
     assert code == 0
     assert '1 skipped' in output
     assert '002.png: 7 bytes are no image' in errors
-    assert errors.endswith('left out: 1 images that are damaged\n')
+    assert errors.endswith('left out: images that are damaged: 1\n')
     stamps = [image.header.stamp.nanosec // 1_000_000 for image in subscriber.images]
     assert stamps == [50, 100, 200]
 

@@ -65,7 +65,7 @@ def test_save_recorded_map_after_a_backup_overwrites_its_own_file(small_map, rou
 
 
 def test_save_recorded_map_that_fails_logs_the_loss(mapping, tmp_path):
-    lost = [('warning', '7 recorded places are in no map: set save_path, call ~/save_map')]
+    lost = [('warning', 'recorded places not saved: 7; set save_path, or call ~/save_map')]
     assert at_the_end(mapping, '') == lost
     level, text = at_the_end(mapping, tmp_path / 'missing' / 'route.stavpr')[-1]
     assert (level, 'does not exist' in text) == ('error', True)

@@ -102,7 +102,7 @@ class _Lookup(NamedTuple):
 
 class FleetRecognizer(SequenceRecognizer):
     """
-    Recognizes places of a city's map, one image at a time; on the CPU, in float32.
+    Recognizer of places of a city's map, one image at a time; on the CPU, in float32.
 
     :param city: the map.
     :param settings: mode robust with all its options.
@@ -162,7 +162,7 @@ class FleetRecognizer(SequenceRecognizer):
 
     @property
     def window_fill(self) -> int:
-        """Images in the window, up to l."""
+        """Return the number of images in the window, up to l."""
         return min(len(self._images), self._settings.sequence.length)
 
     def reset(self) -> None:

@@ -13,6 +13,7 @@ import textwrap
 
 from evaluation_commands import write_images
 from fixtures import route_images
+from language import remarks
 from processes import environment
 import pytest
 from stavpr_ros.commands import stavpr
@@ -195,6 +196,39 @@ def test_speed_in_readme_is_that_of_its_run():
         expected = [1e3 * float32['median_s'], 1e3 * int8['median_s']]
         assert times == pytest.approx(expected, abs=0.051)
         assert float(line.split('|')[3]) == pytest.approx(1 / reading, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'Of the newest images, five are compared.',
+        '| `decision` | of a robot |',
+        'The bound is that\nof every drive.',
+        'A place is not a pose but a number.',
+        'All rows but the last are printed.',
+        'The given is compared.',
+        'The map holds n places.',
+        'How the two are told apart.',
+    ],
+)
+def test_language_check_names_line_and_remedy(text):
+    ((line, words, remedy),) = remarks(f'A line.\n\n{text}\n')
+    assert line == 3
+    assert words in ' '.join(text.split())
+    assert remedy
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'The node is part of the package, but it needs no GPU.',
+        'It shows that the map is old, and all of it is used; most of it, at least.',
+        'An emergency stop holds the wheels. A match is not accepted, but published.',
+        '```\n# Of the images, those of Monday\n```\nA `map holds it` is code.',
+    ],
+)
+def test_language_check_accepts_plain_prose(text):
+    assert not list(remarks(text))
 
 
 FOLDER = Path(__file__).resolve().parents[2] / 'docs/tutorials'

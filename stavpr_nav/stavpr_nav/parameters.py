@@ -19,7 +19,7 @@ REPEAT: dict[str, tuple[Any, str]] = {
     'stamped': (False, 'publish geometry_msgs/TwistStamped'),
     'base_frame': ('base_link', 'frame of TwistStamped'),
     'gain': (0.9, 'radians of a turn per meter, for an offset of a width of the image'),
-    'parallax_weight': (5.0, 'of the parallax over the shift'),
+    'parallax_weight': (5.0, 'weight of the parallax, relative to the shift'),
     'max_speed': (1.0, 'm/s'),
     'max_turn': (0.5, 'rad/s'),
     'max_acceleration': (0.5, 'm/s^2; a stop is not limited'),

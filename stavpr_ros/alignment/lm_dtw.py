@@ -27,7 +27,7 @@ class SequenceDistances:
 
     @property
     def middles(self) -> np.ndarray:
-        """Midpoint floor((first + last) / 2) of each start's sequence, shape (n,), int64."""
+        """Return floor((first + last) / 2) of each start's sequence, shape (n,), int64."""
         starts = np.arange(len(self.lengths))
         return (2 * starts + self.lengths - 1) // 2
 

@@ -15,7 +15,7 @@ MAX_SHIFT = 2  # strips that ``rigid`` shifts an image without xi
 @dataclass(frozen=True)
 class SpatialSettings:
     """
-    How the distance of two images is made from the distances of their strips.
+    Settings of the distance of two images, from the distances of their strips.
 
     :param strategy: ``adaptive`` (weight a on diagonal steps), ``vanilla`` DTW (a = 1),
         ``rigid`` (the best shift of the whole image, by whole strips,
@@ -46,7 +46,7 @@ class SpatialSettings:
 
     @property
     def aligns_strips(self) -> bool:
-        """Whether strips are aligned as they are, in one go with their distances."""
+        """Return whether strips are aligned as they are, in one go with their distances."""
         return self.strategy in ('adaptive', 'vanilla', 'rigid') and not self.vertical
 
     def band(self, W: int) -> int:
@@ -63,7 +63,7 @@ class SpatialSettings:
 @dataclass(frozen=True)
 class SequenceSettings:
     """
-    How a window of query images is matched with the map (LM-DTW).
+    Settings of the matching of a window of query images with the map (LM-DTW).
 
     :param length: images in the window, l >= 2.
     :param beta: map images considered per query image, > 1: each start searches k = ceil(beta l).
@@ -78,5 +78,5 @@ class SequenceSettings:
 
     @property
     def k(self) -> int:
-        """Map images searched by one start: ceil(beta l), which is 55 for 1.1 * 50 as well."""
+        """Return the map images that one start searches: ceil(beta l), 55 for 1.1 * 50 as well."""
         return math.ceil(self.beta * self.length - 1e-9)

@@ -12,7 +12,7 @@ WINDOW = 4  # strips in the sliding window, as in the paper's comparison
 
 def strip_distances(query: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
-    Distances of every query strip to every strip of every map image: d[i, j] = 1 - <x_i, y_j>.
+    Compute the distances of query strips to strips of map images: d[i, j] = 1 - <x_i, y_j>.
 
     A zero feature has the distance 1 to everything.
 
@@ -52,7 +52,7 @@ def adaptive_weights(W: int, settings: SpatialSettings, dtype: np.dtype) -> np.n
 
 def image_distances(d: np.ndarray, settings: SpatialSettings) -> np.ndarray:
     """
-    Distances of one query image to n map images.
+    Compute the distances of one query image to n map images.
 
     :param d: strip distances, shape (W, W, n), float32 or float64; row = query strip. +inf bans a
         pair.

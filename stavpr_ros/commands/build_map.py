@@ -30,7 +30,7 @@ RULES = {  # fields of KeyframeSettings
     'interval': ('S', 'seconds since the last place; for videos and bags'),
     'distance': ('M', 'meters from the last place; needs --odometry or --poses'),
     'angle': ('DEG', 'degrees from the last place; needs --odometry or --poses'),
-    'change': ('C', 'change of the image, 0 to 2; a standing camera stays below 0.004'),
+    'change': ('C', 'change of the image, 0 to 2; a camera at rest stays below 0.004'),
 }
 MAX_SUGGESTED = 20_000  # places of a map whose threshold and seam are sought
 
@@ -64,13 +64,13 @@ def _parser() -> argparse.ArgumentParser:
         required=True,
         nargs='+',
         metavar='FOLDER|VIDEO|BAG',
-        help='images, a video, a ROS 1 or ROS 2 bag; several: a map of each',
+        help='images, a video, a ROS 1 or ROS 2 bag; each of several becomes a map',
     )
     parser.add_argument(
         '--output',
         required=True,
         metavar='MAP',
-        help='the file to write; the folder of the maps of several inputs',
+        help='the file to write; for several inputs the folder of the maps',
     )
     parser.add_argument('--force', action='store_true', help='replace an existing map')
     parser.add_argument('--topic', help='image topic of the bag, if it has several')
@@ -82,13 +82,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--poses',
         metavar='CSV',
-        help='one line an image, in their order or with their names: x y z, '
+        help='poses of the images, a line each, in their order or with their names: x y z, '
         'x y z qx qy qz qw, TUM or KITTI (meters, quaternion)',
     )
     parser.add_argument(
         '--odometry',
         metavar='TOPIC',
-        help='nav_msgs/Odometry of the same bag: poses of the places',
+        help='take the poses of the places from this nav_msgs/Odometry of the bag',
     )
     parser.add_argument(
         '--no-thumbnails', action='store_true', help='keep no thumbnails of the places'
@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
         '--thumbnail-width',
         type=int,
         metavar='PX',
-        help='of the thumbnails (192); larger ones do not help the geometric check',
+        help='width of the thumbnails (192); larger ones do not help the geometric check',
     )
     parser.add_argument(
         '--skip-bad-images',
@@ -109,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         default=0.0,
         metavar='DEG',
-        help='turn images of 360 degrees to the left; 180: as the robot takes them on its return',
+        help='turn 360-degree images to the left; 180: as the robot takes them on its return',
     )
     _add_keyframe_options(parser)
     add_job_options(parser)
@@ -120,8 +120,8 @@ def _parser() -> argparse.ArgumentParser:
 def _add_keyframe_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         'keyframes',
-        'Only images that differ enough from the last place become places. All rules must be met; '
-        'distance and angle are one rule, met by either. 0: off.',
+        'Only images that differ enough from the last place become places. All rules must be\n'
+        'met; distance and angle are one rule, met by either. 0: off.',
     )
     for name, (metavar, text) in RULES.items():
         group.add_argument(
@@ -277,7 +277,7 @@ def _source_of(arguments: argparse.Namespace) -> str:
 
 
 def _suggest_threshold(place_map: 'Map', arguments: argparse.Namespace) -> 'float | None':
-    """Return the threshold of mode paper for a map, None = unknown; print the reason."""
+    """Return the threshold of mode paper for a map; None where the map is too short for one."""
     from stavpr_ros.errors import InputError
     from stavpr_ros.maintenance.threshold import suggest_threshold
 
@@ -286,8 +286,7 @@ def _suggest_threshold(place_map: 'Map', arguments: argparse.Namespace) -> 'floa
     model = getattr(arguments, f'{place_map.settings.kind}_model', None) or ''
     try:
         return suggest_threshold(place_map, model)
-    except InputError as error:
-        say(f'no threshold is suggested for mode paper: {error}')
+    except InputError:  # the node names it in mode paper; other users need no threshold
         return None
 
 
@@ -297,8 +296,6 @@ def _report(place_map: 'Map', output: str) -> None:
     say(f'{output}: {len(place_map)} places, {shape}, {megabytes:.1f} MB')
     if place_map.seam is not None:
         say(f'the route is closed: its last place shows place {place_map.seam}')
-    if place_map.threshold is not None:
-        say(f'suggested threshold for mode paper, in the map: {place_map.threshold:.3f}')
 
 
 def _build_each(arguments: argparse.Namespace, args: list[str]) -> int:

@@ -38,14 +38,15 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
     The help of the latter is in ``--help-features``.
     """
     add = parser.add_argument_group('features').add_argument
-    kind_help = 'kind of features (%(default)s)'
-    add('--features', choices=(AUTO, *kinds()), default=default('features'), help=kind_help)
+    choices = (AUTO, *kinds())
+    kind_help = f'kind of features: {", ".join(choices)} (%(default)s)'
+    add('--features', choices=choices, default=default('features'), metavar='KIND', help=kind_help)
     strips = 'vertical strips of an image (7; 1 if the features are one vector)'
     add('--strips', type=int, metavar='W', help=strips)
-    projection = 'each strip to D dimensions by a random projection (none)'
+    projection = 'reduce each strip to D dimensions by a random projection (none)'
     add('--projection', type=int, metavar='D', help=projection)
-    add('--seed', type=int, default=0, help='of the random projection (%(default)s)')
-    add('--device', default='auto', choices=DEVICES, help='where features are computed')
+    add('--seed', type=int, default=0, help='seed of the random projection (%(default)s)')
+    add('--device', default='auto', choices=DEVICES, help='where to compute features')
     hidden_parser = argparse.ArgumentParser(add_help=False, usage=argparse.SUPPRESS)
     for kind in kinds():
         group_of_kind = hidden_parser.add_argument_group(f'features {kind}')
@@ -62,7 +63,7 @@ def add_feature_options(parser: argparse.ArgumentParser) -> None:
                     metavar=row.name.upper(),
                     help=words,
                 )
-    more = 'show the options of each kind of features, as of networks, and exit'
+    more = 'show the options of each kind of features, such as networks, and exit'
     add('--help-features', action='version', version=hidden_parser.format_help(), help=more)
 
 

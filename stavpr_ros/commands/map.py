@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
         action.add_argument('--storage', choices=storages, default=default, help=text)
 
     force = 'replace an existing output file'
-    halves = 'of the features; float16 halves the file (as it is; float32 for a merged map)'
+    halves = 'type of the features; float16 halves the file (default: as in the maps)'
     action = add(
         'info', _info, 'Show the contents of a map.', 'map', force='replace an existing plot'
     )
@@ -81,33 +81,33 @@ def _parser() -> argparse.ArgumentParser:
         help='also draw the route with its poses, thumbnails, and the distances of places to '
         'each other',
     )
-    action = add('verify', _verify, 'Compare all of a map with its hashes, and check every value.')
+    action = add('verify', _verify, 'Check a map for damage: its hashes, and every value.')
     action.add_argument('maps', nargs='+', metavar='MAP')
-    text = 'Write a map in the present format, in less memory.'
+    text = 'Write a smaller map, in the present format.'
     action = add('compact', _compact, text, 'map', 'output', force=force)
-    text = 'of the features; float16 is half of float32 (%(default)s)'
+    text = 'type of the features; float16 is half of float32 (%(default)s)'
     add_storage(action, 'float16', text)
     action.add_argument(
         '--pca',
         type=int,
         metavar='D',
-        help='strips of D dimensions, by the principal components of the map',
+        help='reduce strips to D dimensions, by the principal components of the map',
     )
     action.add_argument(
         '--drop-duplicates',
         action='store_true',
-        help='without places at which the camera did not move since the place before; of a '
-        'map without poses, also the places of a drive through the dark',
+        help='remove places where the camera had not moved since the place before; in a map '
+        'without poses, also the places of a drive through the dark',
     )
     action.add_argument(
         '--drop-thumbnails',
         action='store_true',
-        help='without the images of the places, which the geometric check and viewers need',
+        help='remove the images of the places, which the geometric check and viewers need',
     )
     action.add_argument(
         '--codes',
         action='store_true',
-        help='also the codes of precision int8, for its fastest start; of 1,000 places or more',
+        help='add int8 codes, for the fastest start with precision int8; from 1,000 places on',
     )
     text = 'Write images, pairs and poses of a map to a folder for COLMAP and hloc.'
     action = add('colmap', _colmap, text, 'map', 'folder')
@@ -116,7 +116,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs='+',
         default=[],
         metavar='PATH',
-        help='folder of images or bag of each session, in their order; without it, thumbnails',
+        help='a folder of images or a bag for each session, in order (the thumbnails)',
     )
     action.add_argument('--topic', help="the bags' image topic, if there are several")
     add_camera(action)
@@ -124,9 +124,9 @@ def _parser() -> argparse.ArgumentParser:
         '--closures',
         default='',
         metavar='FILE',
-        help='also pairs of the loop closures that `record --loop-closures` wrote',
+        help='add pairs from the loop closures that `record --loop-closures` wrote',
     )
-    text = 'Make one map of several: each is a session of it.'
+    text = 'Join maps of one route: each becomes a session.'
     action = add('merge', _merge, text, 'output', force=force)
     action.add_argument('maps', nargs='+', metavar='MAP')
     action.add_argument(
@@ -138,28 +138,28 @@ def _parser() -> argparse.ArgumentParser:
     action.add_argument(
         '--different-routes',
         action='store_true',
-        help='do not look for places that several sessions show; it takes the time of driving '
-        'each session once on a map of the earlier ones',
+        help='skip the search for places that several sessions show, which recognizes each '
+        'session on the earlier ones',
     )
     action.add_argument(
         '--cameras',
         nargs='+',
         default=[],
         metavar='NAME[:DEG]',
-        help='camera of each map, and the yaw of its optical axis in the base of the robot, to '
-        'the left: front:0 left:90 rear:180, of maps that were recorded together; without '
-        'degrees, of the intrinsics of the map',
+        help='name the camera of each map, for maps that were recorded together, and its yaw in '
+        'the base of the robot, to the left: front:0 left:90 rear:180; without degrees, by the '
+        'intrinsics of the map',
     )
     add_storage(action, '', halves)
     _add_routes(add, force)
-    text = 'Write a map to the home of a fleet, docs/fleet.md.'
+    text = 'Upload a map to the store of a fleet, docs/fleet.md.'
     action = add('upload', _upload, text, 'map', force='replace the map that is there')
     action.add_argument(
         'address',
         metavar='ADDRESS',
         help='faiss:FILE, qdrant:FOLDER, or qdrant://HOST:PORT/COLLECTION',
     )
-    text = 'Make a map of the journal of an interrupted recording.'
+    text = 'Make a map from the journal of an interrupted recording.'
     action = add('recover', _recover, text)
     action.add_argument('journal', metavar='JOURNAL', help='such as route.stavpr.journal')
     action.add_argument(
@@ -178,22 +178,27 @@ def _add_routes(add: Callable[..., argparse.ArgumentParser], force: str) -> None
     group = action.add_mutually_exclusive_group(required=True)
     group.add_argument('--keep', metavar='ID', help='only the places of this session')
     group.add_argument('--remove', metavar='ID', help="all places except this session's")
-    text = 'Write the map of a closed route so that recognition goes on from its end to its start.'
+    text = 'Close the map of a round trip: recognition goes on from its end to its start.'
     add('close', _close, text, 'map', 'output', force=force)
 
 
 def _add_upkeep(add: Callable[..., argparse.ArgumentParser]) -> None:
     """Add the actions on versions of a map."""
-    text = 'Let a drive that is certain where it is update a map, docs/upkeep.md.'
+    text = 'Update a map by a new drive whose places are certain, docs/upkeep.md.'
     action = add('update', _update, text, 'map')
     action.add_argument(
         'drive', metavar='DRIVE', help='folder of images, bag or video, or the map of the drive'
     )
     action.add_argument('--topic', help="the bag's image topic, if there are several")
     add_camera(action)
-    add('log', _log, 'Show the versions of a map, and what each update added and removed.', 'map')
-    action = add('rollback', _rollback, 'Make an earlier version the map again.', 'map')
-    action.add_argument('--to', metavar='ID', default='', help='of the version (the one before)')
+    add('log', _log, 'Show the versions of a map, and what each update changed.', 'map')
+    action = add('rollback', _rollback, 'Restore an earlier version of a map.', 'map')
+    action.add_argument(
+        '--to',
+        metavar='ID',
+        default='',
+        help='identifier of the version, see log (the one before)',
+    )
 
 
 def _info(arguments: argparse.Namespace) -> None:
@@ -236,20 +241,17 @@ def describe(place_map: 'Map', path: Path) -> str:
         'features': f'{settings.kind}, version {settings.feature_version}: {settings.strips} '
         f'strips of {place_map.dimension} dimensions, {features.storage}',
         'settings': settings.to_json(),
-        'projection': place_map.projection.identity if place_map.projection else 'none',
-        'statistics': 'none'
-        if features.statistics is None
-        else f'kept for a fast start{", with codes for int8" if features.has_codes else ""}',
-        'threshold': 'none'
-        if place_map.threshold is None
-        else f'{place_map.threshold:.3f}, mode paper',
-        'error rate': 'none'
+        'max_error': 'not calibrated on this map (stavpr evaluate --calibrate)'
         if risks is None
-        else f'at least {risks.bounds[-1]:.3g}, kept by {risks.units} blocks: {risks.method}',
+        else f'from {risks.bounds[-1]:.3g} on, calibrated by {risks.units} blocks of images',
         'stamps': f'{_time(int(stamps.min()))} to {_time(int(stamps.max()))}'
         if len(stamps)
         else 'unknown',
     }
+    if place_map.projection:
+        rows['projection'] = place_map.projection.identity
+    if features.statistics is not None:
+        rows['statistics'] = 'stored for a fast start' + ', with int8 codes' * features.has_codes
     if count and place_map.poses is not None:
         positions = place_map.poses[~np.isnan(place_map.poses[:, 0]), :3]
         length = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()

@@ -15,18 +15,18 @@ BLAS = 'scipy.linalg.cython_blas'  # numba imports it where SciPy is installed
 
 HELP = """usage: node [--ros-args -p map_path:=FILE [-p NAME:=VALUE ...] [-r image:=TOPIC]]
 
-A lifecycle node that configures and activates itself. It recognizes the places of the images on
-the topic `image` (sensor_msgs/Image) on the route of a map (operation localization), records a map
-(mapping), or recognizes places that the route has passed before (loop_closure), with poses from
-`odom`.
+A lifecycle node that configures and activates itself. It compares the images on the topic `image`
+(sensor_msgs/Image) with a map and recognizes their places (operation localization), records a map
+(mapping), or recognizes places that the route has passed before (loop_closure). It takes poses
+from `odom`.
 
 It publishes one ~/match (stavpr_msgs/PlaceMatch) for every image received, with a status; for
 accepted matches also ~/place_index, ~/distance, ~/pose and ~/loop_closure; ~/candidates,
 ~/match_image, ~/map_info and /diagnostics. Services: ~/load_map, ~/save_map, ~/reset,
 ~/relocalize, ~/set_operation.
 
-Build a map with `build_map`. Without a map (in mode paper: or a threshold) the node publishes the
-status NOT_READY with the reason; set them later by ~/load_map and the parameter threshold.
+Build a map with `build_map`. Without a map, the status of each match is NOT_READY; load one later
+by ~/load_map.
 
 parameters:
 {parameters}
@@ -35,10 +35,7 @@ recorded map could not be saved at the end
 """
 
 
-PARAMETERS = {
-    row.name: (row.default, row.sentence + (f' [{row.unit}]' if row.unit else ''))
-    for row in parameters.PARAMETERS
-}
+PARAMETERS = {row.name: (row.default, row.text) for row in parameters.PARAMETERS}
 
 
 def main(args: list[str] | None = None) -> int:

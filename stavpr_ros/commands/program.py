@@ -5,6 +5,7 @@
 import argparse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import difflib
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from io import TextIOWrapper
@@ -13,6 +14,7 @@ import os
 from pathlib import Path
 import shutil
 import sys
+import textwrap
 from types import MappingProxyType
 from typing import Any, NoReturn, TextIO, TypeVar
 
@@ -119,13 +121,13 @@ def positive(text: str) -> float:
 
 def add_fps(group: Any) -> None:
     """Add the option ``--fps`` of videos."""
-    text = 'images per second that are taken of a video (5); the same for map and query'
+    text = 'images per second to take from a video (5); the same for map and query'
     group.add_argument('--fps', type=positive, metavar='HZ', help=text)
 
 
 def add_camera(group: Any) -> None:
     """Add the option ``--camera`` of folders of images."""
-    text = 'the one to read of several cameras in a folder of images: cam0, image_2, left ...'
+    text = 'camera to read, where a folder has images of several: cam0, image_2, left ...'
     group.add_argument('--camera', metavar='NAME', help=text)
 
 
@@ -211,13 +213,14 @@ def run_node_program(text: str, module: str, node: str, args: list[str] | None) 
     :returns: the exit code.
     """
     arguments = sys.argv[1:] if args is None else args
+    wrap = partial(textwrap.fill, width=99, initial_indent=' ' * 6, subsequent_indent=' ' * 6)
     wait_passively()
 
     def run() -> int:
         content = import_module(module)
         if arguments[:1] in (['-h'], ['--help']):
             rows = (
-                f'  {name} (default {default!r})\n      {sentence}\n'
+                f'  {name} (default {default!r})\n{wrap(sentence)}\n'
                 for name, (default, sentence) in content.PARAMETERS.items()
             )
             print(text.format(parameters=''.join(rows)))

@@ -262,7 +262,8 @@ def _parser() -> argparse.ArgumentParser:
         '--fps',
         type=positive,
         metavar='HZ',
-        help=f'images per second: of a folder, as recorded ({FOLDER_FPS:g}); taken of a video (5)',
+        help=f'images per second that a folder was recorded with ({FOLDER_FPS:g}), or to take '
+        'from a video (5)',
     )
     parser.add_argument(
         '--record', metavar='FILE', help='write the matches, as `record`; --lossless misses none'

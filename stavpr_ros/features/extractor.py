@@ -214,18 +214,18 @@ def choose_kind() -> tuple[str, str]:
     except (ImportError, StavprError) as error:
         remedy = ': pip install onnxruntime' * isinstance(error, ImportError)
         return 'gradient', (
-            f'features auto: gradient, {GRADIENT_MS} {COST}, since features hybrid '
-            f'({HYBRID_MS} ms, more matches in other light) are not there: {error}{remedy}'
+            f'features auto: gradient, {GRADIENT_MS} {COST}; hybrid, {HYBRID_MS} ms and more '
+            f'matches in other light, is not available: {error}{remedy}'
         )
     return 'hybrid', (
-        f'features auto: hybrid, {HYBRID_MS} {COST}, since onnxruntime and {path} are '
-        f'there; features gradient take {GRADIENT_MS} ms'
+        f'features auto: hybrid, {HYBRID_MS} {COST}, with onnxruntime and {path}; '
+        f'gradient takes {GRADIENT_MS} ms'
     )
 
 
 class FeatureExtractor:
     """
-    Turns images into local features.
+    Extractor of the local features of images.
 
     A network is tried on one image first, so that unusable ones fail before any work.
 

@@ -97,7 +97,7 @@ def update_file(
     before = current_version(path)
     row = (name, *rows_of(drive, name)[0][1:])
     if earlier := earlier_drive(row, [*before.drives, *rows_of(place_map, 'the map')]):
-        text = f'{name} has the images of {earlier}, taken already: the map stays as it is'
+        text = f'{name} has the same images as {earlier}: the map stays as it is'
         return replace(before, changes=(text,))
     updated, version = update_map(place_map, drive, name, before)
     version = replace(version, drives=(*before.drives[1 - MAX_VERSIONS :], row))

@@ -144,12 +144,12 @@ class GrowingMap:
 
     @property
     def stamps(self) -> np.ndarray:
-        """Stamp of each place, ns, 0 = unknown: a view, shape (n,), int64."""
+        """Return the stamps of all places, ns, 0 = unknown: a view, shape (n,), int64."""
         return self._rows['stamps'][: self._count]
 
     @property
     def poses(self) -> np.ndarray:
-        """Pose of each place, a row of NaN = unknown: a view, shape (n, 7), float64."""
+        """Return the poses of places, a row of NaN = unknown: a view, shape (n, 7), float64."""
         return self._rows['poses'][: self._count]
 
     def place(self, index: int) -> Place:

@@ -142,7 +142,7 @@ def image_change(a: np.ndarray, b: np.ndarray) -> float:
 
 class KeyframeSelector:
     """
-    Selects the images that become keyframes.
+    Selector of the images that become keyframes.
 
     Call :meth:`too_soon` first, which needs no image, then :meth:`too_alike`; if both return no
     reason, :meth:`accept`. The first image is a keyframe, unless the rule of motion has no pose.

@@ -173,8 +173,7 @@ class MapFile:
     def foreign_error(self, why: str) -> MapFileError:
         """Return the error for a file of something else."""
         return MapFileError(
-            f'{self.path} is no map of this program ({why}), or damaged or truncated: build one '
-            'with build_map'
+            f'{self.path} is no map, or a damaged one ({why}): build one with build_map'
         )
 
 

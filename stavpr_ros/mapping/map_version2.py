@@ -37,7 +37,7 @@ def read_header(file: MapFile) -> None:
     head = file.bytes_at(0, min(8, file.size))
     length = int.from_bytes(head, 'little')
     if file.size < 8 or not 2 <= length <= min(MAX_HEADER, file.size - 8):
-        raise file.foreign_error(f'its header would have {length} of {file.size} bytes')
+        raise file.foreign_error(f'it names a header of {length} bytes and has {file.size}')
     content = file.bytes_at(8, length)
     try:
         header = read_json(content, 'the header')

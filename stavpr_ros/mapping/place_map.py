@@ -98,7 +98,7 @@ class Session:
 @dataclass(frozen=True)
 class Place:
     """
-    What is known of a place beside its features.
+    Stamp, pose and names of a place.
 
     :param stamp: ns, 0 = unknown.
     :param identifier: external identifier, '' = none.

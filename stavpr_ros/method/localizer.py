@@ -116,7 +116,7 @@ class SequenceRecognizer(ABC):
 
     @property
     def window_fill(self) -> int:
-        """Images in the window, up to l."""
+        """Return the number of images in the window, up to l."""
         return len(self._window.images)
 
     @property
@@ -289,7 +289,7 @@ class SequenceRecognizer(ABC):
 
 class PlaceRecognizer(SequenceRecognizer):
     """
-    Recognizes places of one map, one image at a time.
+    Recognizer of the places of one map, one image at a time.
 
     The matcher has features of its own, unless they are the map's unchanged (float32, without
     mean centering, on the CPU): then both share the memory. Of a map of
@@ -375,7 +375,7 @@ class PlaceRecognizer(SequenceRecognizer):
 
     @property
     def is_standstill(self) -> bool:
-        """Whether the newest image equals the one before, up to noise."""
+        """Return whether the newest image equals the one before, up to noise."""
         return self._window.is_standstill
 
     @property

@@ -90,7 +90,7 @@ class PathConfirmation:
 
 class LoopCloser(SequenceRecognizer):
     """
-    Recognizes places that the same traverse has passed before, one image at a time.
+    Recognizer of places that the same traverse has passed before, one image at a time.
 
     Every image becomes a place; an image is compared with images that came at least ``exclude``
     images and ``exclude_seconds`` before it. Growing needs no rebuild: memory doubles when it is

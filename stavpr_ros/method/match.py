@@ -224,12 +224,12 @@ class Match(FormerNames):
 
     @property
     def accepted(self) -> bool:
-        """Whether the image was matched."""
+        """Return whether the image was matched."""
         return self.status is Status.MATCH
 
     @property
     def is_late(self) -> bool:
-        """Whether it is one of the late matches of another."""
+        """Return whether it is one of the late matches of another."""
         return self.columns is not None
 
     @property
@@ -245,22 +245,22 @@ class Match(FormerNames):
 
     @property
     def distance(self) -> float:
-        """Mode robust: 1 - probability; mode paper: of the path. NaN without a path."""
+        """Return 1 - probability, in mode paper the distance of the path; NaN without a path."""
         return self.path.distance if math.isnan(self.probability) else 1 - self.probability
 
     @property
     def threshold(self) -> float:
-        """Distance below which a window is matched, mode robust: 1 - probability; NaN = none."""
+        """Return the distance below which a window is matched (1 - probability); NaN = none."""
         return self.limits.threshold
 
     @property
     def last_image(self) -> int:
-        """Place of the newest image on a route that grows with every image, -1 = none."""
+        """Return the place of the newest image on a route that grows with it, -1 = none."""
         return self.first_image + len(self.window_stamps) - 1 if self.first_image >= 0 else -1
 
     @property
     def position(self) -> int:
-        """Position in the window of the image that the place is of."""
+        """Return the position in the window of the image that ``place`` belongs to."""
         return 0 if self.is_oldest else (len(self.window_stamps) - 1) // 2
 
     @property

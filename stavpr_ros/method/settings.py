@@ -104,9 +104,9 @@ class RecognizerSettings:
             )
         if self.threshold is not None and self.has_probability:
             raise SettingsError(
-                f'threshold = {self.threshold} is of mode paper: mode {self.mode} matches above '
-                f'the probability min_probability = {self.min_probability}; set that, and leave '
-                'threshold out (parameter threshold of the node: negative)'
+                f'threshold = {self.threshold} applies to mode paper: mode {self.mode} accepts '
+                f'matches above min_probability = {self.min_probability}; set min_probability, '
+                'and remove threshold'
             )
         require_above('min_probability', self.min_probability, 0, below=1)
         if self.max_error:
@@ -132,12 +132,12 @@ class RecognizerSettings:
 
     @property
     def has_probability(self) -> bool:
-        """Whether matches have a probability: their distance is 1 - probability then."""
+        """Return whether matches have a probability: their distance is 1 - probability then."""
         return self.applied_options.place_filter
 
     @property
     def moves_against(self) -> bool:
-        """Whether the camera may move against the map."""
+        """Return whether the camera may move against the map."""
         return self.direction == 'both'
 
     @property
@@ -184,5 +184,5 @@ class RecognizerSettings:
 
     @property
     def compares_odometry(self) -> bool:
-        """Whether odometry is compared with the paths of matches, where places have poses."""
+        """Return whether odometry is compared with the paths of matches on places with poses."""
         return self.has_probability and self.odometry_error > 0

@@ -36,10 +36,10 @@ from stavpr_ros.sources.files import RANGE_IMAGES, RangeFinder, scale, ToBytes
 from stavpr_ros.units import SECOND
 
 NO_MAP = (
-    "no map: call the service load_map, or set parameter 'map_path' before the node is configured"
+    'no map is loaded: call the service ~/load_map, or start the node with the parameter map_path'
 )
 NO_THRESHOLD = (
-    "parameter 'threshold' is not set, which mode paper requires where the map suggests none: "
+    "mode paper requires the parameter 'threshold', since the map has none: "
     "'ros2 param set /stavpr threshold VALUE', or build the map again"
 )
 NOT_A_KEYFRAME = 'not a keyframe'
@@ -133,7 +133,7 @@ class Operation(ABC):
 
     @property
     def contrast(self) -> float:
-        """Deviation of the last image's green channel, of 255; from 32 rows or columns."""
+        """Return the deviation of the last image's green channel, of 255 (32 rows or columns)."""
         image = self._image  # once: other threads read this while the worker changes it
         if image is None:
             return math.nan

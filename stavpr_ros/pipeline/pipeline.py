@@ -62,7 +62,7 @@ def _join_maps(folder: Path) -> Map:
 
 class Pipeline:
     """
-    Runs one operation. Properties aside, all calls must come from one thread.
+    Runner of one operation. Properties aside, all calls must come from one thread.
 
     :param operation: name of the first one, of ``OPERATIONS``.
     :param open_journal: of recorded places; None = they are in memory only.

@@ -77,7 +77,7 @@ def save_recorded_map(
             places, target = _write_beside(pipeline, on_worker, path)
             log.info(f'{places} places written to {target}')
         elif unsaved and pipeline.operation.name != 'loop_closure':
-            log.warning(f'{unsaved} recorded places are in no map: set save_path, call ~/save_map')
+            log.warning(f'recorded places not saved: {unsaved}; set save_path, or call ~/save_map')
         return True
     except TimeoutError:
         if not (pipeline.unsaved or any(map(len, pipeline.operation.drives))):
@@ -141,8 +141,8 @@ def close_journals(pipeline: Pipeline, delete_route: bool, log: 'Logger | Any') 
     """Close the journals of a pipeline that ends; log those with unsaved places."""
     for path in pipeline.close_journals(delete_route):
         log.warning(
-            f'places that are in no map stay in {path}: the next start of the node makes '
-            'a map of them, or `stavpr map recover`'
+            f'unsaved places stay in {path}: the next start of the node makes a map of them, '
+            'or `stavpr map recover`'
         )
 
 

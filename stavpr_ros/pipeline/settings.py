@@ -182,7 +182,7 @@ class NodeSettings:
 
     @property
     def needs_odometry(self) -> bool:
-        """Whether poses are used: for keyframes, places of a growing map, or the transform."""
+        """Return whether poses are used: for keyframes, a growing map, or the transform."""
         used = self.pipeline.keyframes.needs_poses or self.publish_tf
         return used or self.operation != 'localization'
 

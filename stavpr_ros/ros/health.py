@@ -167,7 +167,7 @@ def _map_finding(health: Health) -> Finding:
         text = f'{health.problem}; the map in use has {places}'
         return (WARN, text) if in_use else (ERROR, health.problem)
     if info.state == 'none':
-        return warning, 'no map: set map_path or call ~/load_map'
+        return warning, 'no map is loaded: set map_path, or call ~/load_map'
     if info.state == 'loading':
         meanwhile = f'; the old map of {places} is used meanwhile' if info.places else ''
         return OK, f'loading {health.map_path}{meanwhile}'

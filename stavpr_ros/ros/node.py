@@ -185,7 +185,7 @@ class PlaceRecognitionNode(ManagedNode):
         if extractor is not None and extractor.choice:
             self.get_logger().info(extractor.choice)
         if missing := self._runtime.pipeline.operation.missing:
-            self.get_logger().warning(f'waiting, no image can be matched: {missing}')
+            self.get_logger().warning(f'no image can be matched yet: {missing}')
         self._publish_map_info()
         # objects of the map and the model are permanent: scanning them again and again takes the
         # garbage collector half a second each time, during an image

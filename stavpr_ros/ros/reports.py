@@ -104,7 +104,7 @@ class Reports:
             return
         if cause == 'no odometry':
             topic = self._node.resolve_topic_name('odom')
-            hint = f"publish it on {topic}, with stamps of the camera's clock"
+            hint = f"publish the odometry on {topic}, with stamps of the camera's clock"
             remedy = self._odometry_fault() or hint
             remedy += '; or set keyframe_distance and keyframe_angle_deg to 0'
         else:

@@ -224,8 +224,8 @@ def _decode_compressed(
     original = message.format.partition(';')[0].strip()
     if 'compresseddepth' in message.format.lower() or _MEASUREMENTS.fullmatch(original):
         raise ImageError(
-            f'compressed format {message.format!r} is depth or measurements, not an image: '
-            "choose the camera's color or gray topic",
+            f'compressed format {message.format!r} has depth or measurements: expected a color or '
+            "gray image; choose the camera's color or gray topic",
             kind='depth',
         )
     try:
@@ -253,12 +253,13 @@ def _layout(encoding: str) -> Encoding:
     layout = ENCODINGS.get(encoding) or _LOWER_CASE.get(encoding.lower())
     if layout is not None:
         return layout
-    problem, remedy, kind = 'not supported', 'set the driver, or use image_proc', 'encoding'
+    problem, remedy, kind = 'is unknown', 'set the driver, or use image_proc', 'encoding'
     if _MEASUREMENTS.fullmatch(encoding):
-        problem, kind = 'depth or measurements, not an image', 'depth'
+        problem, kind = 'has depth or measurements', 'depth'
         remedy = "choose the camera's color or gray topic"
     raise ImageError(
-        f'encoding {encoding!r} is {problem}: expected one of {", ".join(ENCODINGS)}; {remedy}',
+        f'encoding {encoding!r} {problem}: expected a color or gray image, such as rgb8, bgr8, '
+        f'mono8 or yuv422 (all {len(ENCODINGS)}: docs/node.md, encodings); {remedy}',
         kind=kind,
     )
 

@@ -81,10 +81,10 @@ def _parser() -> argparse.ArgumentParser:
     tolerance = 'places that a correct match may be off (%(default)s)'
     add('--tolerance', type=int, default=3, help=tolerance)
     add_parameter(parser, 'sequence_length', 'images in the window (%(default)s)', metavar='L')
-    add_parameter(parser, 'mode', 'of the node (%(default)s)')
-    probability = 'of the node, mode robust: matches have a greater probability (%(default)g)'
+    add_parameter(parser, 'mode', 'mode of the node (%(default)s)')
+    probability = 'probability above which the node accepts a match (%(default)g)'
     add_parameter(parser, 'min_probability', probability, metavar='P')
-    limit = 'of the node, mode paper (estimated from the first traverse)'
+    limit = 'limit of the node in mode paper (estimated from the first traverse)'
     add('--threshold', type=float, metavar='DISTANCE', help=limit)
     exclude = f'with --loop: the latest N places are not compared ({EXCLUDE_PLACES})'
     add('--exclude-places', type=int, metavar='N', help=exclude)
@@ -93,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--geometric-check', choices=checks, help=check)
     add = parser.add_argument_group('options of --slam').add_argument
     add('--world', type=int, default=7, metavar='SEED', help='seed of the world (%(default)s)')
-    add('--draw', type=int, default=0, help='of the errors of the odometry (%(default)s)')
+    add('--draw', type=int, default=0, help='seed of the errors of the odometry (%(default)s)')
     drift = 'factor on the errors of the odometry; 0.06: 2 m after three laps (%(default)s)'
     add('--drift', type=float, default=DRIFT, metavar='F', help=drift)
     wrong = 'share of loop closures that are made wrong (%(default)g)'
@@ -153,7 +153,7 @@ def _check_limits(parser: argparse.ArgumentParser, arguments: argparse.Namespace
     if threshold is None:
         return
     if arguments.mode != 'paper':
-        parser.error('--threshold is of mode paper: give --min-probability in mode robust')
+        parser.error('--threshold applies to mode paper: give --min-probability in mode robust')
     if not threshold > 0:
         parser.error(f'--threshold {threshold} must be above 0')
 

@@ -120,7 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     add('--output', metavar='FOLDER', help=f'write a report ({OUTPUT} without --json)')
     export = 'write the features of map and query as map.npy and query.npy, or --export-format'
     add('--export', metavar='FOLDER', help=export)
-    formats = 'of --export: arrays, or files of another program, listed below (%(default)s)'
+    formats = 'format of --export: arrays, or files of another program, listed below (%(default)s)'
     add('--export-format', choices=tuple(FORMATS), default='arrays', help=formats)
     add('--force', action='store_true', help='replace earlier numbers, reports and arrays')
     protocol = (
@@ -153,7 +153,7 @@ def _add_drive_options(parser: argparse.ArgumentParser) -> None:
     add('--stop', metavar='IMAGE:COUNT', help=stop, **pairs)
     drop = 'leave each image of the query out with this probability (%(default)g)'
     add('--drop', type=float, default=0.0, metavar='P', help=drop)
-    seed = 'of the images that are left out (%(default)s)'
+    seed = 'seed of --drop (%(default)s)'
     add('--drop-seed', type=int, default=0, metavar='N', help=seed)
 
 
@@ -196,14 +196,14 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     add('--beta', type=float, default=SequenceSettings.beta, help=beta)
     strategy = 'spatial alignment (on a map in mode robust: rigid, else adaptive)'
     add('--strategy', choices=STRATEGIES, help=strategy)
-    sigma = 'of the adaptive weight (%(default)g)'
+    sigma = 'width of the adaptive weight (%(default)g)'
     add('--sigma', type=float, default=spatial.sigma, help=sigma)
     add('--xi', type=int, help='strips this far apart are not aligned (none)')
     add('--vertical', action='store_true', help='align the cells of two strips vertically first')
     radius = 'other candidates are farther from the match than this (%(default)s)'
     add_parameter(group, 'nms_radius', radius, metavar='PLACES')
     add_parameter(group, 'backend', '(%(default)s)', default='cpu')
-    add_parameter(group, 'precision', 'of the map (%(default)s)')
+    add_parameter(group, 'precision', 'precision of the map (%(default)s)')
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:

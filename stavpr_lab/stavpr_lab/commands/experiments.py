@@ -65,14 +65,14 @@ def _parser() -> argparse.ArgumentParser:
     datasets = "data sets to run (the paper's, or the field's, in --data)"
     add('--datasets', nargs='+', metavar='NAME[=FOLDER]', help=datasets)
     add('--mode', choices=('paper', 'robust'), default='paper', help='(%(default)s)')
-    add('--parameter', choices=tuple(SWEEPS), help='of sweep (l)')
-    add('--values', nargs='+', type=float, default=(), metavar='X', help='of sweep')
+    add('--parameter', choices=tuple(SWEEPS), help='parameter of sweep (l)')
+    add('--values', nargs='+', type=float, default=(), metavar='X', help='values of sweep')
     arrays = (
-        'of paper: arrays FOLDER/DATASET/map.npy and query.npy (or .npz .csv .mat) for the '
+        'arrays for paper: FOLDER/DATASET/map.npy and query.npy (or .npz .csv .mat) for the '
         'column netvlad, saes or vgg_fc6; may be repeated'
     )
     add('--descriptors', action='append', default=[], metavar='COLUMN=FOLDER', help=arrays)
-    layers = 'of paper: two layers of the network of --features for SSM-VPR, the coarser first'
+    layers = 'two layers of the network of --features, for SSM-VPR in paper, the coarser first'
     add('--ssm-layers', nargs=2, metavar=('FIRST', 'SECOND'), help=layers)
     add('--json', metavar='FILE', help='write all numbers')
     add('--force', action='store_true', help='replace an existing FILE')

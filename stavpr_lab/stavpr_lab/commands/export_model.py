@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument_group('network').add_argument
     repository = 'with a hubconf.py'
     add('--repository', required=True, metavar='OWNER/NAME|FOLDER', help=repository)
-    add('--commit', default='', metavar='SHA', help='of a repository on GitHub, 40 digits')
+    add('--commit', default='', metavar='SHA', help='commit of a repository on GitHub, 40 digits')
     add('--entry', required=True, metavar='NAME', help='function in hubconf.py')
     add(
         '--argument',
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_argument,
         default=[],
         metavar='NAME=JSON',
-        help='of the entry, such as fc_output_dim=512 or backbone=\'"ResNet18"\'; may be repeated',
+        help='argument of the entry: fc_output_dim=512, backbone=\'"ResNet18"\'; may be repeated',
     )
     add('--allow-foreign-code', action='store_true', help='run the repository')
     add = parser.add_argument_group('outputs').add_argument

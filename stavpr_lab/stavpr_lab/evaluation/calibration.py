@@ -34,7 +34,7 @@ class Calibration:
 
     @property
     def expected_error(self) -> float:
-        """Mean distance of declared probability and share of correct matches, over the images."""
+        """Return the mean distance of declared probability and share of correct matches."""
         has_images = self.images > 0
         gaps = np.abs(self.declared - self.right)[has_images]
         return float(np.average(gaps, weights=self.images[has_images]))

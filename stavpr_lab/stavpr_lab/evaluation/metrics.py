@@ -46,18 +46,18 @@ class ConfusionCounts:
 
     @property
     def precision(self) -> float:
-        """TP / (TP + FP); 1 when nothing is accepted."""
+        """Return TP / (TP + FP); 1 when nothing is accepted."""
         return self.true_positives / self.accepted if self.accepted else 1.0
 
     @property
     def recall(self) -> float:
-        """TP / (TP + FN); 0 when there is neither."""
+        """Return TP / (TP + FN); 0 when there is neither."""
         relevant = self.true_positives + self.false_negatives
         return self.true_positives / relevant if relevant else 0.0
 
     @property
     def f1(self) -> float:
-        """2 TP / (2 TP + FP + FN); 0 when there is nothing to count."""
+        """Return 2 TP / (2 TP + FP + FN); 0 when there is nothing to count."""
         total = 2 * self.true_positives + self.false_positives + self.false_negatives
         return 2 * self.true_positives / total if total else 0.0
 

@@ -18,7 +18,7 @@ from stavpr_slam.pose_graph.transforms import adjoints
 @dataclass(frozen=True)
 class ChainSettings:
     """
-    When the odometry becomes a keyframe, and when it breaks.
+    Limits at which the odometry becomes a keyframe, and at which it breaks.
 
     :param distance: meters between keyframes.
     :param angle: radians between keyframes.
